@@ -1,0 +1,1 @@
+../../pathspace_graph/__init__.py

@@ -1,0 +1,1 @@
+"""Evaluation: metrics, yardsticks, tables and figures."""

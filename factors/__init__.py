@@ -1,0 +1,1 @@
+"""Measurement mathematics: splines on plain arrays, and the factors built on them."""

@@ -1,0 +1,48 @@
+"""What readings leave free: control points slide along the curve, and nothing holds them where none was seen."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def spacing_residuals(control_points: Array, nominal: Array, periodic: bool) -> tuple[Array, Array]:
+    """`r_j = |c_{j+1} - c_j| - nominal_j` (m), as GTSAM's RangeFactor2 has it, for all neighbours at once.
+
+    control_points (m, 2), nominal (m - 1,) or (m,) where periodic. Gives r and the unit directions (k, 2), which are
+    dr/dc_{j+1} = -dr/dc_j. Coinciding points have a zero direction.
+    """
+    following = np.roll(control_points, -1, axis=0) if periodic else control_points[1:]
+    offset = following - control_points[: len(following)]
+    length = np.hypot(offset[:, 0], offset[:, 1])
+    return length - nominal, offset / np.maximum(length, np.finfo(float).tiny)[:, None]
+
+
+def smoothness_matrix(abscissae: Array, period: float | None) -> Array:
+    """Second divided differences of control points over their abscissae, times the mean spacing squared.
+
+    abscissae (m,) (Greville's) -> D (m - 2, m), or (m, m) where `period` closes the curve, so that `D c` (m) are the
+    second differences of evenly spaced points; zero for a straight line, whatever the spacing. Linear: a prior
+    `D c ~ N(0, sigma^2)` is a JacobianFactor.
+    """
+    m = len(abscissae)
+    extended = abscissae if period is None else np.concatenate([abscissae, abscissae[:2] + period])
+    gaps = np.diff(extended)
+    mean = gaps.mean()
+    rows = np.arange(len(extended) - 2)
+    before, after = gaps[:-1], gaps[1:]
+    matrix = np.zeros((len(rows), m))
+    scale = 2.0 * mean**2 / (before + after)
+    np.add.at(matrix, (rows, rows), scale / before)
+    np.add.at(matrix, (rows, (rows + 1) % m), -scale / before - scale / after)
+    np.add.at(matrix, (rows, (rows + 2) % m), scale / after)
+    return matrix
+
+
+def greville(knots: Array, degree: int) -> Array:
+    """Greville abscissae `(t_{j+1} + ... + t_{j+p}) / p` (n,): where each control point acts, in parameter units."""
+    n = len(knots) - degree - 1
+    windows = np.lib.stride_tricks.sliding_window_view(knots[1:-1], degree)
+    return np.asarray(windows[:n].mean(axis=1))

@@ -1,0 +1,156 @@
+"""Odometry between two perception cycles: body twists integrated on SE(2), with covariance and calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MIN_SIGMA = 1e-6
+"""Least standard deviation of an integrated odometry (m, rad): keeps the factor of an empty interval finite."""
+
+CALIBRATION_SIZE = 2
+"""Calibration of the odometry: (scale error of the speeds [-], bias of the yaw rate [rad/s])."""
+
+
+@dataclass(frozen=True)
+class IntegratedOdometry:
+    """Relative pose over an interval, as a factor between its two poses needs it."""
+
+    delta: Array
+    """(3,) pose of the end in the frame of the start: x (m), y (m), theta (rad)."""
+    covariance: Array
+    """(3, 3) covariance of the end pose's error, in the frame of the end (GTSAM's right tangent of Pose2)."""
+    calibration_jacobian: Array
+    """(3, 2) derivative of the end pose by (scale error, yaw-rate bias), in the frame of the end."""
+    whitener: Array
+    """(3, 3) W with `W' W = covariance^-1`: whitens a residual."""
+
+
+def wrap_angle(angle: Array) -> Array:
+    """Angle in (-pi, pi], elementwise (rad)."""
+    return -((np.pi - angle) % (2.0 * np.pi) - np.pi)
+
+
+def se2_exp(tangents: Array) -> Array:
+    """Exponential of SE(2), row by row: (k, 3) tangents (vx, vy, wz) times time -> (k, 3) relative poses."""
+    theta = tangents[:, 2]
+    sinc = np.sinc(theta / np.pi)
+    cosc = 0.5 * theta * np.sinc(0.5 * theta / np.pi) ** 2
+    x, y = tangents[:, 0], tangents[:, 1]
+    return np.column_stack([sinc * x - cosc * y, cosc * x + sinc * y, theta])
+
+
+def compose(pose: Array, delta: Array) -> Array:
+    """`pose * delta` on SE(2): both (3,) [x, y, theta]; theta is not wrapped, so that turns accumulate."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return np.array(
+        [pose[0] + c * delta[0] - s * delta[1], pose[1] + s * delta[0] + c * delta[1], pose[2] + delta[2]]
+    )
+
+
+def between(first: Array, second: Array) -> Array:
+    """`first^-1 * second` on SE(2): (3,) [x, y, theta] in the frame of `first`."""
+    c, s = np.cos(first[2]), np.sin(first[2])
+    dx, dy = second[0] - first[0], second[1] - first[1]
+    return np.array([c * dx + s * dy, -s * dx + c * dy, second[2] - first[2]])
+
+
+def integrate_poses(durations: Array, twists: Array) -> Array:
+    """Poses after each of k constant twists: (k,) s, (k, 3) -> (k, 3) in the frame of the start."""
+    steps = se2_exp(twists * durations[:, None])
+    heading = np.cumsum(steps[:, 2])
+    before = heading - steps[:, 2]
+    c, s = np.cos(before), np.sin(before)
+    x = np.cumsum(c * steps[:, 0] - s * steps[:, 1])
+    y = np.cumsum(s * steps[:, 0] + c * steps[:, 1])
+    return np.column_stack([x, y, heading])
+
+
+def integrate_twists(durations: Array, twists: Array, sigma: Array) -> IntegratedOdometry:
+    """`prod_k exp(dt_k xi_k)` with first-order covariance and calibration derivative.
+
+    durations (k,) s; twists (k, 3) body (vx m/s, vy m/s, wz rad/s), each held over its duration; sigma (3,) standard
+    deviation of each reading, white from sample to sample. An error `e` of sample k (its frame) reaches the end as
+    `Ad(T_end^-1 T_k) e`, with T_k the middle of its step; samples are independent, so the covariances add. A speed reads `(1 + scale) v` and a yaw
+    rate `w + bias`, so the calibrated end pose is the end pose minus `calibration_jacobian @ (scale, bias)`.
+    No samples, or no time: the identity, with zero covariance.
+    """
+    if len(durations) == 0:
+        return _integrated(np.zeros(3), np.zeros((3, 3)), np.zeros((3, CALIBRATION_SIZE)))
+    poses = integrate_poses(durations, twists)
+    end = poses[-1]
+    adjoints = _adjoints_to_end(_midpoints(poses, durations, twists), end)
+    scaled = adjoints * (durations[:, None] * sigma)[:, None, :]
+    covariance = np.einsum("kij,klj->il", scaled, scaled)
+    by_scale = np.einsum("kij,kj,k->i", adjoints[:, :, :2], twists[:, :2], durations)
+    by_bias = durations @ adjoints[:, :, 2]
+    return _integrated(end, covariance, np.column_stack([by_scale, by_bias]))
+
+
+def _integrated(delta: Array, covariance: Array, calibration_jacobian: Array) -> IntegratedOdometry:
+    """With the whitener; a covariance of zero (no time has passed) is lifted to the floor."""
+    floored = covariance + np.eye(3) * MIN_SIGMA**2
+    whitener = np.linalg.inv(np.linalg.cholesky(floored))
+    return IntegratedOdometry(delta, covariance, calibration_jacobian, whitener)
+
+
+def _midpoints(poses: Array, durations: Array, twists: Array) -> Array:
+    """Poses (k, 3) in the middle of each step: the right Jacobian of exp is the adjoint there, to second order."""
+    back = se2_exp(-0.5 * twists * durations[:, None])
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x, y = poses[:, 0] + c * back[:, 0] - s * back[:, 1], poses[:, 1] + s * back[:, 0] + c * back[:, 1]
+    return np.column_stack([x, y, poses[:, 2] + back[:, 2]])
+
+
+def _adjoints_to_end(poses: Array, end: Array) -> Array:
+    """Adjoint maps (k, 3, 3) that carry a tangent at each pose to the tangent at the end pose."""
+    theta = poses[:, 2] - end[2]
+    c, s = np.cos(theta), np.sin(theta)
+    ce, se = np.cos(end[2]), np.sin(end[2])
+    dx, dy = poses[:, 0] - end[0], poses[:, 1] - end[1]
+    out = np.zeros((len(poses), 3, 3))
+    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = c, -s, -se * dx + ce * dy
+    out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = s, c, -(ce * dx + se * dy)
+    out[:, 2, 2] = 1.0
+    return out
+
+
+def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> tuple[Array, Array, Array]:
+    """`r = Log(delta^-1 start^-1 end)`, the residual of GTSAM's BetweenFactorPose2, for m factors at once.
+
+    poses (m, 3) in the map frame, deltas (m, 3). Gives residuals (m, 3), a tangent in the frame of the end, and the
+    Jacobians (m, 3, 3) by the start's and the end's (x, y, theta) in the map frame.
+    """
+    angle = poses_start[:, 2] + deltas[:, 2]
+    c, s = np.cos(angle), np.sin(angle)
+    offset = poses_end[:, :2] - poses_start[:, :2]
+    along, across = c * offset[:, 0] + s * offset[:, 1], -s * offset[:, 0] + c * offset[:, 1]
+    cd, sd = np.cos(deltas[:, 2]), np.sin(deltas[:, 2])
+    dx, dy = along - (cd * deltas[:, 0] + sd * deltas[:, 1]), across - (cd * deltas[:, 1] - sd * deltas[:, 0])
+    phi = wrap_angle(poses_end[:, 2] - angle)
+    a, slope = _inverse_left_terms(phi)
+    h = 0.5 * phi
+    residuals = np.column_stack([a * dx + h * dy, a * dy - h * dx, phi])
+    by_phi_x, by_phi_y = slope * dx + 0.5 * dy, slope * dy - 0.5 * dx
+    by_end = np.zeros((len(deltas), 3, 3))
+    by_end[:, 0, 0], by_end[:, 0, 1], by_end[:, 0, 2] = a * c - h * s, a * s + h * c, by_phi_x
+    by_end[:, 1, 0], by_end[:, 1, 1], by_end[:, 1, 2] = -a * s - h * c, a * c - h * s, by_phi_y
+    by_end[:, 2, 2] = 1.0
+    by_start = -by_end
+    by_start[:, 0, 2] += a * across - h * along
+    by_start[:, 1, 2] += -a * along - h * across
+    return residuals, by_start, by_end
+
+
+def _inverse_left_terms(phi: Array) -> tuple[Array, Array]:
+    """`a = (phi/2) cot(phi/2)` of the inverse left Jacobian of SE(2), and da/dphi; by series below 1e-3 rad."""
+    small = np.abs(phi) < 1e-3  # noqa: PLR2004 - the series' next terms are below 1e-15 there
+    half = np.where(small, 0.5, 0.5 * phi)
+    cot = 1.0 / np.tan(half)
+    a = np.where(small, 1.0 - phi**2 / 12.0, half * cot)
+    slope = np.where(small, -phi / 6.0, 0.5 * cot - 0.5 * half * (1.0 + cot**2))
+    return a, slope

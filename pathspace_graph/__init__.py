@@ -1,0 +1,1 @@
+"""B-spline SLAM of race tracks on GTSAM factor graphs."""

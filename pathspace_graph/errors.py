@@ -1,0 +1,27 @@
+"""The few exceptions this library raises; the command line turns each into one line and exit code 2."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class PathspaceError(Exception):
+    """Base of all errors that a user can mend; its text is one line that says expected and found."""
+
+
+class InputError(PathspaceError):
+    """A file a user gave is missing or wrong: names the file, the row (1 is the first line), what was expected."""
+
+    def __init__(self, file: Path | str, message: str, row: int | None = None) -> None:
+        self.file = Path(file)
+        self.row = row
+        where = str(file) if row is None else f"{file}, row {row}"
+        super().__init__(f"{where}: {message}")
+
+
+class OutputError(PathspaceError):
+    """An output path can't be written without losing something that is there already."""
+
+
+class SettingsError(PathspaceError):
+    """A setting is out of its range, or names something unknown."""

@@ -1,0 +1,70 @@
+"""The readings of the poses in the window, row by row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .labels import UNKNOWN
+from .log import Detections
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass
+class Readings:
+    """Columns of equal length, oldest reading first."""
+
+    slot: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
+    """Pose in the window that each was made from, 0 the oldest."""
+    point: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    """Reading in the vehicle frame (m)."""
+    covariance: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
+    """Its covariance in the vehicle frame (m^2)."""
+    label: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
+    """What the sensor says: LEFT, RIGHT or UNKNOWN."""
+    boundary: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
+    """Boundary whose curve it is held against; UNKNOWN until that is decided."""
+    u: Array = field(default_factory=lambda: np.zeros(0))
+    """Its foot point's parameter on that curve, where used."""
+    used: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
+    """Whether it is a row of the factor graph."""
+
+    def __len__(self) -> int:
+        return len(self.slot)
+
+    def append(self, detections: Detections, slot: int) -> slice:
+        """Add the readings of one cycle, none used yet; gives their rows."""
+        m = len(detections.labels)
+        start = len(self)
+        new = Readings(
+            np.full(m, slot, np.intp),
+            np.asarray(detections.points_vehicle, float),
+            np.asarray(detections.covariances, float),
+            np.asarray(detections.labels, np.intp),
+            np.asarray(detections.labels, np.intp),
+            np.zeros(m),
+            np.zeros(m, bool),
+        )
+        for column in fields(self):
+            setattr(self, column.name, np.concatenate([getattr(self, column.name), getattr(new, column.name)]))
+        return slice(start, start + m)
+
+    def drop_oldest_pose(self) -> None:
+        """Forget the readings of slot 0; the others move down by one."""
+        keep = self.slot > 0
+        for column in fields(self):
+            setattr(self, column.name, getattr(self, column.name)[keep])
+        self.slot = self.slot - 1
+
+    def used_on(self, label: int) -> IntArray:
+        """Rows in use on the boundary `label`."""
+        return np.flatnonzero(self.used & (self.boundary == label))
+
+    def pending(self, label: int) -> IntArray:
+        """Rows not in use that may belong to the boundary `label`, those of unknown colour included."""
+        return np.flatnonzero(~self.used & ((self.label == label) | (self.label == UNKNOWN)))

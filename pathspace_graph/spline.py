@@ -1,0 +1,314 @@
+"""A plane B-spline curve: the representation of one track boundary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final, Literal
+
+import numpy as np
+from scipy.interpolate import BSpline as ScipyBSpline
+
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.bspline import (
+    Floats,
+    Ints,
+    SpanPolynomials,
+    clamped_knots,
+    end_change_matrix,
+    periodic_knots,
+    scatter,
+    uniform_knots,
+)
+from pathspace_graph.factors.footpoint import FootPoints, foot_points
+
+_PERIODIC_TOLERANCE: Final = 1e-9
+"""A periodic spline repeats where |difference| <= tolerance * (1 + largest value)."""
+_GRID_PER_SPAN: Final = 8
+"""Grid points for each span in a foot-point search over the whole curve."""
+_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(12)
+_ARC_NEWTON_STEPS: Final = 4
+"""Newton steps that invert the arc length, from a table with `_GRID_PER_SPAN` entries a span."""
+_SHORTEST_EXTENSION: Final = 1e-3
+"""An extension's knot interval is at least this share of the mean one, also where the point is the end."""
+
+
+@dataclass(frozen=True, eq=False)
+class BSpline:
+    """S(u) = sum_j N_j^p(u) c_j in the map frame, u in [knots[p], knots[n]], as scipy's BSpline."""
+
+    knots: Floats
+    """Non-decreasing knots (n + p + 1,)."""
+    control_points: Floats
+    """All control points (n, 2), metres, map frame; where periodic the last p repeat the first."""
+    degree: int = 3
+    """Degree p >= 1."""
+    periodic: bool = False
+    """Closed curve: parameters are taken modulo the domain's length."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "knots", np.array(self.knots, dtype=np.float64))
+        object.__setattr__(self, "control_points", np.array(self.control_points, dtype=np.float64))
+        self._check_shapes()
+        self._check_knots()
+        if self.periodic:
+            self._check_period()
+
+    def _check_shapes(self) -> None:
+        points, knots = self.control_points, self.knots
+        if self.degree < 1:
+            raise SettingsError(f"a spline's degree must be at least 1, not {self.degree}")
+        if points.ndim != 2 or points.shape[1] != 2 or len(points) <= self.degree:
+            raise SettingsError(
+                f"a spline of degree {self.degree} needs control points of shape (n > {self.degree}, 2), "
+                f"not {points.shape}"
+            )
+        if knots.shape != (len(points) + self.degree + 1,):
+            raise SettingsError(
+                f"{len(points)} control points of degree {self.degree} need "
+                f"{len(points) + self.degree + 1} knots, not shape {knots.shape}"
+            )
+        if not (np.isfinite(points).all() and np.isfinite(knots).all()):
+            raise SettingsError("a spline's knots and control points must be finite")
+
+    def _check_knots(self) -> None:
+        steps = np.diff(self.knots)
+        if (steps < 0.0).any():
+            raise SettingsError(f"knots must not decrease, but knot {int(steps.argmin()) + 1} does")
+        if steps[self.degree] <= 0.0 or steps[-self.degree - 1] <= 0.0:
+            raise SettingsError("the first and the last knot interval of a domain must not be empty")
+
+    def _check_period(self) -> None:
+        p, m = self.degree, len(self.control_points) - self.degree
+        if m <= p:
+            raise SettingsError(
+                f"a periodic spline of degree {p} needs more than {p} distinct points, not {m}"
+            )
+        low, high = self.domain
+        knot_error = np.abs(self.knots[m:] - self.knots[: 2 * p + 1] - (high - low)).max()
+        point_error = np.abs(self.control_points[m:] - self.control_points[:p]).max()
+        if knot_error > _PERIODIC_TOLERANCE * (1.0 + np.abs(self.knots).max()):
+            raise SettingsError(f"knots of a periodic spline must repeat, but differ by {knot_error:.3g}")
+        if point_error > _PERIODIC_TOLERANCE * (1.0 + np.abs(self.control_points).max()):
+            raise SettingsError(
+                f"the last {p} control points must repeat the first, not be {point_error:.3g} off"
+            )
+
+    @classmethod
+    def open_uniform(
+        cls, control_points: Floats, degree: int = 3, interval: float = 1.0, start: float = 0.0
+    ) -> BSpline:
+        """Equally spaced knots with floating (unclamped) ends; the domain begins at `start`."""
+        return cls(uniform_knots(len(control_points), degree, interval, start), control_points, degree)
+
+    @classmethod
+    def clamped_from(cls, breaks: Floats, control_points: Floats, degree: int = 3) -> BSpline:
+        """Clamped curve on the breaks (k + 1,), with k + p control points."""
+        return cls(clamped_knots(breaks, degree), control_points, degree)
+
+    @classmethod
+    def periodic_from(cls, breaks: Floats, control_points: Floats, degree: int = 3) -> BSpline:
+        """Closed curve on one period of breaks (m + 1,), with m distinct control points."""
+        if len(breaks) != len(control_points) + 1 or len(control_points) <= degree:
+            raise SettingsError(
+                f"a periodic spline of m > {degree} distinct control points needs m + 1 breaks, "
+                f"not {len(control_points)} points and {len(breaks)} breaks"
+            )
+        unwrapped = np.concatenate([control_points, control_points[:degree]])
+        return cls(periodic_knots(breaks, degree), unwrapped, degree, periodic=True)
+
+    @property
+    def domain(self) -> tuple[float, float]:
+        """[knots[p], knots[n]]."""
+        return float(self.knots[self.degree]), float(self.knots[len(self.control_points)])
+
+    @property
+    def size(self) -> int:
+        """Number m of distinct control points."""
+        return len(self.control_points) - (self.degree if self.periodic else 0)
+
+    @property
+    def distinct_control_points(self) -> Floats:
+        """(m, 2): without the repeated ones of a periodic spline."""
+        return self.control_points[: self.size]
+
+    @property
+    def breaks(self) -> Floats:
+        """The distinct knots of the domain, both ends included."""
+        return np.unique(self.knots[self.degree : len(self.control_points) + 1])
+
+    @cached_property
+    def tables(self) -> SpanPolynomials:
+        """The basis as polynomials on each span."""
+        return SpanPolynomials(self.knots, self.degree, self.periodic)
+
+    def with_points(self, distinct: Floats) -> BSpline:
+        """The spline of the same basis through other distinct control points (m, 2)."""
+        points = np.concatenate([distinct, distinct[: self.degree]]) if self.periodic else distinct
+        spline = replace(self, control_points=points)
+        spline.__dict__["tables"] = self.tables
+        return spline
+
+    def local_basis(self, u: Floats, derivative: int = 0) -> tuple[Floats, Ints]:
+        """Values (k, p + 1) at u (k,), and the distinct control points (k, p + 1) that they belong to."""
+        values, span = self.tables.evaluate(u, derivative)
+        columns = span[:, None] + np.arange(-self.degree, 1)
+        return values[derivative], columns % self.size if self.periodic else columns
+
+    def basis_matrix(self, u: Floats, derivative: int = 0) -> Floats:
+        """B (k, m) onto the distinct control points: S(u) = B c."""
+        values, span = self.tables.evaluate(u, derivative)
+        return scatter(values[derivative], span - self.degree, self.size, self.periodic)
+
+    def evaluate(self, u: Floats, derivative: int = 0) -> Floats:
+        """d^r S / du^r (k, 2) at u (k,), clipped to the domain or wrapped into it."""
+        values, columns = self.local_basis(u, derivative)
+        position: Floats = np.einsum("kj,kjd->kd", values, self.control_points[columns])
+        return position
+
+    def tangent_unit(self, u: Floats) -> Floats:
+        """S' / |S'| (k, 2), zero where S' vanishes."""
+        first = self.evaluate(u, 1)
+        norm = np.linalg.norm(first, axis=1, keepdims=True)
+        return np.asarray(np.divide(first, norm, out=np.zeros_like(first), where=norm > 0.0))
+
+    def curvature(self, u: Floats) -> Floats:
+        """(x' y'' - y' x'') / |S'|^3 (k,), 1/m, positive in a left turn; zero where S' vanishes."""
+        first, second = self.evaluate(u, 1), self.evaluate(u, 2)
+        cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+        cube = np.linalg.norm(first, axis=1) ** 3
+        return np.asarray(np.divide(cross, cube, out=np.zeros_like(cross), where=cube > 0.0))
+
+    def foot_points(self, points: Floats) -> FootPoints:
+        """The nearest points of the whole curve to points (k, 2) of the map frame."""
+        low, high = self.domain
+        step = (high - low) / (_GRID_PER_SPAN * (len(self.control_points) - self.degree))
+        lows, highs = np.full(len(points), low), np.full(len(points), high)
+        return foot_points(self.tables, self.control_points, points, lows, highs, step)
+
+    def length(self) -> float:
+        """Length of the curve, metres."""
+        return float(self._break_lengths[-1])
+
+    def arc_length(self, u: Floats) -> Floats:
+        """Length (k,) from the domain's beginning to u (k,), clipped to it: Gauss-Legendre on each span."""
+        breaks = self.breaks
+        u = np.clip(u, breaks[0], breaks[-1])
+        index = np.clip(np.searchsorted(breaks, u, side="right") - 1, 0, len(breaks) - 2)
+        return self._break_lengths[index] + self._gauss_lengths(breaks[index], u)
+
+    def parameters_at(self, lengths: Floats) -> Floats:
+        """u (k,) at arc lengths (k,), clipped to the curve: the inverse of `arc_length`."""
+        low, high = self.domain
+        lengths = np.clip(lengths, 0.0, self.length())
+        grid = np.linspace(low, high, _GRID_PER_SPAN * (len(self.breaks) - 1) + 1)
+        u = np.interp(lengths, self.arc_length(grid), grid)
+        for _ in range(_ARC_NEWTON_STEPS):
+            speed = np.linalg.norm(self.evaluate(u, 1), axis=1)
+            error = lengths - self.arc_length(u)
+            u = np.clip(u + np.divide(error, speed, out=np.zeros_like(u), where=speed > 0.0), low, high)
+        return u
+
+    @cached_property
+    def _break_lengths(self) -> Floats:
+        """Arc length at each break."""
+        breaks = self.breaks
+        return np.concatenate([[0.0], np.cumsum(self._gauss_lengths(breaks[:-1], breaks[1:]))])
+
+    def _gauss_lengths(self, starts: Floats, ends: Floats) -> Floats:
+        """Integral of |S'| (k,) over intervals that cross no knot."""
+        half = 0.5 * (ends - starts)
+        nodes = (0.5 * (starts + ends))[:, None] + half[:, None] * _GAUSS_NODES
+        speed = np.linalg.norm(self.evaluate(nodes.ravel(), 1), axis=1).reshape(nodes.shape)
+        return np.asarray(half * (speed @ _GAUSS_WEIGHTS))
+
+    def with_end_knots(self, knots: Floats) -> BSpline:
+        """The same curve on its domain, where only knots outside the domain are others: exact."""
+        self._refuse_periodic("change the ends of")
+        matrix = end_change_matrix(self.knots, self.degree, knots)
+        return BSpline(knots, matrix @ self.control_points, self.degree)
+
+    def clamp(self, start: bool = True, end: bool = True) -> BSpline:
+        """The same curve with the chosen end knots p + 1-fold, so that the end control points lie on it."""
+        knots, p = self.knots.copy(), self.degree
+        if start:
+            knots[:p] = knots[p]
+        if end:
+            knots[-p:] = knots[-p - 1]
+        return self.with_end_knots(knots)
+
+    def unclamp(self, start: bool = True, end: bool = True) -> BSpline:
+        """The same curve with floating ends: the chosen end's knot interval repeated p times outward."""
+        knots, p = self.knots.copy(), self.degree
+        outward = np.arange(1, p + 1)
+        if start:
+            knots[:p] = knots[p] - (knots[p + 1] - knots[p]) * outward[::-1]
+        if end:
+            knots[-p:] = knots[-p - 1] + (knots[-p - 1] - knots[-p - 2]) * outward
+        return self.with_end_knots(knots)
+
+    def extension_knots(self, point: Floats) -> Floats:
+        """Knots (n + p + 2,) of the curve extended to a point (2,): interval by chord length, end clamped."""
+        low, high = self.domain
+        chord = float(np.linalg.norm(point - self.evaluate(np.array([high]))[0]))
+        mean = (high - low) / (len(self.breaks) - 1)
+        length = self.length()
+        interval = chord * (high - low) / length if length > 0.0 else mean
+        new_end = high + max(interval, _SHORTEST_EXTENSION * mean)
+        kept = self.knots[: len(self.control_points) + 1]
+        return np.concatenate([kept, np.full(self.degree + 1, new_end)])
+
+    def extend_to(self, point: Floats) -> BSpline:
+        """The curve carried on to a point (2,): unchanged where it was, the new end clamped on the point.
+
+        The end is unclamped about its old domain, the point is the new last control point (Hu et al. 2002).
+        """
+        self._refuse_periodic("extend")
+        knots = self.extension_knots(point)
+        kept = end_change_matrix(self.knots, self.degree, knots) @ self.control_points
+        return BSpline(knots, np.concatenate([kept, np.reshape(point, (1, 2))]), self.degree)
+
+    def grow(self, control_points: Floats, interval: float | None = None) -> BSpline:
+        """Control points (k, 2) appended at a floating end: no basis function or control point changes.
+
+        Each appends a knot, `interval` (by default the last one) after the knot before. The domain moves on
+        to knots that were there; where the end is clamped it would not move, so unclamp first.
+        """
+        self._refuse_periodic("grow")
+        step = self.knots[-1] - self.knots[-2] if interval is None else interval
+        if step <= 0.0:
+            raise SettingsError("a clamped end can't grow: unclamp it first")
+        added = self.knots[-1] + step * np.arange(1, len(control_points) + 1)
+        knots = np.concatenate([self.knots, added])
+        return BSpline(knots, np.concatenate([self.control_points, control_points]), self.degree)
+
+    def reversed(self) -> BSpline:
+        """The same curve travelled the other way: S(-u) on [-high, -low]."""
+        return BSpline(-self.knots[::-1], self.control_points[::-1], self.degree, self.periodic)
+
+    def covariance_at(self, u: Floats, joint_covariance: Floats) -> Floats:
+        """cov S(u) = B Sigma B^T (k, 2, 2), of the joint covariance (2m, 2m) over x0, y0, x1, y1 ...
+
+        Cross terms between control points are included.
+        """
+        values, columns = self.local_basis(u)
+        blocks = joint_covariance.reshape(self.size, 2, self.size, 2).transpose(0, 2, 1, 3)
+        local = blocks[columns[:, :, None], columns[:, None, :]]
+        covariance: Floats = np.einsum("ki,kijab,kj->kab", values, local, values)
+        return covariance
+
+    def normal_sigma(self, u: Floats, joint_covariance: Floats) -> Floats:
+        """sqrt(n^T cov S(u) n) (k,): standard deviation across the curve, metres."""
+        tangent = self.tangent_unit(u)
+        normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+        variance = np.einsum("ka,kab,kb->k", normal, self.covariance_at(u, joint_covariance), normal)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+    def to_scipy(self) -> ScipyBSpline:
+        """The same curve as scipy's class; outside of an open domain it gives NaN."""
+        extrapolate: Literal["periodic", False] = "periodic" if self.periodic else False
+        return ScipyBSpline(self.knots, self.control_points, self.degree, extrapolate=extrapolate)
+
+    def _refuse_periodic(self, what: str) -> None:
+        if self.periodic:
+            raise SettingsError(f"can't {what} a periodic spline: it has no ends")

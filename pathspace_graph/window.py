@@ -1,0 +1,110 @@
+"""The fixed-lag window: a flat state, whitened rows, a Gaussian prior, Gauss-Newton steps and marginalization.
+
+The state is one vector `x = [control points | calibration | poses, oldest first]`. Everything in it is additive: a pose
+is (x, y, theta) in the map frame with theta unwrapped. The prior stands on a leading block of it, so that the oldest
+pose, which comes right after the map, leaves by a Schur complement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from .errors import PathspaceError
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+POSE = 3
+"""Size of a pose in the state."""
+
+
+class SingularSystemError(PathspaceError):
+    """The window's normal equations are not positive definite: something in the state is not held by anything."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Whitened linear rows `J[i] . dx[columns[i]] + r[i]`, of equally many columns each."""
+
+    columns: IntArray
+    """(m, k) columns of the state."""
+    jacobian: Array
+    """(m, k) whitened derivatives."""
+    residual: Array
+    """(m,) whitened residuals at the linearization point."""
+
+    def touching(self, low: int, high: int) -> Rows:
+        """The rows that touch a column in [low, high)."""
+        touches = ((self.columns >= low) & (self.columns < high)).any(axis=1)
+        return Rows(self.columns[touches], self.jacobian[touches], self.residual[touches])
+
+
+@dataclass
+class Prior:
+    """`1/2 (x - x0)' L (x - x0) - g' (x - x0)` on the leading block of the state."""
+
+    information: Array
+    """(q, q) L."""
+    gradient: Array
+    """(q,) g."""
+    point: Array
+    """(q,) x0, where it was linearized."""
+
+    def descent_at(self, state: Array) -> Array:
+        """The negative gradient `g - L (x - x0)` at the state's leading block."""
+        return self.gradient - self.information @ (state[: len(self.point)] - self.point)
+
+    def widen(self, at: int, values: Array) -> None:
+        """Make room for new state entries at index `at`, of which the prior knows nothing."""
+        count = len(values)
+        q = len(self.point)
+        information = np.zeros((q + count, q + count))
+        information[:at, :at] = self.information[:at, :at]
+        information[:at, at + count :] = self.information[:at, at:]
+        information[at + count :, :at] = self.information[at:, :at]
+        information[at + count :, at + count :] = self.information[at:, at:]
+        self.information = information
+        self.gradient = np.insert(self.gradient, at, np.zeros(count))
+        self.point = np.insert(self.point, at, values)
+
+
+def accumulate(groups: Sequence[Rows], size: int) -> tuple[Array, Array]:
+    """Normal equations `H = sum J'J` (size, size) and `-gradient = -sum J'r` (size,) of all rows."""
+    groups = [g for g in groups if len(g.residual)]
+    if not groups:
+        return np.zeros((size, size)), np.zeros(size)
+    flat = [(g.columns[:, :, None] * size + g.columns[:, None, :]).ravel() for g in groups]
+    products = [(g.jacobian[:, :, None] * g.jacobian[:, None, :]).ravel() for g in groups]
+    hessian = np.bincount(np.concatenate(flat), np.concatenate(products), size * size).reshape(size, size)
+    columns = np.concatenate([g.columns.ravel() for g in groups])
+    descent = np.concatenate([(g.jacobian * -g.residual[:, None]).ravel() for g in groups])
+    return hessian, np.bincount(columns, descent, size)
+
+
+def cholesky(hessian: Array) -> Array:
+    """Lower factor `L L' = H` (the upper triangle is not cleared); SingularSystemError where there is none."""
+    factor, info = lapack.dpotrf(hessian.T, lower=1, clean=0, overwrite_a=0)
+    if info != 0:
+        raise SingularSystemError(f"expected a positive definite system, found pivot {info} not positive")
+    return factor
+
+
+def solve(factor: Array, descent: Array) -> Array:
+    """`H^-1 b` from the lower factor."""
+    step, _ = lapack.dpotrs(factor, descent, lower=1)
+    return np.asarray(step)
+
+
+def schur_leave(hessian: Array, descent: Array, low: int, high: int) -> tuple[Array, Array]:
+    """Marginal normal equations without the entries [low, high): `H_bb - H_ba H_aa^-1 H_ab`, and the same for g."""
+    leaving = slice(low, high)
+    stay = np.r_[0:low, high : len(descent)]
+    coupling = hessian[stay, leaving]
+    gain = np.linalg.solve(hessian[leaving, leaving], coupling.T).T
+    information = hessian[np.ix_(stay, stay)] - gain @ coupling.T
+    return 0.5 * (information + information.T), descent[stay] - gain @ descent[leaving]

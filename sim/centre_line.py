@@ -1,0 +1,172 @@
+"""The middle of a track: a smooth curve between two rows of cones, by arc length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+
+from .geometry import along_polyline, arc_lengths, curvature, direction, left_normals, ring, unit
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int_]
+
+STEP: Final = 0.25
+"""Spacing of the samples while the curve is fitted, m."""
+KNOT_STEP: Final = 0.5
+"""Spacing of the knots of the finished curve, m."""
+SMOOTHING: Final = 1.0
+"""Standard deviation of the smoothing Gaussian, m; a corner of radius R is cut by its square / 2R."""
+CENTRINGS: Final = 4
+"""How often the curve is moved to equal distances from both rows, and smoothed."""
+NEIGHBOURS: Final = 3
+"""A sample measures its distance to the row's segments up to so many cones from its own."""
+START_CANDIDATES: Final = 4
+"""So many cones of each row nearest the start are tried as the pair that the matching starts with."""
+
+
+@dataclass(frozen=True, eq=False)
+class CentreLine:
+    """A twice differentiable curve `c(s)` by arc length `s`; periodic where closed."""
+
+    spline: CubicSpline
+    """The curve (s) -> (2,), m; the parameter is the arc length to about 0.1 %."""
+    length: float
+    """Length of the curve, one lap where closed, m."""
+    closed: bool
+    """Whether the end meets the beginning."""
+    clearance: FloatArray
+    """Distance to the nearer row of cones at the spline's knots (k,), m."""
+
+    def points(self, s: FloatArray) -> FloatArray:
+        """The curve at `s` (n,) -> (n, 2)."""
+        return np.asarray(self.spline(s))
+
+    def tangents(self, s: FloatArray) -> FloatArray:
+        """Unit tangents in the direction of travel (n, 2)."""
+        return unit(np.asarray(self.spline(s, 1)))
+
+    def curvatures(self, s: FloatArray) -> FloatArray:
+        """Signed curvature (n,), 1/m, positive to the left."""
+        return curvature(np.asarray(self.spline(s, 1)), np.asarray(self.spline(s, 2)))
+
+    def clearances(self, s: FloatArray) -> FloatArray:
+        """Distance to the nearer row of cones (n,), m."""
+        period = self.length if self.closed else None
+        return np.interp(s, self.spline.x, self.clearance, period=period)
+
+    def nearest(self, pose: FloatArray) -> float:
+        """Arc length of the point nearest to a pose [x, y, theta], among those that head its way."""
+        s = np.arange(0.0, self.length, STEP)
+        distances = np.linalg.norm(self.points(s) - pose[:2], axis=1)
+        ahead = self.tangents(s) @ direction(pose[2])
+        return float(s[np.argmin(np.where(ahead > 0, distances, np.inf))])
+
+
+def fit_centre_line(left: FloatArray, right: FloatArray, closed: bool, near: FloatArray) -> CentreLine:
+    """The curve halfway between two rows of cones (n, 2), (m, 2) in driving order; matching starts at `near`.
+
+    The rows are matched by the triangulation of least total squared width that runs along both, so that their
+    counts and spacings may differ and other parts of the track may be near; the midpoints are then smoothed
+    and moved to equal distances from both rows.
+    """
+    rungs = match_rows(left, right, closed, near)
+    middles = (left[rungs[:, 0]] + right[rungs[:, 1]]) / 2
+    curve, rung_of = _resample(middles, STEP, closed)
+    curve = _smooth(curve, closed)
+    index = rungs[np.rint(rung_of).astype(int) % len(rungs)]
+    for _ in range(CENTRINGS):
+        offset = _row_distances(curve, left, index[:, 0], closed) - _row_distances(
+            curve, right, index[:, 1], closed
+        )
+        curve = _smooth(curve + _normals(curve, closed) * offset[:, None] / 2, closed)
+    clearance = np.minimum(
+        _row_distances(curve, left, index[:, 0], closed), _row_distances(curve, right, index[:, 1], closed)
+    )
+    return _as_spline(curve, clearance, closed)
+
+
+def match_rows(left: FloatArray, right: FloatArray, closed: bool, near: FloatArray) -> IntArray:
+    """Index pairs (k, 2) into both rows, each step advancing one of them, of least total squared distance."""
+    if not closed:
+        return _match(left, right)[1]
+    best_cost, best = np.inf, np.zeros((0, 2), dtype=int)
+    for i in np.argsort(np.linalg.norm(left - near, axis=1))[:START_CANDIDATES]:
+        for j in np.argsort(np.linalg.norm(right - near, axis=1))[:START_CANDIDATES]:
+            lefts, rights = np.arange(i, i + len(left) + 1), np.arange(j, j + len(right) + 1)
+            cost, rungs = _match(left[lefts % len(left)], right[rights % len(right)])
+            if cost < best_cost:
+                pairs = rungs[:-1] + np.array([i, j])
+                best_cost, best = cost, pairs % np.array([len(left), len(right)])
+    return best
+
+
+def _match(left: FloatArray, right: FloatArray) -> tuple[float, IntArray]:
+    """Least total squared distance and the pairs, from the first cones to the last (dynamic programming)."""
+    width = np.sum((left[:, None] - right[None]) ** 2, axis=-1)
+    total = np.empty_like(width)
+    total[0] = np.cumsum(width[0])
+    for i in range(1, len(left)):
+        along = np.cumsum(width[i])
+        total[i] = along + np.minimum.accumulate(total[i - 1] - along + width[i])
+    i, j = len(left) - 1, len(right) - 1
+    pairs = [(i, j)]
+    while i or j:
+        if j == 0 or (i > 0 and total[i - 1, j] <= total[i, j - 1]):
+            i -= 1
+        else:
+            j -= 1
+        pairs.append((i, j))
+    return float(total[-1, -1]), np.array(pairs[::-1])
+
+
+def _resample(points: FloatArray, step: float, closed: bool) -> tuple[FloatArray, FloatArray]:
+    """Points (n, 2) about `step` apart along a polyline, and the fractional index of each in it (n,)."""
+    polyline = ring(points) if closed else points
+    s = arc_lengths(polyline)
+    count = max(int(np.ceil(s[-1] / step)), 2)
+    at = np.linspace(0.0, s[-1], count + 1)[: count if closed else count + 1]
+    return along_polyline(at, s, polyline), np.interp(at, s, np.arange(len(polyline), dtype=float))
+
+
+def _smooth(curve: FloatArray, closed: bool) -> FloatArray:
+    sigma = SMOOTHING / STEP
+    if closed:
+        return np.asarray(gaussian_filter1d(curve, sigma, axis=0, mode="wrap"))
+    pad = min(int(4 * sigma), len(curve) - 1)
+    padded = np.pad(curve, ((pad, pad), (0, 0)), mode="reflect", reflect_type="odd")
+    return np.asarray(gaussian_filter1d(padded, sigma, axis=0)[pad:-pad])
+
+
+def _normals(curve: FloatArray, closed: bool) -> FloatArray:
+    """Unit normals to the left of a sampled curve (n, 2)."""
+    if not closed:
+        return left_normals(unit(np.gradient(curve, axis=0)))
+    return left_normals(unit(np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)))
+
+
+def _row_distances(curve: FloatArray, row: FloatArray, index: IntArray, closed: bool) -> FloatArray:
+    """Distance of each sample to the row's segments near its matched cone `index` (n,)."""
+    segments = index[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS)
+    if closed:
+        a, b = row[segments % len(row)], row[(segments + 1) % len(row)]
+    else:
+        a, b = row[segments.clip(0, len(row) - 1)], row[(segments + 1).clip(0, len(row) - 1)]
+    along = b - a
+    length2 = np.maximum(np.sum(along**2, axis=-1), np.finfo(float).tiny)
+    part = np.clip(np.sum((curve[:, None] - a) * along, axis=-1) / length2, 0.0, 1.0)
+    return np.asarray(np.linalg.norm(a + part[..., None] * along - curve[:, None], axis=-1).min(axis=1))
+
+
+def _as_spline(curve: FloatArray, clearance: FloatArray, closed: bool) -> CentreLine:
+    knots, index = _resample(curve, KNOT_STEP, closed)
+    at_knots = np.interp(index, np.arange(len(curve)), clearance)
+    if closed:
+        knots, at_knots = ring(knots), np.append(at_knots, at_knots[0])
+    s = arc_lengths(knots)
+    spline = CubicSpline(s, knots, bc_type="periodic" if closed else "not-a-knot")
+    return CentreLine(spline, float(s[-1]), closed, at_knots)

@@ -1,0 +1,182 @@
+"""The vehicle's sensors: noisy odometry and detected cones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.log import Detections
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int_]
+
+FALSE_POSITIVE: Final = -1
+"""The association of a detection that is of no cone."""
+
+
+@dataclass(frozen=True)
+class OdometryNoise:
+    """Errors of the measured twist."""
+
+    white: tuple[float, float, float] = (0.25, 0.12, 0.035)
+    """Standard deviation of each reading of [vx, vy, wz], white from sample to sample, m/s, m/s, rad/s."""
+    scale: float = 0.004
+    """Standard deviation of the relative scale error of vx and vy, drawn once for a log."""
+    gyro_bias: float = 0.0015
+    """Standard deviation of the bias of wz, drawn once for a log, rad/s."""
+
+    def __post_init__(self) -> None:
+        if len(self.white) != 3 or not all(0 < sigma < np.inf for sigma in self.white):
+            raise SettingsError(f"odometry.white: expected three positive numbers, found {self.white}")
+        _check_range("odometry", self, ("scale", "gyro_bias"), 0.0, np.inf)
+
+
+@dataclass(frozen=True)
+class SensorSettings:
+    """What the cone detector sees, and its errors."""
+
+    rate: float = 10.0
+    """Perception cycles per second, Hz."""
+    range_max: float = 15.0
+    """Greatest true range of a detected cone, m."""
+    range_min: float = 0.5
+    """Least true range of a detected cone, m."""
+    fov: float = float(np.deg2rad(110.0))
+    """Field of view, the whole angle, rad."""
+    range_sigma: float = 0.05
+    """Standard deviation of the range at range 0, m."""
+    range_sigma_growth: float = 0.012
+    """Growth of that standard deviation with range, m per m."""
+    bearing_sigma: float = float(np.deg2rad(0.9))
+    """Standard deviation of the bearing, rad."""
+    detection_probability: float = 0.98
+    """Probability that a cone in the field is detected, at range 0."""
+    detection_falloff: float = 0.01
+    """Loss of that probability with range, per m."""
+    blind_fraction: float = 0.05
+    """Share of the cones that are never seen, drawn once for a log."""
+    wrong_colour: float = 0.01
+    """Probability that a detected boundary cone has the other boundary's label."""
+    false_positives: float = 0.03
+    """Expected number of detections of nothing in a cycle."""
+    range_bias: bool = False
+    """Whether ranges have a systematic error, as those of cameras do."""
+    range_bias_at: tuple[float, ...] = (2.0, 4.0, 10.0)
+    """Ranges at which the systematic error is given, m, increasing; linear between, constant outside."""
+    range_bias_values: tuple[float, ...] = (0.01, 0.03, 0.40)
+    """The systematic error there, m (typical of cameras: 0.02 m below 4 m, 0.34 m beyond 8 m)."""
+
+    def __post_init__(self) -> None:
+        positive = ("rate", "range_max", "bearing_sigma", "range_sigma", "fov")
+        _check_range("sensor", self, positive, np.nextafter(0.0, 1.0), np.inf)
+        at_least_0 = ("range_min", "range_sigma_growth", "detection_falloff", "false_positives")
+        _check_range("sensor", self, at_least_0, 0.0, np.inf)
+        if self.fov > 2 * np.pi or self.range_min >= self.range_max:
+            raise SettingsError("sensor: expected fov <= 2 pi rad and range_min < range_max")
+        _check_range("sensor", self, ("detection_probability", "blind_fraction", "wrong_colour"), 0.0, 1.0)
+        if len(self.range_bias_at) != len(self.range_bias_values) or not np.all(
+            np.diff(self.range_bias_at) > 0
+        ):
+            raise SettingsError(
+                "sensor.range_bias_at: expected increasing ranges, one for each of range_bias_values"
+            )
+
+    def range_sigmas(self, ranges: FloatArray) -> FloatArray:
+        """Standard deviation of the range at each range (n,), m."""
+        return self.range_sigma + self.range_sigma_growth * ranges
+
+    def range_biases(self, ranges: FloatArray) -> FloatArray:
+        """Systematic error at each range (n,), m."""
+        if not self.range_bias or not self.range_bias_at:
+            return np.zeros_like(ranges)
+        return np.interp(ranges, self.range_bias_at, self.range_bias_values)
+
+    def detection_probabilities(self, ranges: FloatArray) -> FloatArray:
+        """Probability of detection at each range (n,)."""
+        return np.clip(self.detection_probability - self.detection_falloff * ranges, 0.0, 1.0)
+
+
+def measure_twists(twists: FloatArray, noise: OdometryNoise, rng: Generator) -> FloatArray:
+    """Measured twists (N, 3): `(1 + scale) [vx, vy]` and `wz + bias`, each plus white noise."""
+    scale = 1.0 + noise.scale * rng.standard_normal()
+    bias = noise.gyro_bias * rng.standard_normal()
+    white = rng.standard_normal(twists.shape) * np.array(noise.white)
+    return np.asarray(twists * np.array([scale, scale, 1.0]) + np.array([0.0, 0.0, bias]) + white)
+
+
+class ConeSensor:
+    """Detects the cones of one log, some of which it never sees."""
+
+    def __init__(self, cones: FloatArray, labels: IntArray, settings: SensorSettings, rng: Generator) -> None:
+        blind_rng, self._cone_rng, self._false_rng = rng.spawn(3)
+        self._cones, self._labels, self._settings = cones, labels, settings
+        count = round(settings.blind_fraction * len(cones))
+        self.blind: IntArray = np.sort(blind_rng.permutation(len(cones))[:count])
+        self._seen = np.setdiff1d(np.arange(len(cones)), self.blind)
+
+    def detect(self, t: float, pose: FloatArray) -> tuple[Detections, IntArray]:
+        """One perception cycle from a pose [x, y, theta], and the true cone of each detection (m,)."""
+        ranges, bearings, labels, cones = self._detect_cones(pose)
+        false_ranges, false_bearings, false_labels = self._false_positives()
+        ranges = np.concatenate([ranges, false_ranges])
+        bearings = np.concatenate([bearings, false_bearings])
+        points, covariances = _cartesian(ranges, bearings, self._settings)
+        detections = Detections(t, points, covariances, np.concatenate([labels, false_labels]))
+        return detections, np.concatenate([cones, np.full(len(false_ranges), FALSE_POSITIVE)])
+
+    def _detect_cones(self, pose: FloatArray) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+        settings, rng = self._settings, self._cone_rng
+        ranges, bearings = _polar(self._cones[self._seen], pose)
+        inside = (ranges <= settings.range_max) & (ranges >= settings.range_min)
+        inside &= np.abs(bearings) <= settings.fov / 2
+        cones, ranges, bearings = self._seen[inside], ranges[inside], bearings[inside]
+        # every cone in the field draws the same numbers, so that one setting doesn't shift another's
+        chance, colour = rng.random((2, len(cones)))
+        noise = rng.standard_normal((2, len(cones)))
+        labels = self._labels[cones]
+        flipped = (colour < settings.wrong_colour) & (labels != UNKNOWN)
+        labels = np.where(flipped, LEFT + RIGHT - labels, labels)
+        hit = chance < settings.detection_probabilities(ranges)
+        measured = ranges + settings.range_biases(ranges) + settings.range_sigmas(ranges) * noise[0]
+        return measured[hit], (bearings + settings.bearing_sigma * noise[1])[hit], labels[hit], cones[hit]
+
+    def _false_positives(self) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Detections of nothing, uniform over the area of the field, of either boundary's label."""
+        settings, rng = self._settings, self._false_rng
+        count = int(rng.poisson(settings.false_positives))
+        ranges = np.sqrt(rng.uniform(settings.range_min**2, settings.range_max**2, count))
+        bearings = rng.uniform(-settings.fov / 2, settings.fov / 2, count)
+        return ranges, bearings, rng.integers(LEFT, RIGHT, count, endpoint=True)
+
+
+def _polar(cones: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Range and bearing (n,) of points in the map frame, from a pose."""
+    step = cones - pose[:2]
+    bearings = np.arctan2(step[:, 1], step[:, 0]) - pose[2]
+    return np.hypot(step[:, 0], step[:, 1]), np.asarray((bearings + np.pi) % (2 * np.pi) - np.pi)
+
+
+def _cartesian(
+    ranges: FloatArray, bearings: FloatArray, settings: SensorSettings
+) -> tuple[FloatArray, FloatArray]:
+    """Points (m, 2) and covariances (m, 2, 2) in the vehicle frame: `R(b) diag(s_r^2, (r s_b)^2) R(b)^T`."""
+    cos, sin = np.cos(bearings), np.sin(bearings)
+    along, across = settings.range_sigmas(ranges) ** 2, (ranges * settings.bearing_sigma) ** 2
+    xx = cos**2 * along + sin**2 * across
+    yy = sin**2 * along + cos**2 * across
+    xy = cos * sin * (along - across)
+    covariances = np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
+    return np.column_stack([ranges * cos, ranges * sin]), covariances
+
+
+def _check_range(section: str, settings: object, names: tuple[str, ...], low: float, high: float) -> None:
+    for name in names:
+        value = getattr(settings, name)
+        if not low <= value <= high or np.isinf(value):
+            raise SettingsError(f"{section}.{name}: expected a number in [{low:g}, {high:g}], found {value}")

@@ -1,0 +1,297 @@
+"""Track files of other simulators and of surveys: PacSim and fssim YAML, EUFS and TUM CSV."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from pathspace_graph.errors import InputError
+from pathspace_graph.table import Table, read_table
+
+from .driving_order import driving_order
+from .geometry import along_polyline, arc_lengths, direction, left_normals, ring, unit
+from .track import Track
+
+FloatArray = NDArray[np.float64]
+
+KNOWN_KINDS: Final = (
+    "PacSim YAML (track: left, right, start), "
+    "fssim YAML (cones_left, cones_right, starting_pose_front_wing), "
+    "EUFS CSV (tag,x,y,direction), TUM CSV (# x_m,y_m,w_tr_right_m,w_tr_left_m)"
+)
+"""What `read_track` reads, for messages."""
+MIN_CONES: Final = 3
+"""A boundary has at least so many cones."""
+DUPLICATE_DISTANCE: Final = 0.3
+"""Two surveyed cones of one colour nearer than this are one, m."""
+REPEAT_DISTANCE: Final = 0.01
+"""Cones of an ordered row nearer than this to the one before are that cone again, m."""
+MAX_UNPLACED: Final = 0.2
+"""Share of the boundary cones that may belong to no lane, as strays; more isn't a track of one lane."""
+MAX_START_DISTANCE: Final = 10.0
+"""The start is at most so far from the middle of the track, m."""
+CONE_SPACING: Final = 5.0
+"""Greatest gap of the cones that stand along a circuit given by its widths, m."""
+WIDTH_STEP: Final = 0.5
+"""Spacing of the samples of such a circuit's boundaries, m."""
+TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
+"""Centre line and the distances of the boundaries from it."""
+EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
+"""The EUFS tags of cones that belong to no boundary; further tags, such as midpoint, aren't cones."""
+
+
+def read_track(path: Path | str) -> Track:
+    """The track in a file of a known kind, its cones in driving order, in the file's own frame.
+
+    A file that is missing, of no known kind or malformed is an InputError that names the row or the key.
+    """
+    path = Path(path)
+    if path.suffix.lower() in (".yaml", ".yml"):
+        track = _read_yaml(path)
+    elif path.suffix.lower() == ".csv":
+        track = _read_csv(path)
+    else:
+        _check_exists(path)
+        raise _unknown_kind(path)
+    _check(path, track)
+    return track
+
+
+def _unknown_kind(path: Path) -> InputError:
+    return InputError(path, f"expected a track file of a known kind: {KNOWN_KINDS}")
+
+
+def _check_exists(path: Path) -> None:
+    if not path.is_file():
+        raise InputError(path, "expected a track file, found " + ("a folder" if path.is_dir() else "none"))
+
+
+def _check(path: Path, track: Track) -> None:
+    for name, row in (("left", track.left), ("right", track.right)):
+        if len(row) < MIN_CONES:
+            raise InputError(
+                path, f"expected at least {MIN_CONES} cones of the {name} boundary, found {len(row)}"
+            )
+    line = track.centre_line
+    s = np.arange(0.0, line.length, WIDTH_STEP)
+    distances = np.linalg.norm(line.points(s) - track.start[:2], axis=1)
+    nearest = int(np.argmin(distances))
+    if distances[nearest] > MAX_START_DISTANCE:
+        raise InputError(
+            path, f"expected the start on the track, found it {distances[nearest]:.1f} m from its middle"
+        )
+    if line.tangents(s[nearest : nearest + 1])[0] @ direction(track.start[2]) <= 0:
+        raise InputError(
+            path, "expected the boundaries in driving order, found them against the start's heading"
+        )
+
+
+# YAML: PacSim and fssim
+
+
+def _read_yaml(path: Path) -> Track:
+    _check_exists(path)
+    try:
+        data = yaml.load(
+            path.read_text(encoding="utf-8-sig"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+        )
+    except yaml.MarkedYAMLError as error:
+        row = error.problem_mark.line + 1 if error.problem_mark else None
+        raise InputError(path, f"expected YAML: {error.problem}", row) from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(path, f"expected YAML: {' '.join(str(error).split())}") from error
+    if isinstance(data, dict) and isinstance(data.get("track"), dict):
+        return _pacsim(path, data["track"])
+    if isinstance(data, dict) and {"cones_left", "cones_right"} & set(data):
+        return _fssim(path, data)
+    raise _unknown_kind(path)
+
+
+def _pacsim(path: Path, data: Mapping[str, Any]) -> Track:
+    closed = _get(path, data, "lanesFirstWithLastConnected", "track.")
+    if not isinstance(closed, bool):
+        raise InputError(
+            path, f"expected true or false at track.lanesFirstWithLastConnected, found {closed!r}"
+        )
+    start = _get(path, data, "start", "track.")
+    position = _vector(path, _get(path, start, "position", "track.start."), 2, "track.start.position")
+    orientation = _vector(
+        path, _get(path, start, "orientation", "track.start."), 3, "track.start.orientation"
+    )
+    rows = [
+        _pacsim_cones(path, _get(path, data, name, "track."), f"track.{name}") for name in ("left", "right")
+    ]
+    left, right = (_without_repeats(row, closed) for row in rows)
+    other = _pacsim_cones(path, data.get("unknown"), "track.unknown")
+    return Track(left, right, other, closed, np.append(position, orientation[2]), path.stem)
+
+
+def _pacsim_cones(path: Path, cones: object, key: str) -> FloatArray:
+    points = [
+        _vector(path, _get(path, cone, "position", f"{key}[{k}]."), 2, f"{key}[{k}].position")
+        for k, cone in enumerate(_list(path, cones, key))
+    ]
+    return np.array(points).reshape(-1, 2)
+
+
+def _fssim(path: Path, data: Mapping[str, Any]) -> Track:
+    left, right = (
+        _without_repeats(_fssim_cones(path, _get(path, data, name), name), closed=True)
+        for name in ("cones_left", "cones_right")
+    )
+    other = np.vstack(
+        [_fssim_cones(path, data.get(name), name) for name in ("cones_orange", "cones_orange_big")]
+    )
+    start = _vector(path, _get(path, data, "starting_pose_front_wing"), 3, "starting_pose_front_wing")
+    return Track(left, right, other, True, start, path.stem)
+
+
+def _fssim_cones(path: Path, cones: object, key: str) -> FloatArray:
+    points = [_vector(path, cone, 2, f"{key}[{k}]") for k, cone in enumerate(_list(path, cones, key))]
+    return np.array(points).reshape(-1, 2)
+
+
+def _get(path: Path, data: object, name: str, prefix: str = "") -> Any:
+    if not isinstance(data, dict) or name not in data:
+        raise InputError(path, f"expected a key {prefix}{name}, found none")
+    return data[name]
+
+
+def _list(path: Path, value: object, key: str) -> list[Any]:
+    if value is None:
+        return []
+    if not isinstance(value, list):
+        raise InputError(path, f"expected a list at {key}, found {value!r}")
+    return value
+
+
+def _vector(path: Path, value: object, size: int, key: str) -> FloatArray:
+    """The first `size` numbers of a list, all finite."""
+    try:
+        if not isinstance(value, list) or len(value) < size:
+            raise ValueError
+        # YAML 1.1 takes 1e-5 for a word, so words are given a chance to be numbers
+        vector = np.array([float(number) for number in value[:size]])
+    except (TypeError, ValueError):
+        raise InputError(path, f"expected {size} numbers at {key}, found {value!r}") from None
+    if not np.isfinite(vector).all():
+        raise InputError(path, f"expected finite numbers at {key}, found {value!r}")
+    return vector
+
+
+def _without_repeats(row: FloatArray, closed: bool) -> FloatArray:
+    """A row without cones that repeat the one before, nor, where closed, a last that repeats the first."""
+    if not len(row):
+        return row
+    keep = np.append(True, np.linalg.norm(np.diff(row, axis=0), axis=1) > REPEAT_DISTANCE)
+    row = row[keep]
+    if closed and len(row) > 1 and np.linalg.norm(row[-1] - row[0]) <= REPEAT_DISTANCE:
+        row = row[:-1]
+    return row
+
+
+# CSV: EUFS and TUM
+
+
+def _read_csv(path: Path) -> Track:
+    _check_exists(path)
+    table = read_table(path, (), comment="#")
+    if {"x_m", "y_m"} & set(table.columns):
+        return _tum(path)
+    if "tag" in table.columns:
+        return _eufs(path)
+    raise _unknown_kind(path)
+
+
+def _eufs(path: Path) -> Track:
+    table = read_table(path, ("tag", "x", "y"))
+    tags = np.array([tag.strip().lower() for tag in table.columns["tag"]])
+    points = table.stack(("x", "y"))
+    left, right = (_without_duplicates(points[tags == tag]) for tag in ("blue", "yellow"))
+    other, gate = points[np.isin(tags, EUFS_OTHER)], points[tags == "big_orange"]
+    for tag, cones in (("blue", left), ("yellow", right)):
+        if len(cones) < MIN_CONES:
+            raise InputError(path, f"expected at least {MIN_CONES} {tag} cones, found {len(cones)}")
+    start = _eufs_start(table, tags, points, left, right)
+    order = driving_order(left, right, gate, start)
+    placed = 0 if order is None else len(order.left) + len(order.right)
+    if order is None or placed < (1 - MAX_UNPLACED) * (len(left) + len(right)):
+        count = len(left) + len(right)
+        raise InputError(
+            path, f"expected one lane from the start on, found {count - placed} of {count} cones off it"
+        )
+    strays = [np.delete(left, order.left, axis=0), np.delete(right, order.right, axis=0)]
+    other = np.vstack([_without_duplicates(other), *strays])
+    return Track(left[order.left], right[order.right], other, order.closed, start, path.stem)
+
+
+def _eufs_start(
+    table: Table, tags: NDArray[np.str_], points: FloatArray, left: FloatArray, right: FloatArray
+) -> FloatArray:
+    """The pose of the first `car_start`; without one, between the first blue cone and the nearest yellow."""
+    rows = np.flatnonzero(tags == "car_start")
+    if len(rows):
+        text = table.columns.get("direction", [""] * len(table))[rows[0]].strip()
+        try:
+            theta = float(text or 0.0)
+        except ValueError:
+            theta = math.nan
+        if not math.isfinite(theta):
+            table.fail(
+                int(rows[0]), f"expected the heading of car_start in column 'direction', found '{text}'"
+            )
+        return np.append(points[rows[0]], theta)
+    opposite = right[np.argmin(np.linalg.norm(right - left[0], axis=1))]
+    across = left[0] - opposite
+    return np.append((left[0] + opposite) / 2, math.atan2(-across[0], across[1]))
+
+
+def _without_duplicates(cones: FloatArray) -> FloatArray:
+    """The cones (n, 2) that aren't within the duplicate distance of one kept before."""
+    kept: list[FloatArray] = []
+    for cone in cones:
+        if not kept or np.linalg.norm(np.array(kept) - cone, axis=1).min() >= DUPLICATE_DISTANCE:
+            kept.append(cone)
+    return np.array(kept).reshape(-1, 2)
+
+
+def _tum(path: Path) -> Track:
+    circuit = _tum_circuit(path)
+    knots = arc_lengths(circuit[:, :2])
+    spline = CubicSpline(knots, circuit[:, :2], bc_type="periodic")
+    s = np.linspace(0.0, knots[-1], math.ceil(knots[-1] / WIDTH_STEP), endpoint=False)
+    tangents = unit(np.asarray(spline(s, 1)))
+    right_width, left_width = (np.interp(s, knots, circuit[:, k])[:, None] for k in (2, 3))
+    left = np.asarray(spline(s)) + left_normals(tangents) * left_width
+    right = np.asarray(spline(s)) - left_normals(tangents) * right_width
+    start = np.append(circuit[0, :2], math.atan2(tangents[0, 1], tangents[0, 0]))
+    return Track(_spaced(left), _spaced(right), np.zeros((0, 2)), True, start, path.stem)
+
+
+def _tum_circuit(path: Path) -> FloatArray:
+    """Checked rows [x, y, right width, left width], the first repeated at the end (n + 1, 4)."""
+    table = read_table(path, TUM_COLUMNS, comment="#")
+    circuit = table.stack(TUM_COLUMNS)
+    table.require(np.asarray(circuit[:, 2:].min(axis=1) > 0), "expected widths above 0")
+    moved = np.asarray(np.diff(arc_lengths(circuit[:, :2])) > REPEAT_DISTANCE)
+    table.require(np.append(True, moved)[: len(circuit)], "expected a point other than the one before")
+    if len(circuit) > 1 and np.linalg.norm(circuit[-1, :2] - circuit[0, :2]) <= REPEAT_DISTANCE:
+        circuit = circuit[:-1]
+    if len(circuit) < MIN_CONES:
+        raise InputError(path, f"expected at least {MIN_CONES} points, found {len(circuit)}")
+    return ring(circuit)
+
+
+def _spaced(boundary: FloatArray) -> FloatArray:
+    """Cones at equal gaps along a closed polyline (n, 2)."""
+    polyline = ring(boundary)
+    s = arc_lengths(polyline)
+    at = np.linspace(0.0, s[-1], math.ceil(s[-1] / CONE_SPACING), endpoint=False)
+    return along_polyline(at, s, polyline)

@@ -1,0 +1,357 @@
+"""Random tracks by the rules of Formula Student: straights, hairpins, slaloms, chicanes, no crossing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.optimize import brentq
+from scipy.spatial import cKDTree
+
+from pathspace_graph.errors import SettingsError
+
+from .geometry import along_polyline, arc_lengths, curvature, left_normals, ring, unit
+from .track import Track
+
+FloatArray = NDArray[np.float64]
+
+STEP: Final = 0.25
+"""Spacing of the samples of the centre line, m."""
+SMOOTHING: Final = 1.0
+"""Standard deviation of the Gaussian that eases the way into corners, m."""
+MAX_ATTEMPTS: Final = 500
+"""Two attempts in three keep the default rules: so many failing means that the settings contradict."""
+STRAIGHT_RADIUS: Final = 150.0
+"""A stretch of a larger radius than this is straight, m."""
+CORNER_RADIUS: Final = 8.0
+"""At this radius cones stand twice as close as on straights, m."""
+CORNER_BLUR: Final = 2.0
+"""Standard deviation of the Gaussian over which corners draw cones closer before and after them, m."""
+MIN_CONE_GAP: Final = 1.0
+"""Cones never stand closer than this along a row, m."""
+
+
+@dataclass(frozen=True)
+class TrackGeneratorSettings:
+    """The rules a generated track keeps."""
+
+    lap_length: tuple[float, float] = (220.0, 400.0)
+    """Least and greatest length of the centre line, m (the rules allow 200 to 500)."""
+    width: tuple[float, float] = (3.2, 4.2)
+    """Least and greatest width between the boundaries, m (the rules ask for 3); constant along one track."""
+    hairpin_diameter: float = 9.0
+    """Least outside diameter of any corner, m."""
+    straight_max: float = 80.0
+    """Greatest length of a straight, m."""
+    cones: int = 200
+    """Number of cones on both boundaries together, as near as the gaps allow."""
+    cone_gap_max: float = 5.0
+    """Greatest gap between cones of a row, m; they stand closer in corners."""
+    separation: float = 1.5
+    """Least distance between boundaries of different stretches, m."""
+    corners: tuple[int, int] = (5, 9)
+    """Least and greatest number of corners of the layout that the elements are put into."""
+    hairpins: tuple[int, int] = (0, 3)
+    """Least and greatest number of hairpins put into it; corners of the layout may be hairpins as well."""
+    hairpin_inward: float = 0.3
+    """Probability that a hairpin put in points to the inside of the layout."""
+    slalom_probability: float = 0.35
+    """Probability that a straight long enough becomes a slalom."""
+    chicane_probability: float = 0.3
+    """Probability that a straight long enough becomes a chicane."""
+
+    def __post_init__(self) -> None:
+        for name in ("lap_length", "width", "corners", "hairpins"):
+            low, high = getattr(self, name)
+            if not 0 <= low <= high:
+                raise SettingsError(f"generator.{name}: expected 0 <= least <= greatest, found {low, high}")
+        for name in ("hairpin_inward", "slalom_probability", "chicane_probability"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise SettingsError(f"generator.{name}: expected a probability, found {getattr(self, name)}")
+        if self.corners[0] < 3:
+            raise SettingsError(f"generator.corners: expected at least 3, found {self.corners[0]}")
+        if self.hairpin_diameter <= self.width[1]:
+            raise SettingsError(f"generator.hairpin_diameter: expected more than {self.width[1]} (the width)")
+        if self.cone_gap_max <= MIN_CONE_GAP or self.cones < 2 * self.corners[0]:
+            raise SettingsError("generator.cones: expected enough cones, and gaps above 1 m")
+
+
+def generate_track(rng: Generator, settings: TrackGeneratorSettings | None = None) -> Track:
+    """A random closed track that keeps the rules, starting on its longest straight; its frame is its own.
+
+    Layouts are drawn until one keeps every rule; SettingsError where none does.
+    """
+    settings = settings or TrackGeneratorSettings()
+    for _ in range(MAX_ATTEMPTS):
+        width = rng.uniform(*settings.width)
+        layout = _layout(width, settings, rng)
+        curve = None if layout is None else _curve(layout, width, settings, rng)
+        if curve is not None and _keeps_rules(curve, width, settings):
+            return _with_cones(curve, width, settings, rng)
+    raise SettingsError(f"generator: no track kept the rules in {MAX_ATTEMPTS} attempts: {settings}")
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """A polygon whose corners are to be rounded."""
+
+    corners: FloatArray
+    """(n, 2), m."""
+    radii: FloatArray
+    """Radius of the arc at each corner (n,), m."""
+
+
+def _least_radius(width: float, settings: TrackGeneratorSettings) -> float:
+    """Least radius of the centre line, m."""
+    return (settings.hairpin_diameter - width) / 2
+
+
+def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _Layout | None:
+    """A star-shaped polygon with hairpins on some of its sides, or None where a corner can't be rounded."""
+    count = int(rng.integers(*settings.corners, endpoint=True))
+    angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
+    distances = rng.uniform(0.35, 1.0, count)
+    corners = (
+        distances[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]) * [1.0, rng.uniform(0.6, 1.0)]
+    )
+    legs = rng.uniform(12.0, 30.0, int(rng.integers(*settings.hairpins, endpoint=True)))
+    perimeter = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum()
+    # rounding the corners takes about a tenth of the way
+    corners *= (rng.uniform(*settings.lap_length) * 1.1 - 2 * legs.sum()) / perimeter
+    least = _least_radius(width, settings)
+    radii = least + rng.gamma(2.0, 4.0, count)
+    layout: _Layout | None = _Layout(corners, radii)
+    for leg in legs:
+        inward = rng.random() < settings.hairpin_inward
+        layout = (
+            None if layout is None else _with_hairpin(layout, float(leg) * (-1 if inward else 1), least, rng)
+        )
+    if layout is None:
+        return None
+    if rng.random() < 0.5:
+        layout = _Layout(layout.corners[::-1], layout.radii[::-1])
+    return _rounded(layout, least)
+
+
+def _with_hairpin(layout: _Layout, leg: float, least: float, rng: Generator) -> _Layout | None:
+    """A finger on a random side long enough for it: out (inward for a negative leg), round and back."""
+    radius, bend = least + rng.uniform(0.3, 1.5), least + rng.uniform(0.5, 3.0)
+    sides = np.roll(layout.corners, -1, axis=0) - layout.corners
+    lengths = np.linalg.norm(sides, axis=1)
+    room = 2 * radius + 4 * bend
+    fits = np.flatnonzero(lengths > room)
+    if not len(fits):
+        return None
+    side = int(rng.choice(fits))
+    along = sides[side] / lengths[side]
+    outward = np.array([along[1], -along[0]])
+    middle = layout.corners[side] + along * rng.uniform(room / 2, lengths[side] - room / 2)
+    foot = np.array([middle - along * radius, middle + along * radius])
+    tip = foot + outward * leg
+    finger = np.array([foot[0], tip[0], tip[1], foot[1]])
+    corners = np.insert(layout.corners, side + 1, finger, axis=0)
+    return _Layout(corners, np.insert(layout.radii, side + 1, [bend, radius, radius, bend]))
+
+
+def _rounded(layout: _Layout, least: float) -> _Layout | None:
+    """The layout with radii cut to what its sides have room for; None where one is less than the least."""
+    half_turn = np.abs(_turns(layout.corners)) / 2
+    before = np.linalg.norm(layout.corners - np.roll(layout.corners, 1, axis=0), axis=1)
+    # both corners of a side may take half of it
+    room = np.minimum(before, np.roll(before, -1)) / 2
+    radii = np.minimum(layout.radii, room / np.maximum(np.tan(half_turn), np.finfo(float).eps))
+    return _Layout(layout.corners, radii) if (radii >= least - 1e-9).all() else None
+
+
+def _turns(corners: FloatArray) -> FloatArray:
+    """Signed change of direction at each corner (n,), rad."""
+    before = corners - np.roll(corners, 1, axis=0)
+    after = np.roll(before, -1, axis=0)
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    return np.asarray(np.arctan2(cross, np.sum(before * after, axis=1)))
+
+
+def _curve(layout: _Layout, width: float, settings: TrackGeneratorSettings, rng: Generator) -> FloatArray:
+    """Samples of the centre line (n, 2): straights, some with an element, joined by arcs, then eased."""
+    turns = _turns(layout.corners)
+    tangent = layout.radii * np.tan(np.abs(turns) / 2)
+    pieces: list[FloatArray] = []
+    for k in range(len(turns)):
+        following = (k + 1) % len(turns)
+        side = layout.corners[following] - layout.corners[k]
+        direction = side / np.linalg.norm(side)
+        begin = layout.corners[k] + direction * tangent[k]
+        end = layout.corners[following] - direction * tangent[following]
+        pieces += [
+            _straight(begin, end, settings, rng),
+            _arc(end, direction, layout.radii[following], turns[following]),
+        ]
+    curve = _evenly(np.vstack(pieces))
+    return np.asarray(gaussian_filter1d(curve, SMOOTHING / STEP, axis=0, mode="wrap"))
+
+
+def _arc(begin: FloatArray, direction: FloatArray, radius: float, turn: float) -> FloatArray:
+    """Samples of an arc from `begin` on, first along `direction`."""
+    angles = turn * np.linspace(0.0, 1.0, max(int(radius * abs(turn) / STEP), 1), endpoint=False)
+    normal = left_normals(direction) * np.sign(turn)
+    forward, sideways = np.sin(np.abs(angles))[:, None], 1 - np.cos(angles)[:, None]
+    return np.asarray(begin + radius * (forward * direction + sideways * normal))
+
+
+def _straight(
+    begin: FloatArray, end: FloatArray, settings: TrackGeneratorSettings, rng: Generator
+) -> FloatArray:
+    """Samples from `begin` to `end`, with a slalom or a chicane where there is room and the dice say so."""
+    length = float(np.linalg.norm(end - begin))
+    if length < STEP:
+        return begin[None]
+    along = np.arange(0.0, length, STEP)
+    direction = (end - begin) / length
+    offset = _element(along, length, settings, rng)
+    return begin + along[:, None] * direction + offset[:, None] * left_normals(direction)
+
+
+def _element(
+    along: FloatArray, length: float, settings: TrackGeneratorSettings, rng: Generator
+) -> FloatArray:
+    """Lateral offset (n,) of a slalom, a chicane or nothing, on a straight of this length."""
+    dice = rng.random()
+    elements: tuple[tuple[float, Callable[[FloatArray, float, Generator], FloatArray]], ...] = (
+        (settings.slalom_probability, _slalom),
+        (settings.chicane_probability, _chicane),
+    )
+    for probability, element in elements:
+        if dice < probability:
+            return element(along, length, rng)
+        dice -= probability
+    return np.zeros_like(along)
+
+
+def _slalom(along: FloatArray, length: float, rng: Generator) -> FloatArray:
+    """`A sin(2 pi s / wavelength)` of two or three waves, eased in and out; nothing where it has no room."""
+    wavelength = rng.uniform(14.0, 22.0)
+    waves = min(int(length / wavelength), 3)
+    if waves < 2:
+        return np.zeros_like(along)
+    total = waves * wavelength
+    s = along - rng.uniform(0.0, length - total)
+    # the tightest bend of a sine has the radius (wavelength / 2 pi)^2 / A
+    amplitude = (wavelength / (2 * np.pi)) ** 2 / rng.uniform(5.0, 9.0)
+    ease = np.clip(np.minimum(s, total - s) / (wavelength / 4), 0.0, 1.0)
+    return np.asarray(
+        rng.choice([-1.0, 1.0]) * amplitude * np.sin(2 * np.pi * s / wavelength) * ease**2 * (3 - 2 * ease)
+    )
+
+
+def _chicane(along: FloatArray, length: float, rng: Generator) -> FloatArray:
+    """A shift to one side and back, each along half a cosine wave; nothing where there is no room."""
+    shift, hold = rng.uniform(8.0, 13.0), rng.uniform(0.0, 5.0)
+    total = 2 * shift + hold
+    if length < total:
+        return np.zeros_like(along)
+    s = along - rng.uniform(0.0, length - total)
+    # the tightest bend of the shift has the radius 2 (shift / pi)^2 / depth
+    depth = min(2 * (shift / np.pi) ** 2 / rng.uniform(4.5, 8.0), rng.uniform(2.0, 4.5))
+    part = np.clip(np.minimum(s, total - s) / shift, 0.0, 1.0)
+    return np.asarray(rng.choice([-1.0, 1.0]) * depth * (1 - np.cos(np.pi * part)) / 2)
+
+
+def _evenly(points: FloatArray) -> FloatArray:
+    """Samples (n, 2) of a closed polyline at equal distances of about STEP."""
+    polyline = ring(points)
+    s = arc_lengths(polyline)
+    return along_polyline(np.linspace(0.0, s[-1], int(s[-1] / STEP), endpoint=False), s, polyline)
+
+
+def _keeps_rules(curve: FloatArray, width: float, settings: TrackGeneratorSettings) -> bool:
+    length = _length(curve)
+    bend = np.abs(_curvature(curve))
+    return bool(
+        settings.lap_length[0] <= length <= settings.lap_length[1]
+        and bend.max() * _least_radius(width, settings) <= 1
+        and _longest_run(bend < 1 / STRAIGHT_RADIUS)[1] * STEP <= settings.straight_max
+        and _is_separate(curve, width + settings.separation)
+    )
+
+
+def _length(curve: FloatArray) -> float:
+    return float(arc_lengths(ring(curve))[-1])
+
+
+def _curvature(curve: FloatArray) -> FloatArray:
+    """Signed curvature (n,) of an evenly sampled closed curve, 1/m."""
+    after, before = np.roll(curve, -1, axis=0), np.roll(curve, 1, axis=0)
+    return curvature((after - before) / 2, after - 2 * curve + before)
+
+
+def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
+    """Start and length of the longest run of good samples on a ring."""
+    bad = np.flatnonzero(~good)
+    if not len(bad):
+        return 0, len(good)
+    gaps = np.diff(bad, append=bad[0] + len(good)) - 1
+    longest = int(np.argmax(gaps))
+    return int(bad[longest] + 1) % len(good), int(gaps[longest])
+
+
+def _is_separate(curve: FloatArray, distance: float) -> bool:
+    """Whether samples nearer than `distance` are of one stretch: less apart than half such a circle."""
+    pairs = cKDTree(curve).query_pairs(distance, output_type="ndarray")
+    apart = np.abs(pairs[:, 0] - pairs[:, 1])
+    apart = np.minimum(apart, len(curve) - apart) * STEP
+    return bool((apart < np.pi * distance / 2).all())
+
+
+def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSettings, rng: Generator) -> Track:
+    """The track whose start is early on the longest straight, with cones along both boundaries."""
+    first, run = _longest_run(np.abs(_curvature(curve)) < 1 / STRAIGHT_RADIUS)
+    curve = np.roll(curve, -(first + run // 3), axis=0)
+    along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
+    normals = left_normals(unit(along))
+    crowding = 1 + CORNER_RADIUS * gaussian_filter1d(
+        np.abs(_curvature(curve)), CORNER_BLUR / STEP, mode="wrap"
+    )
+    rows = [curve + side * normals * width / 2 for side in (1.0, -1.0)]
+    gap = _straight_gap(rows, crowding, settings)
+    left, right = (_place_cones(row, _density(gap, crowding, settings), rng) for row in rows)
+    start = np.append(curve[0], np.arctan2(along[0, 1], along[0, 0]))
+    return Track(left, right, np.zeros((0, 2)), True, start, "generated")
+
+
+def _density(gap: float, crowding: FloatArray, settings: TrackGeneratorSettings) -> FloatArray:
+    """Cones per metre (n,) along a row for this gap on straights."""
+    return 1.0 / np.clip(gap / crowding, MIN_CONE_GAP, settings.cone_gap_max)
+
+
+def _straight_gap(rows: list[FloatArray], crowding: FloatArray, settings: TrackGeneratorSettings) -> float:
+    """The gap on straights, before it is cut to the greatest one, that gives the wanted number of cones."""
+
+    def excess(gap: float) -> float:
+        density = _density(gap, crowding, settings)
+        return float(sum(_cumulative(row, density)[-1] for row in rows)) - settings.cones
+
+    widest = settings.cone_gap_max * float(crowding.max())
+    if excess(widest) >= 0:
+        return widest
+    if excess(MIN_CONE_GAP) <= 0:
+        return MIN_CONE_GAP
+    return float(brentq(excess, MIN_CONE_GAP, widest))
+
+
+def _cumulative(row: FloatArray, density: FloatArray) -> FloatArray:
+    """Number of cones from the first sample to each sample and round to the first again (n + 1,)."""
+    steps = np.diff(arc_lengths(ring(row)))
+    return np.concatenate([[0.0], np.cumsum(steps * density)])
+
+
+def _place_cones(row: FloatArray, density: FloatArray, rng: Generator) -> FloatArray:
+    """Cones (k, 2) along a closed row at this density, from a random place between the first two on."""
+    total = _cumulative(row, density)
+    count = int(np.ceil(total[-1]))
+    at = (np.arange(count) + rng.random()) * total[-1] / count
+    return along_polyline(at, total, ring(row))

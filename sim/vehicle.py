@@ -1,0 +1,200 @@
+"""A vehicle that follows the middle of a track: true poses and the true twist of its body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from pathspace_graph.errors import SettingsError
+
+from .centre_line import CentreLine
+from .geometry import arc_lengths, curvature, direction, left_normals
+from .track import Track
+
+FloatArray = NDArray[np.float64]
+
+PATH_STEP: Final = 0.25
+"""Spacing of the samples of the driven path, m."""
+WAVES: Final = 8
+"""Number of sines that the wander is made of."""
+MIN_PATH: Final = 10
+"""A path has at least so many samples."""
+
+
+@dataclass(frozen=True)
+class VehicleSettings:
+    """How the vehicle drives."""
+
+    speed_max: float = 12.0
+    """Greatest speed, m/s."""
+    speed_start: float = 0.0
+    """Speed at the start pose, m/s."""
+    acceleration_lateral: float = 5.0
+    """Greatest lateral acceleration, m/s^2; it limits the speed in corners."""
+    acceleration: float = 3.0
+    """Greatest longitudinal acceleration, m/s^2."""
+    deceleration: float = 4.0
+    """Greatest longitudinal deceleration, m/s^2."""
+    wander: float = 0.3
+    """Greatest distance of the smooth lateral wander from the middle, m."""
+    wander_wavelengths: tuple[float, float] = (15.0, 60.0)
+    """Shortest and longest wavelength of the wander, m."""
+    half_width: float = 0.75
+    """Half the vehicle's width, m; the wander never brings its side nearer to the cones than `margin`."""
+    margin: float = 0.25
+    """Distance that the vehicle's side keeps from the cones, m, where the track is wide enough."""
+    settle_distance: float = 5.0
+    """Distance over which the vehicle moves from its start pose to the middle, m."""
+    overrun: float = 10.0
+    """Distance driven beyond the last lap's end, m, so that the lap is complete."""
+    rate: float = 50.0
+    """True poses per second, Hz; the odometry's rate."""
+
+    def __post_init__(self) -> None:
+        positive = (
+            "speed_max",
+            "acceleration_lateral",
+            "acceleration",
+            "deceleration",
+            "settle_distance",
+            "rate",
+        )
+        for name in positive:
+            if not 0 < getattr(self, name) < np.inf:
+                raise SettingsError(
+                    f"vehicle.{name}: expected a positive number, found {getattr(self, name)}"
+                )
+        for name in ("speed_start", "wander", "half_width", "margin", "overrun"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise SettingsError(f"vehicle.{name}: expected a number >= 0, found {getattr(self, name)}")
+        shortest, longest = self.wander_wavelengths
+        if not 0 < shortest <= longest < np.inf:
+            raise SettingsError(f"vehicle.wander_wavelengths: expected 0 < a <= b, found {shortest, longest}")
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """What the vehicle truly did."""
+
+    t: FloatArray
+    """Stamps (N,), s, from 0."""
+    poses: FloatArray
+    """True poses [x, y, theta] (N, 3), map frame; the first is (0, 0, 0), theta isn't wrapped."""
+    twists: FloatArray
+    """True body twist [vx, vy, wz] (N, 3), constant until the next stamp; the last is held."""
+
+
+def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) -> Drive:
+    """Drive `laps` laps of a track in the map frame and a little more, or once along an open one."""
+    path = _driven_path(track, laps, settings, rng)
+    speeds = _speed_profile(path, settings)
+    t, s = _sample_times(path, speeds, settings.rate)
+    derivative = path(s, 1)
+    headings = np.unwrap(np.arctan2(derivative[:, 1], derivative[:, 0]))
+    sampled = np.column_stack([path(s), headings])
+    twists = _twists(sampled, 1.0 / settings.rate)
+    return Drive(t, integrate(twists[:-1], 1.0 / settings.rate), twists)
+
+
+def integrate(twists: FloatArray, dt: float) -> FloatArray:
+    """Poses (N + 1, 3) from (0, 0, 0) under body twists (N, 3), each constant for `dt`; theta isn't wrapped.
+
+    Over one step the vehicle moves by `V(wz dt) [vx, vy] dt` in its own frame, the exponential map of SE(2).
+    """
+    theta = np.concatenate([[0.0], np.cumsum(twists[:, 2] * dt)])
+    a, b = _exponential(twists[:, 2] * dt)
+    dx = (a * twists[:, 0] - b * twists[:, 1]) * dt
+    dy = (b * twists[:, 0] + a * twists[:, 1]) * dt
+    cos, sin = np.cos(theta[:-1]), np.sin(theta[:-1])
+    steps = np.column_stack([cos * dx - sin * dy, sin * dx + cos * dy])
+    return np.column_stack([np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]), theta])
+
+
+def _twists(poses: FloatArray, dt: float) -> FloatArray:
+    """Body twists (N, 3) that carry each pose to the next in `dt` (logarithm of SE(2)); the last repeats."""
+    step = np.diff(poses, axis=0)
+    cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
+    dx, dy = cos * step[:, 0] + sin * step[:, 1], -sin * step[:, 0] + cos * step[:, 1]
+    a, b = _exponential(step[:, 2])
+    scale = 1.0 / ((a * a + b * b) * dt)
+    twists = np.column_stack([(a * dx + b * dy) * scale, (a * dy - b * dx) * scale, step[:, 2] / dt])
+    return np.vstack([twists, twists[-1:]])
+
+
+def _exponential(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """sin(angle) / angle and (1 - cos(angle)) / angle, also at 0."""
+    half = np.sinc(angle / (2 * np.pi))
+    return np.sinc(angle / np.pi), np.sin(angle / 2) * half
+
+
+def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Generator) -> CubicSpline:
+    """The driven path, nearly by arc length: the centre line and a lateral offset, from the start pose on."""
+    line = track.centre_line
+    start = line.nearest(track.start)
+    total = laps * line.length + settings.overrun if line.closed else line.length - start
+    s = np.linspace(0.0, total, max(int(total / PATH_STEP), MIN_PATH))
+    at = (start + s) % line.length if line.closed else start + s
+    normals = left_normals(line.tangents(at))
+    offset = _wander(s, line.clearances(at), settings, rng) + _settling(line, start, track.start, s, settings)
+    points = line.points(at) + normals * offset[:, None]
+    points += (track.start[:2] - points[0]) * np.exp(-s / settings.settle_distance)[:, None]
+    return CubicSpline(arc_lengths(points), points, bc_type=((1, direction(track.start[2])), "not-a-knot"))
+
+
+def _settling(
+    line: CentreLine, start: float, pose: FloatArray, s: FloatArray, settings: VehicleSettings
+) -> FloatArray:
+    """Lateral offset (n,) that begins with the start pose's own offset and slope and dies away."""
+    point, tangent = line.points(np.array([start]))[0], line.tangents(np.array([start]))[0]
+    normal = left_normals(tangent)
+    offset = float(normal @ (pose[:2] - point))
+    heading = direction(pose[2])
+    stretch = 1.0 - line.curvatures(np.array([start]))[0] * offset
+    slope = stretch * float(normal @ heading) / float(tangent @ heading)
+    decay = np.exp(-s / settings.settle_distance)
+    return np.asarray((offset + (slope + offset / settings.settle_distance) * s) * decay)
+
+
+def _wander(s: FloatArray, clearance: FloatArray, settings: VehicleSettings, rng: Generator) -> FloatArray:
+    """Band-limited lateral wander (n,), m: a sum of sines with random phases that begins from nothing."""
+    shortest, longest = settings.wander_wavelengths
+    wavenumbers = 2 * np.pi * rng.uniform(1 / longest, 1 / shortest, WAVES)
+    phases = rng.uniform(0.0, 2 * np.pi, WAVES)
+    wave = np.sin(s[:, None] * wavenumbers + phases).sum(axis=1) / np.sqrt(WAVES)
+    room = np.clip(clearance - settings.half_width - settings.margin, 0.0, settings.wander)
+    begin = -np.expm1(-((s / settings.settle_distance) ** 2))
+    return np.asarray(np.tanh(wave) * room * begin)
+
+
+def _speed_profile(path: CubicSpline, settings: VehicleSettings) -> FloatArray:
+    """Speeds (n,) at the path's knots that keep all three acceleration limits (forward and backward pass)."""
+    s = path.x
+    bend = np.abs(curvature(np.asarray(path(s, 1)), np.asarray(path(s, 2))))
+    cornering2 = settings.acceleration_lateral / np.maximum(bend, np.finfo(float).tiny)
+    speed2 = np.minimum(cornering2, settings.speed_max**2)
+    speed2[0] = min(speed2[0], settings.speed_start**2)
+    gain = (2 * settings.acceleration * np.diff(s)).tolist()
+    loss = (2 * settings.deceleration * np.diff(s)).tolist()
+    limits = speed2.tolist()
+    for i in range(len(gain)):
+        limits[i + 1] = min(limits[i + 1], limits[i] + gain[i])
+    for i in range(len(loss) - 1, -1, -1):
+        limits[i] = min(limits[i], limits[i + 1] + loss[i])
+    return np.asarray(np.sqrt(np.array(limits)))
+
+
+def _sample_times(path: CubicSpline, speeds: FloatArray, rate: float) -> tuple[FloatArray, FloatArray]:
+    """Stamps k / rate and the arc length at each, with constant acceleration between the path's knots."""
+    s = path.x
+    durations = 2 * np.diff(s) / (speeds[1:] + speeds[:-1])
+    knots_t = np.concatenate([[0.0], np.cumsum(durations)])
+    t = np.arange(int(knots_t[-1] * rate) + 1) / rate
+    index = np.clip(np.searchsorted(knots_t, t, side="right") - 1, 0, len(durations) - 1)
+    since = t - knots_t[index]
+    acceleration = (speeds[index + 1] - speeds[index]) / durations[index]
+    return t, s[index] + speeds[index] * since + acceleration * since**2 / 2
