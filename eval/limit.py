@@ -16,7 +16,7 @@ from pathspace_graph.map import Map, SplineBoundary
 from pathspace_graph.spline import BSpline
 
 from .landmark_batch import LandmarkSolution, solve_landmarks
-from .metrics import root_mean_square
+from .metrics import closest_points, root_mean_square
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ def fit_distances(cones: Array, size: int, like: BSpline) -> Array:
     Degree and closedness are those of `like`; knots follow the curvature, as the mapper's own do.
     """
     fitted = fit_spline(cones, size, like.periodic, FitSettings(degree=like.degree))
-    return np.asarray(np.linalg.norm(cones - fitted.foot_points(cones).position, axis=1))
+    return np.asarray(np.linalg.norm(cones - closest_points(fitted, cones).position, axis=1))
 
 
 def driving_order(truth: Truth, label: int) -> Array:
@@ -91,11 +91,11 @@ def driving_order(truth: Truth, label: int) -> Array:
     By their station on the first lap of the true path, or as the file lists them where that makes the shorter
     way (stations tie on the inside of a hairpin) or where there is no true path.
     """
-    cones = truth.cones[truth.cone_labels == label]
+    cones: Array = truth.cones[truth.cone_labels == label]
     if len(truth.poses) < 2 or len(cones) == 0:
         return cones
-    _, station = KDTree(_first_lap(truth)).query(cones)
-    by_station = cones[np.argsort(station, kind="stable")]
+    station: NDArray[np.intp] = np.asarray(KDTree(_first_lap(truth)).query(cones)[1])
+    by_station: Array = cones[np.argsort(station, kind="stable")]
     return by_station if _way_around(by_station) < _way_around(cones) else cones
 
 

@@ -82,9 +82,6 @@ class PlotStyle:
     landmark_size: float = 1.4
     """Of landmarks, small enough for their ellipses to be seen."""
 
-    legend_rows: int = 3
-    """Rows of the legend: a boundary has a band, a curve and control points."""
-
     samples_per_span: int = 24
     """Points drawn on each span of a spline."""
 
@@ -292,15 +289,16 @@ def _finish(figure: Figure, axes: Axes, title: str | None, style: PlotStyle) -> 
     axes.tick_params(width=0.6, length=2.5)
     if title:
         axes.set_title(title)
-    _add_legend(figure, axes, style)
+    _add_legend(figure, axes)
     ratio = (y1 - y0 + 2 * style.margin) / (x1 - x0 + 2 * style.margin)
     figure.set_size_inches(style.width, min(style.max_height, style.width * ratio + style.furniture))
 
 
-def _add_legend(figure: Figure, axes: Axes, style: PlotStyle) -> None:
-    """Below the axes; a column holds what belongs to one boundary, as columns are filled from the top."""
+def _add_legend(figure: Figure, axes: Axes) -> None:
+    """Below the axes; a column is as long as a boundary has entries."""
     handles, labels = axes.get_legend_handles_labels()
-    columns = max(1, -(-len(labels) // style.legend_rows))
+    rows = max(1, *(sum(label.startswith(name) for label in labels) for name in NAMES))
+    columns = -(-len(labels) // rows)
     figure.legend(
         handles,
         labels,

@@ -166,7 +166,7 @@ def _blossom(knots: Floats, degree: int, span: int, arguments: Floats) -> Floats
     return np.asarray(weights[0])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SpanPolynomials:
     """Basis functions as polynomials of s = (u - t_i) / (t_{i+1} - t_i) on each span: `basis`, but faster."""
 
@@ -187,9 +187,9 @@ class SpanPolynomials:
     inverse_widths: Floats = field(init=False, repr=False)
     """1 / (t_{i+1} - t_i) of each span (n - p,), zero for an empty span."""
     _breaks: Floats = field(init=False, repr=False)
-    _by_span: Floats = field(init=False, repr=False)
+    _by_span: dict[int, Floats] = field(init=False, repr=False, default_factory=dict)
     _windows: Ints = field(init=False, repr=False)
-    _stacks: dict[int, Floats] = field(init=False, repr=False, compare=False, default_factory=dict)
+    _stacks: dict[int, Floats] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         knots = np.ascontiguousarray(self.knots, dtype=np.float64)
@@ -204,7 +204,6 @@ class SpanPolynomials:
         widths = np.diff(knots[self.degree : end + 1])
         set_field(self, "inverse_widths", np.where(widths > 0.0, 1.0 / _positive(widths), 0.0))
         set_field(self, "coefficients", _span_coefficients(knots, self.degree))
-        set_field(self, "_by_span", np.ascontiguousarray(self.coefficients.transpose(1, 0, 2)))
         set_field(self, "_windows", np.arange(len(widths))[:, None] + np.arange(self.degree + 1))
         set_field(self, "_breaks", knots[self.degree + 1 : self.degree + 1 + max(last, 0)])
 
@@ -235,10 +234,21 @@ class SpanPolynomials:
             values += stack[power].take(number, axis=0)
         return values.reshape(len(s), derivatives + 1, self.degree + 1).transpose(1, 0, 2)
 
-    def curve_coefficients(self, control_points: Floats) -> Floats:
-        """(p + 1, 2, n - p): S(u) = sum_k coefficients[k, :, i - p] s^k on span i, control points (n, 2)."""
-        by_span: Floats = np.matmul(self._by_span, control_points[self._windows])
-        return np.ascontiguousarray(by_span.transpose(1, 2, 0))
+    def curve_coefficients(self, control_points: Floats, derivatives: int = 0) -> Floats:
+        """(p + 1, derivatives + 1, 2, n - p): d^r S / du^r = sum_k coefficients[k, r, :, i - p] s^k.
+
+        control_points (n, 2), unwrapped where periodic.
+        """
+        by_span = np.matmul(self._rows(derivatives), control_points[self._windows])
+        shape = (len(by_span), self.degree + 1, derivatives + 1, 2)
+        return np.ascontiguousarray(by_span.reshape(shape).transpose(1, 2, 3, 0))
+
+    def _rows(self, derivatives: int) -> Floats:
+        """(n - p spans, (p + 1) (derivatives + 1), p + 1 columns): the polynomials of `_stack` by span."""
+        if derivatives not in self._by_span:
+            by_span = self._stack(derivatives).transpose(1, 0, 2)
+            self._by_span[derivatives] = by_span.reshape(by_span.shape[0], -1, self.degree + 1)
+        return self._by_span[derivatives]
 
     def _stack(self, derivatives: int) -> Floats:
         """(p + 1 powers, n - p spans, (derivatives + 1) (p + 1)): polynomials of all orders side by side."""

@@ -30,7 +30,7 @@ _CHUNK: Final = 1 << 20
 """Most point-to-grid distances held at once (entries)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FootPoints:
     """The nearest curve point to each of m points, within each one's own stretch."""
 
@@ -52,42 +52,36 @@ class FootPoints:
     """Knot span (m,) of u."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Curve:
     """A curve as polynomials on each span, evaluated component-first."""
 
     tables: SpanPolynomials
     """The basis."""
     coefficients: Floats
-    """(p + 1, 2, n - p) of `SpanPolynomials.curve_coefficients`."""
+    """(p + 1, 3, 2, n - p) of `SpanPolynomials.curve_coefficients`: S, S', S''."""
 
     def position(self, u: Floats) -> Floats:
-        """S(u) (2, m) by Horner's rule."""
+        """S(u) (2, m)."""
         number, s = self.tables.locate(u)
-        terms = self.coefficients.take(number, axis=2)
-        position: Floats = terms[-1]
-        for term in terms[-2::-1]:
-            position = position * s + term
-        return position
+        return _horner(self.coefficients[:, 0].take(number, axis=-1), s)
 
-    def derivatives(self, number: Ints, s: Floats, scale: Floats) -> tuple[Floats, Floats, Floats]:
-        """S, S', S'' (2, m) by Horner's rule, where s = (u - start) * scale on span `number`."""
-        terms = self.coefficients.take(number, axis=2)
-        first = terms[-1]
-        position = first * s
-        position += terms[-2]
-        second = np.zeros_like(first)
-        for term in terms[-3::-1]:
-            second = second * s
-            second += first
-            first = first * s
-            first += position
-            position *= s
-            position += term
-        return position, first * scale, second * (2.0 * scale * scale)
+    def derivatives(self, number: Ints, s: Floats) -> Floats:
+        """S, S', S'' (3, 2, m) at the local coordinate s on span `number`."""
+        return _horner(self.coefficients.take(number, axis=-1), s)
 
 
-@dataclass(frozen=True)
+def _horner(terms: Floats, s: Floats) -> Floats:
+    """sum_k terms[k] s^k (..., m) of terms (p + 1, ..., m)."""
+    total: Floats = terms[-1] * s
+    total += terms[-2]
+    for term in terms[-3::-1]:
+        total *= s
+        total += term
+    return total
+
+
+@dataclass(frozen=True, eq=False)
 class _Probe:
     """The curve and the distances to it at one parameter for each row."""
 
@@ -141,7 +135,7 @@ def foot_points(
     long as the period has no limits. `coarse_step` is the grid's step in u. It stops once all rows converged.
     Finite input gives finite output, also where the tangent vanishes, at centres of curvature and at kinks.
     """
-    curve = _Curve(tables, tables.curve_coefficients(control_points))
+    curve = _Curve(tables, tables.curve_coefficients(control_points, 2))
     points_t = np.ascontiguousarray(points.T)
     low, high = _stretches(tables, u_low, u_high)
     limits = _limits(tables, low, high)
@@ -164,7 +158,7 @@ def refine_foot_points(
     As `foot_points`, but from a known parameter (m,), moved into the stretch where it lies outside; a step
     never goes farther than one mean knot interval, and no row ends farther from the curve than it began.
     """
-    curve = _Curve(tables, tables.curve_coefficients(control_points))
+    curve = _Curve(tables, tables.curve_coefficients(control_points, 2))
     points_t = np.ascontiguousarray(points.T)
     low, high = _stretches(tables, u_low, u_high)
     limits = _limits(tables, low, high)
@@ -298,12 +292,13 @@ def _no_farther(square: Floats, than: Floats) -> Bools:
 def _probe(curve: _Curve, points_t: Floats, u: Floats) -> _Probe:
     """The curve and the distances of points (2, m) at u."""
     number, s = curve.tables.locate(u)
-    offset, first, second = curve.derivatives(number, s, curve.tables.inverse_widths.take(number))
+    orders = curve.derivatives(number, s)
+    offset, first = orders[0], orders[1]
     offset -= points_t
-    square = _dot(offset, offset)
-    slope = _dot(offset, first)
+    products = orders * offset
+    square, slope, centripetal = products[:, 0] + products[:, 1]
     speed = _dot(first, first)
-    bend = speed + _dot(offset, second)
+    bend = speed + centripetal
     divisor = np.where(bend > _FLAT * speed, bend, speed)
     step = -slope / np.maximum(divisor, _TINY)
     return _Probe(u, number, s, offset, first, square, slope, step)

@@ -30,7 +30,7 @@ def smoothness_matrix(abscissae: Array, period: float | None) -> Array:
     m = len(abscissae)
     extended = abscissae if period is None else np.concatenate([abscissae, abscissae[:2] + period])
     gaps = np.diff(extended)
-    mean = gaps.mean()
+    mean = gaps[:m].mean()  # the gap that the period repeats counts once
     rows = np.arange(len(extended) - 2)
     before, after = gaps[:-1], gaps[1:]
     matrix = np.zeros((len(rows), m))

@@ -68,5 +68,8 @@ def project(
 
 
 def huber_weights(whitened: Array, threshold: float) -> Array:
-    """`w = min(1, threshold / |z|)` per row: the weight of a whitened residual in a Gauss-Newton step."""
-    return threshold / np.maximum(np.abs(whitened), threshold)
+    """`w = min(1, threshold / |z|)` per row: the weight of a whitened residual in a Gauss-Newton step.
+
+    An infinite threshold gives least squares: every weight is 1.
+    """
+    return 1.0 / np.maximum(np.abs(whitened) / threshold, 1.0)

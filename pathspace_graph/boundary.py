@@ -42,7 +42,11 @@ class Boundary:
         """Distinct control points."""
         self.abscissae = greville(knots, self.degree)[: self.size]
         period = self.length if self.periodic else None
-        following = np.append(self.abscissae[1:], self.abscissae[0] + self.length) if self.periodic else self.abscissae[1:]
+        following = (
+            np.append(self.abscissae[1:], self.abscissae[0] + self.length)
+            if self.periodic
+            else self.abscissae[1:]
+        )
         self.nominal = following - self.abscissae[: len(following)]
         """Nominal distance to the next control point, m."""
         smooth = smoothness_matrix(self.abscissae, period)
@@ -64,7 +68,11 @@ class Boundary:
 
     def extended(self, control_points: Array) -> Array:
         """Control points (n, 2) as the kernels take them: unwrapped where periodic."""
-        return np.concatenate([control_points, control_points[: self.degree]]) if self.periodic else control_points
+        return (
+            np.concatenate([control_points, control_points[: self.degree]])
+            if self.periodic
+            else control_points
+        )
 
     def columns(self, span: IntArray) -> IntArray:
         """(m, degree + 1) control points that matter on each span."""
@@ -102,13 +110,17 @@ class Boundary:
         if missing > 0:
             last = self.knots[-1] + spacing * np.arange(1, missing + 1)
             self._set_knots(np.concatenate([self.knots, last]))
-        kept = max(int(np.searchsorted(self.knots[: old], self.confirmed - 1e-9)) - 1, 0) if old else 0
+        kept = max(int(np.searchsorted(self.knots[:old], self.confirmed - 1e-9)) - 1, 0) if old else 0
         kept = min(kept, old)
         return self._place(control_points, kept, targets_u, targets)
 
     def _place(self, control_points: Array, kept: int, targets_u: Array, targets: Array) -> Array:
         """Least squares of the control points from index `kept` on, through targets and the kept stretch."""
-        held_u = np.linspace(max(self.confirmed - self.nominal[0], 0.0), self.confirmed, 4) if len(control_points) else np.zeros(0)
+        held_u = (
+            np.linspace(max(self.confirmed - self.nominal[0], 0.0), self.confirmed, 4)
+            if len(control_points)
+            else np.zeros(0)
+        )
         held = self._held(control_points, held_u)
         u = np.concatenate([held_u, targets_u])
         values, span = self.tables.evaluate(u)

@@ -55,7 +55,9 @@ def near_start(mapper: FixedLagMapper) -> bool:
     pose = mapper.poses[-1]
     drift = c.radius + c.drift * mapper.path.length
     near = np.hypot(pose[0] - c.overlap, pose[1]) < drift + c.overlap
-    return bool(near and np.cos(pose[2] - mapper.start_heading) > np.cos(c.heading + 0.001 * mapper.path.length))
+    return bool(
+        near and np.cos(pose[2] - mapper.start_heading) > np.cos(c.heading + 0.001 * mapper.path.length)
+    )
 
 
 def close_loop(mapper: FixedLagMapper) -> bool:
@@ -116,7 +118,9 @@ def register(mapper: FixedLagMapper) -> Registration | None:
         f"closing at {mapper.path.length:.1f}: {agree}/{total} {[(len(u), round(float(np.ptp(u)), 1) if len(u) else 0) for _, u in matches.values()]} shift {shift.round(2)} rot {rotation:.3f}"
     )
     enough = total >= c.min_readings and agree >= c.inlier_share * total
-    covered = all(len(u) >= 5 and np.ptp(u) >= c.overlap for _, u in matches.values()) and len(matches) == len(rows)
+    covered = all(len(u) >= 5 and np.ptp(u) >= c.overlap for _, u in matches.values()) and len(
+        matches
+    ) == len(rows)
     if not (enough and covered):
         return None
     return Registration(rotation, shift, centre, matches)

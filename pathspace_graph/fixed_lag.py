@@ -25,6 +25,7 @@ from .boundary import Boundary, open_boundary
 from .closing import close_loop
 from .labels import BOUNDARIES, UNKNOWN
 from .log import Detections, Odometry
+from .map import Map, SplineBoundary
 from .path import DrivenPath, along_and_across
 from .readings import Readings
 from .settings import MapperSettings
@@ -52,7 +53,9 @@ class FixedLagMapper:
 
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
-        self.odometry_sigma = np.array([0.25, 0.12, 0.035]) if odometry_sigma is None else np.asarray(odometry_sigma)
+        self.odometry_sigma = (
+            np.array([0.25, 0.12, 0.035]) if odometry_sigma is None else np.asarray(odometry_sigma)
+        )
         s = self.settings
         self.boundaries: dict[int, Boundary] = {}
         self.sightings = {b: Sightings(s.growth) for b in BOUNDARIES}
@@ -167,7 +170,9 @@ class FixedLagMapper:
         block = np.zeros((q + POSE, q + POSE))
         block[:q, :q] = self.prior.information
         block[q:, q:] = information
-        self.prior = Prior(block, np.append(self.prior.gradient, np.zeros(POSE)), np.append(self.prior.point, pose))
+        self.prior = Prior(
+            block, np.append(self.prior.gradient, np.zeros(POSE)), np.append(self.prior.point, pose)
+        )
 
     # -- classify -----------------------------------------------------------------------------------------------------
 
@@ -320,7 +325,9 @@ class FixedLagMapper:
         self._insert_control_points(label, 0, cps)
         self._consume(label, indices[chain], points, 0.0)
         n = len(self.poses)
-        foot = boundary.find(self.control_points(label), self.poses[:, :2], np.zeros(n), np.full(n, boundary.confirmed))
+        foot = boundary.find(
+            self.control_points(label), self.poses[:, :2], np.zeros(n), np.full(n, boundary.confirmed)
+        )
         self.stations[label] = foot.u
 
     def _extend(self, label: int, path: Array, stations: Array) -> bool:
@@ -331,12 +338,21 @@ class FixedLagMapper:
         s_end, lateral = along_and_across(end, path, stations)
         s_end, side_end = float(s_end[0]), float(lateral[0] if label == 0 else -lateral[0])
         indices, s, side = self._candidates(label, path, stations)
-        distance = np.hypot(*(self.sightings[label].points[indices] - end[0]).T) if len(indices) else np.zeros(0)
+        distance = (
+            np.hypot(*(self.sightings[label].points[indices] - end[0]).T) if len(indices) else np.zeros(0)
+        )
         ahead = (s > s_end + 0.3) & (distance > growth.threshold)
         indices, s, side = indices[ahead], s[ahead], side[ahead]
-        chain = _chain(
-            np.append(s_end, s), np.append(side_end, side), growth.lateral_change, growth.lateral_rate, anchored=True
-        )[1:] - 1
+        chain = (
+            _chain(
+                np.append(s_end, s),
+                np.append(side_end, side),
+                growth.lateral_change,
+                growth.lateral_rate,
+                anchored=True,
+            )[1:]
+            - 1
+        )
         if len(chain):
             points = self.sightings[label].points[indices[chain]]
             self._lead(label, end[0], points)
@@ -427,15 +443,23 @@ class FixedLagMapper:
         m = len(rows)
         base = self.offset(label) + 2 * boundary.columns(foot.span)
         columns = np.concatenate(
-            [self.pose_column(slots)[:, None] + np.arange(POSE), np.stack([base, base + 1], axis=2).reshape(m, 2 * base.shape[1])],
+            [
+                self.pose_column(slots)[:, None] + np.arange(POSE),
+                np.stack([base, base + 1], axis=2).reshape(m, 2 * base.shape[1]),
+            ],
             axis=1,
         )
-        jacobian = np.concatenate([lin.by_pose, lin.by_control.reshape(m, 2 * base.shape[1])], axis=1) * weight[:, None]
+        jacobian = (
+            np.concatenate([lin.by_pose, lin.by_control.reshape(m, 2 * base.shape[1])], axis=1)
+            * weight[:, None]
+        )
         return Rows(columns, jacobian, lin.residual * weight)
 
     def _linearize_spacing(self, label: int) -> Rows:
         boundary = self.boundaries[label]
-        residual, direction = spacing_residuals(self.control_points(label), boundary.nominal, boundary.periodic)
+        residual, direction = spacing_residuals(
+            self.control_points(label), boundary.nominal, boundary.periodic
+        )
         sigma = self.settings.gauge.sigma_spacing * boundary.nominal
         j = np.arange(len(residual))
         k = (j + 1) % boundary.size
@@ -454,9 +478,7 @@ class FixedLagMapper:
         m = len(deltas)
         first = self.pose_column(np.arange(m))[:, None]
         shared = np.full((m, 1), self.map_size)
-        columns = np.concatenate(
-            [shared + np.arange(CALIBRATION_SIZE), first + np.arange(2 * POSE)], axis=1
-        )
+        columns = np.concatenate([shared + np.arange(CALIBRATION_SIZE), first + np.arange(2 * POSE)], axis=1)
         jacobian = roots @ np.concatenate([by_calibration, by_start, by_end], axis=2)
         residual = np.einsum("mij,mj->mi", roots, residual)
         return Rows(np.repeat(columns, POSE, axis=0), jacobian.reshape(m * POSE, -1), residual.ravel())
@@ -520,6 +542,18 @@ class FixedLagMapper:
 
     # -- results ------------------------------------------------------------------------------------------------------
 
+    def map(self) -> Map:
+        """The map as it stands, with the joint covariance of each boundary's control points."""
+        if not self.boundaries:
+            return Map(self.closed, {})
+        joint = self.covariance()
+        boundaries = {}
+        for label, boundary in self.boundaries.items():
+            block = slice(self.offset(label), self.offset(label) + 2 * boundary.size)
+            spline = boundary.spline(self.control_points(label).copy())
+            boundaries[label] = SplineBoundary(spline, joint[block, block])
+        return Map(self.closed, boundaries)
+
     def covariance(self) -> Array:
         """Joint covariance of the control points, of both boundaries together."""
         factor = cholesky(self._normal_equations(self.linearize())[0])
@@ -539,9 +573,7 @@ def _take(foot: FootPoints, keep: IntArray) -> FootPoints:
     return FootPoints(*(getattr(foot, f)[keep] for f in foot.__dataclass_fields__))
 
 
-def _chain(
-    s: Array, side: Array, change: float, rate: float, anchored: bool = False
-) -> IntArray:
+def _chain(s: Array, side: Array, change: float, rate: float, anchored: bool = False) -> IntArray:
     """Indices of a chain along the path (stations `s`, sorted): each next one not much farther from the path than the last,
 
     and of those at about the same station the one nearest to the path."""

@@ -87,7 +87,7 @@ def _equal_lengths(spline: BSpline, low: float, high: float, count: int) -> Floa
     return np.interp(np.linspace(0.0, along[-1], count + 1), along, grid)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Refit:
     """A change of basis between an old and a new spline, on each coordinate alike."""
 

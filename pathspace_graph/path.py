@@ -43,7 +43,9 @@ class DrivenPath:
         s = np.arange(0.0, reach + self.step, self.step)
         angle = 0.5 * curvature * s
         chord = s * np.sinc(angle / np.pi)
-        ahead = pose[:2] + chord[:, None] * np.column_stack([np.cos(pose[2] + angle), np.sin(pose[2] + angle)])
+        ahead = pose[:2] + chord[:, None] * np.column_stack(
+            [np.cos(pose[2] + angle), np.sin(pose[2] + angle)]
+        )
         behind = self.stations < self.length - 0.5 * self.step
         return (
             np.concatenate([self.points[behind], ahead]),
@@ -69,5 +71,7 @@ def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array
     overshoot = np.where(best == len(segment) - 1, (d * e).sum(axis=1) / length2[best] - 1.0, 0.0)
     at = np.where(overshoot > 0.0, 1.0 + overshoot, share[rows, best])
     side = e[:, 0] * d[:, 1] - e[:, 1] * d[:, 0]
-    lateral = np.where(overshoot > 0.0, side / np.sqrt(length2[best]), np.sign(side) * np.sqrt(distance2[rows, best]))
+    lateral = np.where(
+        overshoot > 0.0, side / np.sqrt(length2[best]), np.sign(side) * np.sqrt(distance2[rows, best])
+    )
     return stations[best] + at * (stations[best + 1] - stations[best]), lateral

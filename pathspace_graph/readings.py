@@ -51,7 +51,9 @@ class Readings:
             np.zeros(m, bool),
         )
         for column in fields(self):
-            setattr(self, column.name, np.concatenate([getattr(self, column.name), getattr(new, column.name)]))
+            setattr(
+                self, column.name, np.concatenate([getattr(self, column.name), getattr(new, column.name)])
+            )
         return slice(start, start + m)
 
     def drop_oldest_pose(self) -> None:

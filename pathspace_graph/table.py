@@ -72,7 +72,10 @@ def read_table(file: Path, required: Sequence[str], comment: str = "") -> Table:
     if header:
         header[0] = header[0].removeprefix(comment).strip()
     _check_header(file, header, required, lines[0])
-    body = [_fit(file, row, len(header), line) for row, line in zip(rows[1:], lines[1:], strict=True)]
+    body = [
+        row if len(row) == len(header) else _fit(file, row, len(header), line)
+        for row, line in zip(rows[1:], lines[1:], strict=True)
+    ]
     columns = [list(column) for column in zip(*body, strict=True)] or [[] for _ in header]
     return Table(file, dict(zip(header, columns, strict=True)), lines[1:])
 
@@ -84,7 +87,7 @@ def _read_rows(file: Path) -> tuple[list[list[str]], list[int]]:
         with file.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.reader(stream, skipinitialspace=True)
             for row in reader:
-                if any(field.strip() for field in row):
+                if "".join(row).strip():
                     rows.append(row)
                     lines.append(reader.line_num)
     except FileNotFoundError:

@@ -67,9 +67,9 @@ class SensorSettings:
     """Expected number of detections of nothing in a cycle."""
     range_bias: bool = False
     """Whether ranges have a systematic error, as those of cameras do."""
-    range_bias_at: tuple[float, ...] = (2.0, 4.0, 10.0)
+    range_bias_at: tuple[float, ...] = (4.0, 9.0)
     """Ranges at which the systematic error is given, m, increasing; linear between, constant outside."""
-    range_bias_values: tuple[float, ...] = (0.01, 0.03, 0.40)
+    range_bias_values: tuple[float, ...] = (0.02, 0.34)
     """The systematic error there, m (typical of cameras: 0.02 m below 4 m, 0.34 m beyond 8 m)."""
 
     def __post_init__(self) -> None:

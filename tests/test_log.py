@@ -21,7 +21,9 @@ FINITE = st.floats(-1e6, 1e6, allow_nan=False)
 def small_log() -> Log:
     rng = np.random.default_rng(0)
     cycles = tuple(
-        Detections(t, rng.normal(size=(3, 2)), np.tile([[0.02, 0.001], [0.001, 0.03]], (3, 1, 1)), np.arange(3))
+        Detections(
+            t, rng.normal(size=(3, 2)), np.tile([[0.02, 0.001], [0.001, 0.03]], (3, 1, 1)), np.arange(3)
+        )
         for t in (0.0, 0.1, 0.2)
     )
     t = np.arange(11) / 50
@@ -29,7 +31,9 @@ def small_log() -> Log:
     truth = Truth(t, poses, rng.normal(size=(4, 2)), np.array([0, 1, 2, 0]), np.array([0, 1, -1] * 3))
     source = {"track": 'a "quoted" \\ name\n', "Umlaut": "Zürich \x7f"}
     sensor = SensorInfo(range_max=15.0, fov=1.9)
-    return Log(Odometry(t, rng.normal(size=(11, 3))), cycles, np.array([0.1, 0.2, 1e-5]), sensor, source, truth)
+    return Log(
+        Odometry(t, rng.normal(size=(11, 3))), cycles, np.array([0.1, 0.2, 1e-5]), sensor, source, truth
+    )
 
 
 def assert_same(a: Log, b: Log) -> None:

@@ -55,7 +55,9 @@ def test_real_track(path: Path) -> None:
         assert gaps(row, closed=True).max() < 10.0
         assert gaps(row, closed=True).min() > 0.2
     assert_plausible(track)
-    assert np.linalg.norm(track.centre_line.points(np.zeros(1) + track.centre_line.nearest(np.zeros(3)))) < 2.0
+    assert (
+        np.linalg.norm(track.centre_line.points(np.zeros(1) + track.centre_line.nearest(np.zeros(3)))) < 2.0
+    )
 
 
 @real_tracks
@@ -151,6 +153,7 @@ def test_open_lane_with_duplicates_gate_and_marks(tmp_path: Path) -> None:
 
 def square_yaml(**replaced: str) -> str:
     """A PacSim square of 20 m with 4 m lanes, driven counter-clockwise from the middle of its bottom."""
+
     def row(half: float) -> str:
         side = np.linspace(-half, half, 5)[:-1]
         corners = [(x, -half) for x in side] + [(half, y) for y in side]
@@ -175,7 +178,7 @@ def test_pacsim_square(tmp_path: Path) -> None:
     np.testing.assert_allclose(track.other, [[0.1, 2.0]])
     assert 70.0 < track.centre_line.length < 80.0
     moved = to_map_frame(track)
-    np.testing.assert_allclose(moved.left, track.left + [0.0, 10.0], atol=1e-12)
+    np.testing.assert_allclose(moved.left, track.left + np.array([0.0, 10.0]), atol=1e-12)
 
 
 BAD_YAML = [
@@ -229,7 +232,8 @@ def test_bad_csv(tmp_path: Path, text: str, row: int | None, message: str) -> No
 
 
 @pytest.mark.parametrize(
-    ("name", "text"), [("t.csv", "a,b\n1,2\n"), ("t.yaml", "a: 1\n"), ("t.yaml", ""), ("t.txt", "x"), ("t", "x")]
+    ("name", "text"),
+    [("t.csv", "a,b\n1,2\n"), ("t.yaml", "a: 1\n"), ("t.yaml", ""), ("t.txt", "x"), ("t", "x")],
 )
 def test_unknown_kind_names_the_known_ones(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_text(text)

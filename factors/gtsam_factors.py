@@ -1,0 +1,255 @@
+"""The kernels as GTSAM factors, for anyone's nonlinear graph: projection, spacing, smoothness, odometry.
+
+A factor holds its measurement and keys, never a graph; it is a pure function of the values that it is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import MutableSequence, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from .bspline import SpanPolynomials
+from .footpoint import FootPoints, foot_points
+from .linear_graph import jacobian_factor, rotation
+from .odometry import IntegratedOdometry, odometry_residuals
+from .projection import huber_weights, project, to_map
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+JacobianList = MutableSequence[Array]
+
+GRID_SHARE = 0.25
+"""Coarse step of the foot-point search, as a share of the mean knot interval."""
+
+
+def spline_projection_factor(
+    pose_key: int,
+    control_keys: Sequence[int],
+    tables: SpanPolynomials,
+    *,
+    points_vehicle: Array,
+    covariances: Array,
+    u: Array,
+    room: float,
+    sigma_model: float,
+    huber: float,
+) -> gtsam.CustomFactor:
+    """`z_i = n_i . (R z_i + t - S(u_i)) / sigma_i`, the rows of one cycle on one boundary (see `project`).
+
+    control_keys (k,) of all the boundary's distinct control points, of which the factor takes those that
+    matter within `room` (parameter units, about m) of the parameters u (m,) where the foot points are
+    expected. points_vehicle (m, 2) and covariances (m, 2, 2) in the vehicle frame; sigma_model in m; huber is
+    the whitened residual beyond which a row's weight falls (infinite: never).
+
+    Foot points, standard deviations and weights are found anew at every evaluation. A linearization gives
+    rows scaled by the square root of their Huber weight; an error without Jacobians is the Huber loss itself,
+    so that an optimizer that judges its steps by the error judges them rightly. That sigma turns with the
+    normal is in no derivative: the optimum is where Gauss-Newton stands still, and an optimizer that looks at
+    the error may stop beside it, by as much as sigma depends on the direction. A row whose foot point is not
+    interior, or leaves the spans whose control points are keys, contributes zero: create the factor anew.
+    """
+    if not len(points_vehicle) == len(covariances) == len(u) > 0:
+        raise ValueError(
+            f"expected as many readings, covariances and parameters, at least one, found "
+            f"{len(points_vehicle)}, {len(covariances)} and {len(u)}"
+        )
+    size = _distinct(tables)
+    if len(control_keys) != size:
+        raise ValueError(f"expected a key for each of {size} control points, found {len(control_keys)}")
+    touched = _touched(tables, u - room, u + room)
+    keys = (int(pose_key), *(int(control_keys[j]) for j in touched))
+    function = _Projection(
+        keys, touched, tables, points_vehicle, covariances, u - room, u + room, sigma_model, huber
+    )
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(u)), list(keys), function)
+
+
+@dataclass(frozen=True, eq=False)
+class _Projection:
+    """Error function of a spline-projection factor."""
+
+    keys: tuple[int, ...]
+    """The pose's, then those of the control points `touched`."""
+    touched: IntArray
+    """Indices of the control points whose keys are held."""
+    tables: SpanPolynomials
+    """The basis."""
+    points_vehicle: Array
+    """(m, 2) readings, m."""
+    covariances: Array
+    """(m, 2, 2) their covariances, vehicle frame, m^2."""
+    low: Array
+    """(m,) beginning of the stretch where each foot point is searched for."""
+    high: Array
+    """(m,) its end."""
+    sigma_model: float
+    """Standard deviation of cones about a smooth curve, m."""
+    huber: float
+    """Whitened residual beyond which a row's weight falls."""
+
+    def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
+        """Robust whitened rows (m,), and their Jacobians in H where it is given."""
+        pose = values.atPose2(self.keys[0])
+        poses = np.tile(pose_array(pose), (len(self.low), 1))
+        points = to_map(self.points_vehicle, poses)
+        foot = self._find(values, points)
+        rows = project(points, self.covariances, poses, foot, self.sigma_model)
+        usable, slots = self._usable(foot)
+        whitened = rows.residual / rows.sigma
+        if H is None:
+            return np.asarray(huber_roots(whitened, self.huber) * usable)
+        root = np.sqrt(huber_weights(whitened, self.huber)) * usable
+        scale = root / rows.sigma
+        by_pose = rows.by_pose * scale[:, None]
+        by_pose[:, :2] = by_pose[:, :2] @ rotation(pose.theta())
+        _fill(H, [by_pose, *self._by_key(rows.by_control * scale[:, None, None], slots)])
+        return np.asarray(whitened * root)
+
+    def _find(self, values: gtsam.Values, points: Array) -> FootPoints:
+        """Foot points within the stretch; control points that can't matter there are left at zero."""
+        distinct = np.zeros((_distinct(self.tables), 2))
+        distinct[self.touched] = [values.atPoint2(key) for key in self.keys[1:]]
+        unwrapped = distinct[np.arange(_unwrapped(self.tables)) % len(distinct)]
+        step = GRID_SHARE * (self.tables.high - self.tables.low) / len(self.tables.starts)
+        return foot_points(self.tables, unwrapped, points, self.low, self.high, step)
+
+    def _usable(self, foot: FootPoints) -> tuple[NDArray[np.bool_], IntArray]:
+        """Rows (m,) that may contribute, and the key numbers (m, degree + 1) of their control points."""
+        size = _distinct(self.tables)
+        slot_of = np.full(size, -1, dtype=np.intp)
+        slot_of[self.touched] = np.arange(len(self.touched))
+        slots = slot_of[(foot.span[:, None] + np.arange(-self.tables.degree, 1)) % size]
+        return foot.interior & (slots >= 0).all(axis=1), slots
+
+    def _by_key(self, by_control: Array, slots: IntArray) -> Array:
+        """Derivatives (m, degree + 1, 2) by the control points of each row's span -> (keys, m, 2)."""
+        blocks = np.zeros((len(self.touched), len(by_control), 2))
+        np.add.at(blocks, (slots, np.arange(len(by_control))[:, None]), by_control)
+        return blocks
+
+
+def pose_array(pose: gtsam.Pose2) -> Array:
+    """(3,) x (m), y (m), theta (rad) in (-pi, pi]."""
+    return np.array([pose.x(), pose.y(), pose.theta()])
+
+
+def huber_roots(whitened: Array, threshold: float) -> Array:
+    """`sign(z) sqrt(2 rho(z))` with Huber's loss `rho = z^2 / 2`, beyond the threshold k `k (|z| - k/2)`."""
+    size = np.abs(whitened)
+    inner = np.minimum(size, threshold)
+    return np.sign(whitened) * np.sqrt(inner * (2.0 * size - inner))
+
+
+def _unwrapped(tables: SpanPolynomials) -> int:
+    """Control points as the kernels take them."""
+    return len(tables.knots) - tables.degree - 1
+
+
+def _distinct(tables: SpanPolynomials) -> int:
+    """Control points, without those that a periodic spline repeats."""
+    return _unwrapped(tables) - (tables.degree if tables.periodic else 0)
+
+
+def _touched(tables: SpanPolynomials, low: Array, high: Array) -> IntArray:
+    """Indices of the control points that matter anywhere in the stretches [low, high] (m,)."""
+    period, spans = tables.high - tables.low, len(tables.starts)
+    first, last = tables.locate(low)[0], tables.locate(high)[0]
+    if tables.periodic:
+        turns = np.floor((high - tables.low) / period) - np.floor((low - tables.low) / period)
+        last = np.minimum(last + spans * turns.astype(np.intp), first + spans)
+    stretches = zip(first, last + tables.degree + 1, strict=True)
+    return np.unique(np.concatenate([np.arange(i, end) for i, end in stretches]) % _distinct(tables))
+
+
+def _fill(H: JacobianList, blocks: Sequence[Array]) -> None:
+    """Hand every Jacobian over; GTSAM takes whatever it is given, so the shapes are checked here."""
+    if len(H) != len(blocks):
+        raise ValueError(f"expected {len(H)} Jacobians, one a key, found {len(blocks)}")
+    for i, block in enumerate(blocks):
+        if block.ndim != 2 or len(block) != len(blocks[0]):
+            raise ValueError(f"expected {len(blocks[0])} rows in Jacobian {i}, found shape {block.shape}")
+        H[i] = block
+
+
+def spacing_factors(
+    control_keys: Sequence[int], nominal: Array, sigma: Array, periodic: bool
+) -> list[gtsam.RangeFactor2]:
+    """`|c_{j+1} - c_j| - nominal_j` between neighbours, GTSAM's own range factor (see `spacing_residuals`).
+
+    nominal and sigma (k - 1,), or (k,) where periodic, m.
+    """
+    expected = len(control_keys) - (0 if periodic else 1)
+    if not len(nominal) == len(sigma) == expected:
+        raise ValueError(f"expected {expected} distances and sigmas, found {len(nominal)} and {len(sigma)}")
+    following = [*control_keys[1:], control_keys[0]]
+    return [
+        gtsam.RangeFactor2(first, second, float(d), gtsam.noiseModel.Isotropic.Sigma(1, float(s)))
+        for first, second, d, s in zip(control_keys, following, nominal, sigma, strict=False)
+    ]
+
+
+def smoothness_factors(
+    control_keys: Sequence[int], matrix: Array, sigma: float
+) -> list[gtsam.LinearContainerFactor]:
+    """`D c ~ N(0, sigma^2)`, one linear factor for each row of D (`gauge.smoothness_matrix`); sigma in m."""
+    if matrix.shape[1] != len(control_keys):
+        raise ValueError(f"expected a key for each of {matrix.shape[1]} columns, found {len(control_keys)}")
+    return [_smoothness_factor(control_keys, row, sigma) for row in matrix]
+
+
+def _smoothness_factor(control_keys: Sequence[int], row: Array, sigma: float) -> gtsam.LinearContainerFactor:
+    """Linearized about zero: without a point, GTSAM's error of a linear factor is zero everywhere."""
+    columns = np.flatnonzero(row)
+    keys = [control_keys[int(j)] for j in columns]
+    zero = gtsam.Values()
+    for key in keys:
+        zero.insert(key, np.zeros(2))
+    A = np.kron(row[columns] / sigma, np.eye(2)).astype(np.float64)
+    return gtsam.LinearContainerFactor(jacobian_factor(keys, [2] * len(keys), A, np.zeros(2)), zero)
+
+
+def odometry_factor(
+    first_key: int, second_key: int, odometry: IntegratedOdometry
+) -> gtsam.BetweenFactorPose2:
+    """`Log(delta^-1 x_i^-1 x_j)`, GTSAM's own factor between two poses, with the odometry's covariance."""
+    return gtsam.BetweenFactorPose2(first_key, second_key, gtsam.Pose2(*odometry.delta), _noise(odometry))
+
+
+def calibrated_odometry_factor(
+    first_key: int, second_key: int, calibration_key: int, odometry: IntegratedOdometry
+) -> gtsam.CustomFactor:
+    """`Log(delta^-1 x_i^-1 x_j) + G b`, with b (2,) the odometry's scale error and yaw-rate bias."""
+    keys = (int(first_key), int(second_key), int(calibration_key))
+    return gtsam.CustomFactor(_noise(odometry), list(keys), _CalibratedOdometry(keys, odometry))
+
+
+def _noise(odometry: IntegratedOdometry) -> gtsam.noiseModel.Gaussian:
+    """From the information: GTSAM silently drops the lower triangle of a square root that it is given."""
+    return gtsam.noiseModel.Gaussian.Information(odometry.whitener.T @ odometry.whitener)
+
+
+@dataclass(frozen=True, eq=False)
+class _CalibratedOdometry:
+    """Error function of a calibrated odometry factor."""
+
+    keys: tuple[int, int, int]
+    """Of the start, the end, and the calibration."""
+    odometry: IntegratedOdometry
+    """The measurement."""
+
+    def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
+        """Residual (3,), and its Jacobians in H where it is given; the noise model whitens both."""
+        start, end = values.atPose2(self.keys[0]), values.atPose2(self.keys[1])
+        residual, by_start, by_end = odometry_residuals(
+            pose_array(start)[None], pose_array(end)[None], self.odometry.delta[None]
+        )
+        by_start[0, :, :2] = by_start[0, :, :2] @ rotation(start.theta())
+        by_end[0, :, :2] = by_end[0, :, :2] @ rotation(end.theta())
+        if H is not None:
+            _fill(H, [by_start[0], by_end[0], self.odometry.calibration_jacobian])
+        calibration = values.atPoint2(self.keys[2])
+        return np.asarray(residual[0] + self.odometry.calibration_jacobian @ calibration)

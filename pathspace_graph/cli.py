@@ -1,0 +1,115 @@
+"""The command line: finds the command, turns errors into one line and an exit code."""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+from collections.abc import Sequence
+from contextlib import redirect_stderr
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import version
+from typing import Any, Final
+
+from .errors import PathspaceError, SettingsError
+
+PROGRAM: Final = "pathspace-graph"
+DONE: Final = 0
+BAD_INPUT: Final = 2
+INTERRUPTED: Final = 130
+
+_ANSI: Final = re.compile(r"\x1b\[[0-9;]*m")
+_FRAME: Final = " │\t"
+_RULE: Final = "─╭╮╰╯"
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command, imported only when it is called: `--help` needn't wait for GTSAM and matplotlib."""
+
+    module: str
+    """Module of this package."""
+    name: str
+    """Dataclass in it whose fields are the options and whose `run` does the work."""
+    summary: str
+    """One line for the list of commands."""
+
+
+COMMANDS: Final = {
+    "demo": Command("commands_demo", "Demo", "map a generated track online: a table, a map and its picture"),
+    "simulate": Command("commands_simulate", "Simulate", "write the log of a simulated drive, with truth"),
+    "online": Command("commands_online", "Online", "map a log online, cycle by cycle"),
+    "plot": Command("commands_plot", "Plot", "draw a map with its uncertainty band"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; 0 on success, 2 with one line on standard error on bad usage or bad input."""
+    try:
+        return _run(list(sys.argv[1:] if arguments is None else arguments))
+    except PathspaceError as error:
+        return _refuse(str(error))
+    except OSError as error:
+        return _refuse(f"{error.filename or 'output'}: {error.strerror or error}")
+    except KeyboardInterrupt:
+        print(f"{PROGRAM}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _run(arguments: list[str]) -> int:
+    first = arguments[0] if arguments else ""
+    if first in ("-h", "--help"):
+        print(overview())
+    elif first == "--version":
+        print(f"{PROGRAM} {version(PROGRAM)}")
+    elif first in COMMANDS:
+        command = _parse(first, arguments[1:])
+        if command is not None:
+            command.run()
+    else:
+        known = ", ".join(COMMANDS)
+        raise SettingsError(f"expected a command ({known}), found {repr(first) if first else 'none'}")
+    return DONE
+
+
+def overview() -> str:
+    """The list of commands."""
+    width = max(map(len, COMMANDS)) + 2
+    lines = [f"  {name:<{width}}{command.summary}" for name, command in COMMANDS.items()]
+    usage = f"usage: {PROGRAM} COMMAND [OPTIONS]"
+    return "\n".join([usage, "", *lines, "", f"{PROGRAM} COMMAND --help explains each."])
+
+
+def _parse(name: str, arguments: list[str]) -> Any:
+    """The command with its options; None where it was asked for help, which is printed by then."""
+    import tyro  # noqa: PLC0415 - so that the list of commands needn't wait for it
+
+    command = COMMANDS[name]
+    options = getattr(import_module(f".{command.module}", __package__), command.name)
+    complaint = io.StringIO()
+    try:
+        with redirect_stderr(complaint):
+            return tyro.cli(options, prog=f"{PROGRAM} {name}", args=arguments)
+    except SystemExit as end:
+        if not end.code:
+            return None
+    raise SettingsError(f"{one_line(complaint.getvalue())} (see {PROGRAM} {name} --help)")
+
+
+def one_line(box: str) -> str:
+    """What the first part of tyro's framed message says, on one line."""
+    words: list[str] = []
+    for line in _ANSI.sub("", box).splitlines():
+        text = line.strip(_FRAME)
+        if not text.strip(_RULE + " ") or text[0] in _RULE:
+            if words:
+                break
+            continue
+        words.extend(text.split())
+    return " ".join(words)
+
+
+def _refuse(message: str) -> int:
+    print(f"{PROGRAM}: {' '.join(message.split())}", file=sys.stderr)
+    return BAD_INPUT

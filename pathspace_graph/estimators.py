@@ -1,0 +1,36 @@
+"""The online estimators by the name that the command line knows them by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from .errors import SettingsError
+from .fixed_lag import FixedLagMapper
+from .log import Log
+from .run import OnlineEstimator
+from .settings import MapperSettings
+
+DEFAULT: Final = "fixed-lag"
+"""The estimator that runs where none is named."""
+
+
+def _fixed_lag(settings: MapperSettings, log: Log) -> OnlineEstimator:
+    return FixedLagMapper(settings, log.odometry_sigma)
+
+
+ONLINE: Final[Mapping[str, Callable[[MapperSettings, Log], OnlineEstimator]]] = {DEFAULT: _fixed_lag}
+"""What makes each online estimator for a log, of which it is told the sensors' noise only."""
+
+
+def check_online(name: str) -> None:
+    """SettingsError, naming the known ones, where there is no online estimator of that name."""
+    if name not in ONLINE:
+        known = ", ".join(sorted(ONLINE))
+        raise SettingsError(f"--estimator: expected a known online estimator ({known}), found '{name}'")
+
+
+def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimator:
+    """The online estimator of that name, ready for the log's first cycle."""
+    check_online(name)
+    return ONLINE[name](settings, log)

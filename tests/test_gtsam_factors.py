@@ -1,0 +1,511 @@
+"""The GTSAM factors against the vectorized kernels: the same linear system, the same optimum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import gtsam
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.bspline import SpanPolynomials, periodic_knots, uniform_knots
+from pathspace_graph.factors.footpoint import foot_points
+from pathspace_graph.factors.gauge import greville, smoothness_matrix, spacing_residuals
+from pathspace_graph.factors.gtsam_factors import (
+    calibrated_odometry_factor,
+    huber_roots,
+    odometry_factor,
+    pose_array,
+    smoothness_factors,
+    spacing_factors,
+    spline_projection_factor,
+)
+from pathspace_graph.factors.linear_graph import CALIBRATION_KEY, linear_graph, window_keys
+from pathspace_graph.factors.odometry import (
+    IntegratedOdometry,
+    compose,
+    integrate_twists,
+    odometry_residuals,
+)
+from pathspace_graph.factors.projection import huber_weights, project, to_map
+from pathspace_graph.window import POSE, Rows, accumulate, cholesky, solve
+
+from .jacobians import assert_jacobians
+
+Array = NDArray[np.float64]
+
+SPACING, DEGREE, SIZE = 3.5, 3, 11
+"""Knot interval (m), degree and control points of each boundary."""
+POSES = 10
+ROOM = 2.5
+SIGMA_MODEL, HUBER = 0.08, 1.5
+SIGMA_SPACING, SIGMA_SMOOTHNESS = 0.3 * SPACING, SPACING
+SIGMA_CALIBRATION = np.array([0.005, 0.002])
+SIGMA_START = 1e-2
+SIGMA_ANCHOR = 0.5
+"""Hold of each control point where it starts (m): an optimum to 1e-6 needs one that the slide can't blur."""
+MAP = 4 * SIZE
+"""State entries that are control points."""
+TABLES = SpanPolynomials(uniform_knots(SIZE, DEGREE, SPACING), DEGREE)
+CONTROL_KEYS = [[gtsam.symbol(letter, j) for j in range(SIZE)] for letter in "lr"]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A drive around a bend between two boundaries, as measured, and an estimate to start from."""
+
+    state: Array
+    """[left | right control points, calibration, poses]: the initial estimate."""
+    start: Array
+    """First pose, held by a prior."""
+    odometry: list[IntegratedOdometry]
+    """Between the poses."""
+    slots: tuple[Array, Array]
+    """Pose of each reading, by boundary."""
+    points: tuple[Array, Array]
+    """Readings (m, 2) in the vehicle frame."""
+    covariances: tuple[Array, Array]
+    """Their covariances (m, 2, 2)."""
+    u: tuple[Array, Array] = field(default=(np.zeros(0), np.zeros(0)))
+    """Parameters where their foot points are expected."""
+
+    def control(self, label: int, state: Array) -> Array:
+        return state[2 * SIZE * label : 2 * SIZE * (label + 1)].reshape(-1, 2)
+
+    def poses(self, state: Array) -> Array:
+        return state[MAP + 2 :].reshape(-1, POSE)
+
+
+def on_bend(s: Array, radius: float) -> Array:
+    """Points along a left bend of the middle line with radius 25 m, here at another radius."""
+    return np.column_stack([radius * np.sin(s / 25.0), 25.0 - radius * np.cos(s / 25.0)])
+
+
+def make_scene(seed: int, isotropic: bool = True, outliers: int = 4) -> Scene:
+    """Noisy odometry and readings of cones beside the way; the estimate starts at dead reckoning."""
+    rng = np.random.default_rng(seed)
+    true = np.column_stack([on_bend(1.8 * np.arange(POSES), 25.0), 1.8 * np.arange(POSES) / 25.0])
+    odometry = [integrate_noisy(rng) for _ in range(POSES - 1)]
+    poses = [true[0]]
+    for step in odometry:
+        poses.append(compose(poses[-1], step.delta))
+    slots, points, covariances = zip(*(make_readings(rng, true, label, isotropic, outliers) for label in (0, 1)))
+    control = [on_bend(SPACING * np.arange(-1, SIZE - 1), radius) for radius in (23.0, 27.0)]
+    noisy = np.concatenate([(c + rng.normal(0.0, 0.1, c.shape)).ravel() for c in control])
+    state = np.concatenate([noisy, np.zeros(2), np.ravel(poses)])
+    scene = Scene(state, true[0], odometry, slots, points, covariances)
+    return replace(scene, u=tuple(search(scene, label) for label in (0, 1)))
+
+
+def integrate_noisy(rng: np.random.Generator) -> IntegratedOdometry:
+    """Nine readings of 0.02 s at 10 m/s in the bend."""
+    sigma = np.array([0.25, 0.12, 0.035])
+    return integrate_twists(np.full(9, 0.02), [10.0, 0.0, 0.4] + rng.normal(size=(9, 3)) * sigma, sigma)
+
+
+def make_readings(
+    rng: np.random.Generator, true: Array, label: int, isotropic: bool, outliers: int
+) -> tuple[Array, Array, Array]:
+    """Cones ahead of each pose, read with noise; a few are half a metre to a metre off."""
+    cones = on_bend(np.arange(1.0, 28.0, 2.5), 23.0 if label == 0 else 27.0)
+    slots, points = [], []
+    for k, pose in enumerate(true):
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        local = (cones - pose[:2]) @ np.array([[c, -s], [s, c]])
+        seen = local[np.hypot(*local.T) < 12.0]
+        slots += [k] * len(seen)
+        points += list(seen)
+    read = np.array(points) + rng.normal(0.0, 0.1, (len(points), 2))
+    read[rng.choice(len(read), outliers, replace=False), 1] += rng.uniform(0.5, 1.0, outliers)
+    covariance = np.diag([0.01, 0.01] if isotropic else [0.02, 0.005])
+    return np.array(slots), read, np.tile(covariance, (len(read), 1, 1))
+
+
+def search(scene: Scene, label: int) -> Array:
+    """Parameters of the foot points at the initial estimate."""
+    points = to_map(scene.points[label], scene.poses(scene.state)[scene.slots[label]])
+    whole = np.full(len(points), TABLES.low), np.full(len(points), TABLES.high)
+    return foot_points(TABLES, scene.control(label, scene.state), points, *whole, 0.5).u
+
+
+def reading_rows(scene: Scene, label: int, state: Array) -> Rows:
+    """All readings of a boundary at once, by the kernels."""
+    slots, u = scene.slots[label], scene.u[label]
+    poses = scene.poses(state)[slots]
+    points = to_map(scene.points[label], poses)
+    foot = foot_points(TABLES, scene.control(label, state), points, u - ROOM, u + ROOM, 1.0)
+    lin = project(points, scene.covariances[label], poses, foot, SIGMA_MODEL)
+    weight = np.sqrt(huber_weights(lin.residual / lin.sigma, HUBER)) * foot.interior / lin.sigma
+    base = 2 * SIZE * label + 2 * (foot.span[:, None] + np.arange(-DEGREE, 1))
+    by_control = lin.by_control.reshape(len(u), -1)
+    columns = [MAP + 2 + POSE * slots[:, None] + np.arange(POSE), np.stack([base, base + 1], 2).reshape(len(u), -1)]
+    jacobian = np.concatenate([lin.by_pose, by_control], axis=1) * weight[:, None]
+    return Rows(np.concatenate(columns, axis=1), jacobian, lin.residual * weight)
+
+
+def gauge_rows(scene: Scene, label: int, state: Array) -> list[Rows]:
+    """Spacing, smoothness and anchors of a boundary."""
+    control, base = scene.control(label, state), 2 * SIZE * label
+    residual, direction = spacing_residuals(control, np.full(SIZE - 1, SPACING), False)
+    first = base + 2 * np.arange(SIZE - 1)[:, None] + np.arange(4)
+    spacing = Rows(
+        first, np.concatenate([-direction, direction], 1) / SIGMA_SPACING, residual / SIGMA_SPACING
+    )
+    D = np.kron(smooth(), np.eye(2)) / SIGMA_SMOOTHNESS
+    columns = np.tile(base + np.arange(2 * SIZE), (len(D), 1))
+    offset = (control - scene.control(label, scene.state)).ravel() / SIGMA_ANCHOR
+    anchors = Rows(base + np.arange(2 * SIZE)[:, None], np.full((2 * SIZE, 1), 1.0 / SIGMA_ANCHOR), offset)
+    return [spacing, Rows(columns, D, D @ control.ravel()), anchors]
+
+
+def smooth() -> Array:
+    return smoothness_matrix(greville(TABLES.knots, DEGREE), None)
+
+
+def odometry_rows(scene: Scene, state: Array) -> Rows:
+    """Odometry with its calibration."""
+    poses, m = scene.poses(state), POSES - 1
+    residual, by_start, by_end = odometry_residuals(
+        poses[:-1], poses[1:], np.array([o.delta for o in scene.odometry])
+    )
+    by_calibration = np.array([o.calibration_jacobian for o in scene.odometry])
+    whiteners = np.array([o.whitener for o in scene.odometry])
+    residual = residual + by_calibration @ state[MAP : MAP + 2]
+    jacobian = whiteners @ np.concatenate([by_calibration, by_start, by_end], axis=2)
+    poses_columns = MAP + 2 + POSE * np.arange(m)[:, None] + np.arange(2 * POSE)
+    columns = np.concatenate([np.tile([MAP, MAP + 1], (m, 1)), poses_columns], axis=1)
+    whitened = np.einsum("mij,mj->mi", whiteners, residual)
+    return Rows(np.repeat(columns, POSE, axis=0), jacobian.reshape(m * POSE, -1), whitened.ravel())
+
+
+def prior_rows_of(scene: Scene, state: Array) -> list[Rows]:
+    """The first pose and the calibration are held."""
+    calibration = MAP + np.arange(2)[:, None]
+    start = MAP + 2 + np.arange(POSE)[:, None]
+    return [
+        Rows(calibration, 1.0 / SIGMA_CALIBRATION[:, None], state[MAP : MAP + 2] / SIGMA_CALIBRATION),
+        Rows(start, np.full((POSE, 1), 1.0 / SIGMA_START), (scene.poses(state)[0] - scene.start) / SIGMA_START),
+    ]
+
+
+def all_rows(scene: Scene, state: Array) -> list[Rows]:
+    groups = [*prior_rows_of(scene, state), odometry_rows(scene, state)]
+    for label in (0, 1):
+        groups += [reading_rows(scene, label, state), *gauge_rows(scene, label, state)]
+    return groups
+
+
+def nonlinear_graph(scene: Scene) -> gtsam.NonlinearFactorGraph:
+    """The same problem as GTSAM factors."""
+    graph = gtsam.NonlinearFactorGraph()
+    calibration_noise = gtsam.noiseModel.Diagonal.Sigmas(SIGMA_CALIBRATION)
+    start_noise = gtsam.noiseModel.Isotropic.Sigma(POSE, SIGMA_START)
+    graph.add(gtsam.PriorFactorPoint2(CALIBRATION_KEY, np.zeros(2), calibration_noise))
+    graph.add(gtsam.PriorFactorPose2(gtsam.symbol("x", 0), gtsam.Pose2(*scene.start), start_noise))
+    for k, odometry in enumerate(scene.odometry):
+        ends = gtsam.symbol("x", k), gtsam.symbol("x", k + 1)
+        graph.add(calibrated_odometry_factor(*ends, CALIBRATION_KEY, odometry))
+    nominal, sigma = np.full(SIZE - 1, SPACING), np.full(SIZE - 1, SIGMA_SPACING)
+    for label, keys in enumerate(CONTROL_KEYS):
+        for factor in spacing_factors(keys, nominal, sigma, False):
+            graph.add(factor)
+        for factor in smoothness_factors(keys, smooth(), SIGMA_SMOOTHNESS):
+            graph.add(factor)
+        for key, point in zip(keys, scene.control(label, scene.state), strict=True):
+            graph.add(gtsam.PriorFactorPoint2(key, point, gtsam.noiseModel.Isotropic.Sigma(2, SIGMA_ANCHOR)))
+        for slot in np.unique(scene.slots[label]):
+            graph.add(projection_factor(scene, label, slot))
+    return graph
+
+
+def projection_factor(scene: Scene, label: int, slot: int) -> gtsam.CustomFactor:
+    rows = np.flatnonzero(scene.slots[label] == slot)
+    return spline_projection_factor(
+        gtsam.symbol("x", int(slot)),
+        CONTROL_KEYS[label],
+        TABLES,
+        points_vehicle=scene.points[label][rows],
+        covariances=scene.covariances[label][rows],
+        u=scene.u[label][rows],
+        room=ROOM,
+        sigma_model=SIGMA_MODEL,
+        huber=HUBER,
+    )
+
+
+def to_values(scene: Scene, state: Array) -> gtsam.Values:
+    values = gtsam.Values()
+    for label, keys in enumerate(CONTROL_KEYS):
+        for key, point in zip(keys, scene.control(label, state), strict=True):
+            values.insert(key, point)
+    values.insert(CALIBRATION_KEY, state[MAP : MAP + 2])
+    for k, pose in enumerate(scene.poses(state)):
+        values.insert(gtsam.symbol("x", k), gtsam.Pose2(*pose))
+    return values
+
+
+def to_state(values: gtsam.Values) -> Array:
+    control = [values.atPoint2(key) for keys in CONTROL_KEYS for key in keys]
+    poses = [pose_array(values.atPose2(gtsam.symbol("x", k))) for k in range(POSES)]
+    return np.concatenate([np.ravel(control), values.atPoint2(CALIBRATION_KEY), np.ravel(poses)])
+
+
+def solve_window(scene: Scene, iterations: int = 40) -> Array:
+    """Gauss-Newton on the kernels' rows, relinearized at every step."""
+    state = scene.state
+    for _ in range(iterations):
+        state = state + solve(*system(scene, state))
+    return state
+
+
+def system(scene: Scene, state: Array) -> tuple[Array, Array]:
+    hessian, descent = accumulate(all_rows(scene, state), len(state))
+    return cholesky(hessian), descent
+
+
+def curves(scene: Scene, state: Array) -> Array:
+    """Both curves, sampled where readings hold them."""
+    samples = []
+    for label in (0, 1):
+        u = np.linspace(scene.u[label].min(), scene.u[label].max(), 100)
+        values, span = TABLES.evaluate(u)
+        columns = span[:, None] + np.arange(-DEGREE, 1)
+        samples.append(np.einsum("mj,mjd->md", values[0], scene.control(label, state)[columns]))
+    return np.concatenate(samples)
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["isotropic", "anisotropic"])
+def scene(request: pytest.FixtureRequest) -> Scene:
+    return make_scene(0, isotropic=request.param)
+
+
+def assert_same_system(first: gtsam.GaussianFactorGraph, second: gtsam.GaussianFactorGraph) -> None:
+    """Hessian and gradient to 1e-9 of their largest entry."""
+    ordering = gtsam.Ordering()
+    for key in sorted(first.keyVector()):
+        ordering.push_back(key)
+    for a, b in zip(first.hessian(ordering), second.hessian(ordering), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(a).max(), rtol=0.0)
+
+
+def test_both_adapters_give_the_same_linear_system(scene: Scene) -> None:
+    """Far from the optimum, with outliers weighed down, and the poses turned."""
+    state = scene.state + np.random.default_rng(1).normal(0.0, 0.05, scene.state.shape)
+    state[MAP + 2 : MAP + 2 + POSE] = scene.start  # the prior's tangent is the state's only where it holds
+    groups = all_rows(scene, state)
+    assert (np.abs(reading_rows(scene, 0, state).residual) > np.sqrt(HUBER)).any()
+    window = window_keys((SIZE, SIZE), 2, scene.poses(state))
+    vectorized = linear_graph([(g.columns, g.jacobian, g.residual) for g in groups], window)
+    assert_same_system(nonlinear_graph(scene).linearize(to_values(scene, state)), vectorized)
+
+
+def test_levenberg_marquardt_reaches_the_windows_optimum() -> None:
+    """Curves and poses to 1e-6 m; readings as uncertain in every direction, so that sigma doesn't turn."""
+    scene = make_scene(0)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(0.0)
+    parameters.setAbsoluteErrorTol(1e-13)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(
+        nonlinear_graph(scene), to_values(scene, scene.state), parameters
+    )
+    found, expected = to_state(optimizer.optimize()), solve_window(scene)
+    np.testing.assert_allclose(curves(scene, found), curves(scene, expected), atol=1e-6)
+    np.testing.assert_allclose(scene.poses(found), scene.poses(expected), atol=1e-6)
+    assert np.abs(curves(scene, found) - curves(scene, scene.state)).max() > 0.05
+
+
+def test_gauss_newton_reaches_the_windows_optimum(scene: Scene) -> None:
+    """GTSAM's own Gauss-Newton stands still where the window does, whatever the covariances."""
+    optimizer = gtsam.GaussNewtonOptimizer(nonlinear_graph(scene), to_values(scene, scene.state))
+    for _ in range(40):
+        optimizer.iterate()
+    found, expected = to_state(optimizer.values()), solve_window(scene)
+    np.testing.assert_allclose(curves(scene, found), curves(scene, expected), atol=1e-6)
+    np.testing.assert_allclose(scene.poses(found), scene.poses(expected), atol=1e-6)
+
+
+def test_error_is_hubers_loss_and_its_derivative_is_the_linearizations_gradient() -> None:
+    """So that an optimizer that judges its steps by the error judges the rows that it was given."""
+    scene = make_scene(2)
+    factor = projection_factor(scene, 0, 3)
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(factor)
+    values = to_values(scene, scene.state)
+    assert np.abs(factor.unwhitenedError(values)).max() > HUBER
+    gradient = graph.linearize(values).gradientAtZero()
+    for key in factor.keys():
+        expected = gradient.at(key)
+        numeric = [error_slope(graph, values, key, e) for e in np.eye(len(expected))]
+        np.testing.assert_allclose(numeric, expected, atol=1e-5 * (1.0 + np.abs(expected).max()))
+
+
+def error_slope(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, key: int, along: Array) -> float:
+    """Central difference of the error along a tangent of one key."""
+    errors = []
+    for step in (1e-5, -1e-5):
+        delta = values.zeroVectors()
+        delta.update(single(key, step * along))
+        errors.append(graph.error(values.retract(delta)))
+    return float((errors[0] - errors[1]) / 2e-5)
+
+
+def single(key: int, vector: Array) -> gtsam.VectorValues:
+    values = gtsam.VectorValues()
+    values.insert(key, vector)
+    return values
+
+
+@pytest.mark.parametrize("threshold", [1.5, np.inf])
+def test_huber_roots(threshold: float) -> None:
+    z = np.array([-4.0, -1.0, 0.0, 1.5, 100.0])
+    loss = np.where(np.abs(z) <= threshold, 0.5 * z**2, np.minimum(threshold, 1e9) * (np.abs(z) - 0.75))
+    roots = huber_roots(z, threshold)
+    np.testing.assert_allclose(0.5 * roots**2, loss, rtol=1e-14)
+    np.testing.assert_array_equal(np.sign(roots), np.sign(z))
+
+
+def pose_plus(pose: Array, delta: Array) -> Array:
+    return pose_array(gtsam.Pose2(*pose).retract(delta))
+
+
+def test_calibrated_odometry_jacobians_in_pose2s_tangent() -> None:
+    """Residuals of metres; the noise model is left out, as the factor's function leaves it out."""
+    odometry = integrate_noisy(np.random.default_rng(3))
+    unit = IntegratedOdometry(odometry.delta, np.eye(3), odometry.calibration_jacobian, np.eye(3))
+    factor = calibrated_odometry_factor(0, 1, 2, unit)
+
+    def function(start: Array, end: Array, calibration: Array) -> tuple[Array, ...]:
+        values = gtsam.Values()
+        values.insert(0, gtsam.Pose2(*start))
+        values.insert(1, gtsam.Pose2(*end))
+        values.insert(2, calibration)
+        linear = gtsam.JacobianFactor(factor.linearize(values))
+        assert linear.keys() == [0, 1, 2]
+        A = linear.getA()
+        return -linear.getb(), A[:, :3].copy(), A[:, 3:6].copy(), A[:, 6:].copy()
+
+    inputs = [np.array([1.0, -2.0, 2.5]), np.array([4.0, 1.0, -2.9]), np.array([0.01, -0.02])]
+    assert_jacobians(function, inputs, [pose_plus, pose_plus, lambda x, d: x + d])
+
+
+def test_without_calibration_both_odometry_factors_agree() -> None:
+    odometry = integrate_noisy(np.random.default_rng(4))
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose2(1.0, 2.0, 3.0))
+    values.insert(1, gtsam.Pose2(2.0, 2.5, -3.0))
+    values.insert(2, np.zeros(2))
+    native = gtsam.JacobianFactor(odometry_factor(0, 1, odometry).linearize(values))
+    own = gtsam.JacobianFactor(calibrated_odometry_factor(0, 1, 2, odometry).linearize(values))
+    scale = np.abs(native.getA()).max()
+    np.testing.assert_allclose(own.getA()[:, :6], native.getA(), atol=1e-9 * scale)
+    np.testing.assert_allclose(own.getb(), native.getb(), atol=1e-9 * np.abs(native.getb()).max())
+
+
+def test_periodic_stretch_across_the_seam_holds_only_its_own_keys() -> None:
+    """Readings at the seam of a closed curve: keys of both of its ends, and the Jacobians are right."""
+    size = 12
+    angle = 2.0 * np.pi * np.arange(size) / size
+    points = 6.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    tables = SpanPolynomials(periodic_knots(3.0 * np.arange(size + 1.0), DEGREE), DEGREE, True)
+    factor = spline_projection_factor(
+        99,
+        list(range(size)),
+        tables,
+        points_vehicle=np.array([[2.0, 0.0], [2.2, 0.3]]),
+        covariances=np.tile(0.01 * np.eye(2), (2, 1, 1)),
+        u=whole_period_search(tables, points, np.array([[7.0, 1.0], [7.2, 1.3]])),
+        room=1.0,
+        sigma_model=SIGMA_MODEL,
+        huber=np.inf,
+    )
+    keys = factor.keys()[1:]
+    assert 4 <= len(keys) < size
+
+    def function(pose: Array, control: Array) -> tuple[Array, ...]:
+        values = gtsam.Values()
+        values.insert(99, gtsam.Pose2(*pose))
+        for key, point in zip(keys, control.reshape(-1, 2), strict=True):
+            values.insert(key, point)
+        linear = gtsam.JacobianFactor(factor.linearize(values))
+        return -linear.getb(), linear.getA()[:, :3].copy(), linear.getA()[:, 3:].copy()
+
+    inputs = [np.array([5.0, 1.0, 0.0]), points[keys].ravel()]
+    residual = function(*inputs)[0]
+    assert np.abs(residual).min() > 1.0
+    assert_jacobians(function, inputs, [pose_plus, lambda x, d: x + d])
+
+
+def whole_period_search(tables: SpanPolynomials, distinct: Array, points: Array) -> Array:
+    unwrapped = np.concatenate([distinct, distinct[:DEGREE]])
+    ends = np.full(len(points), tables.low), np.full(len(points), tables.high)
+    return foot_points(tables, unwrapped, points, *ends, 0.5).u
+
+
+def straight_factor(u: Array, points: Array) -> tuple[gtsam.CustomFactor, gtsam.Values]:
+    """Readings beside a straight boundary along the x axis, from a pose at the origin."""
+    factor = spline_projection_factor(
+        99,
+        list(range(SIZE)),
+        TABLES,
+        points_vehicle=points,
+        covariances=np.tile(0.01 * np.eye(2), (len(u), 1, 1)),
+        u=u,
+        room=1.0,
+        sigma_model=SIGMA_MODEL,
+        huber=np.inf,
+    )
+    values = gtsam.Values()
+    values.insert(99, gtsam.Pose2())
+    for j, x in enumerate(greville(TABLES.knots, DEGREE)):
+        values.insert(j, np.array([x, 0.0]))
+    return factor, values
+
+
+def test_a_row_whose_foot_point_leaves_its_stretch_contributes_zero() -> None:
+    """Until the factor is created anew; so does one beyond the end of the curve."""
+    end = TABLES.high
+    points = np.array([[10.5, 0.4], [13.0, 0.4], [end + 0.5, 0.4]])
+    factor, values = straight_factor(np.array([10.0, 10.0, end]), points)
+    linear = gtsam.JacobianFactor(factor.linearize(values))
+    sigma = np.hypot(0.1, SIGMA_MODEL)
+    np.testing.assert_allclose(linear.getb(), [-0.4 / sigma, 0.0, 0.0], atol=1e-9)
+    assert np.abs(linear.getA()[0]).max() > 1.0
+    np.testing.assert_array_equal(linear.getA()[1:], 0.0)
+    assert factor.error(values) == pytest.approx(0.5 * (0.4 / sigma) ** 2, rel=1e-9)
+
+
+def test_a_factor_holds_only_the_keys_of_its_stretch() -> None:
+    """Foot points between 9 and 11: spans 2 and 3 (7 to 14), so control points 2 to 6."""
+    factor, _ = straight_factor(np.array([10.0]), np.array([[10.0, 0.4]]))
+    assert factor.keys() == [99, 2, 3, 4, 5, 6]
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        straight_factor(np.zeros(0), np.zeros((0, 2)))
+    with pytest.raises(ValueError, match="expected as many"):
+        straight_factor(np.zeros(2), np.zeros((1, 2)))
+    with pytest.raises(ValueError, match="expected 2 distances"):
+        spacing_factors([1, 2, 3], np.ones(3), np.ones(3), False)
+    with pytest.raises(ValueError, match="expected a key for each of 4 columns"):
+        smoothness_factors([1, 2, 3], smoothness_matrix(np.arange(4.0), None), 1.0)
+
+
+@pytest.mark.parametrize("period", [None, 9.0])
+def test_smoothness_factors_are_the_matrix_far_from_zero(period: float | None) -> None:
+    """Their error is 1/2 |D c / sigma|^2 at any control points, not only where they were created."""
+    matrix = smoothness_matrix(np.array([0.0, 1.0, 3.0, 4.0, 7.0]), period)
+    points = np.random.default_rng(5).normal(size=(5, 2)) * 10.0
+    values = gtsam.Values()
+    for j, point in enumerate(points):
+        values.insert(j, point)
+    factors = smoothness_factors(list(range(5)), matrix, 0.5)
+    assert all(len(f.keys()) <= 3 for f in factors)
+    expected = 0.5 * np.sum((matrix @ points / 0.5) ** 2)
+    assert sum(f.error(values) for f in factors) == pytest.approx(expected, rel=1e-12)
+
+
+def test_periodic_spacing_closes_the_ring() -> None:
+    factors = spacing_factors([5, 6, 7], np.full(3, 2.0), np.ones(3), True)
+    assert [f.keys() for f in factors] == [[5, 6], [6, 7], [7, 5]]

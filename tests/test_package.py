@@ -1,0 +1,152 @@
+"""The package is what it says: every folder listed, seen by mypy, imported lazily, and as in the README."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pathspace_graph
+from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.log import Detections, Log, Odometry, write_log
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+FOLDERS = PROJECT["tool"]["setuptools"]["package-dir"]
+README = (ROOT / "README.md").read_text()
+
+
+def python_folders() -> set[Path]:
+    """Every folder with Python code below the root, but for tests and what is hidden or built."""
+    skipped = {"tests", "build", "dist"}
+    files = (file.relative_to(ROOT) for file in ROOT.rglob("*.py"))
+    return {
+        file.parent
+        for file in files
+        if file.parts[0] not in skipped and not any(part.startswith(".") for part in file.parts)
+    }
+
+
+# --- the package list ------------------------------------------------------------------------------------
+
+
+def test_the_packages_listed_are_the_folders_on_disk() -> None:
+    assert {Path(folder) for folder in FOLDERS.values()} == python_folders()
+    assert sorted(PROJECT["tool"]["setuptools"]["packages"]) == sorted(FOLDERS)
+    assert all((ROOT / folder / "__init__.py").is_file() for folder in FOLDERS.values())
+
+
+@pytest.mark.parametrize("package", FOLDERS)
+def test_each_package_is_imported_from_its_folder(package: str) -> None:
+    home = Path(str(import_module(package).__file__)).parent
+    names = {file.name for file in home.glob("*.py")}
+    assert names == {file.name for file in (ROOT / FOLDERS[package]).glob("*.py")}
+
+
+def test_types_are_told_to_users() -> None:
+    assert (ROOT / "pathspace_graph" / "py.typed").is_file()
+
+
+def test_mypy_sees_every_folder() -> None:
+    checked = {(ROOT / file).resolve() for file in PROJECT["tool"]["mypy"]["files"]}
+    assert checked == {ROOT / folder for folder in FOLDERS.values()}
+    overlay = ROOT / ".overlay" / "pathspace_graph"
+    assert (overlay / "__init__.py").resolve() == ROOT / "pathspace_graph" / "__init__.py"
+
+
+# --- imports ---------------------------------------------------------------------------------------------
+
+
+def test_every_public_name_is_found_where_it_is_said_to_be() -> None:
+    assert sorted(pathspace_graph._HOME) == sorted(pathspace_graph.__all__)
+    for name in pathspace_graph.__all__:
+        assert getattr(pathspace_graph, name).__name__ == name
+    with pytest.raises(AttributeError):
+        pathspace_graph.nothing  # noqa: B018 - the access is the test
+
+
+def modules_after(code: str) -> set[str]:
+    """What is imported in a fresh interpreter after `code`."""
+    script = f"{code}\nimport sys, json; print(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def test_the_command_line_starts_without_the_heavy_libraries() -> None:
+    loaded = modules_after("from pathspace_graph.cli import main; main(['--help'])")
+    assert not loaded & {"numpy", "scipy", "gtsam", "matplotlib", "tyro", "rich"}
+
+
+def test_the_simulator_knows_no_estimator() -> None:
+    loaded = modules_after("import pathspace_graph.sim.simulate, pathspace_graph.sim.track_generator")
+    ours = {name for name in loaded if name.startswith("pathspace_graph.")}
+    allowed = {"errors", "files", "labels", "log", "table"}
+    assert {name.split(".")[1] for name in ours} - {"sim"} <= allowed
+    assert "gtsam" not in loaded
+
+
+def test_the_factors_stand_on_their_own() -> None:
+    allowed = {"__future__", "gtsam", "numpy", "scipy"}
+    standard = set(sys.stdlib_module_names)
+    for file in (ROOT / "factors").glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.level == 0:
+                assert str(node.module).split(".")[0] in allowed | standard, file
+            elif isinstance(node, ast.Import):
+                assert {alias.name.split(".")[0] for alias in node.names} <= allowed | standard, file
+
+
+# --- README ----------------------------------------------------------------------------------------------
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+def straight_log() -> Log:
+    """A short drive along a straight between two rows of cones."""
+    t = np.arange(0.0, 4.0, 0.02)
+    cones = np.array([[x, y] for x in np.arange(0.0, 60.0, 3.0) for y in (2.0, -2.0)])
+    cycles = []
+    for stamp in np.arange(0.0, 4.0, 0.1):
+        points = cones - [8.0 * stamp, 0.0]
+        points = points[(points[:, 0] > 1.0) & (points[:, 0] < 12.0)]
+        labels = np.where(points[:, 1] > 0, LEFT, RIGHT)
+        cycles.append(
+            Detections(float(stamp), points, np.tile(0.01 * np.eye(2), (len(points), 1, 1)), labels)
+        )
+    twist = np.tile([8.0, 0.0, 0.0], (len(t), 1))
+    return Log(Odometry(t, twist), tuple(cycles), np.array([0.1, 0.1, 0.01]))
+
+
+def test_the_example_of_the_readme_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (example,) = blocks("python")
+    assert len(example.strip().splitlines()) <= 12
+    write_log(straight_log(), tmp_path / "log")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, "README.md", "exec"), {})
+    printed = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in printed] == [str(LEFT), str(RIGHT)]
+
+
+def test_the_readme_sets_up_with_one_command_each() -> None:
+    demo, tests = (block.strip() for block in blocks("sh")[:2])
+    assert demo.endswith(".venv/bin/pathspace-graph demo")
+    assert tests.endswith(".venv/bin/pytest")
+    assert all("\n" not in command for command in (demo, tests))
+
+
+def test_what_the_readme_shows_is_there() -> None:
+    for target in re.findall(r"\]\(([^)#:]+)\)", README):
+        assert (ROOT / target).is_file(), target
+    assert (ROOT / "docs" / "track.png").stat().st_size < 300_000

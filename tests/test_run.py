@@ -1,0 +1,209 @@
+"""The loop over a log: every twist once, none from the future, and maps kept from the right moment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from threadpoolctl import threadpool_info
+
+from pathspace_graph.labels import LEFT
+from pathspace_graph.log import Detections, Log, Odometry
+from pathspace_graph.map import Map, PointBoundary
+from pathspace_graph.run import CycleRecord, run_online, split_odometry
+
+
+def detections(t: float) -> Detections:
+    return Detections(t, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, dtype=int))
+
+
+def make_log(odometry_t: np.ndarray, cycle_t: np.ndarray, twist: np.ndarray | None = None) -> Log:
+    twist = np.arange(3.0 * len(odometry_t)).reshape(-1, 3) if twist is None else twist
+    return Log(Odometry(odometry_t, twist), tuple(detections(float(t)) for t in cycle_t), np.ones(3))
+
+
+@dataclass(frozen=True)
+class Told:
+    """Settings of the estimator below."""
+
+    inner: dict[str, float] = field(default_factory=lambda: {"a": 1.0})
+
+
+@dataclass(frozen=True)
+class Estimate:
+    pose: np.ndarray
+    sizes: tuple[int, int]
+    readings: int = 5
+    stages: dict[str, float] = field(default_factory=dict)
+
+
+class Counting:
+    """An estimator whose map has as many points as there were cycles, and that drives given poses."""
+
+    def __init__(self, poses: np.ndarray | None = None) -> None:
+        self.settings = Told()
+        self.poses = poses
+        self.count = 0
+        self.threads: set[int] = set()
+
+    def update(self, odometry: Odometry, detections: Detections) -> Estimate:
+        assert (odometry.t < detections.t).all()
+        self.threads |= {pool["num_threads"] for pool in threadpool_info()}
+        self.count += 1
+        pose = np.zeros(3) if self.poses is None else self.poses[self.count - 1]
+        return Estimate(pose, (self.count, 0))
+
+    def map(self) -> Map:
+        size = self.count
+        return Map(False, {LEFT: PointBoundary(np.zeros((size, 2)), np.zeros((2 * size, 2 * size)))})
+
+
+def circles(laps: float, n: int = 200) -> np.ndarray:
+    """Poses of n per lap (a hair more, to pass the line) around a circle of 20 m radius, from (0, 0, 0)."""
+    angle = np.arange(round(laps * n)) * 2 * np.pi / n * (1 + 1e-6)
+    return np.column_stack([20.0 * np.sin(angle), 20.0 * (1.0 - np.cos(angle)), angle])
+
+
+# --- split_odometry --------------------------------------------------------------------------------------
+
+stamps = st.lists(st.integers(0, 60), min_size=1, max_size=12, unique=True).map(sorted)
+
+
+@given(odometry=stamps, cycles=stamps)
+def test_segments_tile_the_time_with_the_twist_in_force(odometry: list[int], cycles: list[int]) -> None:
+    odometry_t = np.array(odometry) / 4.0
+    cycle_t = np.array([t for t in cycles if t >= odometry[0]]) / 4.0
+    log = make_log(odometry_t, cycle_t)
+    since = odometry_t[0]
+    for segment, cycle in split_odometry(log):
+        edges = np.append(segment.t, cycle.t)
+        assert edges[0] == since or cycle.t == since
+        assert (np.diff(edges) > 0).all()
+        for twist, (begin, end) in zip(segment.twist, pairwise(edges), strict=True):
+            middle = (begin + end) / 2
+            in_force = log.odometry.twist[np.flatnonzero(odometry_t <= middle)[-1]]
+            np.testing.assert_array_equal(twist, in_force)
+        assert np.diff(edges).sum() == cycle.t - since
+        since = cycle.t
+
+
+@given(odometry=stamps, cycles=stamps, at=st.integers(0, 11))
+def test_nothing_at_or_after_a_cycle_reaches_it(odometry: list[int], cycles: list[int], at: int) -> None:
+    odometry_t = np.array(odometry) / 4.0
+    cycle_t = np.array([t for t in cycles if t >= odometry[0]]) / 4.0
+    if len(cycle_t) == 0:
+        return
+    log = make_log(odometry_t, cycle_t)
+    at = min(at, len(cycle_t) - 1)
+    twist = log.odometry.twist.copy()
+    twist[odometry_t >= cycle_t[at]] = np.nan
+    blind = replace(log, odometry=Odometry(odometry_t, twist))
+    for number, ((told, _), (known, _)) in enumerate(
+        zip(split_odometry(blind), split_odometry(log), strict=True)
+    ):
+        if number <= at:
+            np.testing.assert_array_equal(told.twist, known.twist)
+
+
+def test_a_cycle_at_the_first_stamp_has_no_odometry() -> None:
+    segments = list(split_odometry(make_log(np.array([2.0, 2.1]), np.array([2.0, 2.1]))))
+    assert len(segments[0][0].t) == 0
+    assert segments[0][0].twist.shape == (0, 3)
+    np.testing.assert_array_equal(segments[1][0].t, [2.0])
+
+
+def test_the_last_twist_is_held_beyond_the_last_stamp() -> None:
+    segments = list(split_odometry(make_log(np.array([0.0, 0.1]), np.array([0.25, 0.5]))))
+    np.testing.assert_array_equal(segments[0][0].t, [0.0, 0.1])
+    np.testing.assert_array_equal(segments[1][0].t, [0.25])
+    np.testing.assert_array_equal(segments[1][0].twist, [[3.0, 4.0, 5.0]])
+
+
+# --- run_online ------------------------------------------------------------------------------------------
+
+
+def run(cycles: int, poses: np.ndarray | None = None, **options: Any) -> tuple[Any, Counting]:
+    estimator = Counting(poses)
+    t = np.arange(cycles) / 10.0
+    return run_online(make_log(np.array([0.0]), t), estimator, **options), estimator
+
+
+def test_every_cycle_has_its_record_and_its_pose() -> None:
+    poses = circles(0.1, 100)
+    seen: list[CycleRecord] = []
+    result, _ = run(10, poses, on_cycle=seen.append, name="counting")
+    assert result.estimator == "counting"
+    assert result.settings == {"inner": {"a": 1.0}}
+    assert tuple(seen) == result.cycles
+    assert [record.cycle for record in seen] == list(range(10))
+    assert [record.size_left for record in seen] == list(range(1, 11))
+    assert {(record.size_right, record.readings, record.lap) for record in seen} == {(0, 5, 1)}
+    assert all(record.seconds > 0 for record in seen)
+    np.testing.assert_array_equal(result.trajectory, poses)
+    np.testing.assert_array_equal(result.trajectory_t, [record.t for record in seen])
+    assert result.map.size == 10
+
+
+@pytest.mark.parametrize(
+    ("time", "cycles_before"), [(-1.0, 0), (0.0, 1), (0.05, 1), (0.3, 4), (0.9, 10), (5.0, 10)]
+)
+def test_a_snapshot_is_the_map_as_it_stood_then(time: float, cycles_before: int) -> None:
+    result, _ = run(10, snapshot_times=[time])
+    assert [track.size for track in result.snapshots] == [cycles_before]
+
+
+def test_snapshots_keep_their_order_and_number() -> None:
+    result, _ = run(10, snapshot_times=[0.1, 0.1, 0.5, 7.0])
+    assert [track.size for track in result.snapshots] == [2, 2, 6, 10]
+
+
+def test_laps_are_counted_on_the_estimated_trajectory() -> None:
+    result, _ = run(450, circles(2.25))
+    assert result.laps == 2
+    assert [record.lap for record in result.cycles[:200]] == [1] * 200
+    assert [lap for lap, _ in result.lap_maps] == [1, 2]
+    assert [track.size for _, track in result.lap_maps] == [201, 401]
+    assert result.cycles[-1].lap == 3
+
+
+def test_a_lap_that_ends_just_short_of_the_line_counts() -> None:
+    result, _ = run(197, circles(1.0)[:197])
+    assert result.laps == 1
+    assert [(lap, track.size) for lap, track in result.lap_maps] == [(1, 197)]
+
+
+def test_a_lap_broken_off_does_not_count() -> None:
+    result, _ = run(150, circles(0.75))
+    assert result.laps == 0
+    assert result.lap_maps == ()
+
+
+def test_a_log_without_cycles_gives_an_empty_result() -> None:
+    result, estimator = run(0, snapshot_times=[1.0])
+    assert estimator.count == 0
+    assert result.trajectory.shape == (0, 3)
+    assert result.trajectory_t.shape == (0,)
+    assert result.cycles == ()
+    assert [track.size for track in result.snapshots] == [0]
+
+
+def test_blas_has_one_thread_while_it_runs() -> None:
+    _, estimator = run(2)
+    assert estimator.threads == {1}
+
+
+class Forbidden:
+    """A truth that may not be looked at."""
+
+    def __getattribute__(self, name: str) -> Any:
+        raise AssertionError(f"an online run read the truth's {name}")
+
+
+def test_the_truth_is_not_read() -> None:
+    log = replace(make_log(np.array([0.0]), np.arange(5) / 10), truth=Forbidden())
+    assert len(run_online(log, Counting()).cycles) == 5
