@@ -33,39 +33,37 @@ def spline_projection_factor(
     *,
     points_vehicle: Array,
     covariances: Array,
-    u: Array,
-    room: float,
+    low: Array,
+    high: Array,
     sigma_model: float,
     huber: float,
 ) -> gtsam.CustomFactor:
     """`z_i = n_i . (R z_i + t - S(u_i)) / sigma_i`, the rows of one cycle on one boundary (see `project`).
 
     control_keys (k,) of all the boundary's distinct control points, of which the factor takes those that
-    matter within `room` (parameter units, about m) of the parameters u (m,) where the foot points are
-    expected. points_vehicle (m, 2) and covariances (m, 2, 2) in the vehicle frame; sigma_model in m; huber is
-    the whitened residual beyond which a row's weight falls (infinite: never).
+    matter in the stretches [low, high] (m,) of the curve where each foot point is searched for: a few metres
+    about where it is expected. points_vehicle (m, 2) and covariances (m, 2, 2) in the vehicle frame;
+    sigma_model in m; huber is the whitened residual beyond which a row's weight falls (infinite: never).
 
     Foot points, standard deviations and weights are found anew at every evaluation. A linearization gives
     rows scaled by the square root of their Huber weight; an error without Jacobians is the Huber loss itself,
     so that an optimizer that judges its steps by the error judges them rightly. That sigma turns with the
     normal is in no derivative: the optimum is where Gauss-Newton stands still, and an optimizer that looks at
     the error may stop beside it, by as much as sigma depends on the direction. A row whose foot point is not
-    interior, or leaves the spans whose control points are keys, contributes zero: create the factor anew.
+    interior, so that it would leave its stretch or the curve, contributes zero: create the factor anew.
     """
-    if not len(points_vehicle) == len(covariances) == len(u) > 0:
+    if not len(points_vehicle) == len(covariances) == len(low) == len(high) > 0:
         raise ValueError(
-            f"expected as many readings, covariances and parameters, at least one, found "
-            f"{len(points_vehicle)}, {len(covariances)} and {len(u)}"
+            f"expected as many readings, covariances and stretches, at least one, found "
+            f"{len(points_vehicle)}, {len(covariances)} and {len(low)}, {len(high)}"
         )
     size = _distinct(tables)
     if len(control_keys) != size:
         raise ValueError(f"expected a key for each of {size} control points, found {len(control_keys)}")
-    touched = _touched(tables, u - room, u + room)
+    touched = _touched(tables, low, high)
     keys = (int(pose_key), *(int(control_keys[j]) for j in touched))
-    function = _Projection(
-        keys, touched, tables, points_vehicle, covariances, u - room, u + room, sigma_model, huber
-    )
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(u)), list(keys), function)
+    function = _Projection(keys, touched, tables, points_vehicle, covariances, low, high, sigma_model, huber)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(low)), list(keys), function)
 
 
 @dataclass(frozen=True, eq=False)

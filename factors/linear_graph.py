@@ -63,9 +63,11 @@ def jacobian_factor(keys: Sequence[int], dims: Sequence[int], A: Array, b: Array
         raise ValueError(f"expected one size for each of {len(keys)} different keys, found {len(dims)}")
     if A.shape != (len(b), sum(dims)):
         raise ValueError(f"expected a matrix of shape {(len(b), sum(dims))}, found {A.shape}")
-    blocks = np.asfortranarray(np.column_stack([A, b]), dtype=np.float64)
-    matrix = gtsam.VerticalBlockMatrix([int(d) for d in dims] + [1], blocks, False)
-    return gtsam.JacobianFactor(gtsam.GaussianConditional([int(k) for k in keys], 1, matrix))
+    blocks = np.empty((len(b), A.shape[1] + 1), order="F")
+    blocks[:, :-1] = A
+    blocks[:, -1] = b
+    matrix = gtsam.VerticalBlockMatrix([*dims, 1], blocks, False)
+    return gtsam.JacobianFactor(gtsam.GaussianConditional(list(keys), 1, matrix))
 
 
 def linear_graph(groups: Iterable[LinearRows], window: WindowKeys) -> gtsam.GaussianFactorGraph:
@@ -74,32 +76,45 @@ def linear_graph(groups: Iterable[LinearRows], window: WindowKeys) -> gtsam.Gaus
     Pose columns come in as the state has them, (x, y, theta) in the map frame, and go out in GTSAM's tangent
     of Pose2 (`t += R v`, `theta += w`, to first order), as `retract` wants the solution.
     """
-    block_of = np.repeat(np.arange(len(window.keys)), window.dims)
     graph = gtsam.GaussianFactorGraph()
+    block_of = np.repeat(np.arange(len(window.keys)), window.dims)
     for columns, jacobian, residual in groups:
         touched = np.zeros((len(residual), len(window.keys)), dtype=bool)
         np.put_along_axis(touched, block_of[columns], True, axis=1)
-        sets, member = np.unique(touched, axis=0, return_inverse=True)
-        for number, blocks in enumerate(sets):
-            rows = np.flatnonzero(member.ravel() == number)
-            part = (columns[rows], jacobian[rows], residual[rows])
-            graph.add(_factor(part, np.flatnonzero(blocks), window))
+        dense = _in_tangents(_scattered(columns, jacobian, len(block_of)), window)
+        for rows in _rows_by_set(touched):
+            blocks = np.flatnonzero(touched[rows[0]])
+            A = dense[rows[:, None], np.flatnonzero(touched[rows[0], block_of])]
+            keys = [window.keys[k] for k in blocks]
+            graph.add(jacobian_factor(keys, window.dims[blocks].tolist(), A, -residual[rows]))
     return graph
 
 
-def _factor(part: LinearRows, blocks: IntArray, window: WindowKeys) -> gtsam.JacobianFactor:
-    """Rows that touch the same keys, as one factor."""
-    columns, jacobian, residual = part
-    starts = np.concatenate([[0], np.cumsum(window.dims)])
-    entries = np.concatenate([np.arange(starts[k], starts[k + 1]) for k in blocks])
-    dense = np.zeros((len(residual), len(entries)))
-    np.add.at(dense, (np.arange(len(residual))[:, None], np.searchsorted(entries, columns)), jacobian)
-    first = 0
-    for k in blocks:
-        if window.dims[k] == POSE_SIZE:
-            dense[:, first : first + 2] = dense[:, first : first + 2] @ rotation(window.headings[k])
-        first += int(window.dims[k])
-    return jacobian_factor([window.keys[k] for k in blocks], window.dims[blocks].tolist(), dense, -residual)
+def _scattered(columns: IntArray, jacobian: Array, size: int) -> Array:
+    """Rows on the whole state (m, size); a column met twice in a row counts twice."""
+    flat = np.arange(len(columns))[:, None] * size + columns
+    dense = np.bincount(flat.ravel(), jacobian.ravel(), len(columns) * size)
+    return np.asarray(dense.reshape(len(columns), size), dtype=np.float64)
+
+
+def _in_tangents(dense: Array, window: WindowKeys) -> Array:
+    """The same with pose columns by the pose's own axes: `dr/dv = dr/dt R`."""
+    x = (np.cumsum(window.dims) - window.dims)[window.dims == POSE_SIZE]
+    heading = window.headings[window.dims == POSE_SIZE]
+    c, s = np.cos(heading), np.sin(heading)
+    turned = dense.copy()
+    turned[:, x] = dense[:, x] * c + dense[:, x + 1] * s
+    turned[:, x + 1] = dense[:, x + 1] * c - dense[:, x] * s
+    return turned
+
+
+def _rows_by_set(touched: NDArray[np.bool_]) -> list[IntArray]:
+    """Row numbers of each different row of `touched`."""
+    if len(touched) == 0:
+        return []
+    _, member = np.unique(np.packbits(touched, axis=1), axis=0, return_inverse=True)
+    order = np.argsort(member.ravel(), kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(member.ravel()[order])) + 1)
 
 
 def rotation(theta: float) -> Array:

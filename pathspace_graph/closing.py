@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 
 from .boundary import Boundary
 from .knots import BreakSettings, curvature_weighted_breaks, refit
+from .segments import relinearized_prior
 from .spline import BSpline
+
+from .window import POSE, Prior, schur_leave
 
 if TYPE_CHECKING:
     from .fixed_lag import FixedLagMapper
@@ -69,8 +72,7 @@ def close_loop(mapper: FixedLagMapper) -> bool:
     if registration is None:
         return False
     _tie(mapper, registration)
-    for _ in range(mapper.settings.closing.iterations):
-        mapper.step(damped=False)
+    _bend(mapper)
     joins = {label: _join(mapper, label) for label in mapper.boundaries}
     _substitute(mapper, joins)
     for _ in range(mapper.settings.closing.iterations):
@@ -136,6 +138,33 @@ def _tie(mapper: FixedLagMapper, registration: Registration) -> None:
         r.used[rows] = True
         r.boundary[rows] = label
         r.u[rows] = u
+
+
+def _bend(mapper: FixedLagMapper) -> None:
+    """Solve the whole loop, each stretch of the drive relinearized in its own frame; then forget the keyframes."""
+    history = mapper.history
+    assert history is not None
+    segments = history.all_segments(*mapper.control_ids())
+    low = mapper.pose_column(0)
+    count = len(segments)
+    if count:
+        mapper.state = np.insert(mapper.state, low, np.concatenate(history.keyframes))
+        mapper.keyframes = count
+    offsets = {label: mapper.offset(label) for label in mapper.boundaries}
+    for _ in range(mapper.settings.closing.iterations):
+        if count:
+            mapper.prior = relinearized_prior(history, segments, mapper.state, offsets, mapper.map_size)
+        mapper.step(damped=False)
+    if count:
+        prior = relinearized_prior(history, segments, mapper.state, offsets, mapper.map_size)
+        keyframes = slice(low, low + POSE * count)
+        information, gradient = schur_leave(
+            prior.information, prior.gradient, keyframes.start, keyframes.stop
+        )
+        mapper.prior = Prior(information, gradient, np.delete(prior.point, keyframes))
+        mapper.state = np.delete(mapper.state, keyframes)
+        mapper.keyframes = 0
+    mapper.history = None
 
 
 @dataclass(frozen=True)

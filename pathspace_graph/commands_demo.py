@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -42,14 +43,12 @@ class Demo:
         check_target(self.out, PICTURE)
         with progress("driving"):
             log = simulate(generated_track(self.seed), SimulationSettings(laps=self.laps), self.seed)
-        console = Console()
-        console.print(f"a generated track, {self.laps} times around: {describe(log)}", highlight=False)
+        say = partial(Console().print, highlight=False, soft_wrap=True, markup=False)
+        say(f"a generated track, {self.laps} times around: {describe(log)}")
         result = map_online(log, MapperSettings())
         write_demo(self.out, log, result)
         report(result, log)
-        console.print(
-            f"log, map and {PICTURE} are in {self.out}", highlight=False, soft_wrap=True, markup=False
-        )
+        say(f"log, map and {PICTURE} are in {self.out}")
 
 
 def write_demo(out: Path, log: Log, result: RunResult) -> None:

@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 from pathspace_graph.eval.metrics import LapMetrics
 from pathspace_graph.eval.summary import lap_times, laps_of, not_mapped, summarize
 
-from .estimators import DEFAULT, check_online, make_online
+from .estimators import DEFAULT, check_online, check_settings, make_online
 from .files import check_target
 from .labels import NAMES
 from .log import Log, read_log
@@ -39,6 +39,7 @@ class Online:
     def run(self) -> None:
         """Read, map, write, and say what came out."""
         check_online(self.estimator)
+        check_settings(self.settings)
         check_target(self.out, MAP_FILE)
         log = read_log(self.log)
         result = map_online(log, self.settings, self.estimator)

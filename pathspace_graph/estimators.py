@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Final
+from dataclasses import fields, is_dataclass
+from typing import Any, Final
 
 from .errors import SettingsError
 from .fixed_lag import FixedLagMapper
@@ -34,3 +35,13 @@ def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimato
     """The online estimator of that name, ready for the log's first cycle."""
     check_online(name)
     return ONLINE[name](settings, log)
+
+
+def check_settings(settings: Any, where: str = "") -> None:
+    """SettingsError unless every number of a settings dataclass, nested ones too, is finite and positive."""
+    for entry in fields(settings):
+        name, value = f"{where}{entry.name}", getattr(settings, entry.name)
+        if is_dataclass(value):
+            check_settings(value, f"{name}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool) and not 0 < value < float("inf"):
+            raise SettingsError(f"{name}: expected a finite, positive number, found {value}")

@@ -29,6 +29,7 @@ from .map import Map, SplineBoundary
 from .path import DrivenPath, along_and_across
 from .readings import Readings
 from .settings import MapperSettings
+from .segments import History
 from .sightings import Sightings
 from .window import POSE, Prior, Rows, accumulate, cholesky, schur_leave, solve
 
@@ -75,13 +76,15 @@ class FixedLagMapper:
         self.debug: list[str] = []
         self.start_heading = 0.0
         self.closing_checked = 0.0
+        self.keyframes = 0
+        self.history: History | None = None
 
     # -- the state, by name -----------------------------------------------------------------------------------------
 
     @property
     def poses(self) -> Array:
         """Poses (P, 3) in the window, oldest first: a view of the state."""
-        return self.state[self.map_size + CALIBRATION_SIZE :].reshape(-1, POSE)
+        return self.state[self.pose_column(0) :].reshape(-1, POSE)
 
     @property
     def map_size(self) -> int:
@@ -105,7 +108,7 @@ class FixedLagMapper:
 
     def pose_column(self, slot: int | IntArray) -> int | IntArray:
         """First state entry of a pose in the window."""
-        return self.map_size + CALIBRATION_SIZE + POSE * slot
+        return self.map_size + CALIBRATION_SIZE + POSE * (self.keyframes + slot)
 
     # -- one cycle ----------------------------------------------------------------------------------------------------
 
@@ -173,6 +176,7 @@ class FixedLagMapper:
         self.prior = Prior(
             block, np.append(self.prior.gradient, np.zeros(POSE)), np.append(self.prior.point, pose)
         )
+        self.history = History(self.prior, self.settings.closing.keyframe_interval)
 
     # -- classify -----------------------------------------------------------------------------------------------------
 
@@ -397,6 +401,8 @@ class FixedLagMapper:
         index = self.offset(label) + 2 * at
         self.state = np.insert(self.state, index, points.ravel())
         self.prior.widen(index, points.ravel())
+        if self.history is not None:
+            self.history.widen(index, points.ravel())
 
     def _consume(self, label: int, indices: IntArray, points: Array, from_u: float) -> None:
         """Sightings that are on the curve now: their readings update it."""
@@ -524,6 +530,8 @@ class FixedLagMapper:
         size = low + 2 * POSE
         touching = [g.touching(low, low + POSE) for g in self._groups]
         hessian, descent = accumulate(touching, size)
+        if self.history is not None:
+            self.history.leave(hessian, descent, self._linearized_at[:size], *self.control_ids())
         q = len(self.prior.point)
         hessian[:q, :q] += self.prior.information
         descent[:q] += self.prior.descent_at(self._linearized_at)
@@ -539,6 +547,12 @@ class FixedLagMapper:
         self.stations = {label: u[1:] for label, u in self.stations.items()}
         self.first_pose += 1
         self.factor_dropped += 1
+
+    def control_ids(self) -> tuple[IntArray, IntArray]:
+        """Boundary and index (n,) of each control point, in the order of the state."""
+        sizes = [b.size for b in self.boundaries.values()]
+        labels = np.repeat(np.array(list(self.boundaries), np.intp), sizes)
+        return labels, np.concatenate([np.arange(n) for n in sizes] or [np.zeros(0, np.intp)])
 
     # -- results ------------------------------------------------------------------------------------------------------
 

@@ -107,6 +107,8 @@ class ClosingSettings:
     """A reading farther than this from the beginning doesn't pull in the first iteration (m)."""
     icp_iterations: int = 10
     """Iterations of the registration."""
+    keyframe_interval: float = 12.0
+    """Path (m) between the keyframes in whose frames the drive so far is kept until the loop closes."""
     iterations: int = 4
     """Gauss-Newton steps after the tie, and again after simplification."""
 

@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 Retraction = Callable[[Array, Array], Array]
 
 STEP = 1e-5
-"""Half of the difference's width, in the units of the input: truncation and round-off are both about 1e-10."""
+"""Half of the difference's width, in the units of the input: truncation and round-off are near 1e-10."""
 TOLERANCE = 1e-6
 """Largest |analytic - numeric|, as a share of 1 + the largest entry of the numeric Jacobian."""
 

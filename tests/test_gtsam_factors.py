@@ -90,7 +90,8 @@ def make_scene(seed: int, isotropic: bool = True, outliers: int = 4) -> Scene:
     poses = [true[0]]
     for step in odometry:
         poses.append(compose(poses[-1], step.delta))
-    slots, points, covariances = zip(*(make_readings(rng, true, label, isotropic, outliers) for label in (0, 1)))
+    read = [make_readings(rng, true, label, isotropic, outliers) for label in (0, 1)]
+    slots, points, covariances = zip(*read, strict=True)
     control = [on_bend(SPACING * np.arange(-1, SIZE - 1), radius) for radius in (23.0, 27.0)]
     noisy = np.concatenate([(c + rng.normal(0.0, 0.1, c.shape)).ravel() for c in control])
     state = np.concatenate([noisy, np.zeros(2), np.ravel(poses)])
@@ -139,7 +140,10 @@ def reading_rows(scene: Scene, label: int, state: Array) -> Rows:
     weight = np.sqrt(huber_weights(lin.residual / lin.sigma, HUBER)) * foot.interior / lin.sigma
     base = 2 * SIZE * label + 2 * (foot.span[:, None] + np.arange(-DEGREE, 1))
     by_control = lin.by_control.reshape(len(u), -1)
-    columns = [MAP + 2 + POSE * slots[:, None] + np.arange(POSE), np.stack([base, base + 1], 2).reshape(len(u), -1)]
+    columns = [
+        MAP + 2 + POSE * slots[:, None] + np.arange(POSE),
+        np.stack([base, base + 1], 2).reshape(len(u), -1),
+    ]
     jacobian = np.concatenate([lin.by_pose, by_control], axis=1) * weight[:, None]
     return Rows(np.concatenate(columns, axis=1), jacobian, lin.residual * weight)
 
@@ -185,7 +189,9 @@ def prior_rows_of(scene: Scene, state: Array) -> list[Rows]:
     start = MAP + 2 + np.arange(POSE)[:, None]
     return [
         Rows(calibration, 1.0 / SIGMA_CALIBRATION[:, None], state[MAP : MAP + 2] / SIGMA_CALIBRATION),
-        Rows(start, np.full((POSE, 1), 1.0 / SIGMA_START), (scene.poses(state)[0] - scene.start) / SIGMA_START),
+        Rows(
+            start, np.full((POSE, 1), 1.0 / SIGMA_START), (scene.poses(state)[0] - scene.start) / SIGMA_START
+        ),
     ]
 
 
@@ -227,8 +233,8 @@ def projection_factor(scene: Scene, label: int, slot: int) -> gtsam.CustomFactor
         TABLES,
         points_vehicle=scene.points[label][rows],
         covariances=scene.covariances[label][rows],
-        u=scene.u[label][rows],
-        room=ROOM,
+        low=scene.u[label][rows] - ROOM,
+        high=scene.u[label][rows] + ROOM,
         sigma_model=SIGMA_MODEL,
         huber=HUBER,
     )
@@ -251,7 +257,7 @@ def to_state(values: gtsam.Values) -> Array:
     return np.concatenate([np.ravel(control), values.atPoint2(CALIBRATION_KEY), np.ravel(poses)])
 
 
-def solve_window(scene: Scene, iterations: int = 40) -> Array:
+def solve_window(scene: Scene, iterations: int = 25) -> Array:
     """Gauss-Newton on the kernels' rows, relinearized at every step."""
     state = scene.state
     for _ in range(iterations):
@@ -300,25 +306,31 @@ def test_both_adapters_give_the_same_linear_system(scene: Scene) -> None:
     assert_same_system(nonlinear_graph(scene).linearize(to_values(scene, state)), vectorized)
 
 
-def test_levenberg_marquardt_reaches_the_windows_optimum() -> None:
-    """Curves and poses to 1e-6 m; readings as uncertain in every direction, so that sigma doesn't turn."""
-    scene = make_scene(0)
+@pytest.mark.parametrize(
+    ("seed", "isotropic", "allowed"), [(0, True, 1e-6), (1, True, 1e-6), (2, False, 5e-3)]
+)
+def test_levenberg_marquardt_reaches_the_windows_optimum(seed: int, isotropic: bool, allowed: float) -> None:
+    """Curves and poses to 1e-6 m where sigma doesn't turn with the normal.
+
+    Where it does, Levenberg-Marquardt looks at an error whose derivative isn't quite the gradient that it was
+    given, and stops when no step lowers it: millimetres at most, here.
+    """
+    scene = make_scene(seed, isotropic)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(0.0)
     parameters.setAbsoluteErrorTol(1e-13)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(
-        nonlinear_graph(scene), to_values(scene, scene.state), parameters
-    )
-    found, expected = to_state(optimizer.optimize()), solve_window(scene)
-    np.testing.assert_allclose(curves(scene, found), curves(scene, expected), atol=1e-6)
-    np.testing.assert_allclose(scene.poses(found), scene.poses(expected), atol=1e-6)
+    values = to_values(scene, scene.state)
+    found = to_state(gtsam.LevenbergMarquardtOptimizer(nonlinear_graph(scene), values, parameters).optimize())
+    expected = solve_window(scene)
+    np.testing.assert_allclose(curves(scene, found), curves(scene, expected), atol=allowed)
+    np.testing.assert_allclose(scene.poses(found), scene.poses(expected), atol=allowed)
     assert np.abs(curves(scene, found) - curves(scene, scene.state)).max() > 0.05
 
 
 def test_gauss_newton_reaches_the_windows_optimum(scene: Scene) -> None:
     """GTSAM's own Gauss-Newton stands still where the window does, whatever the covariances."""
     optimizer = gtsam.GaussNewtonOptimizer(nonlinear_graph(scene), to_values(scene, scene.state))
-    for _ in range(40):
+    for _ in range(25):
         optimizer.iterate()
     found, expected = to_state(optimizer.values()), solve_window(scene)
     np.testing.assert_allclose(curves(scene, found), curves(scene, expected), atol=1e-6)
@@ -334,7 +346,7 @@ def test_error_is_hubers_loss_and_its_derivative_is_the_linearizations_gradient(
     values = to_values(scene, scene.state)
     assert np.abs(factor.unwhitenedError(values)).max() > HUBER
     gradient = graph.linearize(values).gradientAtZero()
-    for key in factor.keys():
+    for key in list(factor.keys()):
         expected = gradient.at(key)
         numeric = [error_slope(graph, values, key, e) for e in np.eye(len(expected))]
         np.testing.assert_allclose(numeric, expected, atol=1e-5 * (1.0 + np.abs(expected).max()))
@@ -408,19 +420,21 @@ def test_periodic_stretch_across_the_seam_holds_only_its_own_keys() -> None:
     angle = 2.0 * np.pi * np.arange(size) / size
     points = 6.0 * np.column_stack([np.cos(angle), np.sin(angle)])
     tables = SpanPolynomials(periodic_knots(3.0 * np.arange(size + 1.0), DEGREE), DEGREE, True)
+    u = whole_period_search(tables, points, np.array([[7.0, 1.0], [7.2, 1.3]]))
     factor = spline_projection_factor(
         99,
         list(range(size)),
         tables,
         points_vehicle=np.array([[2.0, 0.0], [2.2, 0.3]]),
         covariances=np.tile(0.01 * np.eye(2), (2, 1, 1)),
-        u=whole_period_search(tables, points, np.array([[7.0, 1.0], [7.2, 1.3]])),
-        room=1.0,
+        low=u - 1.0,
+        high=u + 1.0,
         sigma_model=SIGMA_MODEL,
         huber=np.inf,
     )
     keys = factor.keys()[1:]
-    assert 4 <= len(keys) < size
+    assert {0, size - 1} < set(keys)
+    assert len(keys) < size
 
     def function(pose: Array, control: Array) -> tuple[Array, ...]:
         values = gtsam.Values()
@@ -450,8 +464,8 @@ def straight_factor(u: Array, points: Array) -> tuple[gtsam.CustomFactor, gtsam.
         TABLES,
         points_vehicle=points,
         covariances=np.tile(0.01 * np.eye(2), (len(u), 1, 1)),
-        u=u,
-        room=1.0,
+        low=u - 1.0,
+        high=u + 1.0,
         sigma_model=SIGMA_MODEL,
         huber=np.inf,
     )

@@ -50,9 +50,7 @@ def test_integration_is_gtsams_composition(seed: int) -> None:
     delta = integrate_twists(durations, twists, SIGMA).delta
     np.testing.assert_allclose(delta, as_array(gtsam_composition(durations, twists)), atol=1e-12)
     for k, pose in enumerate(integrate_poses(durations, twists), start=1):
-        np.testing.assert_allclose(
-            pose, as_array(gtsam_composition(durations[:k], twists[:k])), atol=1e-12
-        )
+        np.testing.assert_allclose(pose, as_array(gtsam_composition(durations[:k], twists[:k])), atol=1e-12)
 
 
 @pytest.mark.parametrize("turn", [0.0, 1e-12, 1e-6, 0.1, 3.0, -3.0])
@@ -75,7 +73,7 @@ def test_wrap_angle_is_half_open() -> None:
 
 
 def test_covariance_against_monte_carlo() -> None:
-    """A sample covariance of n errors has a standard error of sqrt((S_ii S_jj + S_ij^2) / n); five are allowed."""
+    """The standard error of a sample covariance is sqrt((S_ii S_jj + S_ij^2) / n); five are allowed."""
     rng = np.random.default_rng(7)
     durations, twists = random_twists(rng, 10)
     odometry = integrate_twists(durations, twists, SIGMA)
@@ -95,18 +93,20 @@ def test_covariance_against_monte_carlo() -> None:
 
 
 def test_covariance_of_a_straight_run_by_hand() -> None:
-    """Ten steps of 0.1 s at 5 m/s: a yaw error in the middle of step k is carried over what is left of the way."""
+    """Ten steps of 0.1 s at 5 m/s: a yaw error in the middle of a step swings what is left of the way."""
     odometry = integrate_twists(np.full(10, 0.1), np.tile([5.0, 0.0, 0.0], (10, 1)), SIGMA)
     left = 5.0 * (1.0 - 0.1 * (np.arange(10) + 0.5))
     yaw = (0.1 * SIGMA[2]) ** 2
-    expected = np.diag([10 * (0.1 * SIGMA[0]) ** 2, 10 * (0.1 * SIGMA[1]) ** 2 + yaw * np.sum(left**2), 10 * yaw])
+    expected = np.diag(
+        [10 * (0.1 * SIGMA[0]) ** 2, 10 * (0.1 * SIGMA[1]) ** 2 + yaw * np.sum(left**2), 10 * yaw]
+    )
     expected[1, 2] = expected[2, 1] = yaw * np.sum(left)
     np.testing.assert_allclose(odometry.covariance, expected, rtol=1e-10, atol=1e-15)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_calibration_jacobian(seed: int) -> None:
-    """Derivative of the integrated end by errors of the readings, up to the (w dt)^2 / 24 of its midpoint rule."""
+    """Derivative of the end by errors of the readings, but for the midpoint rule's (w dt)^2 / 24."""
     durations, twists = random_twists(np.random.default_rng(seed), 8)
     nominal = integrate_twists(durations, twists, SIGMA)
 
@@ -122,7 +122,9 @@ def test_calibration_jacobian(seed: int) -> None:
 
 
 @pytest.mark.parametrize(("durations", "twists"), [([], []), ([0.0], [[5.0, 0.0, 1.0]])])
-def test_no_time_is_the_identity_with_a_finite_whitener(durations: list[float], twists: list[list[float]]) -> None:
+def test_no_time_is_the_identity_with_a_finite_whitener(
+    durations: list[float], twists: list[list[float]]
+) -> None:
     odometry = integrate_twists(np.array(durations), np.array(twists).reshape(-1, 3), SIGMA)
     np.testing.assert_array_equal(odometry.delta, np.zeros(3))
     np.testing.assert_array_equal(odometry.covariance, np.zeros((3, 3)))
@@ -153,7 +155,7 @@ def residual_function(delta: Array, calibration_jacobian: Array):
     turn=st.sampled_from([0.0, 1e-9, 1e-4, 0.99e-3, 1.01e-3, 0.1, -1.5, 3.0, -3.1]),
 )
 def test_residual_jacobians_near_and_far(seed: int, offset: float, turn: float) -> None:
-    """From the measured pose itself to residuals of metres and nearly half a turn, by start, end, calibration."""
+    """From the measured pose itself to residuals of metres and nearly half a turn."""
     rng = np.random.default_rng(seed)
     start = np.append(rng.uniform(-50.0, 50.0, 2), rng.uniform(-7.0, 7.0))
     delta = np.append(rng.normal(size=2), rng.uniform(-1.0, 1.0))

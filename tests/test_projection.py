@@ -22,7 +22,7 @@ ROOM = 2.0
 """Stretch on either side of the parameter where a foot point is searched for (m)."""
 SIGMA_MODEL = 0.08
 MAX_BEND = 0.8
-"""Largest curvature times distance: at 1 the reading is the centre of curvature, with no foot point of its own."""
+"""Largest curvature times distance: at 1 the reading is the centre of curvature."""
 
 
 def control_columns(tables: SpanPolynomials, span: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -59,7 +59,7 @@ def find(tables: SpanPolynomials, distinct: Array, points: Array, u: Array) -> F
 
 
 def well_posed(tables: SpanPolynomials, distinct: Array, points: Array, u: Array) -> NDArray[np.bool_]:
-    """Interior foot points away from kinks and from the centre of curvature, where the nearest point jumps."""
+    """Interior foot points away from kinks and centres of curvature, where the nearest point jumps."""
     foot = find(tables, distinct, points, u)
     values, _ = tables.evaluate(foot.u, 2)
     columns = control_columns(tables, foot.span)
@@ -115,7 +115,7 @@ def readings_beside(
     kind=st.sampled_from(["open", "clamped", "repeated", "periodic"]),
 )
 def test_jacobians_are_exact_metres_away_from_the_curve(seed: int, degree: int, kind: str) -> None:
-    """Every term through the foot point vanishes, though the foot point moves with pose and control points."""
+    """Every term through the foot point vanishes, though it moves with pose and control points."""
     rng = np.random.default_rng(seed)
     tables, distinct = random_curve(rng, degree, kind)
     points, u = readings_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 25))
@@ -138,7 +138,13 @@ def test_the_samples_are_far_from_zero_and_their_foot_points_move() -> None:
 
 @pytest.mark.parametrize(
     "pose",
-    [[0.0, 0.0, 0.0], [1e-9, -1e-9, 1e-9], [3.0, 1.0, np.pi], [3.0, 1.0, -np.pi + 1e-7], [500.0, -300.0, 40.0]],
+    [
+        [0.0, 0.0, 0.0],
+        [1e-9, -1e-9, 1e-9],
+        [3.0, 1.0, np.pi],
+        [3.0, 1.0, -np.pi + 1e-7],
+        [500.0, -300.0, 40.0],
+    ],
 )
 @pytest.mark.parametrize("distance", [0.0, 1e-9, 0.3])
 def test_jacobians_at_degenerate_states(pose: list[float], distance: float) -> None:
@@ -171,7 +177,7 @@ def test_coinciding_control_points_keep_the_jacobians() -> None:
 
 
 def test_at_the_end_of_the_curve_the_row_is_marked() -> None:
-    """Beyond the end the residual is not the distance and the Jacobians are not exact: `interior` is False."""
+    """Beyond the end the residual is not the distance, the Jacobians not exact: `interior` is False."""
     tables = SpanPolynomials(uniform_knots(6, 3, SPACING), 3)
     distinct = SPACING * np.column_stack([np.arange(6.0), np.zeros(6)])
     end = SPACING * 4.0
@@ -195,7 +201,7 @@ def test_to_map_is_the_rigid_transform() -> None:
 
 
 def test_sigma_across_against_monte_carlo() -> None:
-    """The sample deviation of n samples has a relative standard error of 1 / sqrt(2 n); five of them allowed."""
+    """A sample deviation has a relative standard error of 1 / sqrt(2 n); five are allowed."""
     rng = np.random.default_rng(6)
     count, theta, angle = 100_000, 2.1, 0.4
     covariance = np.array([[0.04, 0.015], [0.015, 0.01]])

@@ -79,7 +79,9 @@ def test_schur_leave_is_the_marginal() -> None:
     information, gradient = schur_leave(hessian, descent, 8, 11)
     stay = np.r_[0:8, 11:17]
     covariance = np.linalg.inv(hessian)
-    np.testing.assert_allclose(np.linalg.inv(information), covariance[np.ix_(stay, stay)], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.inv(information), covariance[np.ix_(stay, stay)], rtol=1e-9, atol=1e-9
+    )
     mean = np.linalg.solve(hessian, descent)
     np.testing.assert_allclose(np.linalg.solve(information, gradient), mean[stay], rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(information, information.T)
@@ -123,7 +125,7 @@ def test_a_priors_descent_is_the_derivative_of_its_cost() -> None:
 
 @pytest.mark.parametrize("at", [0, 2, 5])
 def test_widening_knows_nothing_of_the_new_entries(at: int) -> None:
-    """Old entries keep their prior wherever the new ones come in; the new ones have neither weight nor pull."""
+    """Old entries keep their prior wherever new ones come in; those have neither weight nor pull."""
     rng = np.random.default_rng(5)
     prior = random_prior(rng, 5)
     old_state, new = rng.normal(size=7), np.array([7.0, -8.0])
