@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.projection import to_map
+
 from .boundary import Boundary
 from .knots import BreakSettings, curvature_weighted_breaks, refit
 from .segments import relinearized_prior
@@ -53,14 +55,14 @@ def _moved(points: Array, centre: Array, rotation: float, shift: Array) -> Array
 def near_start(mapper: FixedLagMapper) -> bool:
     """Whether the vehicle may be on the beginning again: driven far enough, and near it in place and direction."""
     c = mapper.settings.closing
-    if mapper.path.length < c.min_path or not mapper.boundaries:
+    if mapper.path.length < max(c.min_path, 1.5 * c.overlap) or not mapper.boundaries:
         return False
     pose = mapper.poses[-1]
+    beginning = mapper.path.beginning
     drift = c.radius + c.drift * mapper.path.length
-    near = np.hypot(pose[0] - c.overlap, pose[1]) < drift + c.overlap
-    return bool(
-        near and np.cos(pose[2] - mapper.start_heading) > np.cos(c.heading + 0.001 * mapper.path.length)
-    )
+    away = np.hypot(*(beginning[:, :2] - pose[:2]).T)
+    same_way = np.cos(beginning[:, 2] - pose[2]) > np.cos(c.heading)
+    return bool((same_way & (away < drift)).any())
 
 
 def close_loop(mapper: FixedLagMapper) -> bool:
@@ -81,51 +83,78 @@ def close_loop(mapper: FixedLagMapper) -> bool:
 
 
 def register(mapper: FixedLagMapper) -> Registration | None:
-    """Iterated closest points on the curves' beginnings, for a rigid motion of the newest readings."""
+    """Iterated closest points on the curves' beginnings, for a rigid motion of the newest readings.
+
+    The vehicle's own uncertainty is the prior: along a straight or an arc the readings leave the motion free.
+    """
     c, r = mapper.settings.closing, mapper.readings
     recent = np.flatnonzero(np.asarray(mapper.times)[r.slot] > mapper.times[-1] - c.window)
-    poses = mapper.poses[r.slot[recent]]
-    from pathspace_graph.factors.projection import to_map
-
-    points = to_map(r.point[recent], poses)
-    rows = {b: np.flatnonzero(r.label[recent] == b) for b in mapper.boundaries}
-    centre, rotation, shift = mapper.poses[-1, :2].copy(), 0.0, np.zeros(2)
-    length = c.beginning
-    prior = np.diag([(1.0 / (0.5 + 0.01 * mapper.path.length)) ** 2] * 2 + [(1.0 / 0.1) ** 2])
-    matches: dict[int, tuple[IntArray, Array]] = {}
+    recent = recent[np.isin(r.label[recent], list(mapper.boundaries))]
+    points = to_map(r.point[recent], mapper.poses[r.slot[recent]])
+    centre, motion = mapper.poses[-1, :2].copy(), np.zeros(3)
+    prior = np.linalg.inv(mapper.pose_covariance() * c.prior_scale**2)
+    matched = _Matches(np.zeros(0, np.intp), np.zeros(0), np.zeros(0, bool), prior, np.zeros(3))
     for iteration in range(c.icp_iterations):
         reach = max(c.inlier_distance, c.icp_reach * 0.7**iteration)
-        hessian, descent = prior.copy(), -prior @ np.append(shift, rotation)
-        matches, total, agree = {}, 0, 0
-        for b, of in rows.items():
-            if len(of) == 0:
-                continue
-            moved = _moved(points[of], centre, rotation, shift)
-            high = np.full(len(of), min(length, mapper.boundaries[b].confirmed))
-            foot = mapper.boundaries[b].find(mapper.control_points(b), moved, np.zeros(len(of)), high)
-            good = foot.interior & (np.abs(foot.distance) < reach)
-            n = foot.normal_unit[good]
-            arm = moved[good] - centre - shift
-            jac = np.column_stack([n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]])
-            weight = 1.0 / 0.2**2
-            hessian += weight * jac.T @ jac
-            descent -= weight * jac.T @ foot.distance[good]
-            total += int(foot.interior.sum())
-            inlier = foot.interior & (np.abs(foot.distance) < c.inlier_distance)
-            agree += int(inlier.sum())
-            matches[b] = (recent[of[inlier]], foot.u[inlier])
-        step = np.linalg.solve(hessian, descent)
-        shift, rotation = shift + step[:2], rotation + step[2]
-    mapper.debug.append(
-        f"closing at {mapper.path.length:.1f}: {agree}/{total} {[(len(u), round(float(np.ptp(u)), 1) if len(u) else 0) for _, u in matches.values()]} shift {shift.round(2)} rot {rotation:.3f}"
-    )
-    enough = total >= c.min_readings and agree >= c.inlier_share * total
-    covered = all(len(u) >= 5 and np.ptp(u) >= c.overlap for _, u in matches.values()) and len(
-        matches
-    ) == len(rows)
-    if not (enough and covered):
+        matched = _match(mapper, recent, points, centre, motion, reach)
+        descent = matched.descent - prior @ motion
+        motion = motion + np.linalg.solve(matched.hessian + prior, descent)
+    posterior = np.linalg.inv(matched.hessian + prior)
+    sigma = float(np.sqrt(np.linalg.eigvalsh(posterior[:2, :2])[-1]))
+    agree = matched.near
+    labels = r.label[matched.rows]
+    spans = [np.ptp(matched.u[agree & (labels == b)]) if (agree & (labels == b)).sum() > 4 else 0.0 for b in mapper.boundaries]
+    mapper.debug.append(f"closing at {mapper.path.length:.1f}: {agree.sum()}/{len(agree)} spans {np.round(spans,1)} motion {motion.round(2)} sigma {sigma:.2f} prior {np.sqrt(np.diag(np.linalg.inv(prior))).round(2)}")
+    enough = len(agree) >= c.min_readings and agree.sum() >= c.inlier_share * len(agree)
+    if not enough or min(spans) < c.overlap:
         return None
-    return Registration(rotation, shift, centre, matches)
+    driven_again = float(np.median(matched.u[agree]))
+    if sigma > c.sigma_max and driven_again < c.patience:
+        return None
+    matches = {b: (matched.rows[agree & (labels == b)], matched.u[agree & (labels == b)]) for b in mapper.boundaries}
+    return Registration(float(motion[2]), motion[:2], centre, matches)
+
+
+@dataclass(frozen=True)
+class _Matches:
+    """Readings against the beginning, at one motion."""
+
+    rows: IntArray
+    """Readings whose foot point is inside the beginning."""
+    u: Array
+    """Their parameters."""
+    near: NDArray[np.bool_]
+    """Whether they lie on it."""
+    hessian: Array
+    """(3, 3) of the motion (x, y, rotation), from the readings within reach."""
+    descent: Array
+    """(3,) negative gradient."""
+
+
+def _match(
+    mapper: FixedLagMapper, recent: IntArray, points: Array, centre: Array, motion: Array, reach: float
+) -> _Matches:
+    c = mapper.settings.closing
+    labels = mapper.readings.label[recent]
+    moved = _moved(points, centre, motion[2], motion[:2])
+    rows, u, near = [], [], []
+    hessian, descent = np.zeros((3, 3)), np.zeros(3)
+    for b, boundary in mapper.boundaries.items():
+        of = np.flatnonzero(labels == b)
+        if len(of) == 0:
+            continue
+        high = np.full(len(of), min(c.beginning, 0.6 * boundary.confirmed))
+        foot = boundary.find(mapper.control_points(b), moved[of], np.zeros(len(of)), high)
+        good = foot.interior & (np.abs(foot.distance) < reach)
+        n, arm = foot.normal_unit[good], moved[of[good]] - centre - motion[:2]
+        jacobian = np.column_stack([n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]]) / c.sigma_reading
+        hessian += jacobian.T @ jacobian
+        descent -= jacobian.T @ foot.distance[good] / c.sigma_reading
+        inside = foot.interior
+        rows.append(recent[of[inside]])
+        u.append(foot.u[inside])
+        near.append(np.abs(foot.distance[inside]) < c.inlier_distance)
+    return _Matches(np.concatenate(rows), np.concatenate(u), np.concatenate(near), hessian, descent)
 
 
 def _tie(mapper: FixedLagMapper, registration: Registration) -> None:

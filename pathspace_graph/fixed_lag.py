@@ -155,7 +155,7 @@ class FixedLagMapper:
             self._extend_prior_by_pose(np.linalg.inv(covariance), pose)
         else:
             self.odometry.append(integrated)
-        self.path.update(pose[:2])
+        self.path.update(pose)
         if len(odometry.t):
             twist = odometry.twist.mean(axis=0)
             if twist[0] > 1.0:
@@ -567,6 +567,13 @@ class FixedLagMapper:
             spline = boundary.spline(self.control_points(label).copy())
             boundaries[label] = SplineBoundary(spline, joint[block, block])
         return Map(self.closed, boundaries)
+
+    def pose_covariance(self) -> Array:
+        """(3, 3) marginal covariance of the newest pose (x, y, theta), map frame, without damping."""
+        factor = cholesky(self._normal_equations(self.linearize())[0])
+        selected = np.eye(len(factor), POSE, -(len(factor) - POSE))
+        half, _ = lapack.dtrtrs(factor, selected, lower=1)
+        return half.T @ half
 
     def covariance(self) -> Array:
         """Joint covariance of the control points, of both boundaries together."""

@@ -11,18 +11,23 @@ Array = NDArray[np.float64]
 class DrivenPath:
     """Positions driven, at least `step` apart, with their station (path length, m)."""
 
-    def __init__(self, step: float = 0.3, memory: float = 40.0) -> None:
+    def __init__(self, step: float = 0.3, memory: float = 60.0) -> None:
         self.step = step
         """Least distance of two kept positions (m)."""
         self.memory = memory
         """Stretch behind the vehicle (m) that is kept."""
         self.points: Array = np.zeros((0, 2))
         self.stations: Array = np.zeros(0)
+        self.beginning: Array = np.zeros((0, 3))
+        """Poses about a metre apart on the first stretch, as long as the memory."""
         self.length = 0.0
         """Path driven so far (m), the station of the last position."""
 
-    def update(self, position: Array) -> None:
-        """Drive on to `position` (2,), map frame."""
+    def update(self, pose: Array) -> None:
+        """Drive on to `pose` (3,), map frame."""
+        position = pose[:2]
+        if self.length <= self.memory and (len(self.beginning) == 0 or np.hypot(*(position - self.beginning[-1, :2])) >= 1.0):
+            self.beginning = np.concatenate([self.beginning, pose[None]])
         if len(self.points) == 0:
             self.points, self.stations = position[None].copy(), np.zeros(1)
             return

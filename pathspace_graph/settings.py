@@ -101,7 +101,15 @@ class ClosingSettings:
     """Fewest readings that may close a loop."""
     window: float = 2.0
     """Time (s) of the newest readings that are registered with the beginning."""
-    beginning: float = 35.0
+    prior_scale: float = 1.5
+    """Trust in the vehicle's own uncertainty: its sigmas are multiplied by this."""
+    sigma_reading: float = 0.5
+    """Deviation (m) that a reading counts with in the registration: many readings are of one and the same cone."""
+    sigma_max: float = 0.3
+    """The registered position must be this certain (m, one sigma along its worst direction) ..."""
+    patience: float = 40.0
+    """... until so much of the beginning (m) has been driven again."""
+    beginning: float = 60.0
     """Stretch of the curves (m) that counts as their beginning."""
     icp_reach: float = 3.0
     """A reading farther than this from the beginning doesn't pull in the first iteration (m)."""

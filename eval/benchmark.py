@@ -1,0 +1,374 @@
+"""The online mapper's speed, held against GTSAM's own linear algebra on the same windows, in one run.
+
+`python -m pathspace_graph.eval.benchmark --laps 5 --seed 0 --json FILE`
+
+What GTSAM is timed on is the mapper's window after a cycle, already linearized, so that neither linearization nor
+the building of a graph counts: `optimize()` and `marginal(control points, calibration, next pose)`, once each. It is
+given its fair best: prior, gauge and damping come as one Hessian factor (as a square root they were slower, and so
+was a gauge of many factors); readings and odometry are cut into factors in each of `CUTS`; the window is solved in
+each of several orderings, finding one beforehand not counted; each call is made once untimed before it is timed; what
+is reported is the cut and ordering that were fastest on average over the run. BLAS has one thread.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Final, Literal, get_args
+
+import gtsam
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from pathspace_graph.factors.linear_graph import (
+    LinearRows,
+    WindowKeys,
+    linear_graph,
+    prior_rows,
+    window_keys,
+)
+from pathspace_graph.files import atomic_file, check_file_target
+from pathspace_graph.fixed_lag import FixedLagMapper
+from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.log import Log
+from pathspace_graph.progress import progress
+from pathspace_graph.run import CycleRecord, RunResult, run_online
+from pathspace_graph.settings import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
+from pathspace_graph.window import POSE, accumulate
+
+Array = NDArray[np.float64]
+
+Cut = Literal["key set", "pose"]
+"""A factor for each set of keys that rows share, or all rows of a cycle and boundary stacked in one."""
+CUTS: Final[tuple[Cut, ...]] = get_args(Cut)
+"""All of them."""
+SAMPLE_EVERY: Final = 10
+"""GTSAM is timed after every so many cycles."""
+WARM_UP: Final = 50
+"""Cycles before the first sample: the window is full by then."""
+REFERENCE_LAP: Final = 2
+"""The first lap that is driven on a closed map; the last lap is compared with it."""
+MEAN_RATIO: Final = 2.0
+"""Mean cycle at most so many times GTSAM's mean."""
+P99_MILLISECONDS: Final = 10.0
+"""99th percentile of a cycle, where a mean cycle of 3 ms was measured."""
+LAP_RATIO: Final = 1.1
+"""Mean cycle of the last lap at most so many times that of lap 2."""
+CLOSING_MILLISECONDS: Final = 100.0
+"""The cycle that closes the loop."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One figure, and what it is held to."""
+
+    key: str
+    """Name, for a baseline to be compared with."""
+    value: float
+    """NaN where the run was too short for it."""
+    unit: str
+    """Empty for a ratio."""
+    direction: Literal["lower", "higher"] = "lower"
+    """Which way is better."""
+    bound: float | None = None
+    """Worst value allowed; None where nothing is asked."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether the bound is kept; a value that isn't known keeps none."""
+        if self.bound is None:
+            return True
+        return self.value <= self.bound if self.direction == "lower" else self.value >= self.bound
+
+
+# --- GTSAM on the mapper's window ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class LinearWindow:
+    """`min sum |J dx + r|^2 + dx' L dx - 2 g' dx`: a window, linearized at its estimate."""
+
+    groups: tuple[LinearRows, ...]
+    """Rows of each boundary's readings, and of the odometry."""
+    information: Array
+    """(q, q) L of prior, gauge and damping, on the leading entries of the state."""
+    descent: Array
+    """(q,) g."""
+    keys: WindowKeys
+    """GTSAM's keys of the state."""
+
+
+def linear_window(mapper: FixedLagMapper) -> LinearWindow:
+    """The window of a mapper between two cycles, which is left as it is."""
+    mapper = deepcopy(mapper)  # linearizing refreshes foot points
+    q, map_size = len(mapper.prior.point), mapper.map_size
+    groups = mapper.linearize()
+    gauge = [rows for rows in groups if rows.columns.max(initial=-1) < map_size]
+    information, descent = accumulate(gauge, q)
+    information += mapper.prior.information
+    descent += mapper.prior.descent_at(mapper.state)
+    for label, boundary in mapper.boundaries.items():
+        block = slice(mapper.offset(label), mapper.offset(label) + 2 * boundary.size)
+        information[block, block] += boundary.gauge_hessian
+        descent[block] -= boundary.smooth_only @ mapper.state[block]
+    information[np.arange(map_size), np.arange(map_size)] += mapper.settings.sigma_step**-2
+    left, right = (mapper.boundaries[b].size if b in mapper.boundaries else 0 for b in (LEFT, RIGHT))
+    keys = window_keys((left, right), len(mapper.calibration), mapper.poses)
+    moving = [rows for rows in groups if rows.columns.max(initial=-1) >= map_size]
+    return LinearWindow(
+        tuple((rows.columns, rows.jacobian, rows.residual) for rows in moving), information, descent, keys
+    )
+
+
+def gaussian_graph(window: LinearWindow, cut: Cut) -> gtsam.GaussianFactorGraph:
+    """The window as GTSAM has it."""
+    graph = linear_graph(window.groups if cut == "key set" else _stacked(window), window.keys)
+    held = prior_rows(window.information, window.descent)
+    graph.add(gtsam.HessianFactor(linear_graph([held], window.keys)))
+    return graph
+
+
+def _stacked(window: LinearWindow) -> list[LinearRows]:
+    """The rows of each group, cut by their newest pose, all rows of a cut on the same columns."""
+    size = int(window.keys.dims.sum())
+    stacked: list[LinearRows] = []
+    for columns, jacobian, residual in window.groups:
+        newest = (size - 1 - columns.max(axis=1)) // POSE  # poses come last in the state
+        for pose in np.unique(newest):
+            of = newest == pose
+            stacked.append(_widened((columns[of], jacobian[of], residual[of]), size))
+    return stacked
+
+
+def _widened(rows: LinearRows, size: int) -> LinearRows:
+    """The same rows, all on the same columns."""
+    columns, jacobian, residual = rows
+    dense = np.zeros((len(residual), size))
+    np.add.at(dense, (np.arange(len(residual))[:, None], columns), jacobian)
+    touched = np.unique(columns)
+    return np.tile(touched, (len(residual), 1)), dense[:, touched], residual
+
+
+def orderings(graph: gtsam.GaussianFactorGraph, window: LinearWindow) -> dict[str, gtsam.Ordering | None]:
+    """What `optimize` may be given: nothing, COLAMD found beforehand, or the poses before everything shared."""
+    shared = window.keys.dims != POSE
+    poses_first = gtsam.Ordering()
+    for key in np.array(window.keys.keys, dtype=object)[np.argsort(shared, kind="stable")]:
+        poses_first.push_back(key)
+    return {
+        "no ordering given": None,
+        "COLAMD given": gtsam.Ordering.ColamdGaussianFactorGraph(graph),
+        "poses first": poses_first,
+    }
+
+
+def marginal_keys(window: LinearWindow) -> list[int]:
+    """What stays of the window when its oldest pose leaves, as far as its marginal reaches."""
+    keys = window.keys
+    poses = [key for key, size in zip(keys.keys, keys.dims, strict=True) if size == POSE]
+    return [key for key in keys.keys if key not in poses] + poses[1:2]
+
+
+def time_gtsam(window: LinearWindow) -> dict[str, tuple[float, float]]:
+    """Seconds of (`optimize`, `marginal`), once each, by cut and ordering."""
+    timings = {}
+    staying = gtsam.KeyVector(marginal_keys(window))
+    for cut in CUTS:
+        graph = gaussian_graph(window, cut)
+        marginal = seconds(partial(graph.marginal, staying))
+        for name, ordering in orderings(graph, window).items():
+            optimize = seconds(partial(graph.optimize, *(() if ordering is None else (ordering,))))
+            timings[f"a factor for each {cut}, {name}"] = (optimize, marginal)
+    return timings
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """Wall time of the second of two calls, s."""
+    call()
+    begin = time.perf_counter()
+    call()
+    return time.perf_counter() - begin
+
+
+# --- one run ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Gtsam:
+    """GTSAM at its best."""
+
+    candidate: str
+    """Cut and ordering that were fastest on average; empty where nothing was sampled."""
+    optimize: float
+    """Mean of `optimize`, s."""
+    marginal: float
+    """Mean of `marginal`, s."""
+    samples: int
+    """Windows that it was timed on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What one run gave."""
+
+    cycles: tuple[CycleRecord, ...]
+    """Every cycle."""
+    laps: int
+    """Complete laps."""
+    closing: int | None
+    """The cycle that closed the loop; None where it stayed open."""
+    gtsam: Gtsam
+    """What it is held against."""
+
+
+class _Sampler:
+    """Times GTSAM between cycles, and notes the cycle that closes the loop."""
+
+    def __init__(self, mapper: FixedLagMapper, every: int, advance: Callable[[], None]) -> None:
+        self._mapper, self._every, self._advance = mapper, every, advance
+        self._timings: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
+        self.closing: int | None = None
+
+    def __call__(self, record: CycleRecord) -> None:
+        if self._mapper.closed and self.closing is None:
+            self.closing = record.cycle
+        if record.cycle >= WARM_UP and record.cycle % self._every == 0 and self._mapper.boundaries:
+            for name, pair in time_gtsam(linear_window(self._mapper)).items():
+                self._timings[name].append(pair)
+        self._advance()
+
+    def fastest(self) -> Gtsam:
+        """The candidate with the least mean."""
+        if not self._timings:
+            return Gtsam("", float("nan"), float("nan"), 0)
+        best = min(self._timings, key=lambda name: float(np.mean(np.sum(self._timings[name], axis=1))))
+        optimize, marginal = np.mean(self._timings[best], axis=0).tolist()
+        return Gtsam(best, optimize, marginal, len(self._timings[best]))
+
+
+def measure(log: Log, settings: MapperSettings, every: int = SAMPLE_EVERY) -> Measurement:
+    """Map a log online and time GTSAM on the window after every so many cycles."""
+    mapper = FixedLagMapper(settings, log.odometry_sigma)
+    with progress("benchmark", len(log.cycles)) as advance:
+        sampler = _Sampler(mapper, every, advance)
+        result: RunResult = run_online(log, mapper, on_cycle=sampler)
+    return Measurement(result.cycles, result.laps, sampler.closing, sampler.fastest())
+
+
+def metrics(measurement: Measurement) -> tuple[Metric, ...]:
+    """Every figure, those that something is asked of first."""
+    cycles, best = measurement.cycles, measurement.gtsam
+    times = np.array([record.seconds for record in cycles])
+    reference = best.optimize + best.marginal
+    laps = _lap_means(cycles, measurement.laps)
+    slowdown = laps[-1] / laps[REFERENCE_LAP - 1] if len(laps) > REFERENCE_LAP else float("nan")
+    closing = times[measurement.closing] if measurement.closing is not None else float("nan")
+    return (
+        Metric("mean_by_gtsam", _mean(times[WARM_UP:]) / reference, "", bound=MEAN_RATIO),
+        Metric("p99", 1e3 * float(np.quantile(times, 0.99)), "ms", bound=P99_MILLISECONDS),
+        Metric("last_lap_by_lap_2", slowdown, "", bound=LAP_RATIO),
+        Metric("closing", 1e3 * float(closing), "ms", bound=CLOSING_MILLISECONDS),
+        Metric("mean", 1e3 * _mean(times), "ms"),
+        Metric("median", 1e3 * float(np.median(times)), "ms"),
+        Metric("slowest", 1e3 * float(times.max()), "ms"),
+        Metric("gtsam", 1e3 * reference, "ms"),
+        Metric("gtsam_optimize", 1e3 * best.optimize, "ms"),
+        Metric("gtsam_marginal", 1e3 * best.marginal, "ms"),
+        *(Metric(f"mean_lap_{lap}", 1e3 * value, "ms") for lap, value in enumerate(laps, start=1)),
+        *(Metric(f"mean_{stage}", 1e3 * value, "ms") for stage, value in _stage_means(cycles).items()),
+    )
+
+
+def _lap_means(cycles: Sequence[CycleRecord], laps: int) -> list[float]:
+    """Mean cycle (s) of each complete lap."""
+    return [_mean([c.seconds for c in cycles if c.lap == lap]) for lap in range(1, laps + 1)]
+
+
+def _stage_means(cycles: Sequence[CycleRecord]) -> dict[str, float]:
+    """Mean time (s) of each stage of the update."""
+    names = dict.fromkeys(name for record in cycles for name in record.stages)
+    return {name: _mean([record.stages.get(name, 0.0) for record in cycles]) for name in names}
+
+
+def _mean(values: Iterable[float]) -> float:
+    array = np.asarray(list(values))
+    return float(array.mean()) if len(array) else float("nan")
+
+
+# --- command ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Benchmark:
+    """Time the online mapper on a generated track of 200 cones, and GTSAM's linear algebra on its windows."""
+
+    laps: int = 5
+    """Laps driven."""
+    seed: int = 0
+    """Of the track, the drive and its noise."""
+    json: Path | None = None
+    """File to write the figures to."""
+
+    def measure(self) -> Measurement:
+        """The run."""
+        track = generate_track(np.random.default_rng(self.seed))
+        log = simulate(track, SimulationSettings(laps=self.laps), self.seed)
+        return measure(log, MapperSettings())
+
+
+def write_json(file: Path, figures: Iterable[Metric]) -> None:
+    """The figures as a file, a list of objects; NaN becomes null."""
+    rows = [asdict(metric) | {"value": _json_number(metric.value)} for metric in figures]
+    with atomic_file(file) as temporary:
+        temporary.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+
+
+def _json_number(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def rich_table(figures: Iterable[Metric]) -> Table:
+    """For a terminal: each figure beside what is asked of it."""
+    table = Table("figure")
+    for name in ("value", "unit", "asked"):
+        table.add_column(name, justify="right")
+    for metric in figures:
+        style = None if metric.holds else "red"
+        table.add_row(metric.key, f"{metric.value:.3g}", metric.unit, _asked(metric), style=style)
+    return table
+
+
+def _asked(metric: Metric) -> str:
+    if metric.bound is None:
+        return ""
+    return f"{'<=' if metric.direction == 'lower' else '>='} {metric.bound:g}"
+
+
+def main() -> None:
+    """The script."""
+    benchmark = tyro.cli(Benchmark)
+    if benchmark.json is not None:
+        check_file_target(benchmark.json)
+    measurement = benchmark.measure()
+    figures = metrics(measurement)
+    if benchmark.json is not None:
+        write_json(benchmark.json, figures)
+    console = Console()
+    console.print(rich_table(figures))
+    best = measurement.gtsam
+    console.print(f"GTSAM at its best over {best.samples} windows: {best.candidate}")
+
+
+if __name__ == "__main__":
+    main()
