@@ -1,4 +1,4 @@
-"""What readings leave free: control points slide along the curve, and nothing holds them where none was seen."""
+"""What readings leave free: control points slide along the curve, and nothing holds unseen ones."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ Array = NDArray[np.float64]
 def spacing_residuals(control_points: Array, nominal: Array, periodic: bool) -> tuple[Array, Array]:
     """`r_j = |c_{j+1} - c_j| - nominal_j` (m), as GTSAM's RangeFactor2 has it, for all neighbours at once.
 
-    control_points (m, 2), nominal (m - 1,) or (m,) where periodic. Gives r and the unit directions (k, 2), which are
-    dr/dc_{j+1} = -dr/dc_j. Coinciding points have a zero direction.
+    control_points (m, 2), nominal (m - 1,) or (m,) where periodic. Gives r and the unit directions (k, 2),
+    which are dr/dc_{j+1} = -dr/dc_j. Coinciding points have a zero direction.
     """
     following = np.roll(control_points, -1, axis=0) if periodic else control_points[1:]
     offset = following - control_points[: len(following)]
@@ -23,9 +23,9 @@ def spacing_residuals(control_points: Array, nominal: Array, periodic: bool) -> 
 def smoothness_matrix(abscissae: Array, period: float | None) -> Array:
     """Second divided differences of control points over their abscissae, times the mean spacing squared.
 
-    abscissae (m,) (Greville's) -> D (m - 2, m), or (m, m) where `period` closes the curve, so that `D c` (m) are the
-    second differences of evenly spaced points; zero for a straight line, whatever the spacing. Linear: a prior
-    `D c ~ N(0, sigma^2)` is a JacobianFactor.
+    abscissae (m,) (Greville's) -> D (m - 2, m), or (m, m) where `period` closes the curve, so that `D c` (m)
+    are the second differences of evenly spaced points; zero for a straight line, whatever the spacing.
+    Linear: a prior `D c ~ N(0, sigma^2)` is a JacobianFactor.
     """
     m = len(abscissae)
     extended = abscissae if period is None else np.concatenate([abscissae, abscissae[:2] + period])
@@ -42,7 +42,7 @@ def smoothness_matrix(abscissae: Array, period: float | None) -> Array:
 
 
 def greville(knots: Array, degree: int) -> Array:
-    """Greville abscissae `(t_{j+1} + ... + t_{j+p}) / p` (n,): where each control point acts, in parameter units."""
+    """Greville abscissae `(t_{j+1} + ... + t_{j+p}) / p` (n,): the parameter where each point acts."""
     n = len(knots) - degree - 1
     windows = np.lib.stride_tricks.sliding_window_view(knots[1:-1], degree)
     return np.asarray(windows[:n].mean(axis=1))

@@ -1,4 +1,4 @@
-"""Odometry between two perception cycles: body twists integrated on SE(2), with covariance and calibration."""
+"""Odometry between two perception cycles: twists integrated on SE(2), with covariance and calibration."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 MIN_SIGMA = 1e-6
-"""Least standard deviation of an integrated odometry (m, rad): keeps the factor of an empty interval finite."""
+"""Least sigma of an integrated odometry (m, rad): keeps the factor of an empty interval finite."""
 
 CALIBRATION_SIZE = 2
 """Calibration of the odometry: (scale error of the speeds [-], bias of the yaw rate [rad/s])."""
@@ -73,11 +73,12 @@ def integrate_poses(durations: Array, twists: Array) -> Array:
 def integrate_twists(durations: Array, twists: Array, sigma: Array) -> IntegratedOdometry:
     """`prod_k exp(dt_k xi_k)` with first-order covariance and calibration derivative.
 
-    durations (k,) s; twists (k, 3) body (vx m/s, vy m/s, wz rad/s), each held over its duration; sigma (3,) standard
-    deviation of each reading, white from sample to sample. An error `e` of sample k (its frame) reaches the end as
-    `Ad(T_end^-1 T_k) e`, with T_k the middle of its step; samples are independent, so the covariances add. A speed reads `(1 + scale) v` and a yaw
-    rate `w + bias`, so the calibrated end pose is the end pose minus `calibration_jacobian @ (scale, bias)`.
-    No samples, or no time: the identity, with zero covariance.
+    durations (k,) s; twists (k, 3) body (vx m/s, vy m/s, wz rad/s), each held over its duration; sigma (3,)
+    standard deviation of each reading, white from sample to sample. An error `e` of sample k (its frame)
+    reaches the end as `Ad(T_end^-1 T_k) e`, with T_k the middle of its step; samples are independent, so the
+    covariances add. A speed reads `(1 + scale) v` and a yaw rate `w + bias`, so the calibrated end pose is
+    the end pose minus `calibration_jacobian @ (scale, bias)`. No samples, or no time: the identity, with zero
+    covariance.
     """
     if len(durations) == 0:
         return _integrated(np.zeros(3), np.zeros((3, 3)), np.zeros((3, CALIBRATION_SIZE)))
@@ -99,7 +100,7 @@ def _integrated(delta: Array, covariance: Array, calibration_jacobian: Array) ->
 
 
 def _midpoints(poses: Array, durations: Array, twists: Array) -> Array:
-    """Poses (k, 3) in the middle of each step: the right Jacobian of exp is the adjoint there, to second order."""
+    """Poses (k, 3) in the middle of each step: exp's right Jacobian is the adjoint there, to second order."""
     back = se2_exp(-0.5 * twists * durations[:, None])
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = poses[:, 0] + c * back[:, 0] - s * back[:, 1], poses[:, 1] + s * back[:, 0] + c * back[:, 1]
@@ -122,8 +123,8 @@ def _adjoints_to_end(poses: Array, end: Array) -> Array:
 def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> tuple[Array, Array, Array]:
     """`r = Log(delta^-1 start^-1 end)`, the residual of GTSAM's BetweenFactorPose2, for m factors at once.
 
-    poses (m, 3) in the map frame, deltas (m, 3). Gives residuals (m, 3), a tangent in the frame of the end, and the
-    Jacobians (m, 3, 3) by the start's and the end's (x, y, theta) in the map frame.
+    poses (m, 3) in the map frame, deltas (m, 3). Gives residuals (m, 3), a tangent in the frame of the end,
+    and the Jacobians (m, 3, 3) by the start's and the end's (x, y, theta) in the map frame.
     """
     angle = poses_start[:, 2] + deltas[:, 2]
     c, s = np.cos(angle), np.sin(angle)
@@ -147,8 +148,8 @@ def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> t
 
 
 def _inverse_left_terms(phi: Array) -> tuple[Array, Array]:
-    """`a = (phi/2) cot(phi/2)` of the inverse left Jacobian of SE(2), and da/dphi; by series below 1e-3 rad."""
-    small = np.abs(phi) < 1e-3  # noqa: PLR2004 - the series' next terms are below 1e-15 there
+    """`a = (phi/2) cot(phi/2)` of SE(2)'s inverse left Jacobian, and da/dphi; by series below 1e-3 rad."""
+    small = np.abs(phi) < 1e-3  # the series' next terms are below 1e-15 there
     half = np.where(small, 0.5, 0.5 * phi)
     cot = 1.0 / np.tan(half)
     a = np.where(small, 1.0 - phi**2 / 12.0, half * cot)

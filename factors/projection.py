@@ -27,14 +27,14 @@ class ProjectionRows:
 
 
 def to_map(points_vehicle: Array, poses: Array) -> Array:
-    """`p = R z + t`: points (m, 2) in the vehicle frame of each row's own pose (m, 3) -> (m, 2) in the map frame."""
+    """`p = R z + t`: points (m, 2) in the vehicle frame of each row's own pose (m, 3) -> map frame (m, 2)."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = points_vehicle[:, 0], points_vehicle[:, 1]
     return np.column_stack([c * x - s * y + poses[:, 0], s * x + c * y + poses[:, 1]])
 
 
 def sigma_across(normals: Array, covariances: Array, poses: Array, sigma_model: float) -> Array:
-    """`sqrt(n^T R K R^T n + sigma_model^2)` (m,): a reading's standard deviation along the map-frame normals (m, 2)."""
+    """`sqrt(n^T R K R^T n + sigma_model^2)` (m,): a reading's sigma along the map-frame normals (m, 2)."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     nx, ny = c * normals[:, 0] + s * normals[:, 1], -s * normals[:, 0] + c * normals[:, 1]
     variance = (
@@ -46,15 +46,16 @@ def sigma_across(normals: Array, covariances: Array, poses: Array, sigma_model: 
 def project(
     points_map: Array, covariances: Array, poses: Array, foot: FootPoints, sigma_model: float
 ) -> ProjectionRows:
-    """`r = n . (p - S(u))` with `u` the foot point of `p = R z + t` (paper: Update; DESIGN: spline projection).
+    """`r = n . (p - S(u))` with `u` the foot point of `p = R z + t` (paper: Update).
 
-    points_map (m, 2), covariances (m, 2, 2) in the vehicle frame, poses (m, 3) of each row. At an interior foot
-    point `p - S` is along `n` while `S'` and `dn/du` are along the tangent, so every term through `u` vanishes and
+    points_map (m, 2), covariances (m, 2, 2) in the vehicle frame, poses (m, 3) of each row. At an interior
+    foot point `p - S` is along `n` while `S'` and `dn/du` are along the tangent, so every term through `u`
+    vanishes and
 
         dr/dt = n,   dr/dtheta = n . (J R z),   dr/dc_j = -beta_j(u) n      (J: the quarter turn)
 
-    are exact at any distance from the curve. At an end of the curve, or of a stretch, they are not: leave such rows
-    out (`foot.interior`).
+    are exact at any distance from the curve. At an end of the curve, or of a stretch, they are not: leave
+    such rows out (`foot.interior`).
     """
     n = foot.normal_unit
     arm = points_map - poses[:, :2]

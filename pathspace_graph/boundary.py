@@ -8,27 +8,29 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.footpoint import FootPoints, foot_points, refine_foot_points
 from pathspace_graph.factors.gauge import greville, smoothness_matrix
-from .spline import BSpline
+
 from .settings import GaugeSettings, SplineSettings
+from .spline import BSpline
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-FIT_SMOOTHNESS = 0.1
-"""Weight of second differences when new control points are placed through sightings."""
+ROUND_OFF = 1e-9
+"""Parameters (m) this near to a knot are on it."""
 
 
 class Boundary:
     """Knots, and what follows from them; the control points are entries of the mapper's state.
 
-    An open boundary has uniform, floating knots whose interval is the spacing of its control points, so that the
-    parameter is roughly a length in metres, from 0 at the first sighting.
+    An open boundary has uniform, floating knots whose interval is the spacing of its control points, so that
+    the parameter is roughly a length in metres, from 0 at the first sighting.
     """
 
-    def __init__(self, knots: Array, degree: int, periodic: bool, gauge: GaugeSettings) -> None:
-        self.degree = degree
-        self.periodic = periodic
+    def __init__(self, knots: Array, periodic: bool, settings: SplineSettings, gauge: GaugeSettings) -> None:
+        self.settings = settings
         self.gauge = gauge
+        self.degree = settings.degree
+        self.periodic = periodic
         self.confirmed = 0.0
         """Parameter up to which sightings hold the curve; beyond it is extrapolated."""
         self.sighted: list[Array] = []
@@ -41,21 +43,25 @@ class Boundary:
         self.size = n - self.degree if self.periodic else n
         """Distinct control points."""
         self.abscissae = greville(knots, self.degree)[: self.size]
-        period = self.length if self.periodic else None
-        following = (
-            np.append(self.abscissae[1:], self.abscissae[0] + self.length)
-            if self.periodic
-            else self.abscissae[1:]
-        )
+        """(m,) where each control point acts, in parameter units."""
+        following = self.abscissae[1:]
+        if self.periodic:
+            following = np.append(following, self.abscissae[0] + self.length)
         self.nominal = following - self.abscissae[: len(following)]
         """Nominal distance to the next control point, m."""
-        smooth = smoothness_matrix(self.abscissae, period)
+        self._set_gauge()
+
+    def _set_gauge(self) -> None:
+        """`D' D / (sigma_smoothness spacing)^2 + I / sigma_anchor^2`: constant until the knots change."""
+        smooth = smoothness_matrix(self.abscissae, self.length if self.periodic else None)
         spacing = float(np.mean(self.nominal))
-        scaled = smooth / (self.gauge.sigma_smoothness * spacing)
-        hessian = scaled.T @ scaled + np.eye(self.size) / self.gauge.sigma_anchor**2
-        self.smooth_only = np.kron(scaled.T @ scaled, np.eye(2))
-        self.gauge_hessian = np.kron(hessian, np.eye(2))
-        """Constant part of the normal equations of its control points: smoothness and anchor."""
+        scaled: Array = smooth / (self.gauge.sigma_smoothness * spacing)
+        hessian = scaled.T @ scaled
+        self.smooth_only: Array = np.asarray(np.kron(hessian, np.eye(2)), float)
+        """(2m, 2m) smoothness in the normal equations of its control points; zero along a straight line."""
+        anchor = np.eye(self.size) / self.gauge.sigma_anchor**2
+        self.gauge_hessian: Array = np.asarray(np.kron(hessian + anchor, np.eye(2)), float)
+        """(2m, 2m) smoothness and anchor; the anchor holds each point where it is, so it has no gradient."""
 
     @property
     def knots(self) -> Array:
@@ -85,48 +91,61 @@ class Boundary:
 
     def find(self, control_points: Array, points: Array, low: Array, high: Array) -> FootPoints:
         """Foot points of points (m, 2) in their stretches, searched for globally."""
-        return foot_points(self.tables, self.extended(control_points), points, low, high, 1.0, 4)
+        s = self.settings
+        unwrapped = self.extended(control_points)
+        return foot_points(self.tables, unwrapped, points, low, high, s.search_step, s.search_iterations)
 
-    def refine(self, control_points: Array, points: Array, u: Array, room: float) -> FootPoints:
-        """Foot points of points (m, 2) near the parameters they had."""
-        low, high = u - room, u + room
-        if not self.periodic:
-            high = np.minimum(high, self.confirmed + 0.5)
-        return refine_foot_points(self.tables, self.extended(control_points), points, u, low, high, 1)
+    def refine(self, control_points: Array, points: Array, u: Array) -> FootPoints:
+        """Foot points of points (m, 2) near the parameters (m,) they had."""
+        s = self.settings
+        low, high = u - s.refine_room, self.believed(u + s.refine_room)
+        unwrapped = self.extended(control_points)
+        return refine_foot_points(self.tables, unwrapped, points, u, low, high, s.refine_iterations)
+
+    def believed(self, high: Array) -> Array:
+        """Upper limits of stretches, (m,), kept off what an open curve only extrapolates."""
+        return high if self.periodic else np.minimum(high, self.confirmed + self.settings.confirmed_margin)
 
     def evaluate(self, control_points: Array, u: Array, derivative: int = 0) -> Array:
         """S(u) or a derivative, (m, 2)."""
         values, span = self.tables.evaluate(np.asarray(u, float), derivative)
-        return np.einsum("mj,mjd->md", values[derivative], control_points[self.columns(span)])
+        return np.asarray(np.einsum("mj,mjd->md", values[derivative], control_points[self.columns(span)]))
 
-    def grow(self, control_points: Array, targets_u: Array, targets: Array, spacing: float) -> Array:
-        """Append control points until the domain holds all `targets_u`, bent so that the curve meets `targets` (k, 2).
+    def closed(self, knots: Array) -> Boundary:
+        """The boundary on periodic knots, all of it confirmed."""
+        boundary = Boundary(knots, True, self.settings, self.gauge)
+        boundary.confirmed = boundary.tables.high
+        return boundary
 
-        No basis function of the old curve changes; the old control points that act only beyond `confirmed` are
-        placed anew with the new ones. Gives all control points (n', 2).
+    def grow(self, control_points: Array, targets_u: Array, targets: Array) -> Array:
+        """Append control points until the domain holds `targets_u` (k,); bend the end to `targets` (k, 2).
+
+        No basis function of the old curve changes; the old control points that act only beyond `confirmed`
+        are placed anew with the new ones. Gives all control points (n', 2); the last target is `confirmed`
+        now.
         """
-        old = len(control_points)
-        missing = int(np.ceil((targets_u.max() - self.tables.high) / spacing - 1e-9))
+        old, spacing = len(control_points), self.settings.spacing
+        missing = int(np.ceil((targets_u[-1] - self.tables.high) / spacing - ROUND_OFF))
         if missing > 0:
             last = self.knots[-1] + spacing * np.arange(1, missing + 1)
             self._set_knots(np.concatenate([self.knots, last]))
-        kept = max(int(np.searchsorted(self.knots[:old], self.confirmed - 1e-9)) - 1, 0) if old else 0
-        kept = min(kept, old)
-        return self._place(control_points, kept, targets_u, targets)
+        before = int(np.searchsorted(self.knots[:old], self.confirmed - ROUND_OFF)) - 1
+        placed = self._place(control_points, max(before, 0), targets_u, targets)
+        self.confirmed = float(targets_u[-1])
+        return placed
 
     def _place(self, control_points: Array, kept: int, targets_u: Array, targets: Array) -> Array:
         """Least squares of the control points from index `kept` on, through targets and the kept stretch."""
-        held_u = (
-            np.linspace(max(self.confirmed - self.nominal[0], 0.0), self.confirmed, 4)
-            if len(control_points)
-            else np.zeros(0)
-        )
+        held_u = np.zeros(0)
+        if len(control_points):
+            start = max(self.confirmed - self.nominal[0], 0.0)
+            held_u = np.linspace(start, self.confirmed, self.settings.fit_held)
         held = self._held(control_points, held_u)
         u = np.concatenate([held_u, targets_u])
         values, span = self.tables.evaluate(u)
         design = np.zeros((len(u), self.size))
-        np.put_along_axis(design, span[:, None] - self.degree + np.arange(self.degree + 1), values[0], axis=1)
-        smooth = FIT_SMOOTHNESS * smoothness_matrix(self.abscissae, None)
+        np.put_along_axis(design, self.columns(span), values[0], axis=1)
+        smooth = self.settings.fit_smoothness * smoothness_matrix(self.abscissae, None)
         matrix = np.concatenate([design, smooth])
         right = np.concatenate([held, targets, np.zeros((len(smooth), 2))])
         right = right - matrix[:, :kept] @ control_points[:kept]
@@ -134,15 +153,16 @@ class Boundary:
         return np.concatenate([control_points[:kept], free])
 
     def _held(self, control_points: Array, u: Array) -> Array:
+        """(k, 2) the old curve at u (k,), by the old control points (n, 2) alone."""
         if len(u) == 0:
             return np.zeros((0, 2))
         values, span = self.tables.evaluate(u)
         columns = np.minimum(self.columns(span), len(control_points) - 1)
-        return np.einsum("mj,mjd->md", values[0], control_points[columns])
+        return np.asarray(np.einsum("mj,mjd->md", values[0], control_points[columns]))
 
 
 def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
     """An open boundary of one span, from parameter 0 to the spacing."""
     p = settings.degree
     knots = settings.spacing * np.arange(-p, p + 2, dtype=float)
-    return Boundary(knots, p, False, gauge)
+    return Boundary(knots, False, settings, gauge)

@@ -1,306 +1,214 @@
-"""Closing the loop: the newest readings meet the beginning of the curves, and each curve becomes periodic.
+"""Closing the loop: the newest readings meet the beginning of the curves.
 
-Steps of one closing cycle: find the rigid motion of the newest poses that lays their readings on the beginning (`register`);
-tie those readings to the oldest control points and solve; join each curve and simplify it, a linear change of variables
-`C_old = E C_new` in the prior (paper: Simplification).
+`near_start` says where to look; `register` finds the rigid motion of the newest poses that lays their
+readings on the beginning; `tie` holds those readings against the oldest control points; `bend` solves the
+whole loop. What then makes each curve periodic is `simplification`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.projection import to_map
 
-from .boundary import Boundary
-from .knots import BreakSettings, curvature_weighted_breaks, refit
-from .segments import relinearized_prior
-from .spline import BSpline
-
+from .path import DrivenPath
+from .segments import History, Segment, relinearized_prior
+from .settings import ClosingSettings
+from .smoother import Smoother
+from .state import State
 from .window import POSE, Prior, schur_leave
-
-if TYPE_CHECKING:
-    from .fixed_lag import FixedLagMapper
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
-@dataclass(frozen=True)
-class Registration:
-    """Where the newest readings lie on the beginning of the curves."""
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A rigid motion of the newest poses and their readings."""
 
-    rotation: float
-    """Rotation (rad) of the window about `centre`."""
-    shift: Array
-    """(2,) translation after it, m."""
     centre: Array
-    """(2,) the newest position, m, map frame."""
-    matches: dict[int, tuple[IntArray, Array]]
-    """Per boundary: rows of the readings that agree, and their parameters on the beginning."""
+    """(2,) what it turns about: the newest position, m, map frame."""
+    vector: Array
+    """(3,) translation (m, m) after the rotation (rad)."""
 
     def apply(self, points: Array) -> Array:
         """Moved points (m, 2)."""
-        return _moved(points, self.centre, self.rotation, self.shift)
+        c, s = np.cos(self.vector[2]), np.sin(self.vector[2])
+        turned = (points - self.centre) @ np.array([[c, s], [-s, c]])
+        return np.asarray(turned + self.centre + self.vector[:2])
 
 
-def _moved(points: Array, centre: Array, rotation: float, shift: Array) -> Array:
-    c, s = np.cos(rotation), np.sin(rotation)
-    return (points - centre) @ np.array([[c, s], [-s, c]]) + centre + shift
-
-
-def near_start(mapper: FixedLagMapper) -> bool:
-    """Whether the vehicle may be on the beginning again: driven far enough, and near it in place and direction."""
-    c = mapper.settings.closing
-    if mapper.path.length < max(c.min_path, 1.5 * c.overlap) or not mapper.boundaries:
-        return False
-    pose = mapper.poses[-1]
-    beginning = mapper.path.beginning
-    drift = c.radius + c.drift * mapper.path.length
-    away = np.hypot(*(beginning[:, :2] - pose[:2]).T)
-    same_way = np.cos(beginning[:, 2] - pose[2]) > np.cos(c.heading)
-    return bool((same_way & (away < drift)).any())
-
-
-def close_loop(mapper: FixedLagMapper) -> bool:
-    """Close the loop where the newest readings agree with the beginning; True where it closed."""
-    if not near_start(mapper) or mapper.path.length - mapper.closing_checked < 1.0:
-        return False
-    mapper.closing_checked = mapper.path.length
-    registration = register(mapper)
-    if registration is None:
-        return False
-    _tie(mapper, registration)
-    _bend(mapper)
-    joins = {label: _join(mapper, label) for label in mapper.boundaries}
-    _substitute(mapper, joins)
-    for _ in range(mapper.settings.closing.iterations):
-        mapper.step(damped=False)
-    return True
-
-
-def register(mapper: FixedLagMapper) -> Registration | None:
-    """Iterated closest points on the curves' beginnings, for a rigid motion of the newest readings.
-
-    The vehicle's own uncertainty is the prior: along a straight or an arc the readings leave the motion free.
-    """
-    c, r = mapper.settings.closing, mapper.readings
-    recent = np.flatnonzero(np.asarray(mapper.times)[r.slot] > mapper.times[-1] - c.window)
-    recent = recent[np.isin(r.label[recent], list(mapper.boundaries))]
-    points = to_map(r.point[recent], mapper.poses[r.slot[recent]])
-    centre, motion = mapper.poses[-1, :2].copy(), np.zeros(3)
-    prior = np.linalg.inv(mapper.pose_covariance() * c.prior_scale**2)
-    matched = _Matches(np.zeros(0, np.intp), np.zeros(0), np.zeros(0, bool), prior, np.zeros(3))
-    for iteration in range(c.icp_iterations):
-        reach = max(c.inlier_distance, c.icp_reach * 0.7**iteration)
-        matched = _match(mapper, recent, points, centre, motion, reach)
-        descent = matched.descent - prior @ motion
-        motion = motion + np.linalg.solve(matched.hessian + prior, descent)
-    posterior = np.linalg.inv(matched.hessian + prior)
-    sigma = float(np.sqrt(np.linalg.eigvalsh(posterior[:2, :2])[-1]))
-    agree = matched.near
-    labels = r.label[matched.rows]
-    spans = [np.ptp(matched.u[agree & (labels == b)]) if (agree & (labels == b)).sum() > 4 else 0.0 for b in mapper.boundaries]
-    mapper.debug.append(f"closing at {mapper.path.length:.1f}: {agree.sum()}/{len(agree)} spans {np.round(spans,1)} motion {motion.round(2)} sigma {sigma:.2f} prior {np.sqrt(np.diag(np.linalg.inv(prior))).round(2)}")
-    enough = len(agree) >= c.min_readings and agree.sum() >= c.inlier_share * len(agree)
-    if not enough or min(spans) < c.overlap:
-        return None
-    driven_again = float(np.median(matched.u[agree]))
-    if sigma > c.sigma_max and driven_again < c.patience:
-        return None
-    matches = {b: (matched.rows[agree & (labels == b)], matched.u[agree & (labels == b)]) for b in mapper.boundaries}
-    return Registration(float(motion[2]), motion[:2], centre, matches)
-
-
-@dataclass(frozen=True)
-class _Matches:
-    """Readings against the beginning, at one motion."""
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Readings whose foot point is inside the beginning of their boundary, at one motion."""
 
     rows: IntArray
-    """Readings whose foot point is inside the beginning."""
+    """(m,) readings."""
+    labels: IntArray
+    """(m,) their boundaries."""
     u: Array
-    """Their parameters."""
+    """(m,) their parameters on it."""
     near: NDArray[np.bool_]
-    """Whether they lie on it."""
+    """(m,) whether they lie on it."""
     hessian: Array
-    """(3, 3) of the motion (x, y, rotation), from the readings within reach."""
+    """(3, 3) of the motion, from the readings within reach."""
     descent: Array
     """(3,) negative gradient."""
 
+    def agreeing(self, label: int) -> tuple[IntArray, Array]:
+        """Readings that lie on the beginning of one boundary, and their parameters."""
+        chosen = self.near & (self.labels == label)
+        return self.rows[chosen], self.u[chosen]
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Where the newest readings lie on the beginning of the curves."""
+
+    motion: Motion
+    """Takes the window there."""
+    matches: dict[int, tuple[IntArray, Array]]
+    """Per boundary: rows of the readings that agree, and their parameters on the beginning."""
+
+
+def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool:
+    """Whether a pose (3,) may be on the beginning again: driven far enough, near it, and along it."""
+    if path.length < settings.min_path:
+        return False
+    drift = settings.radius + settings.drift * path.length
+    away = np.hypot(*(path.beginning[:, :2] - pose[:2]).T)
+    same_way = np.cos(path.beginning[:, 2] - pose[2]) > np.cos(settings.heading)
+    return bool((same_way & (away < drift)).any())
+
+
+def register(smoother: Smoother, settings: ClosingSettings) -> Registration | None:
+    """The motion that lays the newest readings on the beginning; None where they don't agree with it.
+
+    Iterated closest points on the curves, `min sum (n . (M p - S(u)))^2 / sigma^2 + m' P^-1 m`. The vehicle's
+    own uncertainty P is the prior: along a straight or an arc the readings leave the motion free.
+    """
+    recent, points = _recent(smoother, settings.window)
+    prior = np.linalg.inv(smoother.pose_covariance() * settings.prior_scale**2)
+    centre, vector = smoother.state.poses[-1, :2].copy(), np.zeros(3)
+    for reach in _reaches(settings):
+        matches = _match(smoother, settings, recent, points, Motion(centre, vector), reach)
+        descent = matches.descent - prior @ vector
+        vector = vector + np.linalg.solve(matches.hessian + prior, descent)
+    posterior = np.linalg.inv(matches.hessian + prior)
+    labels = smoother.state.boundaries
+    if not (_agree(matches, list(labels), settings) and _certain(matches, posterior, settings)):
+        return None
+    return Registration(Motion(centre, vector), {label: matches.agreeing(label) for label in labels})
+
+
+def _recent(smoother: Smoother, seconds: float) -> tuple[IntArray, Array]:
+    """Coloured readings of the newest poses, and where they are in the map (m, 2)."""
+    readings = smoother.readings
+    times = np.asarray(smoother.times)
+    rows = np.flatnonzero(times[readings.slot] > times[-1] - seconds)
+    rows = rows[np.isin(readings.label[rows], list(smoother.state.boundaries))]
+    return rows, to_map(readings.point[rows], smoother.state.poses[readings.slot[rows]])
+
+
+def _reaches(settings: ClosingSettings) -> Iterator[float]:
+    """How far off a reading may be to pull, in each iteration: less and less."""
+    for iteration in range(settings.icp_iterations):
+        yield max(settings.inlier_distance, settings.icp_reach * settings.icp_shrink**iteration)
+
 
 def _match(
-    mapper: FixedLagMapper, recent: IntArray, points: Array, centre: Array, motion: Array, reach: float
-) -> _Matches:
-    c = mapper.settings.closing
-    labels = mapper.readings.label[recent]
-    moved = _moved(points, centre, motion[2], motion[:2])
-    rows, u, near = [], [], []
+    smoother: Smoother,
+    settings: ClosingSettings,
+    recent: IntArray,
+    points: Array,
+    motion: Motion,
+    reach: float,
+) -> Matches:
+    """Readings against the beginning; those within reach (m) pull."""
+    state = smoother.state
+    labels, moved = smoother.readings.label[recent], motion.apply(points)
     hessian, descent = np.zeros((3, 3)), np.zeros(3)
-    for b, boundary in mapper.boundaries.items():
-        of = np.flatnonzero(labels == b)
-        if len(of) == 0:
-            continue
-        high = np.full(len(of), min(c.beginning, 0.6 * boundary.confirmed))
-        foot = boundary.find(mapper.control_points(b), moved[of], np.zeros(len(of)), high)
-        good = foot.interior & (np.abs(foot.distance) < reach)
-        n, arm = foot.normal_unit[good], moved[of[good]] - centre - motion[:2]
-        jacobian = np.column_stack([n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]]) / c.sigma_reading
-        hessian += jacobian.T @ jacobian
-        descent -= jacobian.T @ foot.distance[good] / c.sigma_reading
-        inside = foot.interior
-        rows.append(recent[of[inside]])
-        u.append(foot.u[inside])
-        near.append(np.abs(foot.distance[inside]) < c.inlier_distance)
-    return _Matches(np.concatenate(rows), np.concatenate(u), np.concatenate(near), hessian, descent)
+    rows, u, near = [recent[:0]], [np.zeros(0)], [np.zeros(0, bool)]
+    for label, boundary in state.boundaries.items():
+        of = np.flatnonzero(labels == label)
+        low = np.zeros(len(of))
+        high = low + min(settings.beginning, settings.beginning_share * boundary.confirmed)
+        foot = boundary.find(state.control_points(label), moved[of], low, high)
+        pulls = foot.interior & (np.abs(foot.distance) < reach)
+        n, arm = foot.normal_unit[pulls], moved[of[pulls]] - motion.centre - motion.vector[:2]
+        by_motion = np.column_stack([n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]]) / settings.sigma_reading
+        hessian += by_motion.T @ by_motion
+        descent -= by_motion.T @ foot.distance[pulls] / settings.sigma_reading
+        rows.append(recent[of[foot.interior]])
+        u.append(foot.u[foot.interior])
+        near.append(np.abs(foot.distance[foot.interior]) < settings.inlier_distance)
+    matched = np.concatenate(rows)
+    of_rows = smoother.readings.label[matched]
+    return Matches(matched, of_rows, np.concatenate(u), np.concatenate(near), hessian, descent)
 
 
-def _tie(mapper: FixedLagMapper, registration: Registration) -> None:
+def _agree(matches: Matches, labels: list[int], settings: ClosingSettings) -> bool:
+    """Enough readings, nearly all of them on the beginning, along enough of it on every boundary."""
+    count, agreeing = len(matches.rows), int(matches.near.sum())
+    if count < settings.min_readings or agreeing < settings.inlier_share * count:
+        return False
+    on_each = [matches.agreeing(label)[1] for label in labels]
+    return all(len(u) >= settings.min_boundary_readings and np.ptp(u) >= settings.overlap for u in on_each)
+
+
+def _certain(matches: Matches, posterior: Array, settings: ClosingSettings) -> bool:
+    """The motion is certain in every direction, or so much is driven again that no more will be known."""
+    sigma = float(np.sqrt(np.linalg.eigvalsh(posterior[:2, :2])[-1]))
+    driven_again = float(np.median(matches.u[matches.near]))
+    return sigma <= settings.sigma_max or driven_again >= settings.patience
+
+
+def tie(smoother: Smoother, registration: Registration) -> None:
     """Move the window onto the beginning, and hold the agreeing readings against it."""
-    poses = mapper.poses
-    poses[:, :2] = registration.apply(poses[:, :2])
-    poses[:, 2] += registration.rotation
-    r = mapper.readings
+    poses, readings = smoother.state.poses, smoother.readings
+    poses[:, :2] = registration.motion.apply(poses[:, :2])
+    poses[:, 2] += registration.motion.vector[2]
     for label, (rows, u) in registration.matches.items():
-        r.used[rows] = True
-        r.boundary[rows] = label
-        r.u[rows] = u
+        readings.used[rows] = True
+        readings.boundary[rows] = label
+        readings.u[rows] = u
 
 
-def _bend(mapper: FixedLagMapper) -> None:
-    """Solve the whole loop, each stretch of the drive relinearized in its own frame; then forget the keyframes."""
-    history = mapper.history
-    assert history is not None
-    segments = history.all_segments(*mapper.control_ids())
-    low = mapper.pose_column(0)
-    count = len(segments)
-    if count:
-        mapper.state = np.insert(mapper.state, low, np.concatenate(history.keyframes))
-        mapper.keyframes = count
-    offsets = {label: mapper.offset(label) for label in mapper.boundaries}
-    for _ in range(mapper.settings.closing.iterations):
-        if count:
-            mapper.prior = relinearized_prior(history, segments, mapper.state, offsets, mapper.map_size)
-        mapper.step(damped=False)
-    if count:
-        prior = relinearized_prior(history, segments, mapper.state, offsets, mapper.map_size)
-        keyframes = slice(low, low + POSE * count)
-        information, gradient = schur_leave(
-            prior.information, prior.gradient, keyframes.start, keyframes.stop
-        )
-        mapper.prior = Prior(information, gradient, np.delete(prior.point, keyframes))
-        mapper.state = np.delete(mapper.state, keyframes)
-        mapper.keyframes = 0
-    mapper.history = None
+def bend(smoother: Smoother) -> None:
+    """Solve the whole loop, each stretch of the drive relinearized in its own frame.
+
+    The keyframes are in the state while it is solved, and leave by a Schur complement. Without a history (a
+    user's factors are absolute) the running prior stays linearized where it is.
+    """
+    settings, state, history = smoother.settings.closing, smoother.state, smoother.history
+    segments = history.all_segments(*state.control_ids()) if history is not None else []
+    if history is None or not segments:
+        for _ in range(settings.iterations):
+            smoother.step(settings.sigma_step)
+        return
+    state.insert(state.pose_column(0), np.concatenate(history.keyframes))
+    state.keyframes = len(segments)
+    for _ in range(settings.iterations):
+        smoother.prior = _relinearized(history, segments, state)
+        smoother.step(settings.sigma_step)
+    smoother.prior = _without_keyframes(_relinearized(history, segments, state), state)
+    smoother.history = None
 
 
-@dataclass(frozen=True)
-class Join:
-    """How an open curve becomes periodic."""
-
-    period: float
-    """Length of the closed curve in the open one's parameter, m."""
-    knots: Array
-    """Periodic knots."""
-    points: Array
-    """Control points (m, 2) of the closed curve."""
-    old_from_new: Array
-    """E (n, m)."""
-    overlap_u: Array
-    """Parameters (k,) of the open curve that lie on the beginning, and ..."""
-    overlap_w: Array
-    """... theirs (k,) on the beginning."""
-
-    def new_parameter(self, u: Array) -> Array:
-        """Parameter on the closed curve (not wrapped) of the open curve's."""
-        return np.where(u < self.overlap_u[0], u, self.period + np.interp(u, self.overlap_u, self.overlap_w))
+def _relinearized(history: History, segments: list[Segment], state: State) -> Prior:
+    offsets = {label: state.offset(label) for label in state.boundaries}
+    return relinearized_prior(history, segments, state.vector, offsets, state.map_size)
 
 
-def _join(mapper: FixedLagMapper, label: int) -> Join:
-    boundary = mapper.boundaries[label]
-    cps = mapper.control_points(label)
-    spline = boundary.spline(cps)
-    period, overlap_u, overlap_w = _overlap(mapper, boundary, cps)
-    s = mapper.settings.spline
-    sighted = np.array(boundary.sighted).reshape(-1, 2)
-    low = np.zeros(len(sighted))
-    u = boundary.find(cps, sighted, low, low + boundary.confirmed).u
-    size = max(s.min_size, int(s.size_share * int((u < period - 0.5).sum())))
-    breaks = curvature_weighted_breaks(spline, size, BreakSettings(s.linear_baseline), 0.0, period)
-    frame = BSpline.periodic_from(breaks, np.zeros((size, 2)), boundary.degree)
-    join = Join(period, frame.knots, np.zeros((size, 2)), np.zeros((0, 0)), overlap_u, overlap_w)
-    change = refit(spline, frame, join.new_parameter)
-    return Join(period, frame.knots, change.new_from_old @ cps, change.old_from_new, overlap_u, overlap_w)
-
-
-def _overlap(mapper: FixedLagMapper, boundary: Boundary, cps: Array) -> tuple[float, Array, Array]:
-    """Period, and the parameters of the end with theirs on the beginning (relative to 0)."""
-    c = mapper.settings.closing
-    late = max(boundary.confirmed - c.beginning - 10.0, 0.5 * boundary.confirmed)
-    start = boundary.evaluate(cps, np.zeros(1))
-    foot = boundary.find(cps, start, np.array([late]), np.array([boundary.confirmed]))
-    if not foot.interior[0]:
-        end = boundary.evaluate(cps, np.array([boundary.confirmed]))
-        period = boundary.confirmed + float(np.hypot(*(start - end)[0]))
-        high = boundary.tables.high
-        return period, np.array([period, period + 1.0]), np.array([0.0, 1.0])
-    u0 = float(foot.u[0])
-    u = np.linspace(u0, boundary.confirmed, max(int(boundary.confirmed - u0), 1) + 1)
-    points = boundary.evaluate(cps, u)
-    guess = u - u0
-    low, high = np.maximum(guess - 4.0, 0.0), guess + 4.0
-    w = boundary.find(cps, points, low, high).u
-    w = np.maximum.accumulate(w)
-    w[0] = 0.0
-    step = boundary.nominal[0]
-    u, w = np.append(u, u[-1] + 2 * step), np.append(w, w[-1] + 2 * step)
-    return u0, u, w
-
-
-def _substitute(mapper: FixedLagMapper, joins: dict[int, Join]) -> None:
-    """`x_old = M x_new` in the prior: the closed curves' control points replace the open ones."""
-    q, n_old = len(mapper.prior.point), mapper.map_size
-    sizes = [2 * len(j.points) for j in joins.values()]
-    n_new = sum(sizes)
-    change = np.zeros((q, n_new + q - n_old))
-    change[n_old:, n_new:] = np.eye(q - n_old)
-    at = 0
-    for (label, join), size in zip(joins.items(), sizes, strict=True):
-        rows = slice(mapper.offset(label), mapper.offset(label) + 2 * mapper.boundaries[label].size)
-        change[rows, at : at + size] = np.kron(join.old_from_new, np.eye(2))
-        at += size
-    points = np.concatenate([j.points.ravel() for j in joins.values()])
-    point = np.concatenate([points, mapper.state[n_old:q]])
-    information, gradient = _loosened(mapper, n_old)
-    gradient = gradient - information @ (change @ point - mapper.prior.point)
-    mapper.prior.information = change.T @ information @ change
-    mapper.prior.gradient = change.T @ gradient
-    mapper.prior.point = point
-    mapper.state = np.concatenate([points, mapper.state[n_old:]])
-    for label, join in joins.items():
-        _replace(mapper, label, join)
-
-
-def _loosened(mapper: FixedLagMapper, n_old: int) -> tuple[Array, Array]:
-    """The prior where the old control points may be off `E C_new` by sigma_simplify: `(I + L S)^-1 (L, g)`."""
-    prior = mapper.prior
-    variance = np.zeros(len(prior.point))
-    variance[:n_old] = mapper.settings.spline.sigma_simplify**2
-    inner = np.eye(len(variance)) + prior.information * variance
-    solved = np.linalg.solve(inner, np.column_stack([prior.information, prior.gradient]))
-    information = solved[:, :-1]
-    return 0.5 * (information + information.T), solved[:, -1]
-
-
-def _replace(mapper: FixedLagMapper, label: int, join: Join) -> None:
-    """The closed boundary takes the open one's place, for its readings and stations too."""
-    old = mapper.boundaries[label]
-    new = Boundary(join.knots, old.degree, True, old.gauge)
-    mapper.boundaries[label] = new
-    new.confirmed = new.tables.high
-    rows = mapper.readings.used_on(label)
-    mapper.readings.u[rows] = join.new_parameter(mapper.readings.u[rows])
-    mapper.stations[label] = join.new_parameter(mapper.stations[label])
-    mapper.sightings[label].clear()
+def _without_keyframes(prior: Prior, state: State) -> Prior:
+    """The keyframes leave the state and its prior."""
+    stop = state.pose_column(0)
+    start = stop - POSE * state.keyframes
+    information, gradient = schur_leave(prior.information, prior.gradient, start, stop)
+    state.vector = np.delete(state.vector, np.s_[start:stop])
+    state.keyframes = 0
+    return Prior(information, gradient, np.delete(prior.point, np.s_[start:stop]))

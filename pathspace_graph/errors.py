@@ -10,7 +10,7 @@ class PathspaceError(Exception):
 
 
 class InputError(PathspaceError):
-    """A file a user gave is missing or wrong: names the file, the row (1 is the first line), what was expected."""
+    """A user's file is missing or wrong: names the file, the row (1 is the first line), what was expected."""
 
     def __init__(self, file: Path | str, message: str, row: int | None = None) -> None:
         self.file = Path(file)

@@ -18,5 +18,5 @@ _CODES: Final = {"left": LEFT, "blue": LEFT, "right": RIGHT, "yellow": RIGHT}
 
 
 def label_from_name(name: str) -> int:
-    """`left`/`blue` -> LEFT, `right`/`yellow` -> RIGHT, any other word -> UNKNOWN (FORMATS: detections.csv)."""
+    """`left`/`blue` -> LEFT, `right`/`yellow` -> RIGHT, any other word -> UNKNOWN (FORMATS: a log)."""
     return _CODES.get(name.strip().lower(), UNKNOWN)

@@ -1,73 +1,109 @@
-"""The way driven, and the way ahead as the current turn predicts it: what comes next is what comes next along it."""
+"""The way driven, and the way ahead as the current turn predicts it: growth goes along it."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .settings import PathSettings
+
 Array = NDArray[np.float64]
 
 
-class DrivenPath:
-    """Positions driven, at least `step` apart, with their station (path length, m)."""
+@dataclass(frozen=True, eq=False)
+class Way:
+    """The path driven and an arc ahead of the vehicle, as one polyline."""
 
-    def __init__(self, step: float = 0.3, memory: float = 60.0) -> None:
-        self.step = step
-        """Least distance of two kept positions (m)."""
-        self.memory = memory
-        """Stretch behind the vehicle (m) that is kept."""
+    points: Array
+    """(n, 2) positions, map frame, m."""
+    stations: Array
+    """(n,) path length to each, m."""
+    driven: float
+    """Station of the vehicle, m."""
+
+    def locate(self, points: Array) -> tuple[Array, Array]:
+        """Stations (m,) and signed distances (m,), left positive, of points (m, 2)."""
+        return along_and_across(points, self.points, self.stations)
+
+    def beside(self, station: float, lateral: float) -> Array:
+        """(2,) the point at about a station, so far to the left of the way."""
+        i = int(np.clip(np.searchsorted(self.stations, station), 1, len(self.stations) - 1))
+        direction = self.points[i] - self.points[i - 1]
+        direction /= max(np.hypot(*direction), np.finfo(float).tiny)
+        return np.asarray(self.points[i] + lateral * np.array([-direction[1], direction[0]]))
+
+
+class DrivenPath:
+    """Positions driven, a least step apart, with their stations (path length, m); and the present turn."""
+
+    def __init__(self, settings: PathSettings | None = None) -> None:
+        self.settings = settings or PathSettings()
         self.points: Array = np.zeros((0, 2))
+        """(n, 2) positions kept, map frame, m."""
         self.stations: Array = np.zeros(0)
+        """(n,) theirs, m."""
         self.beginning: Array = np.zeros((0, 3))
-        """Poses about a metre apart on the first stretch, as long as the memory."""
+        """Poses on the first stretch, as long as the memory."""
         self.length = 0.0
-        """Path driven so far (m), the station of the last position."""
+        """Path driven so far, the station of the last position, m."""
+        self.curvature = 0.0
+        """Smoothed curvature of the path now, left positive, 1/m."""
 
     def update(self, pose: Array) -> None:
         """Drive on to `pose` (3,), map frame."""
+        self._keep_beginning(pose)
         position = pose[:2]
-        if self.length <= self.memory and (len(self.beginning) == 0 or np.hypot(*(position - self.beginning[-1, :2])) >= 1.0):
-            self.beginning = np.concatenate([self.beginning, pose[None]])
         if len(self.points) == 0:
             self.points, self.stations = position[None].copy(), np.zeros(1)
             return
         distance = float(np.hypot(*(position - self.points[-1])))
         self.length = float(self.stations[-1]) + distance
-        if distance >= self.step:
+        if distance >= self.settings.step:
             self.points = np.concatenate([self.points, position[None]])
             self.stations = np.append(self.stations, self.length)
-            keep = self.stations >= self.length - self.memory
+            keep = self.stations >= self.length - self.settings.memory
             self.points, self.stations = self.points[keep], self.stations[keep]
 
-    def move(self, shift: Array) -> None:
-        """Shift all positions by (2,), after the estimate jumped."""
-        self.points = self.points + shift
+    def _keep_beginning(self, pose: Array) -> None:
+        if self.length > self.settings.memory:
+            return
+        first = len(self.beginning) == 0
+        if first or np.hypot(*(pose[:2] - self.beginning[-1, :2])) >= self.settings.beginning_step:
+            self.beginning = np.concatenate([self.beginning, pose[None]])
 
-    def with_prediction(self, pose: Array, curvature: float, reach: float) -> tuple[Array, Array]:
-        """Positions (n, 2) and stations (n,) of the path driven and of an arc of `reach` metres ahead of `pose`."""
-        s = np.arange(0.0, reach + self.step, self.step)
-        angle = 0.5 * curvature * s
+    def steer(self, twists: Array) -> None:
+        """Follow the curvature `w / v` of body twists (k, 3), where they are fast enough to tell."""
+        if len(twists) == 0:
+            return
+        speed, _, rate = twists.mean(axis=0)
+        if speed > self.settings.min_speed:
+            limit = self.settings.max_curvature
+            now = float(np.clip(rate / speed, -limit, limit))
+            self.curvature += self.settings.curvature_gain * (now - self.curvature)
+
+    def ahead(self, pose: Array, reach: float) -> Way:
+        """The path driven, and an arc of the current curvature for `reach` metres ahead of `pose` (3,)."""
+        step = self.settings.step
+        s = np.arange(0.0, reach + step, step)
+        angle = 0.5 * self.curvature * s
         chord = s * np.sinc(angle / np.pi)
-        ahead = pose[:2] + chord[:, None] * np.column_stack(
-            [np.cos(pose[2] + angle), np.sin(pose[2] + angle)]
-        )
-        behind = self.stations < self.length - 0.5 * self.step
-        return (
-            np.concatenate([self.points[behind], ahead]),
-            np.concatenate([self.stations[behind], self.length + s]),
-        )
+        direction = np.column_stack([np.cos(pose[2] + angle), np.sin(pose[2] + angle)])
+        behind = self.stations < self.length - 0.5 * step
+        points = np.concatenate([self.points[behind], pose[:2] + chord[:, None] * direction])
+        return Way(points, np.concatenate([self.stations[behind], self.length + s]), self.length)
 
 
 def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array, Array]:
-    """Station (m,) and signed distance (m,), left positive, of points (m, 2) from the polyline `path` (n, 2), n >= 2.
+    """Station (m,) and signed distance (m,), left positive, of points (m, 2) from a polyline (n, 2), n >= 2.
 
     Past the last position the station runs on along the last segment.
     """
     start, segment = path[:-1], np.diff(path, axis=0)
     length2 = np.maximum((segment**2).sum(axis=1), np.finfo(float).tiny)
     offset = points[:, None, :] - start[None]
-    share = (offset * segment).sum(axis=2) / length2
-    share = np.clip(share, 0.0, 1.0)
+    share = np.clip((offset * segment).sum(axis=2) / length2, 0.0, 1.0)
     to = offset - share[:, :, None] * segment
     distance2 = (to**2).sum(axis=2)
     best = distance2.argmin(axis=1)
@@ -76,7 +112,6 @@ def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array
     overshoot = np.where(best == len(segment) - 1, (d * e).sum(axis=1) / length2[best] - 1.0, 0.0)
     at = np.where(overshoot > 0.0, 1.0 + overshoot, share[rows, best])
     side = e[:, 0] * d[:, 1] - e[:, 1] * d[:, 0]
-    lateral = np.where(
-        overshoot > 0.0, side / np.sqrt(length2[best]), np.sign(side) * np.sqrt(distance2[rows, best])
-    )
+    across = np.sign(side) * np.sqrt(distance2[rows, best])
+    lateral = np.where(overshoot > 0.0, side / np.sqrt(length2[best]), across)
     return stations[best] + at * (stations[best + 1] - stations[best]), lateral

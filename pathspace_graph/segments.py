@@ -1,9 +1,9 @@
-"""What left the window, stretch by stretch and each in its own frame, so that closing the loop can relinearize it.
+"""What left the window, stretch by stretch, each in its own frame, so that closing can relinearize it.
 
-Everything that a stretch of the drive measured is relative: readings tie poses to control points, odometry ties poses to
-poses. Its marginal is therefore a function of coordinates in the frame of the stretch's first pose, its *keyframe*, and
-stays valid when the loop turns the whole stretch. A single dense prior can't do that: it is linearized at the heading
-that the vehicle had drifted to.
+Everything that a stretch of the drive measured is relative: readings tie poses to control points, odometry
+ties poses to poses. Its marginal is therefore a function of coordinates in the frame of the stretch's first
+pose, its *keyframe*, and stays valid when the loop turns the whole stretch. A single dense prior can't do
+that: it is linearized at the heading that the vehicle had drifted to.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ IntArray = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Segment:
-    """`1/2 e' L e - g' e` with `e = y(x) - y0`: control points, calibration and end pose seen from a keyframe."""
+    """`1/2 e' L e - g' e`, `e = y(x) - y0`: control points, calibration and end pose seen from a keyframe."""
 
     labels: IntArray
     """(k,) boundary of each control point it touches."""
@@ -38,9 +38,10 @@ class Segment:
 def compress(
     prior: Prior, keyframe: Array, labels: IntArray, indices: IntArray, touched: NDArray[np.bool_]
 ) -> Segment:
-    """A segment from a prior on [control points | calibration | pose], given that `keyframe` (3,) is where it is.
+    """A segment from a prior on [control points | calibration | pose], given its keyframe's pose (3,).
 
-    labels, indices (n,) name the prior's control points, `touched` (n,) says which of them it knows anything of.
+    labels, indices (n,) name the prior's control points, `touched` (n,) says which of them it knows anything
+    of.
     """
     n = len(labels)
     columns = np.concatenate([np.flatnonzero(np.repeat(touched, 2)), np.arange(2 * n, len(prior.point))])
@@ -74,7 +75,7 @@ def relinearize(segment: Segment, values: Array, keyframe: Array) -> tuple[Array
 
 
 def _frame_rotation(k: int, q: int, theta: float) -> Array:
-    """(q, q) block-diagonal: vectors in the keyframe's frame to the map frame; calibration and heading unchanged."""
+    """(q, q) block-diagonal: keyframe's frame to map frame; calibration and heading stay as they are."""
     c, s = np.cos(theta), np.sin(theta)
     matrix = np.eye(q)
     x = np.append(np.arange(0, 2 * k, 2), q - 3)
@@ -116,7 +117,7 @@ class History:
     def leave(
         self, hessian: Array, descent: Array, point: Array, labels: IntArray, indices: IntArray
     ) -> None:
-        """The oldest pose leaves: normal equations of the rows that touch it, on [map | calibration | it | next]."""
+        """The oldest pose leaves: normal equations of its rows, on [map | calibration | it | next]."""
         low = len(point) - 2 * POSE
         pose, following = point[low : low + POSE], point[low + POSE :]
         stay = np.r_[0:low, low + POSE : len(point)]

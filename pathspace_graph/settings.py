@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+
+from .errors import SettingsError
+
+
+class _Positive:
+    """Settings whose numbers are all positive; infinity is allowed."""
+
+    def __post_init__(self) -> None:
+        """SettingsError names the first setting that isn't, as the command line knows it."""
+        group = type(self).__name__.removesuffix("Settings").lower()
+        prefix = "" if group == "mapper" else f"{group}."
+        for entry in fields(self):  # type: ignore[arg-type]  # every heir is a dataclass
+            value = getattr(self, entry.name)
+            if isinstance(value, int | float) and not value > 0:
+                raise SettingsError(f"{prefix}{entry.name}: expected a positive number, found {value}")
 
 
 @dataclass(frozen=True)
-class SplineSettings:
+class SplineSettings(_Positive):
     """The two boundary curves."""
 
     degree: int = 3
@@ -14,7 +29,7 @@ class SplineSettings:
     spacing: float = 3.5
     """Distance of the control points (m) while the curve is open and grows."""
     size_share: float = 0.42
-    """Control points after closing, as a share of the distinct cones that were sighted (the paper has 0.44)."""
+    """Control points after closing, as a share of the distinct cones sighted (the paper has 0.44)."""
     min_size: int = 8
     """Fewest control points of a closed boundary."""
     linear_baseline: float = 0.5
@@ -22,39 +37,77 @@ class SplineSettings:
     sigma_model: float = 0.08
     """How far cones stand off a smooth curve (m, one sigma), added to each reading across the curve."""
     sigma_simplify: float = 0.05
-    """Displacement of a control point (m, one sigma) that simplification may cause; loosens the prior by as much."""
+    """Shift of a control point (m, one sigma) that simplification may cause: loosens the prior by as much."""
+    confirmed_margin: float = 0.5
+    """So far past its last sighting (m) an open curve is believed; beyond, it is extrapolated."""
+    search_step: float = 1.0
+    """Coarse step (m along the curve) of a global search for foot points."""
+    search_iterations: int = 4
+    """Newton steps of a global search."""
+    refine_room: float = 2.0
+    """How far from where it was (m along the curve) a foot point is looked for in a Gauss-Newton step."""
+    refine_iterations: int = 1
+    """Newton steps of each foot point in a Gauss-Newton step, which start at the last one's parameter."""
+    fit_smoothness: float = 0.1
+    """Weight of second differences where new control points are placed through sightings."""
+    fit_held: int = 4
+    """Points on the end of the known curve that new control points must keep to."""
 
 
 @dataclass(frozen=True)
-class GaugeSettings:
+class GaugeSettings(_Positive):
     """Weak priors on what readings leave free."""
 
     sigma_spacing: float = 0.3
     """Deviation of neighbouring control points from their nominal distance, as a share of it."""
     sigma_smoothness: float = 1.0
-    """Second difference of control points, as a share of their spacing (a circle of radius one spacing has 1)."""
+    """Second difference of control points, as a share of their spacing (1: a circle of that radius)."""
     sigma_anchor: float = 100.0
     """Weak hold of every control point where it is (m): keeps the system regular, too weak to be seen."""
 
 
 @dataclass(frozen=True)
-class GateSettings:
+class GateSettings(_Positive):
     """Which readings are used."""
 
     chi: float = 3.0
     """A reading joins the curve within this many sigmas of its joint uncertainty."""
     sigma_floor: float = 0.1
     """Added to that uncertainty (m): what the model doesn't know of its own errors."""
+    rough: float = 3.0
+    """A reading farther from the curve than this (m) isn't tested at all."""
     huber: float = 1.5
     """Whitened residual beyond which a row's weight falls."""
     view_ahead: float = 25.0
     """Stretch of the curve ahead of the vehicle (m along it) that a reading may belong to."""
     view_behind: float = 4.0
     """The same behind the vehicle."""
+    station_ahead: float = 8.0
+    """The vehicle's own foot point on the curve is searched for so far ahead of the last cycle's (m), ..."""
+    station_behind: float = 3.0
+    """... and so far behind it (m)."""
 
 
 @dataclass(frozen=True)
-class GrowthSettings:
+class PathSettings(_Positive):
+    """The way driven, and the way ahead."""
+
+    step: float = 0.3
+    """Least distance of two kept positions (m)."""
+    memory: float = 60.0
+    """Stretch behind the vehicle (m) that is kept; the drive's first such stretch is kept for closing."""
+    beginning_step: float = 1.0
+    """Least distance of two kept poses of the first stretch (m)."""
+    max_curvature: float = 0.3
+    """Largest curvature of the path predicted ahead of the vehicle (1/m)."""
+    curvature_gain: float = 0.4
+    """Share of a cycle's measured curvature in the smoothed one."""
+    min_speed: float = 1.0
+    """Slower than this (m/s), yaw rate over speed says nothing of the curvature."""
+
+
+@dataclass(frozen=True)
+class GrowthSettings(_Positive):
     """How an open end grows."""
 
     reach: float = 7.0
@@ -73,18 +126,30 @@ class GrowthSettings:
     """How much farther from the path than the end of the curve the next sighting may be (m)."""
     lateral_rate: float = 0.2
     """The same, for each metre along the path beyond that (-)."""
-    max_curvature: float = 0.3
-    """Largest curvature of the path predicted ahead of the vehicle (1/m)."""
+    beside: float = 2.0
+    """Of sightings that are so near to each other along the path (m) ..."""
+    lateral_gap: float = 0.8
+    """... those are left out that stand so much farther from it than the nearest (m)."""
+    station_margin: float = 0.3
+    """A sighting must lie so far past the end of the curve (m along the path) to extend it."""
     stranded: float = 2.0
-    """An end so far behind the vehicle (m along the path) with nothing ahead is carried on along the path."""
+    """An end so far behind the vehicle (m along the path), nothing ahead, is carried along it, ..."""
+    stranded_left: float = 0.5
+    """... to this share of that distance behind it."""
+    min_lateral: float = 0.5
+    """A carried end keeps at least so far from the path (m)."""
+    min_carry: float = 0.5
+    """An end is carried by so much at least (m), or not at all."""
 
 
 @dataclass(frozen=True)
-class ClosingSettings:
+class ClosingSettings(_Positive):
     """Loop closing."""
 
     min_path: float = 60.0
     """Shortest lap (m)."""
+    check_interval: float = 1.0
+    """Path (m) between two attempts to close."""
     radius: float = 8.0
     """Distance from the start (m) within which the loop may close, ..."""
     drift: float = 0.03
@@ -98,41 +163,63 @@ class ClosingSettings:
     inlier_share: float = 0.8
     """Share of the readings that must agree."""
     min_readings: int = 25
-    """Fewest readings that may close a loop."""
+    """Fewest readings that may close a loop, ..."""
+    min_boundary_readings: int = 5
+    """... and fewest of each boundary among those that agree."""
     window: float = 2.0
     """Time (s) of the newest readings that are registered with the beginning."""
     prior_scale: float = 1.5
     """Trust in the vehicle's own uncertainty: its sigmas are multiplied by this."""
     sigma_reading: float = 0.5
-    """Deviation (m) that a reading counts with in the registration: many readings are of one and the same cone."""
+    """Deviation (m) of a reading in the registration: large, since many readings are of one cone."""
     sigma_max: float = 0.3
     """The registered position must be this certain (m, one sigma along its worst direction) ..."""
     patience: float = 40.0
     """... until so much of the beginning (m) has been driven again."""
     beginning: float = 60.0
-    """Stretch of the curves (m) that counts as their beginning."""
+    """Stretch of the curves (m) that counts as their beginning, ..."""
+    beginning_share: float = 0.6
+    """... or this share of a shorter curve."""
     icp_reach: float = 3.0
-    """A reading farther than this from the beginning doesn't pull in the first iteration (m)."""
+    """A reading farther than this from the beginning doesn't pull in the first iteration (m), ..."""
+    icp_shrink: float = 0.7
+    """... and this share of the distance with each further one, down to `inlier_distance`."""
     icp_iterations: int = 10
     """Iterations of the registration."""
     keyframe_interval: float = 12.0
     """Path (m) between the keyframes in whose frames the drive so far is kept until the loop closes."""
     iterations: int = 4
-    """Gauss-Newton steps after the tie, and again after simplification."""
+    """Gauss-Newton steps after the tie, and again after simplification, ..."""
+    sigma_step: float = 10.0
+    """... in which a control point moves so far freely (m): hardly damped."""
+    join_margin: float = 10.0
+    """The seam lies on a curve's last stretch, as long as `beginning` and this (m), ..."""
+    join_share: float = 0.5
+    """... or, on a short curve, past this share of it."""
+    overlap_step: float = 1.0
+    """Step (m) at which the overlap's end is put on its beginning."""
+    overlap_room: float = 4.0
+    """Room (m along the curve) about the place on the beginning where a point of the overlap belongs."""
+    seam_margin: float = 0.5
+    """A sighting this near to the seam (m) is the beginning's own cone, and isn't counted twice."""
 
 
 @dataclass(frozen=True)
-class OdometrySettings:
+class OdometrySettings(_Positive):
     """What is not white in the odometry: constant errors, estimated along with the map."""
 
     sigma_scale: float = 0.005
     """Scale error of the speeds (one sigma)."""
     sigma_bias: float = 0.002
     """Bias of the yaw rate (rad/s, one sigma)."""
+    sigma_start: float = 1e-4
+    """Position of the vehicle at the first odometry stamp (m, one sigma): zero by definition, ..."""
+    sigma_start_heading: float = 1e-5
+    """... and its heading (rad): not exactly zero, so that the first pose's information is finite."""
 
 
 @dataclass(frozen=True)
-class MapperSettings:
+class MapperSettings(_Positive):
     """Everything that the fixed-lag mapper can be told."""
 
     lag: float = 3.0
@@ -140,13 +227,15 @@ class MapperSettings:
     steps: int = 1
     """Gauss-Newton steps a cycle, each relinearized at the current estimate."""
     sigma_step: float = 0.5
-    """How far a control point moves freely in one step (m): damps the slide along the curve, not the optimum."""
+    """How far a control point moves freely in a step (m): damps sliding along the curve, not the optimum."""
     spline: SplineSettings = field(default_factory=SplineSettings)
     """The curves."""
     gauge: GaugeSettings = field(default_factory=GaugeSettings)
     """Weak priors."""
     gate: GateSettings = field(default_factory=GateSettings)
     """Which readings are used."""
+    path: PathSettings = field(default_factory=PathSettings)
+    """The way driven and the way ahead."""
     growth: GrowthSettings = field(default_factory=GrowthSettings)
     """How ends grow."""
     closing: ClosingSettings = field(default_factory=ClosingSettings)

@@ -26,7 +26,7 @@ class Sightings:
         """When each was last seen, s."""
 
     def add(self, points: Array, variances: Array, t: float) -> None:
-        """Merge readings (m, 2), each with a scalar variance (m,), into the nearest sighting or begin new ones."""
+        """Merge readings (m, 2), each with a scalar variance (m,), into the nearest sighting or a new one."""
         self._keep(self.last_t > t - self.settings.forget_after)
         if len(points) == 0:
             return

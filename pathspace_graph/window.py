@@ -1,8 +1,8 @@
-"""The fixed-lag window: a flat state, whitened rows, a Gaussian prior, Gauss-Newton steps and marginalization.
+"""The window's linear algebra: whitened rows, a Gaussian prior, a dense solve and the Schur complement.
 
-The state is one vector `x = [control points | calibration | poses, oldest first]`. Everything in it is additive: a pose
-is (x, y, theta) in the map frame with theta unwrapped. The prior stands on a leading block of it, so that the oldest
-pose, which comes right after the map, leaves by a Schur complement.
+The state is one vector `x = [control points | calibration | poses, oldest first]`. Everything in it is
+additive: a pose is (x, y, theta) in the map frame with theta unwrapped. The prior stands on a leading block
+of it, so that the oldest pose, which comes right after the map, leaves by a Schur complement.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ POSE = 3
 
 
 class SingularSystemError(PathspaceError):
-    """The window's normal equations are not positive definite: something in the state is not held by anything."""
+    """The window's normal equations are not positive definite: nothing holds some entry of the state."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,18 @@ class Rows:
         """The rows that touch a column in [low, high)."""
         touches = ((self.columns >= low) & (self.columns < high)).any(axis=1)
         return Rows(self.columns[touches], self.jacobian[touches], self.residual[touches])
+
+    def without(self, low: int, high: int) -> Rows:
+        """The rows that don't touch the columns [low, high), which are taken out of the state."""
+        keep = ~((self.columns >= low) & (self.columns < high)).any(axis=1)
+        columns = self.columns[keep]
+        moved = np.where(columns >= low, columns - (high - low), columns)
+        return Rows(moved, self.jacobian[keep], self.residual[keep])
+
+    @property
+    def reach(self) -> int:
+        """One past the last column that any row touches."""
+        return int(self.columns.max(initial=-1)) + 1
 
 
 @dataclass
@@ -80,18 +92,23 @@ def accumulate(groups: Sequence[Rows], size: int) -> tuple[Array, Array]:
         return np.zeros((size, size)), np.zeros(size)
     flat = [(g.columns[:, :, None] * size + g.columns[:, None, :]).ravel() for g in groups]
     products = [(g.jacobian[:, :, None] * g.jacobian[:, None, :]).ravel() for g in groups]
-    hessian = np.bincount(np.concatenate(flat), np.concatenate(products), size * size).reshape(size, size)
+    hessian = _sums(np.concatenate(flat), np.concatenate(products), size * size)
     columns = np.concatenate([g.columns.ravel() for g in groups])
     descent = np.concatenate([(g.jacobian * -g.residual[:, None]).ravel() for g in groups])
-    return hessian, np.bincount(columns, descent, size)
+    return hessian.reshape(size, size), _sums(columns, descent, size)
+
+
+def _sums(index: IntArray, terms: Array, size: int) -> Array:
+    """(size,) sum of the terms of each index."""
+    return np.asarray(np.bincount(index, terms, size), np.float64)
 
 
 def cholesky(hessian: Array) -> Array:
-    """Lower factor `L L' = H` (the upper triangle is not cleared); SingularSystemError where there is none."""
+    """Lower factor `L L' = H`, its upper triangle not cleared; SingularSystemError where there is none."""
     factor, info = lapack.dpotrf(hessian.T, lower=1, clean=0, overwrite_a=0)
     if info != 0:
         raise SingularSystemError(f"expected a positive definite system, found pivot {info} not positive")
-    return factor
+    return np.asarray(factor)
 
 
 def solve(factor: Array, descent: Array) -> Array:
@@ -101,7 +118,7 @@ def solve(factor: Array, descent: Array) -> Array:
 
 
 def schur_leave(hessian: Array, descent: Array, low: int, high: int) -> tuple[Array, Array]:
-    """Marginal normal equations without the entries [low, high): `H_bb - H_ba H_aa^-1 H_ab`, and the same for g."""
+    """Without the entries [low, high): `H_bb - H_ba H_aa^-1 H_ab` and `g_b - H_ba H_aa^-1 g_a`."""
     leaving = slice(low, high)
     stay = np.r_[0:low, high : len(descent)]
     coupling = hessian[stay, leaving]

@@ -49,9 +49,7 @@ def exact_log(twists: Array, cones: Array, labels: IntArray) -> Log:
     t = DT * np.arange(len(twists))
     poses = integrate(twists[:-1], DT)
     cycles = tuple(see(float(t[k]), poses[k], cones, labels) for k in range(0, len(t), CYCLE))
-    return Log(
-        Odometry(t, twists), cycles, ODOMETRY_SIGMA, truth=Truth(t, poses, cones, labels)
-    )
+    return Log(Odometry(t, twists), cycles, ODOMETRY_SIGMA, truth=Truth(t, poses, cones, labels))
 
 
 def corridor(length: float, gap: float = 4.0, half_width: float = 2.0) -> tuple[Array, IntArray]:
@@ -67,7 +65,7 @@ def ahead(speed: float, seconds: float) -> Array:
 
 
 def bean_track(radius: float = 16.0, dent: float = 0.25, half_width: float = 1.8, gap: float = 3.0) -> Track:
-    """A closed track of about 105 m around `r(phi) = radius (1 + dent cos 2 phi)`, driven counterclockwise."""
+    """A closed track of about 105 m around `r(phi) = radius (1 + dent cos 2 phi)`, counterclockwise."""
     phi = np.linspace(0.0, 2 * np.pi, 2000)
     r = radius * (1.0 + dent * np.cos(2 * phi))
     middle = r[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])

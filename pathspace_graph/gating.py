@@ -1,0 +1,130 @@
+"""Which readings a curve takes: those that lie on it, by the joint uncertainty of pose and curve."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from pathspace_graph.factors.footpoint import FootPoints
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
+from pathspace_graph.factors.projection import ProjectionRows, project, to_map
+
+from .labels import UNKNOWN
+from .smoother import Smoother, Step
+from .state import State
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+def locate_vehicle(smoother: Smoother) -> None:
+    """The newest pose's station: its foot point on each boundary, near where the last one's was."""
+    state, gate = smoother.state, smoother.settings.gate
+    for label, boundary in state.boundaries.items():
+        known = state.stations[label]
+        low, high = known[-1:] - gate.station_behind, known[-1:] + gate.station_ahead
+        u = boundary.find(state.control_points(label), state.poses[-1:, :2], low, high).u
+        if boundary.periodic:  # laps add up
+            u = u + boundary.length * np.round((known[-1] - u) / boundary.length)
+        state.stations[label] = np.append(known, u)
+
+
+def admit(smoother: Smoother, label: int, retest: bool) -> None:
+    """Readings that are not in use and lie on the curve: `d^2 < chi^2 (sigma^2 + g' Sigma g)`.
+
+    Those of the newest pose; all in the window where `retest`, since the curve has grown. A reading of
+    unknown colour is used only where no other curve has taken it.
+    """
+    readings, gate = smoother.readings, smoother.settings.gate
+    rows = readings.pending(label)
+    if not retest:
+        rows = rows[readings.slot[rows] == len(smoother.times) - 1]
+    if len(rows) == 0 or smoother.last_step is None:
+        return
+    rows, foot, projected = _near_curve(smoother, label, rows)
+    if len(rows) == 0:
+        return
+    variance = projected.sigma**2 + gate.sigma_floor**2
+    variance += joint_variance(smoother, label, readings.slot[rows], foot, projected)
+    passes = foot.distance**2 < gate.chi**2 * variance
+    passes &= (readings.label[rows] != UNKNOWN) | (readings.boundary[rows] == UNKNOWN)
+    chosen = rows[passes]
+    readings.used[chosen] = True
+    readings.boundary[chosen] = label
+    readings.u[chosen] = foot.u[passes]
+
+
+def _near_curve(
+    smoother: Smoother, label: int, rows: IntArray
+) -> tuple[IntArray, FootPoints, ProjectionRows]:
+    """Those of some readings that lie roughly on the visible stretch of a curve, projected on it."""
+    readings, state, settings = smoother.readings, smoother.state, smoother.settings
+    boundary, gate, slots = state.boundaries[label], settings.gate, readings.slot[rows]
+    station = state.stations[label][slots]
+    low, high = station - gate.view_behind, station + gate.view_ahead
+    poses = state.poses[slots]
+    points = to_map(readings.point[rows], poses)
+    foot = boundary.find(state.control_points(label), points, low, boundary.believed(high))
+    keep = np.flatnonzero(foot.interior & (np.abs(foot.distance) < gate.rough))
+    rows, foot = rows[keep], _take(foot, keep)
+    sigma_model = settings.spline.sigma_model
+    return rows, foot, project(points[keep], readings.covariance[rows], poses[keep], foot, sigma_model)
+
+
+def _take(foot: FootPoints, keep: IntArray) -> FootPoints:
+    return FootPoints(*(getattr(foot, column.name)[keep] for column in fields(foot)))
+
+
+def joint_variance(
+    smoother: Smoother, label: int, slots: IntArray, foot: FootPoints, projected: ProjectionRows
+) -> Array:
+    """`g_i' Sigma g_i` (m,) in m^2: variance of each row's residual by what is estimated.
+
+    Sigma is that of the last step, which the newest pose wasn't part of: it is reached through its odometry,
+    `g_last = g dx_now/dx_last`, `g_calibration = -g R G`, plus the odometry's own noise.
+    """
+    step, state = smoother.last_step, smoother.state
+    assert step is not None
+    gradient = _control_gradient(state, label, foot, projected, len(step.factor))
+    by_pose, extra = projected.by_pose.copy(), np.zeros(len(slots))
+    newest = slots == len(smoother.times) - 1
+    if newest.any():
+        g = by_pose[newest]
+        local = g @ _rotation(state.poses[-1, 2])
+        odometry: IntegratedOdometry = smoother.odometry[-1]
+        extra[newest] = np.einsum("mi,ij,mj->m", local, odometry.covariance, local)
+        calibration = slice(state.map_size, state.map_size + CALIBRATION_SIZE)
+        gradient[calibration, newest] = (-local @ odometry.calibration_jacobian).T
+        dx, dy = state.poses[-1, :2] - state.poses[-2, :2]
+        by_pose[newest, 2] += g[:, 1] * dx - g[:, 0] * dy
+        slots = np.where(newest, slots - 1, slots)
+    _add_pose_gradient(gradient, state, step, slots, by_pose)
+    half, _ = lapack.dtrtrs(step.factor, gradient, lower=1, overwrite_b=1)
+    return np.asarray(np.einsum("im,im->m", half, half)) + extra
+
+
+def _control_gradient(
+    state: State, label: int, foot: FootPoints, projected: ProjectionRows, size: int
+) -> Array:
+    """(size, m) derivative of each residual by the state, of which only the control points are filled in."""
+    m = len(foot.u)
+    gradient = np.zeros((size, m), order="F")
+    base, row = state.offset(label) + 2 * state.boundaries[label].columns(foot.span), np.arange(m)[:, None]
+    gradient[base, row] += projected.by_control[:, :, 0]
+    gradient[base + 1, row] += projected.by_control[:, :, 1]
+    return gradient
+
+
+def _add_pose_gradient(gradient: Array, state: State, step: Step, slots: IntArray, by_pose: Array) -> None:
+    """Fill in the poses' derivatives (m, 3), at their columns in the last step's system."""
+    columns = state.pose_columns(slots + step.dropped)
+    gradient[columns, np.arange(len(slots))[:, None]] += by_pose
+
+
+def _rotation(theta: float) -> Array:
+    """(3, 3) a pose's own tangent to the map frame's (x, y, theta)."""
+    c, s = np.cos(theta), np.sin(theta)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -1,0 +1,101 @@
+"""The window as whitened linear rows at the current estimate, and their normal equations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.gauge import spacing_residuals
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, odometry_residuals
+from pathspace_graph.factors.projection import huber_weights, project, to_map
+
+from .readings import Readings
+from .settings import MapperSettings
+from .state import State
+from .window import POSE, Prior, Rows, accumulate
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class FootParameters:
+    """Foot points found anew while linearizing."""
+
+    rows: IntArray
+    """(m,) readings."""
+    u: Array
+    """(m,) their parameters."""
+
+
+def reading_rows(
+    state: State, readings: Readings, label: int, settings: MapperSettings
+) -> tuple[Rows, FootParameters]:
+    """`w_i n_i . (R z_i + t - S(u_i)) / sigma_i` of every reading in use on a boundary (paper: Update).
+
+    Columns [pose | control points of the span]; w the root of its Huber weight, zero where the foot point is
+    not interior. The readings are left as they are.
+    """
+    boundary = state.boundaries[label]
+    rows = readings.used_on(label)
+    slots = readings.slot[rows]
+    poses = state.poses[slots]
+    points = to_map(readings.point[rows], poses)
+    foot = boundary.refine(state.control_points(label), points, readings.u[rows])
+    projected = project(points, readings.covariance[rows], poses, foot, settings.spline.sigma_model)
+    whitened = projected.residual / projected.sigma
+    weight = np.sqrt(huber_weights(whitened, settings.gate.huber)) * foot.interior / projected.sigma
+    base = state.offset(label) + 2 * boundary.columns(foot.span)
+    shape = len(rows), 2 * base.shape[1]
+    by_control = np.stack([base, base + 1], axis=2).reshape(shape)
+    columns = np.concatenate([state.pose_columns(slots), by_control], axis=1)
+    jacobian = np.concatenate([projected.by_pose, projected.by_control.reshape(shape)], axis=1)
+    whitened_rows = Rows(columns, jacobian * weight[:, None], projected.residual * weight)
+    return whitened_rows, FootParameters(rows, foot.u)
+
+
+def spacing_rows(state: State, label: int, sigma_share: float) -> Rows:
+    """`(|c_{j+1} - c_j| - nominal_j) / (sigma_share nominal_j)`: control points keep their distance."""
+    boundary = state.boundaries[label]
+    residual, direction = spacing_residuals(state.control_points(label), boundary.nominal, boundary.periodic)
+    sigma = sigma_share * boundary.nominal
+    j = np.arange(len(residual))
+    k = (j + 1) % boundary.size
+    columns = state.offset(label) + np.column_stack([2 * j, 2 * j + 1, 2 * k, 2 * k + 1])
+    jacobian = np.concatenate([-direction, direction], axis=1) / sigma[:, None]
+    return Rows(columns, jacobian, residual / sigma)
+
+
+def odometry_rows(state: State, odometry: Sequence[IntegratedOdometry]) -> Rows:
+    """`W_k (Log(delta_k^-1 x_k^-1 x_{k+1}) + G_k calibration)` between all neighbouring poses of the window.
+
+    Columns [calibration | pose | next pose]; G is `calibration_jacobian`, W `whitener`.
+    """
+    poses, m = state.poses, len(odometry)
+    deltas = np.array([o.delta for o in odometry])
+    whiteners = np.array([o.whitener for o in odometry])
+    by_calibration = np.array([o.calibration_jacobian for o in odometry])
+    residual, by_start, by_end = odometry_residuals(poses[:-1], poses[1:], deltas)
+    residual = residual + by_calibration @ state.calibration
+    shared = np.full((m, 1), state.map_size) + np.arange(CALIBRATION_SIZE)
+    pairs = (state.pose_column(0) + POSE * np.arange(m))[:, None] + np.arange(2 * POSE)
+    columns = np.repeat(np.concatenate([shared, pairs], axis=1), POSE, axis=0)
+    jacobian = whiteners @ np.concatenate([by_calibration, by_start, by_end], axis=2)
+    whitened = np.einsum("mij,mj->mi", whiteners, residual)
+    return Rows(columns, jacobian.reshape(m * POSE, -1), whitened.ravel())
+
+
+def normal_equations(groups: Sequence[Rows], prior: Prior, state: State) -> tuple[Array, Array]:
+    """`H` (n, n) and `-gradient` (n,) of the rows, the prior, and each boundary's smoothness and anchor."""
+    hessian, descent = accumulate(groups, len(state.vector))
+    q = len(prior.point)
+    hessian[:q, :q] += prior.information
+    descent[:q] += prior.descent_at(state.vector)
+    for label, boundary in state.boundaries.items():
+        block = state.block(label)
+        hessian[block, block] += boundary.gauge_hessian
+        descent[block] -= boundary.smooth_only @ state.vector[block]
+    return hessian, descent

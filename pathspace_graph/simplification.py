@@ -1,0 +1,160 @@
+"""Simplification (paper): closed curves on fewer, curvature-weighted knots, `C_old = E C_new`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .boundary import Boundary
+from .knots import BreakSettings, curvature_weighted_breaks, refit
+from .settings import ClosingSettings, MapperSettings, SplineSettings
+from .smoother import Smoother
+from .spline import BSpline
+from .window import Prior
+
+Array = NDArray[np.float64]
+
+EXTRAPOLATED = 2
+"""Knot intervals past the last sighting whose parameters are given a place on the closed curve."""
+
+
+@dataclass(frozen=True, eq=False)
+class Overlap:
+    """Where a curve's end lies on its beginning."""
+
+    period: float
+    """Length of the closed curve in the open one's parameter, m."""
+    u: Array
+    """(k,) parameters of the open curve from there on, increasing, ..."""
+    w: Array
+    """... and theirs (k,) on the beginning, from 0 on."""
+
+    def new_parameter(self, u: Array) -> Array:
+        """Parameter on the closed curve (not wrapped) of the open curve's."""
+        return np.where(u < self.u[0], u, self.period + np.interp(u, self.u, self.w))
+
+
+@dataclass(frozen=True, eq=False)
+class Join:
+    """How an open curve becomes periodic."""
+
+    overlap: Overlap
+    """Of its end and its beginning."""
+    knots: Array
+    """(m + 2 p + 1,) periodic knots."""
+    points: Array
+    """(m, 2) control points of the closed curve, map frame, m."""
+    old_from_new: Array
+    """(n, m) E."""
+
+
+def simplify(smoother: Smoother) -> None:
+    """Join every curve, whose end readings already tie to its beginning, and change to the new variables."""
+    state, settings = smoother.state, smoother.settings
+    joins = {b: join(boundary, state.control_points(b), settings) for b, boundary in state.boundaries.items()}
+    substitute(smoother, joins)
+    for _ in range(settings.closing.iterations):
+        smoother.step(settings.closing.sigma_step)
+
+
+def join(boundary: Boundary, control_points: Array, settings: MapperSettings) -> Join:
+    """The periodic curve nearest to an open one with control points (n, 2)."""
+    spline = boundary.spline(control_points)
+    overlap = find_overlap(boundary, control_points, settings.closing)
+    size = _size(boundary, control_points, overlap.period, settings)
+    baseline = BreakSettings(settings.spline.linear_baseline)
+    breaks = curvature_weighted_breaks(spline, size, baseline, 0.0, overlap.period)
+    frame = BSpline.periodic_from(breaks, np.zeros((size, 2)), boundary.degree)
+    change = refit(spline, frame, overlap.new_parameter)
+    return Join(overlap, frame.knots, change.new_from_old @ control_points, change.old_from_new)
+
+
+def _size(boundary: Boundary, control_points: Array, period: float, settings: MapperSettings) -> int:
+    """Control points of the closed curve: a share of the distinct cones that it was led through."""
+    spline: SplineSettings = settings.spline
+    sighted = np.array(boundary.sighted).reshape(-1, 2)
+    low = np.zeros(len(sighted))
+    u = boundary.find(control_points, sighted, low, low + boundary.confirmed).u
+    distinct = int((u < period - settings.closing.seam_margin).sum())
+    return max(spline.min_size, int(spline.size_share * distinct))
+
+
+def find_overlap(boundary: Boundary, control_points: Array, settings: ClosingSettings) -> Overlap:
+    """The seam is the foot point of the beginning on the end; from there on the end repeats the beginning.
+
+    Where the end doesn't reach the beginning, the gap is closed straight.
+    """
+    confirmed = boundary.confirmed
+    late = confirmed - settings.beginning - settings.join_margin
+    late = max(late, settings.join_share * confirmed)
+    ends = boundary.evaluate(control_points, np.array([0.0, confirmed]))
+    foot = boundary.find(control_points, ends[:1], np.array([late]), np.array([confirmed]))
+    if not foot.interior[0]:
+        period = confirmed + float(np.hypot(*(ends[0] - ends[1])))
+        return Overlap(period, np.array([period, period + 1.0]), np.array([0.0, 1.0]))
+    seam = float(foot.u[0])
+    u = np.linspace(seam, confirmed, max(int((confirmed - seam) / settings.overlap_step), 1) + 1)
+    w = _on_beginning(boundary, control_points, u, settings.overlap_room)
+    beyond = EXTRAPOLATED * boundary.nominal[0]
+    return Overlap(seam, np.append(u, u[-1] + beyond), np.append(w, w[-1] + beyond))
+
+
+def _on_beginning(boundary: Boundary, control_points: Array, u: Array, room: float) -> Array:
+    """Parameters (k,) on the beginning of the end's points at u (k,), from 0 on and never falling."""
+    guess = u - u[0]
+    points = boundary.evaluate(control_points, u)
+    w = boundary.find(control_points, points, np.maximum(guess - room, 0.0), guess + room).u
+    w = np.maximum.accumulate(w)
+    w[0] = 0.0
+    return w
+
+
+def substitute(smoother: Smoother, joins: dict[int, Join]) -> None:
+    """`x_old = M x_new`, so `L <- M' L M` and `g <- M' (g - L (M x_new - x0))`: closed curves for open."""
+    prior, state = smoother.prior, smoother.state
+    q, n_old = len(prior.point), state.map_size
+    change = _change(smoother, joins)
+    points = np.concatenate([j.points.ravel() for j in joins.values()])
+    point = np.concatenate([points, state.vector[n_old:q]])
+    information, gradient = _loosened(prior, n_old, smoother.settings.spline.sigma_simplify)
+    gradient = gradient - information @ (change @ point - prior.point)
+    smoother.prior = Prior(change.T @ information @ change, change.T @ gradient, point)
+    state.vector = np.concatenate([points, state.vector[n_old:]])
+    for label, new in joins.items():
+        _replace(smoother, label, new)
+
+
+def _change(smoother: Smoother, joins: dict[int, Join]) -> Array:
+    """M (q, q'): E on each boundary's control points, the identity on the rest of the prior."""
+    state = smoother.state
+    n_old, n_new = state.map_size, 2 * sum(len(j.points) for j in joins.values())
+    rest = len(smoother.prior.point) - n_old
+    change = np.zeros((n_old + rest, n_new + rest))
+    change[n_old:, n_new:] = np.eye(rest)
+    at = 0
+    for label, new in joins.items():
+        size = 2 * len(new.points)
+        change[state.block(label), at : at + size] = np.kron(new.old_from_new, np.eye(2))
+        at += size
+    return change
+
+
+def _loosened(prior: Prior, n_old: int, sigma: float) -> tuple[Array, Array]:
+    """The prior where the first n_old entries may be off `E C_new` by sigma (m): `(I + L S)^-1 (L, g)`."""
+    variance = np.zeros(len(prior.point))
+    variance[:n_old] = sigma**2
+    inner = np.eye(len(variance)) + prior.information * variance
+    solved = np.linalg.solve(inner, np.column_stack([prior.information, prior.gradient]))
+    information = solved[:, :-1]
+    return 0.5 * (information + information.T), np.asarray(solved[:, -1])
+
+
+def _replace(smoother: Smoother, label: int, new: Join) -> None:
+    """The closed boundary takes the open one's place, for its readings and stations too."""
+    state, readings = smoother.state, smoother.readings
+    state.boundaries[label] = state.boundaries[label].closed(new.knots)
+    rows = readings.used_on(label)
+    readings.u[rows] = new.overlap.new_parameter(readings.u[rows])
+    state.stations[label] = new.overlap.new_parameter(state.stations[label])

@@ -1,0 +1,165 @@
+"""The benchmark: GTSAM solves the mapper's own system, and the figures are the run's; never how fast."""
+
+from __future__ import annotations
+
+import io
+import json
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from rich.console import Console
+
+from pathspace_graph.eval.benchmark import (
+    CUTS,
+    Cut,
+    Gtsam,
+    Measurement,
+    Metric,
+    gaussian_graph,
+    linear_window,
+    marginal_keys,
+    measure,
+    metrics,
+    orderings,
+    rich_table,
+    time_gtsam,
+    write_json,
+)
+from pathspace_graph.fixed_lag import FixedLagMapper
+from pathspace_graph.run import CycleRecord
+from pathspace_graph.settings import MapperSettings
+from pathspace_graph.window import POSE, Rows, accumulate, cholesky, schur_leave, solve
+
+from .scenes import ahead, bean_track, corridor, exact_log, lap_log, map_log
+
+
+@pytest.fixture(scope="module")
+def mapper() -> FixedLagMapper:
+    """In a bend, with a full window."""
+    log = lap_log(bean_track())
+    return map_log(replace(log, cycles=log.cycles[:60]))[0]
+
+
+def test_the_window_is_the_system_that_the_mapper_solves(mapper: FixedLagMapper) -> None:
+    state = mapper.state.copy()
+    window = linear_window(mapper)
+    hessian, descent = accumulate([Rows(*rows) for rows in window.groups], len(state))
+    q = len(window.descent)
+    hessian[:q, :q] += window.information
+    descent[:q] += window.descent
+    np.testing.assert_array_equal(mapper.state, state)
+    stepped = deepcopy(mapper)
+    stepped.smoother.step(stepped.settings.sigma_step)
+    np.testing.assert_allclose(solve(cholesky(hessian), descent), stepped.state - state, atol=1e-9)
+
+
+@pytest.mark.parametrize("cut", CUTS)
+def test_gtsam_solves_the_same_system(mapper: FixedLagMapper, cut: Cut) -> None:
+    """In every cut and ordering; positions by the pose's own axes."""
+    window = linear_window(mapper)
+    stepped = deepcopy(mapper)
+    stepped.smoother.step(stepped.settings.sigma_step)
+    expected = stepped.state - mapper.state
+    graph = gaussian_graph(window, cut)
+    for ordering in orderings(graph, window).values():
+        solution = graph.optimize() if ordering is None else graph.optimize(ordering)
+        at = 0
+        for key, size, heading in zip(*window_columns(mapper), strict=True):
+            step = expected[at : at + size].copy()
+            if size == POSE:
+                c, s = np.cos(heading), np.sin(heading)
+                step[:2] = np.array([[c, s], [-s, c]]) @ step[:2]
+            np.testing.assert_allclose(solution.at(key), step, atol=1e-7)
+            at += size
+
+
+def window_columns(mapper: FixedLagMapper) -> tuple[list[int], list[int], list[float]]:
+    keys = linear_window(mapper).keys
+    return list(keys.keys), keys.dims.tolist(), keys.headings.tolist()
+
+
+def test_the_marginal_is_on_the_map_and_the_next_pose(mapper: FixedLagMapper) -> None:
+    window = linear_window(mapper)
+    keys = marginal_keys(window)
+    assert len(keys) == mapper.smoother.state.map_size // 2 + 2
+    assert keys[-1] == gtsam.symbol("x", 1)
+    graph = gaussian_graph(window, "key set").marginal(gtsam.KeyVector(keys))
+    ordering = gtsam.Ordering()
+    for key in keys[:-1]:
+        ordering.push_back(key)
+    ordering.push_back(keys[-1])
+    hessian, descent = accumulate([Rows(*rows) for rows in window.groups], len(mapper.state))
+    q = len(window.descent)
+    hessian[:q, :q] += window.information
+    descent[:q] += window.descent
+    low = q - POSE
+    hessian, descent = schur_leave(hessian, descent, q + POSE, len(mapper.state))
+    information, _ = schur_leave(hessian, descent, low, q)
+    # what concerns no pose needs no turning
+    marginal = graph.hessian(ordering)[0]
+    np.testing.assert_allclose(marginal[:low, :low], information[:low, :low], rtol=1e-6, atol=1e-5)
+
+
+def test_every_candidate_is_timed(mapper: FixedLagMapper) -> None:
+    timings = time_gtsam(linear_window(mapper))
+    assert len(timings) == len(CUTS) * 3
+    assert all(optimize > 0.0 and marginal > 0.0 for optimize, marginal in timings.values())
+
+
+def test_a_short_run_gives_every_figure() -> None:
+    measurement = measure(exact_log(ahead(8.0, 7.0), *corridor(80.0)), MapperSettings(lag=1.0), every=10)
+    assert len(measurement.cycles) == 70
+    assert measurement.gtsam.samples == 2
+    assert measurement.closing is None
+    figures = {metric.key: metric.value for metric in metrics(measurement)}
+    assert figures["gtsam"] == pytest.approx(figures["gtsam_optimize"] + figures["gtsam_marginal"])
+    assert np.isfinite(figures["mean_by_gtsam"])
+    assert np.isnan(figures["closing"])
+    assert np.isnan(figures["last_lap_by_lap_2"])
+
+
+def record(cycle: int, seconds: float, lap: int) -> CycleRecord:
+    return CycleRecord(cycle, 0.1 * cycle, seconds, 5, 5, 4, lap, {"update": 0.5 * seconds})
+
+
+def test_figures_by_hand() -> None:
+    """Three laps of 100 cycles: 2, 3 and 4 ms, one closing cycle of 40 ms; GTSAM takes 2 ms."""
+    cycles = [record(k, 0.002 + 0.001 * (k // 100), 1 + k // 100) for k in range(300)]
+    cycles[99] = record(99, 0.040, 1)
+    measurement = Measurement(tuple(cycles), 3, 99, Gtsam("any", 0.0015, 0.0005, 25))
+    figures = {metric.key: metric for metric in metrics(measurement)}
+    mean_later = (49 * 2.0 + 40.0 + 100 * 3.0 + 100 * 4.0) / 250
+    assert figures["mean_by_gtsam"].value == pytest.approx(mean_later / 2.0)
+    assert figures["mean"].value == pytest.approx((99 * 2.0 + 40.0 + 700.0) / 300)
+    assert figures["median"].value == pytest.approx(3.0)
+    assert figures["p99"].value == pytest.approx(4.0)
+    assert figures["slowest"].value == figures["closing"].value == pytest.approx(40.0)
+    assert figures["mean_lap_2"].value == pytest.approx(3.0)
+    assert figures["last_lap_by_lap_2"].value == pytest.approx(4.0 / 3.0)
+    assert figures["mean_update"].value == pytest.approx(0.5 * figures["mean"].value)
+    assert {key for key, metric in figures.items() if not metric.holds} == {"last_lap_by_lap_2"}
+
+
+def test_a_bound_is_kept_or_not() -> None:
+    assert Metric("a", 2.0, "", bound=2.0).holds
+    assert not Metric("a", 2.1, "", bound=2.0).holds
+    assert Metric("a", 2.1, "", "higher", 2.0).holds
+    assert not Metric("a", 1.9, "", "higher", 2.0).holds
+    assert not Metric("a", float("nan"), "", bound=2.0).holds
+    assert Metric("a", float("nan"), "").holds
+
+
+def test_output(tmp_path: Path) -> None:
+    figures = [Metric("mean_by_gtsam", 1.234, "", bound=2.0), Metric("closing", float("nan"), "ms")]
+    write_json(tmp_path / "figures.json", figures)
+    rows = json.loads((tmp_path / "figures.json").read_text())
+    assert rows[0] == {"key": "mean_by_gtsam", "value": 1.234, "unit": "", "direction": "lower", "bound": 2.0}
+    assert rows[1]["value"] is None
+    console = Console(width=100, file=io.StringIO(), record=True)
+    console.print(rich_table(figures))
+    lines = console.export_text().splitlines()
+    assert any("mean_by_gtsam" in line and "1.23" in line and "<= 2" in line for line in lines)

@@ -1,0 +1,230 @@
+"""Loop closing: where it must happen, where it mustn't, and what it may change."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.closing import Registration, near_start, register
+from pathspace_graph.eval.metrics import cone_distances
+from pathspace_graph.factors.projection import to_map
+from pathspace_graph.fixed_lag import CycleResult, FixedLagMapper
+from pathspace_graph.log import Log
+from pathspace_graph.map import SplineBoundary
+from pathspace_graph.run import split_odometry
+from pathspace_graph.settings import ClosingSettings, MapperSettings
+from pathspace_graph.simplification import join, substitute
+
+from .scenes import ODOMETRY_SIGMA, ahead, bean_track, corridor, exact_log, lap_log, map_log, true_poses
+
+Array = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return lap_log(bean_track(), overrun=45.0)
+
+
+@pytest.fixture(scope="module")
+def run(log: Log) -> tuple[FixedLagMapper, list[CycleResult]]:
+    """The whole drive."""
+    return map_log(log)
+
+
+@pytest.fixture(scope="module")
+def before(log: Log, run: tuple[FixedLagMapper, list[CycleResult]]) -> FixedLagMapper:
+    """The mapper a cycle before it closed; copy it to change it."""
+    cycle = next(k for k, result in enumerate(run[1]) if result.closed)
+    mapper, results = map_log(replace(log, cycles=log.cycles[:cycle]))
+    assert not results[-1].closed
+    return mapper
+
+
+@pytest.fixture(scope="module")
+def just_closed(log: Log, run: tuple[FixedLagMapper, list[CycleResult]]) -> FixedLagMapper:
+    """The mapper after the cycle that closed it."""
+    cycle = next(k for k, result in enumerate(run[1]) if result.closed)
+    return map_log(replace(log, cycles=log.cycles[: cycle + 1]))[0]
+
+
+def test_the_loop_closes_once_the_beginning_is_driven_again(
+    log: Log, run: tuple[FixedLagMapper, list[CycleResult]]
+) -> None:
+    mapper, results = run
+    assert mapper.closed
+    assert mapper.map().closed
+    closed = [result.closed for result in results]
+    assert closed == sorted(closed)
+    lap = bean_track().centre_line.length
+    driven = np.cumsum(np.hypot(*np.diff(true_poses(log)[:, :2], axis=0).T))
+    assert driven[closed.index(True) - 1] > lap
+
+
+def test_closed_boundaries_are_periodic_and_of_their_final_size(
+    log: Log, run: tuple[FixedLagMapper, list[CycleResult]], before: FixedLagMapper
+) -> None:
+    mapper, results = run
+    track = mapper.map()
+    assert log.truth is not None
+    assert track.size <= 0.44 * len(log.truth.cones)
+    assert track.size < before.map().size
+    assert len({result.sizes for result in results if result.closed}) == 1
+    for boundary in track.boundaries.values():
+        assert isinstance(boundary, SplineBoundary)
+        assert boundary.spline.periodic
+        assert boundary.covariance.shape == (2 * boundary.size, 2 * boundary.size)
+        assert np.linalg.eigvalsh(boundary.covariance)[0] > 0.0
+
+
+def test_a_closed_curve_has_no_seam(run: tuple[FixedLagMapper, list[CycleResult]]) -> None:
+    """Position, direction and curvature go on where the ends met."""
+    for boundary in run[0].map().boundaries.values():
+        assert isinstance(boundary, SplineBoundary)
+        low, high = boundary.spline.domain
+        for derivative in range(3):
+            ends = [boundary.spline.to_scipy()(u, nu=derivative) for u in (low, high - 1e-9)]
+            np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("when", ["just_closed", "run"])
+def test_the_closed_curves_pass_the_cones(log: Log, when: str, request: pytest.FixtureRequest) -> None:
+    """Right after closing, and after more driving."""
+    mapper = request.getfixturevalue(when)
+    mapper = mapper[0] if isinstance(mapper, tuple) else mapper
+    assert log.truth is not None
+    distances = cone_distances(mapper.map(), log.truth)
+    assert np.sqrt(np.mean(distances**2)) < 0.15
+    assert distances.max() < 0.5
+
+
+def test_closing_leaves_the_pose_where_it_is(log: Log, run: tuple[FixedLagMapper, list[CycleResult]]) -> None:
+    """Nothing had drifted."""
+    poses = np.array([result.pose for result in run[1]])
+    error = poses - true_poses(log)
+    assert np.hypot(error[:, 0], error[:, 1]).max() < 0.3
+    assert np.abs(error[:, 2]).max() < 0.03
+
+
+@pytest.mark.parametrize("when", ["just_closed", "run"])
+def test_readings_in_use_lie_on_the_closed_curve(when: str, request: pytest.FixtureRequest) -> None:
+    mapper = request.getfixturevalue(when)
+    mapper = mapper[0] if isinstance(mapper, tuple) else mapper
+    readings = mapper.smoother.readings
+    for label, boundary in mapper.boundaries.items():
+        rows = readings.used_on(label)
+        assert len(rows) > 20
+        points = to_map(readings.point[rows], mapper.poses[readings.slot[rows]])
+        on_curve = boundary.evaluate(mapper.control_points(label), readings.u[rows])
+        distances = np.hypot(*(points - on_curve).T)
+        assert np.median(distances) < 0.15
+        assert distances.max() < 0.6
+
+
+def registered(before: FixedLagMapper, theta: float, shift: Array) -> tuple[FixedLagMapper, Registration]:
+    """A mapper whose window has drifted by a rigid motion about the vehicle, and how it is found back.
+
+    How certain the position along the track is doesn't matter here.
+    """
+    mapper = deepcopy(before)
+    c, s = np.cos(theta), np.sin(theta)
+    centre = mapper.poses[-1, :2].copy()
+    mapper.poses[:, :2] = (mapper.poses[:, :2] - centre) @ np.array([[c, s], [-s, c]]) + centre + shift
+    mapper.poses[:, 2] += theta
+    registration = register(mapper.smoother, ClosingSettings(sigma_max=10.0))
+    assert registration is not None
+    return mapper, registration
+
+
+@pytest.mark.parametrize(
+    ("theta", "shift"), [(0.0, (0.0, 0.0)), (0.02, (0.3, -0.25)), (-0.03, (-0.1, 0.4)), (0.0, (0.6, 0.0))]
+)
+def test_a_drifted_window_is_registered_back(
+    before: FixedLagMapper, theta: float, shift: tuple[float, float]
+) -> None:
+    """Across the track by the readings; along it as far as the curve's bends tell."""
+    mapper, registration = registered(before, theta, np.array(shift))
+    assert registration.motion.vector[2] == pytest.approx(-theta, abs=0.02)
+    moved = registration.motion.apply(mapper.poses[:, :2])
+    np.testing.assert_allclose(moved, before.poses[:, :2], atol=0.3)
+    readings = mapper.smoother.readings
+    for label, (rows, u) in registration.matches.items():
+        assert (readings.label[rows] == label).all()
+        points = registration.motion.apply(to_map(readings.point[rows], mapper.poses[readings.slot[rows]]))
+        on_curve = mapper.boundaries[label].evaluate(mapper.control_points(label), u)
+        distances = np.hypot(*(points - on_curve).T)
+        assert np.median(distances) < 0.1
+        assert distances.max() < mapper.settings.closing.inlier_distance + 0.1
+
+
+def prior_energy(mapper: FixedLagMapper, x: Array) -> float:
+    d = x - mapper.prior.point
+    return float(0.5 * d @ mapper.prior.information @ d - mapper.prior.gradient @ d)
+
+
+def test_an_exact_change_of_variables_keeps_the_priors_energy(before: FixedLagMapper) -> None:
+    """`C_old = E C_new`: the same energy at every curve of the new space, to a constant."""
+    mapper = deepcopy(before)
+    spline = replace(mapper.settings.spline, sigma_simplify=1e-9)
+    mapper.smoother.settings = settings = replace(mapper.settings, spline=spline)
+    old, state = deepcopy(mapper), mapper.smoother.state
+    joins = {b: join(curve, state.control_points(b), settings) for b, curve in state.boundaries.items()}
+    substitute(mapper.smoother, joins)
+    q_old, q_new = len(old.prior.point), len(mapper.prior.point)
+    shared = q_old - old.smoother.state.map_size
+    assert q_new == state.map_size + shared
+    rng = np.random.default_rng(0)
+    energies = []
+    for _ in range(4):
+        new = mapper.prior.point + 0.1 * rng.normal(size=q_new)
+        points, at = [], 0
+        for label, change in joins.items():
+            size = mapper.boundaries[label].size
+            points.append(change.old_from_new @ new[at : at + 2 * size].reshape(-1, 2))
+            at += 2 * size
+        x = np.concatenate([np.concatenate(points).ravel(), new[at:]])
+        energies.append((prior_energy(old, x), prior_energy(mapper, new)))
+    difference = np.diff(np.array(energies), axis=1).ravel()
+    scale = np.abs(energies).max()
+    np.testing.assert_allclose(difference - difference[0], 0.0, atol=1e-7 * scale)
+
+
+# --- where it mustn't ------------------------------------------------------------------------------------
+
+
+def test_an_open_track_stays_open() -> None:
+    log = exact_log(ahead(10.0, 9.0), *corridor(110.0))
+    mapper, results = map_log(log)
+    assert mapper.path.length > mapper.settings.closing.min_path
+    assert not any(result.closed for result in results)
+    assert not mapper.map().closed
+
+
+def test_no_loop_is_shorter_than_the_shortest(log: Log) -> None:
+    settings = MapperSettings()
+    settings = replace(settings, closing=replace(settings.closing, min_path=1000.0))
+    mapper = FixedLagMapper(settings, ODOMETRY_SIGMA)
+    for odometry, cycle in split_odometry(replace(log, cycles=log.cycles[:175])):
+        mapper.update(odometry, cycle)
+    assert not mapper.closed
+    assert not near_start(mapper.path, mapper.poses[-1], settings.closing)
+    assert near_start(mapper.path, mapper.poses[-1], MapperSettings().closing)
+
+
+def test_standing_on_the_start_line_closes_nothing() -> None:
+    log = exact_log(ahead(0.0, 4.0), *corridor(60.0))
+    mapper, _ = map_log(log)
+    assert not near_start(mapper.path, mapper.poses[-1], mapper.settings.closing)
+    assert not mapper.closed
+
+
+def test_another_way_past_the_beginning_is_no_loop() -> None:
+    """There and back again on the same straight: the place is the same, the direction is not."""
+    turning = np.tile([6.0, 0.0, np.pi / 3.0], (150, 1))
+    twists = np.concatenate([ahead(10.0, 6.0), turning, ahead(10.0, 7.0)])
+    mapper, _ = map_log(exact_log(twists, *corridor(80.0)))
+    assert mapper.path.length > mapper.settings.closing.min_path
+    assert not mapper.closed
