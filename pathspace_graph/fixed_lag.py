@@ -92,7 +92,7 @@ class FixedLagMapper:
         watch.lap("classify")
         self._expand()
         watch.lap("expand")
-        for _ in range(self.settings.steps):
+        for _ in range(self.settings.steps if self.closed else self.settings.steps_open):
             self.smoother.step(self.settings.sigma_step)
         watch.lap("update")
         closes = self._close()
@@ -172,6 +172,8 @@ class FixedLagMapper:
         if not self.boundaries:
             return Map(self.closed, {})
         joint, state = self.smoother.map_covariance(), self.smoother.state
+        if self.closed:
+            joint = joint + np.eye(len(joint)) * self.settings.spline.sigma_shape**2
         boundaries = {}
         for label, boundary in self.boundaries.items():
             block = state.block(label)

@@ -25,8 +25,12 @@ def locate_vehicle(smoother: Smoother) -> None:
     state, gate = smoother.state, smoother.settings.gate
     for label, boundary in state.boundaries.items():
         known = state.stations[label]
-        low, high = known[-1:] - gate.station_behind, known[-1:] + gate.station_ahead
-        u = boundary.find(state.control_points(label), state.poses[-1:, :2], low, high).u
+        points, position = state.control_points(label), state.poses[-1:, :2]
+        if float(np.hypot(*(position[0] - state.poses[-2, :2]))) < gate.station_step:
+            u = boundary.refine(points, position, known[-1:]).u
+        else:
+            low, high = known[-1:] - gate.station_behind, known[-1:] + gate.station_ahead
+            u = boundary.find(points, position, low, high).u
         if boundary.periodic:  # laps add up
             u = u + boundary.length * np.round((known[-1] - u) / boundary.length)
         state.stations[label] = np.append(known, u)

@@ -28,21 +28,25 @@ class SplineSettings(_Positive):
     """Degree of the splines (1 or more; cubic has a continuous curvature)."""
     spacing: float = 3.5
     """Distance of the control points (m) while the curve is open and grows."""
-    size_share: float = 0.42
+    size_share: float = 0.43
     """Control points after closing, as a share of the distinct cones sighted (the paper has 0.44)."""
     min_size: int = 8
     """Fewest control points of a closed boundary."""
     linear_baseline: float = 0.5
     """Share of the knots spread evenly; the rest follows the curvature (paper: Simplification)."""
-    sigma_model: float = 0.08
-    """How far cones stand off a smooth curve (m, one sigma), added to each reading across the curve."""
-    sigma_simplify: float = 0.05
+    sigma_model: float = 0.25
+    """Added to each reading across the curve (m, one sigma): how far cones stand off it. That error is the same
+    every time a cone is seen, which is why it is larger than the offsets themselves, about 0.1 m."""
+    sigma_shape: float = 0.1
+    """What a curve of so few control points can't follow (m, one sigma): added to the covariance of a closed map,
+    since no number of readings averages it out."""
+    sigma_simplify: float = 0.1
     """Shift of a control point (m, one sigma) that simplification may cause: loosens the prior by as much."""
     confirmed_margin: float = 0.5
     """So far past its last sighting (m) an open curve is believed; beyond, it is extrapolated."""
     search_step: float = 1.0
     """Coarse step (m along the curve) of a global search for foot points."""
-    search_iterations: int = 4
+    search_iterations: int = 2
     """Newton steps of a global search."""
     refine_room: float = 2.0
     """How far from where it was (m along the curve) a foot point is looked for in a Gauss-Newton step."""
@@ -82,8 +86,10 @@ class GateSettings(_Positive):
     """Stretch of the curve ahead of the vehicle (m along it) that a reading may belong to."""
     view_behind: float = 4.0
     """The same behind the vehicle."""
+    station_step: float = 1.5
+    """A vehicle that moved less than this (m) in a cycle has its foot point near the last cycle's; else ..."""
     station_ahead: float = 8.0
-    """The vehicle's own foot point on the curve is searched for so far ahead of the last cycle's (m), ..."""
+    """... it is searched for as far ahead of that (m) as this, ..."""
     station_behind: float = 3.0
     """... and so far behind it (m)."""
 
@@ -148,7 +154,7 @@ class ClosingSettings(_Positive):
 
     min_path: float = 60.0
     """Shortest lap (m)."""
-    check_interval: float = 1.0
+    check_interval: float = 2.0
     """Path (m) between two attempts to close."""
     radius: float = 8.0
     """Distance from the start (m) within which the loop may close, ..."""
@@ -184,11 +190,11 @@ class ClosingSettings(_Positive):
     """A reading farther than this from the beginning doesn't pull in the first iteration (m), ..."""
     icp_shrink: float = 0.7
     """... and this share of the distance with each further one, down to `inlier_distance`."""
-    icp_iterations: int = 10
+    icp_iterations: int = 7
     """Iterations of the registration."""
     keyframe_interval: float = 12.0
     """Path (m) between the keyframes in whose frames the drive so far is kept until the loop closes."""
-    iterations: int = 4
+    iterations: int = 3
     """Gauss-Newton steps after the tie, and again after simplification, ..."""
     sigma_step: float = 10.0
     """... in which a control point moves so far freely (m): hardly damped."""
@@ -226,6 +232,8 @@ class MapperSettings(_Positive):
     """Time (s) that poses stay in the window."""
     steps: int = 1
     """Gauss-Newton steps a cycle, each relinearized at the current estimate."""
+    steps_open: int = 2
+    """The same while the curves still grow, and new control points are far from their optimum."""
     sigma_step: float = 0.5
     """How far a control point moves freely in a step (m): damps sliding along the curve, not the optimum."""
     spline: SplineSettings = field(default_factory=SplineSettings)

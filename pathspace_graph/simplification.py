@@ -77,8 +77,18 @@ def _size(boundary: Boundary, control_points: Array, period: float, settings: Ma
     sighted = np.array(boundary.sighted).reshape(-1, 2)
     low = np.zeros(len(sighted))
     u = boundary.find(control_points, sighted, low, low + boundary.confirmed).u
-    distinct = int((u < period - settings.closing.seam_margin).sum())
+    on_lap = np.sort(u[u < period - settings.closing.seam_margin])
+    distinct = _count_apart(on_lap, settings.growth.merge_radius)
     return max(spline.min_size, int(spline.size_share * distinct))
+
+
+def _count_apart(values: Array, distance: float) -> int:
+    """How many of the sorted values (k,) are more than `distance` past the last one counted."""
+    count, last = 0, -np.inf
+    for value in values:
+        if value - last > distance:
+            count, last = count + 1, value
+    return count
 
 
 def find_overlap(boundary: Boundary, control_points: Array, settings: ClosingSettings) -> Overlap:
