@@ -124,8 +124,9 @@ class Growth:
         found = found.where(far & (found.stations > end.station + settings.station_margin))
         found = found.where(chain(found, settings, end))
         if len(found.points):
+            known = smoother.state.boundaries[label].confirmed
             lead(smoother, label, end.position, found.points)
-            self._consume(smoother, label, found, smoother.state.boundaries[label].confirmed)
+            self._consume(smoother, label, found, known)
             return True
         if end.station < way.driven - settings.stranded:
             return _carry_on(smoother, label, way, end)

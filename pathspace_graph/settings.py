@@ -35,11 +35,11 @@ class SplineSettings(_Positive):
     linear_baseline: float = 0.5
     """Share of the knots spread evenly; the rest follows the curvature (paper: Simplification)."""
     sigma_model: float = 0.25
-    """Added to each reading across the curve (m, one sigma): how far cones stand off it. That error is the same
-    every time a cone is seen, which is why it is larger than the offsets themselves, about 0.1 m."""
+    """Added to each reading across the curve (m, one sigma): how far cones stand off it. That error is the
+    same every time a cone is seen, which is why it is larger than the offsets themselves, about 0.1 m."""
     sigma_shape: float = 0.1
-    """What a curve of so few control points can't follow (m, one sigma): added to the covariance of a closed map,
-    since no number of readings averages it out."""
+    """What a curve of so few control points can't follow (m, one sigma): added to the covariance of a closed
+    map, since no number of readings averages it out."""
     sigma_simplify: float = 0.1
     """Shift of a control point (m, one sigma) that simplification may cause: loosens the prior by as much."""
     confirmed_margin: float = 0.5
@@ -87,7 +87,7 @@ class GateSettings(_Positive):
     view_behind: float = 4.0
     """The same behind the vehicle."""
     station_step: float = 1.5
-    """A vehicle that moved less than this (m) in a cycle has its foot point near the last cycle's; else ..."""
+    """A vehicle that moved less than this (m) in a cycle has its foot point near the last one's; else ..."""
     station_ahead: float = 8.0
     """... it is searched for as far ahead of that (m) as this, ..."""
     station_behind: float = 3.0
