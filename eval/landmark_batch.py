@@ -144,14 +144,8 @@ def held_twists(odometry: Odometry, start: float, end: float) -> tuple[Array, Ar
 
     Each is held until the next row's time, the last for good; before the first row nothing moves.
     """
-    t = odometry.t
-    start = max(start, float(t[0]))
-    if end <= start:
-        return np.zeros(0), np.zeros((0, 3))
-    first = int(np.searchsorted(t, start, side="right")) - 1
-    last = int(np.searchsorted(t, end, side="left"))
-    edges = np.concatenate([[start], t[first + 1 : last], [end]])
-    return np.diff(edges), odometry.twist[first:last]
+    held = odometry.between(start, end)
+    return np.diff(np.append(held.t, end)), held.twist
 
 
 def _motion_graph(

@@ -44,6 +44,16 @@ class Odometry:
     twist: FloatArray
     """[vx, vy, wz] (N, 3), m/s, m/s, rad/s, vehicle frame."""
 
+    def between(self, start: float, end: float) -> Odometry:
+        """The twists in force from `start` to `end` (s): the first from `start`, the last held until `end`.
+
+        Before the first row nothing moves; where no time passes there are no rows.
+        """
+        start = max(start, float(self.t[0]))
+        first = int(np.searchsorted(self.t, start, side="right")) - 1
+        stop = max(first, int(np.searchsorted(self.t, end, side="left"))) if end > start else first
+        return Odometry(np.maximum(self.t[first:stop], start), self.twist[first:stop])
+
 
 @dataclass(frozen=True, eq=False)
 class Detections:

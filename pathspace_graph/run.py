@@ -105,13 +105,9 @@ def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
     Rows [t_i, t_(i+1)) tile the time from the first odometry stamp to the cycle: the first row begins at the
     last cycle's stamp with the twist that was held there, the last one is held until the cycle.
     """
-    stamps, twists = log.odometry.t, log.odometry.twist
-    since = float(stamps[0])
+    since = float(log.odometry.t[0])
     for detections in log.cycles:
-        first = int(np.searchsorted(stamps, since, side="right")) - 1
-        stop = max(first, int(np.searchsorted(stamps, detections.t, side="left")))
-        t = np.maximum(stamps[first:stop], since)
-        yield Odometry(t, twists[first:stop]), detections
+        yield log.odometry.between(since, detections.t), detections
         since = detections.t
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from pathspace_graph.map import (
     read_map,
     write_result,
 )
+from pathspace_graph.run import CycleRecord, RunResult
 from pathspace_graph.spline import BSpline
 
 
@@ -51,33 +51,19 @@ def spline_map() -> Map:
     )
 
 
-@dataclass(frozen=True)
-class Cycle:
-    cycle: int
-    t: float
-    seconds: float
-    size_left: int
-    size_right: int
-    readings: int
-    lap: int
-    stages: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Result:
-    map: Map
-    trajectory_t: np.ndarray
-    trajectory: np.ndarray
-    cycles: tuple[Cycle, ...]
-
-
-def result() -> Any:
+def result() -> RunResult:
     rng = np.random.default_rng(4)
-    return Result(
+    return RunResult(
+        estimator="fixed-lag",
+        settings={},
+        laps=1,
         map=spline_map(),
         trajectory_t=np.array([0.1, 0.2, 1 / 3]),
         trajectory=np.column_stack([rng.normal(0.0, 10.0, (3, 2)), [0.0, np.pi, -3.0]]),
-        cycles=(Cycle(0, 0.1, 1e-3, 0, 4, 7, 1), Cycle(1, 0.2, np.float64(2e-3), 9, 7, 12, 2)),
+        cycles=(
+            CycleRecord(0, 0.1, 1e-3, 0, 4, 7, 1),
+            CycleRecord(1, 0.2, np.float64(2e-3), 9, 7, 12, 2),
+        ),
     )
 
 
