@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
-from .errors import SettingsError
-
-
-class _Positive:
-    """Settings whose numbers are all positive; infinity is allowed."""
-
-    def __post_init__(self) -> None:
-        """SettingsError names the first setting that isn't, as the command line knows it."""
-        group = type(self).__name__.removesuffix("Settings").lower()
-        prefix = "" if group == "mapper" else f"{group}."
-        for entry in fields(self):  # type: ignore[arg-type]  # every heir is a dataclass
-            value = getattr(self, entry.name)
-            if isinstance(value, int | float) and not value > 0:
-                raise SettingsError(f"{prefix}{entry.name}: expected a positive number, found {value}")
+from .batch_settings import BatchSettings
+from .ckf_settings import CkfSettings
+from .landmark_settings import LandmarkSettings
+from .positive import Positive
 
 
 @dataclass(frozen=True)
-class SplineSettings(_Positive):
+class SplineSettings(Positive):
     """The two boundary curves."""
 
     degree: int = 3
@@ -59,7 +49,7 @@ class SplineSettings(_Positive):
 
 
 @dataclass(frozen=True)
-class GaugeSettings(_Positive):
+class GaugeSettings(Positive):
     """Weak priors on what readings leave free."""
 
     sigma_spacing: float = 0.3
@@ -71,7 +61,7 @@ class GaugeSettings(_Positive):
 
 
 @dataclass(frozen=True)
-class GateSettings(_Positive):
+class GateSettings(Positive):
     """Which readings are used."""
 
     chi: float = 3.0
@@ -95,7 +85,7 @@ class GateSettings(_Positive):
 
 
 @dataclass(frozen=True)
-class PathSettings(_Positive):
+class PathSettings(Positive):
     """The way driven, and the way ahead."""
 
     step: float = 0.3
@@ -113,7 +103,7 @@ class PathSettings(_Positive):
 
 
 @dataclass(frozen=True)
-class GrowthSettings(_Positive):
+class GrowthSettings(Positive):
     """How an open end grows."""
 
     reach: float = 7.0
@@ -149,7 +139,7 @@ class GrowthSettings(_Positive):
 
 
 @dataclass(frozen=True)
-class ClosingSettings(_Positive):
+class ClosingSettings(Positive):
     """Loop closing."""
 
     min_path: float = 60.0
@@ -211,7 +201,7 @@ class ClosingSettings(_Positive):
 
 
 @dataclass(frozen=True)
-class OdometrySettings(_Positive):
+class OdometrySettings(Positive):
     """What is not white in the odometry: constant errors, estimated along with the map."""
 
     sigma_scale: float = 0.005
@@ -225,8 +215,8 @@ class OdometrySettings(_Positive):
 
 
 @dataclass(frozen=True)
-class MapperSettings(_Positive):
-    """Everything that the fixed-lag mapper can be told."""
+class MapperSettings(Positive):
+    """Everything that the estimators can be told; each takes the parts that are its own."""
 
     lag: float = 3.0
     """Time (s) that poses stay in the window."""
@@ -250,3 +240,9 @@ class MapperSettings(_Positive):
     """How the loop closes."""
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     """Calibration of the odometry."""
+    batch: BatchSettings = field(default_factory=BatchSettings)
+    """The batch optimization over a whole log."""
+    landmark: LandmarkSettings = field(default_factory=LandmarkSettings)
+    """The Hungarian landmark graph."""
+    ckf: CkfSettings = field(default_factory=CkfSettings)
+    """The paper's filters."""
