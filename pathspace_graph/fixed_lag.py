@@ -13,7 +13,7 @@ from pathspace_graph.factors.odometry import IntegratedOdometry, compose, integr
 
 from .boundary import Boundary
 from .closing import bend, near_start, register, tie
-from .gating import admit, locate_vehicle
+from .gating import admit
 from .growth import Growth
 from .labels import LEFT, RIGHT
 from .log import Detections, Odometry
@@ -92,7 +92,7 @@ class FixedLagMapper:
         watch.lap("classify")
         self._expand()
         watch.lap("expand")
-        for _ in range(self.settings.steps if self.closed else self.settings.steps_open):
+        for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
             self.smoother.step(self.settings.sigma_step)
         watch.lap("update")
         closes = self._close()
@@ -125,7 +125,6 @@ class FixedLagMapper:
     def _classify(self, detections: Detections) -> None:
         """Which readings update a curve, and which are sightings of what no curve explains yet."""
         new = self.smoother.add_readings(detections)
-        locate_vehicle(self.smoother)
         for label in self.boundaries:
             admit(self.smoother, label, retest=label in self._grown)
         if not self.closed:

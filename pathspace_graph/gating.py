@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,47 +14,36 @@ from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometr
 from pathspace_graph.factors.projection import ProjectionRows, project, to_map
 
 from .labels import UNKNOWN
+from .settings import MapperSettings
 from .smoother import Smoother, Step
 from .state import State
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-
-
-def locate_vehicle(smoother: Smoother) -> None:
-    """The newest pose's station: its foot point on each boundary, near where the last one's was."""
-    state, gate = smoother.state, smoother.settings.gate
-    for label, boundary in state.boundaries.items():
-        known = state.stations[label]
-        points, position = state.control_points(label), state.poses[-1:, :2]
-        if float(np.hypot(*(position[0] - state.poses[-2, :2]))) < gate.station_step:
-            u = boundary.refine(points, position, known[-1:]).u
-        else:
-            low, high = known[-1:] - gate.station_behind, known[-1:] + gate.station_ahead
-            u = boundary.find(points, position, low, high).u
-        if boundary.periodic:  # laps add up
-            u = u + boundary.length * np.round((known[-1] - u) / boundary.length)
-        state.stations[label] = np.append(known, u)
+T = TypeVar("T", FootPoints, ProjectionRows)
 
 
 def admit(smoother: Smoother, label: int, retest: bool) -> None:
     """Readings that are not in use and lie on the curve: `d^2 < chi^2 (sigma^2 + g' Sigma g)`.
 
-    Those of the newest pose; all in the window where `retest`, since the curve has grown. A reading of
-    unknown colour is used only where no other curve has taken it.
+    Those of the newest pose, whose station is found along with them; all in the window where `retest`, since
+    the curve has grown. A reading of unknown colour is used only where no other curve has taken it.
     """
     readings, gate = smoother.readings, smoother.settings.gate
     rows = readings.pending(label)
     if not retest:
         rows = rows[readings.slot[rows] == len(smoother.times) - 1]
+    rows, foot, projected = _near_curve(smoother, label, rows)
     if len(rows) == 0 or smoother.last_step is None:
         return
-    rows, foot, projected = _near_curve(smoother, label, rows)
-    if len(rows) == 0:
-        return
     variance = projected.sigma**2 + gate.sigma_floor**2
-    variance += joint_variance(smoother, label, readings.slot[rows], foot, projected)
     passes = foot.distance**2 < gate.chi**2 * variance
+    if not passes.all():  # what the joint uncertainty adds matters to the others only
+        far = np.flatnonzero(~passes)
+        variance[far] += joint_variance(
+            smoother, label, readings.slot[rows[far]], _take(foot, far), _take(projected, far)
+        )
+        passes = foot.distance**2 < gate.chi**2 * variance
     passes &= (readings.label[rows] != UNKNOWN) | (readings.boundary[rows] == UNKNOWN)
     chosen = rows[passes]
     readings.used[chosen] = True
@@ -64,22 +54,47 @@ def admit(smoother: Smoother, label: int, retest: bool) -> None:
 def _near_curve(
     smoother: Smoother, label: int, rows: IntArray
 ) -> tuple[IntArray, FootPoints, ProjectionRows]:
-    """Those of some readings that lie roughly on the visible stretch of a curve, projected on it."""
+    """Those of some readings that lie roughly on the visible stretch of a curve, projected on it.
+
+    In the same search the newest pose gets its station.
+    """
     readings, state, settings = smoother.readings, smoother.state, smoother.settings
     boundary, gate, slots = state.boundaries[label], settings.gate, readings.slot[rows]
-    station = state.stations[label][slots]
-    low, high = station - gate.view_behind, station + gate.view_ahead
     poses = state.poses[slots]
     points = to_map(readings.point[rows], poses)
-    foot = boundary.find(state.control_points(label), points, low, boundary.believed(high))
-    keep = np.flatnonzero(foot.interior & (np.abs(foot.distance) < gate.rough))
+    expected, behind, ahead = _expected_station(state, label, settings)
+    stations = np.append(state.stations[label], expected)[slots]
+    low = np.append(stations - gate.view_behind, expected - behind)
+    high = boundary.believed(np.append(stations + gate.view_ahead, expected + ahead))
+    sought = np.concatenate([points, state.poses[-1:, :2]])
+    foot = boundary.find(state.control_points(label), sought, low, high)
+    _append_station(state, label, foot.u[-1])
+    keep = np.flatnonzero(foot.interior[:-1] & (np.abs(foot.distance[:-1]) < gate.rough))
     rows, foot = rows[keep], _take(foot, keep)
     sigma_model = settings.spline.sigma_model
     return rows, foot, project(points[keep], readings.covariance[rows], poses[keep], foot, sigma_model)
 
 
-def _take(foot: FootPoints, keep: IntArray) -> FootPoints:
-    return FootPoints(*(getattr(foot, column.name)[keep] for column in fields(foot)))
+def _expected_station(state: State, label: int, settings: MapperSettings) -> tuple[float, float, float]:
+    """About where the newest pose's foot point is, and how far behind and ahead it is looked for (m)."""
+    known, gate = float(state.stations[label][-1]), settings.gate
+    moved = float(np.hypot(*(state.poses[-1, :2] - state.poses[-2, :2])))
+    if moved < gate.station_step:
+        return known, settings.spline.refine_room, settings.spline.refine_room
+    return known, gate.station_behind, gate.station_ahead
+
+
+def _append_station(state: State, label: int, u: float) -> None:
+    """The newest pose's station; on a closed curve laps add up."""
+    boundary, known = state.boundaries[label], state.stations[label]
+    if boundary.periodic:
+        u += boundary.length * np.round((known[-1] - u) / boundary.length)
+    state.stations[label] = np.append(known, u)
+
+
+def _take(rows: T, keep: IntArray) -> T:
+    """Some rows of a dataclass of columns."""
+    return type(rows)(*(getattr(rows, column.name)[keep] for column in fields(rows)))
 
 
 def joint_variance(

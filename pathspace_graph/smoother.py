@@ -19,7 +19,7 @@ from .readings import Readings
 from .segments import History
 from .settings import MapperSettings
 from .state import State
-from .window import POSE, Prior, Rows, accumulate, cholesky, schur_leave, solve
+from .window import POSE, Prior, Rows, accumulate, cholesky, schur_leave, solve, without
 
 Array = NDArray[np.float64]
 
@@ -142,7 +142,7 @@ class Smoother:
         hessian, descent = normal_equations(groups, self.prior, self.state)
         damped = np.arange(self.state.map_size)
         hessian[damped, damped] += sigma_step**-2
-        factor = cholesky(hessian)
+        factor = cholesky(hessian, overwrite=True)
         self.last_step = Step(groups, self.state.vector, factor)
         self.state.vector = self.state.vector + solve(factor, descent)
 
@@ -158,7 +158,8 @@ class Smoother:
         step, state = self.last_step, self.state
         assert step is not None
         low = state.pose_column(0)
-        touching = [rows.touching(low, low + POSE) for rows in step.groups]
+        halves = [rows.split(low, low + POSE) for rows in step.groups]
+        touching = [leaving for leaving, _ in halves]
         size = max(low + 2 * POSE, len(self.prior.point), *(rows.reach for rows in touching))
         hessian, descent = accumulate(touching, size)
         if self.history is not None:
@@ -167,10 +168,9 @@ class Smoother:
         hessian[:q, :q] += self.prior.information
         descent[:q] += self.prior.descent_at(step.point)
         information, gradient = schur_leave(hessian, descent, low, low + POSE)
-        leaving = np.s_[low : low + POSE]
-        self.prior = Prior(information, gradient, np.delete(step.point[:size], leaving))
-        step.point = np.delete(step.point, leaving)
-        step.groups = [rows.without(low, low + POSE) for rows in step.groups]
+        self.prior = Prior(information, gradient, without(step.point[:size], low, low + POSE, 0))
+        step.point = without(step.point, low, low + POSE, 0)
+        step.groups = [staying for _, staying in halves]
         step.dropped += 1
         self._forget_oldest()
 
@@ -197,4 +197,4 @@ class Smoother:
         return np.asarray(half.T @ half)
 
     def _undamped_factor(self) -> Array:
-        return cholesky(normal_equations(self.linearize(), self.prior, self.state)[0])
+        return cholesky(normal_equations(self.linearize(), self.prior, self.state)[0], overwrite=True)

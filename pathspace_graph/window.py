@@ -38,17 +38,20 @@ class Rows:
     residual: Array
     """(m,) whitened residuals at the linearization point."""
 
-    def touching(self, low: int, high: int) -> Rows:
-        """The rows that touch a column in [low, high)."""
-        touches = ((self.columns >= low) & (self.columns < high)).any(axis=1)
-        return Rows(self.columns[touches], self.jacobian[touches], self.residual[touches])
+    def split(self, low: int, high: int) -> tuple[Rows, Rows]:
+        """The rows that touch a column in [low, high); and the others, once those are taken out of the state."""
+        touches = np.asarray(((self.columns >= low) & (self.columns < high)).any(axis=1))
+        if not touches.any():
+            return self._take(touches), self._without(low, high)
+        return self._take(touches), self._take(~touches)._without(low, high)
 
-    def without(self, low: int, high: int) -> Rows:
-        """The rows that don't touch the columns [low, high), which are taken out of the state."""
-        keep = ~((self.columns >= low) & (self.columns < high)).any(axis=1)
-        columns = self.columns[keep]
-        moved = np.where(columns >= low, columns - (high - low), columns)
-        return Rows(moved, self.jacobian[keep], self.residual[keep])
+    def _take(self, rows: NDArray[np.bool_]) -> Rows:
+        return Rows(self.columns[rows], self.jacobian[rows], self.residual[rows])
+
+    def _without(self, low: int, high: int) -> Rows:
+        """The columns from `high` on move down to `low`."""
+        moved = self.columns - (high - low) * (self.columns >= high)
+        return Rows(moved, self.jacobian, self.residual)
 
     @property
     def reach(self) -> int:
@@ -103,9 +106,12 @@ def _sums(index: IntArray, terms: Array, size: int) -> Array:
     return np.asarray(np.bincount(index, terms, size), np.float64)
 
 
-def cholesky(hessian: Array) -> Array:
-    """Lower factor `L L' = H`, its upper triangle not cleared; SingularSystemError where there is none."""
-    factor, info = lapack.dpotrf(hessian.T, lower=1, clean=0, overwrite_a=0)
+def cholesky(hessian: Array, overwrite: bool = False) -> Array:
+    """Lower factor `L L' = H`, its upper triangle not cleared; SingularSystemError where there is none.
+
+    `overwrite`: it may take the place of a row-major H.
+    """
+    factor, info = lapack.dpotrf(hessian.T, lower=1, clean=0, overwrite_a=overwrite)
     if info != 0:
         raise SingularSystemError(f"expected a positive definite system, found pivot {info} not positive")
     return np.asarray(factor)
@@ -118,10 +124,20 @@ def solve(factor: Array, descent: Array) -> Array:
 
 
 def schur_leave(hessian: Array, descent: Array, low: int, high: int) -> tuple[Array, Array]:
-    """Without the entries [low, high): `H_bb - H_ba H_aa^-1 H_ab` and `g_b - H_ba H_aa^-1 g_a`."""
-    leaving = slice(low, high)
-    stay = np.r_[0:low, high : len(descent)]
-    coupling = hessian[stay, leaving]
-    gain = np.linalg.solve(hessian[leaving, leaving], coupling.T).T
-    information = hessian[np.ix_(stay, stay)] - gain @ coupling.T
-    return 0.5 * (information + information.T), descent[stay] - gain @ descent[leaving]
+    """Without the entries [low, high): `H_bb - H_ba H_aa^-1 H_ab` and `g_b - H_ba H_aa^-1 g_a`.
+
+    By the root `W = L_a^-1 H_ab`, so that it stays symmetric: `H_bb - W' W`.
+    """
+    half = cholesky(hessian[low:high, low:high])
+    coupling = np.column_stack([without(hessian[low:high], low, high, 1), descent[low:high]])
+    root, _ = lapack.dtrtrs(half, coupling, lower=1)
+    w, g = np.ascontiguousarray(root[:, :-1]), root[:, -1]
+    information = without(without(hessian, low, high, 0), low, high, 1)
+    information -= w.T @ w
+    return information, without(descent, low, high, 0) - g @ w
+
+
+def without(values: Array, low: int, high: int, axis: int) -> Array:
+    """A copy of an array without [low, high) of an axis."""
+    parts = [values[:low], values[high:]] if axis == 0 else [values[:, :low], values[:, high:]]
+    return np.concatenate(parts, axis=axis)

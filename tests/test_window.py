@@ -64,12 +64,14 @@ def test_solve_is_least_squares_and_a_free_direction_is_an_error() -> None:
         cholesky(np.diag(np.append(np.ones(11), 0.0)))
 
 
-def test_touching_takes_the_rows_of_a_range() -> None:
-    columns = np.array([[0, 1], [1, 4], [3, 2], [4, 5]])
+def test_split_cuts_the_rows_of_a_range_off() -> None:
+    columns = np.array([[0, 1], [1, 4], [3, 2], [6, 5]])
     rows = Rows(columns, np.arange(8.0).reshape(4, 2), np.arange(4.0))
-    touching = rows.touching(2, 5)
-    assert touching.residual.tolist() == [1.0, 2.0, 3.0]
-    np.testing.assert_array_equal(touching.columns, columns[1:])
+    touching, others = rows.split(2, 5)
+    assert touching.residual.tolist() == [1.0, 2.0]
+    np.testing.assert_array_equal(touching.columns, columns[1:3])
+    assert others.residual.tolist() == [0.0, 3.0]
+    np.testing.assert_array_equal(others.columns, [[0, 1], [3, 2]])
 
 
 def test_schur_leave_is_the_marginal() -> None:
@@ -205,13 +207,13 @@ def fixed_lag(cycles: list[list[Rows]], lag: int, rng: np.random.Generator) -> A
 def leave(prior: Prior, held: list[Rows], state: Array) -> tuple[Prior, list[Rows]]:
     """The oldest pose goes into the prior on the map and the next pose."""
     low, size = MAP, MAP + 2 * POSE
-    touching = [at_state(g, state).touching(low, low + POSE) for g in held]
+    touching = [at_state(g, state).split(low, low + POSE)[0] for g in held]
     hessian, descent = accumulate(touching, size)
     q = len(prior.point)
     hessian[:q, :q] += prior.information
     descent[:q] += prior.descent_at(state)
     information, gradient = schur_leave(hessian, descent, low, low + POSE)
-    kept = [g for g in held if not len(g.touching(low, low + POSE).residual)]
+    kept = [g for g in held if not len(g.split(low, low + POSE)[0].residual)]
     point = np.delete(state[:size], np.s_[low : low + POSE])
     return Prior(information, gradient, point), [shifted(g, POSE) for g in kept]
 
