@@ -39,6 +39,7 @@ from pathspace_graph.factors.linear_graph import (
 from pathspace_graph.files import atomic_file, check_file_target
 from pathspace_graph.fixed_lag import FixedLagMapper
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.linearizer import add_smoothness
 from pathspace_graph.log import Log
 from pathspace_graph.progress import progress
 from pathspace_graph.run import CycleRecord, run_online
@@ -111,17 +112,15 @@ class LinearWindow:
 
 def linear_window(mapper: FixedLagMapper) -> LinearWindow:
     """The window of a mapper between two cycles, which is left as it is."""
-    state = mapper.smoother.state
-    q, map_size = len(mapper.prior.point), state.map_size
-    groups = mapper.linearize()
+    whole = mapper.smoother.whole()
+    state = whole.state
+    q, map_size = len(whole.prior.point), state.map_size
+    groups = whole.linearize()
     gauge = [rows for rows in groups if rows.columns.max(initial=-1) < map_size]
     information, descent = accumulate(gauge, q)
-    information += mapper.prior.information
-    descent += mapper.prior.descent_at(state.vector)
-    for label, boundary in mapper.boundaries.items():
-        block = state.block(label)
-        information[block, block] += boundary.gauge_hessian
-        descent[block] -= boundary.smooth_only @ state.vector[block]
+    information += whole.prior.information
+    descent += whole.prior.descent_at(state.vector)
+    add_smoothness(information, descent, state, state.vector)
     information[np.arange(map_size), np.arange(map_size)] += mapper.settings.sigma_step**-2
     left, right = (mapper.boundaries[b].size if b in mapper.boundaries else 0 for b in (LEFT, RIGHT))
     keys = window_keys((left, right), len(mapper.calibration), mapper.poses)

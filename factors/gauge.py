@@ -20,17 +20,18 @@ def spacing_residuals(control_points: Array, nominal: Array, periodic: bool) -> 
     return length - nominal, offset / np.maximum(length, np.finfo(float).tiny)[:, None]
 
 
-def smoothness_matrix(abscissae: Array, period: float | None) -> Array:
-    """Second divided differences of control points over their abscissae, times the mean spacing squared.
+def smoothness_matrix(abscissae: Array, period: float | None, spacing: float | None = None) -> Array:
+    """Second divided differences of control points over their abscissae, times the spacing squared.
 
     abscissae (m,) (Greville's) -> D (m - 2, m), or (m, m) where `period` closes the curve, so that `D c` (m)
     are the second differences of evenly spaced points; zero for a straight line, whatever the spacing.
+    `spacing`: the curve's mean one, unless these points' own is meant.
     Linear: a prior `D c ~ N(0, sigma^2)` is a JacobianFactor.
     """
     m = len(abscissae)
     extended = abscissae if period is None else np.concatenate([abscissae, abscissae[:2] + period])
     gaps = np.diff(extended)
-    mean = gaps[:m].mean()  # the gap that the period repeats counts once
+    mean = gaps[:m].mean() if spacing is None else spacing  # the gap that the period repeats counts once
     rows = np.arange(len(extended) - 2)
     before, after = gaps[:-1], gaps[1:]
     matrix = np.zeros((len(rows), m))

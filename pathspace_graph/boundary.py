@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,24 @@ IntArray = NDArray[np.intp]
 
 ROUND_OFF = 1e-9
 """Parameters (m) this near to a knot are on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gauge:
+    """Weak priors between the control points of a stretch."""
+
+    near: IntArray
+    """(k,) the control points, in driving order."""
+    whole: bool
+    """Whether they are a closed curve's, all of them, so that the last is followed by the first."""
+    columns: IntArray
+    """(r, 4) entries of each and the next, counted from the boundary's first, ..."""
+    nominal: Array
+    """... and their nominal distance (r,), m."""
+    smooth: Array
+    """(2k, 2k) smoothness in their normal equations; zero along a straight line."""
+    hessian: Array
+    """(2k, 2k) smoothness and anchor; the anchor holds each point where it is, so it has no gradient."""
 
 
 class Boundary:
@@ -49,19 +69,46 @@ class Boundary:
             following = np.append(following, self.abscissae[0] + self.length)
         self.nominal = following - self.abscissae[: len(following)]
         """Nominal distance to the next control point, m."""
-        self._set_gauge()
+        self.everything = np.arange(self.size)
+        """(m,) indices of all control points."""
+        self._gauge: Gauge | None = None
 
-    def _set_gauge(self) -> None:
-        """`D' D / (sigma_smoothness spacing)^2 + I / sigma_anchor^2`: constant until the knots change."""
-        smooth = smoothness_matrix(self.abscissae, self.length if self.periodic else None)
+    def gauge_on(self, near: IntArray) -> Gauge:
+        """The gauge between the control points `near` (k,), a stretch in driving order; the last one is kept."""
+        if self._gauge is None or self._gauge.near is not near:
+            self._gauge = self._new_gauge(near)
+        return self._gauge
+
+    @property
+    def gauge_hessian(self) -> Array:
+        """(2m, 2m) smoothness and anchor between all control points."""
+        return self.gauge_on(self.everything).hessian
+
+    @property
+    def smooth_only(self) -> Array:
+        """(2m, 2m) smoothness between all control points."""
+        return self.gauge_on(self.everything).smooth
+
+    def _new_gauge(self, near: IntArray) -> Gauge:
+        """`D' D / (sigma_smoothness spacing)^2 + I / sigma_anchor^2`, and the neighbours to keep apart."""
+        whole = self.periodic and len(near) == self.size
+        abscissae = self.abscissae[near]
+        abscissae = abscissae + self.length * (abscissae < abscissae[:1])  # a stretch past the seam
         spacing = float(np.mean(self.nominal))
-        scaled: Array = smooth / (self.gauge.sigma_smoothness * spacing)
-        hessian = scaled.T @ scaled
-        self.smooth_only: Array = np.asarray(np.kron(hessian, np.eye(2)), float)
-        """(2m, 2m) smoothness in the normal equations of its control points; zero along a straight line."""
-        anchor = np.eye(self.size) / self.gauge.sigma_anchor**2
-        self.gauge_hessian: Array = np.asarray(np.kron(hessian + anchor, np.eye(2)), float)
-        """(2m, 2m) smoothness and anchor; the anchor holds each point where it is, so it has no gradient."""
+        scaled = smoothness_matrix(abscissae, self.length if whole else None, spacing)
+        scaled = scaled / (self.gauge.sigma_smoothness * spacing)
+        smooth = scaled.T @ scaled
+        anchor = np.eye(len(near)) / self.gauge.sigma_anchor**2
+        first = near if whole else near[:-1]
+        pairs = np.stack([first, (first + 1) % self.size], axis=1)
+        return Gauge(
+            near=near,
+            whole=whole,
+            columns=np.stack([2 * pairs, 2 * pairs + 1], axis=2).reshape(-1, 4),
+            nominal=self.nominal[first],
+            smooth=np.asarray(np.kron(smooth, np.eye(2)), float),
+            hessian=np.asarray(np.kron(smooth + anchor, np.eye(2)), float),
+        )
 
     @property
     def knots(self) -> Array:

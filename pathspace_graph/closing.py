@@ -20,7 +20,7 @@ from .segments import History, Segment, relinearized_prior
 from .settings import ClosingSettings
 from .smoother import Smoother
 from .state import State
-from .window import POSE, Prior, schur_leave
+from .window import POSE, Prior, schur_leave, without
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -169,6 +169,7 @@ def _certain(matches: Matches, posterior: Array, settings: ClosingSettings) -> b
 
 def tie(smoother: Smoother, registration: Registration) -> None:
     """Move the window onto the beginning, and hold the agreeing readings against it."""
+    smoother.join()
     poses, readings = smoother.state.poses, smoother.readings
     poses[:, :2] = registration.motion.apply(poses[:, :2])
     poses[:, 2] += registration.motion.vector[2]
@@ -209,6 +210,5 @@ def _without_keyframes(prior: Prior, state: State) -> Prior:
     stop = state.pose_column(0)
     start = stop - POSE * state.keyframes
     information, gradient = schur_leave(prior.information, prior.gradient, start, stop)
-    state.vector = np.delete(state.vector, np.s_[start:stop])
-    state.keyframes = 0
-    return Prior(information, gradient, np.delete(prior.point, np.s_[start:stop]))
+    state.drop_keyframes()
+    return Prior(information, gradient, without(prior.point, start, stop, 0))

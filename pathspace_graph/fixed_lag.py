@@ -17,6 +17,7 @@ from .gating import admit
 from .growth import Growth
 from .labels import LEFT, RIGHT
 from .log import Detections, Odometry
+from .narrowing import narrow
 from .map import Map, SplineBoundary
 from .path import DrivenPath
 from .pose_factors import pose_key
@@ -91,6 +92,7 @@ class FixedLagMapper:
         self._classify(detections)  # projects and gates: what no curve takes may expand one
         watch.lap("classify")
         self._expand()
+        narrow(self.smoother)
         watch.lap("expand")
         for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
             self.smoother.step(self.settings.sigma_step)
@@ -145,6 +147,7 @@ class FixedLagMapper:
         if length - self._closing_tried < settings.check_interval:
             return False
         self._closing_tried = length
+        self.smoother.refresh()
         registration = register(self.smoother, settings)
         if registration is None:
             return False
@@ -197,6 +200,7 @@ class FixedLagMapper:
 
     def control_points(self, label: int) -> Array:
         """Control points (m, 2) of a boundary, map frame, m: a view."""
+        self.smoother.refresh()
         return self.smoother.state.control_points(label)
 
     @property

@@ -17,6 +17,7 @@ from .labels import UNKNOWN
 from .settings import MapperSettings
 from .smoother import Smoother, Step
 from .state import State
+from .window import POSE
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -107,7 +108,7 @@ def joint_variance(
     """
     step, state = smoother.last_step, smoother.state
     assert step is not None
-    gradient = _control_gradient(state, label, foot, projected, len(step.factor))
+    gradient = _control_gradient(state, label, foot, projected, step)
     by_pose, extra = projected.by_pose.copy(), np.zeros(len(slots))
     newest = slots == len(smoother.times) - 1
     if newest.any():
@@ -115,32 +116,32 @@ def joint_variance(
         local = g @ _rotation(state.poses[-1, 2])
         odometry: IntegratedOdometry = smoother.odometry[-1]
         extra[newest] = np.einsum("mi,ij,mj->m", local, odometry.covariance, local)
-        calibration = slice(state.map_size, state.map_size + CALIBRATION_SIZE)
-        gradient[calibration, newest] = (-local @ odometry.calibration_jacobian).T
+        calibration = step.position[state.map_size : state.map_size + CALIBRATION_SIZE]
+        gradient[calibration[:, None], newest] = (-local @ odometry.calibration_jacobian).T
         dx, dy = state.poses[-1, :2] - state.poses[-2, :2]
         by_pose[newest, 2] += g[:, 1] * dx - g[:, 0] * dy
         slots = np.where(newest, slots - 1, slots)
-    _add_pose_gradient(gradient, state, step, slots, by_pose)
+    columns = step.poses + POSE * (slots + step.dropped)[:, None] + np.arange(POSE)
+    gradient[columns, np.arange(len(slots))[:, None]] += by_pose
     half, _ = lapack.dtrtrs(step.factor, gradient, lower=1, overwrite_b=1)
     return np.asarray(np.einsum("im,im->m", half, half)) + extra
 
 
 def _control_gradient(
-    state: State, label: int, foot: FootPoints, projected: ProjectionRows, size: int
+    state: State, label: int, foot: FootPoints, projected: ProjectionRows, step: Step
 ) -> Array:
-    """(size, m) derivative of each residual by the state, of which only the control points are filled in."""
+    """(n, m) derivative of each residual by the step's system, of which only control points are filled in.
+
+    A reading where the map was far has none: it gets no benefit of the doubt, and waits for the next cycle.
+    """
     m = len(foot.u)
-    gradient = np.zeros((size, m), order="F")
-    base, row = state.offset(label) + 2 * state.boundaries[label].columns(foot.span), np.arange(m)[:, None]
-    gradient[base, row] += projected.by_control[:, :, 0]
-    gradient[base + 1, row] += projected.by_control[:, :, 1]
+    gradient = np.zeros((len(step.factor), m), order="F")
+    base = state.offset(label) + 2 * state.boundaries[label].columns(foot.span)
+    place, row = step.position[base], np.broadcast_to(np.arange(m)[:, None], base.shape)
+    known = place >= 0
+    gradient[place[known], row[known]] += projected.by_control[:, :, 0][known]
+    gradient[place[known] + 1, row[known]] += projected.by_control[:, :, 1][known]
     return gradient
-
-
-def _add_pose_gradient(gradient: Array, state: State, step: Step, slots: IntArray, by_pose: Array) -> None:
-    """Fill in the poses' derivatives (m, 3), at their columns in the last step's system."""
-    columns = state.pose_columns(slots + step.dropped)
-    gradient[columns, np.arange(len(slots))[:, None]] += by_pose
 
 
 def _rotation(theta: float) -> Array:

@@ -58,13 +58,13 @@ def reading_rows(
 
 
 def spacing_rows(state: State, label: int, sigma_share: float) -> Rows:
-    """`(|c_{j+1} - c_j| - nominal_j) / (sigma_share nominal_j)`: control points keep their distance."""
-    boundary = state.boundaries[label]
-    residual, direction = spacing_residuals(state.control_points(label), boundary.nominal, boundary.periodic)
-    sigma = sigma_share * boundary.nominal
-    j = np.arange(len(residual))
-    k = (j + 1) % boundary.size
-    columns = state.offset(label) + np.column_stack([2 * j, 2 * j + 1, 2 * k, 2 * k + 1])
+    """`(|c_{j+1} - c_j| - nominal_j) / (sigma_share nominal_j)`: near control points keep their distance."""
+    near = state.near(label)
+    gauge = state.boundaries[label].gauge_on(near)
+    points = state.control_points(label)[near]
+    residual, direction = spacing_residuals(points, gauge.nominal, gauge.whole)
+    sigma = sigma_share * gauge.nominal
+    columns = state.offset(label) + gauge.columns
     jacobian = np.concatenate([-direction, direction], axis=1) / sigma[:, None]
     return Rows(columns, jacobian, residual / sigma)
 
@@ -88,14 +88,24 @@ def odometry_rows(state: State, odometry: Sequence[IntegratedOdometry]) -> Rows:
     return Rows(columns, jacobian.reshape(m * POSE, -1), whitened.ravel())
 
 
-def normal_equations(groups: Sequence[Rows], prior: Prior, state: State) -> tuple[Array, Array]:
-    """`H` (n, n) and `-gradient` (n,) of the rows, the prior, and each boundary's smoothness and anchor."""
-    hessian, descent = accumulate(groups, len(state.vector))
+def normal_equations(
+    groups: Sequence[Rows], prior: Prior, state: State, system: Array
+) -> tuple[Array, Array]:
+    """`H` (n, n) and `-gradient` (n,) of the rows, the prior, and each boundary's smoothness and anchor.
+
+    All on the state's system, whose values are `system` (n,).
+    """
+    hessian, descent = accumulate(groups, len(system))
     q = len(prior.point)
     hessian[:q, :q] += prior.information
-    descent[:q] += prior.descent_at(state.vector)
-    for label, boundary in state.boundaries.items():
-        block = state.block(label)
-        hessian[block, block] += boundary.gauge_hessian
-        descent[block] -= boundary.smooth_only @ state.vector[block]
+    descent[:q] += prior.descent_at(system)
+    add_smoothness(hessian, descent, state, system)
     return hessian, descent
+
+
+def add_smoothness(hessian: Array, descent: Array, state: State, system: Array) -> None:
+    """Each boundary's smoothness and anchor between near control points, added to normal equations."""
+    for label, boundary in state.boundaries.items():
+        block, gauge = state.near_block(label), boundary.gauge_on(state.near(label))
+        hessian[block, block] += gauge.hessian
+        descent[block] -= gauge.smooth @ system[block]

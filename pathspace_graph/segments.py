@@ -121,9 +121,8 @@ class History:
         low = len(point) - 2 * POSE
         pose, following = point[low : low + POSE], point[low + POSE :]
         stay = np.r_[0:low, low + POSE : len(point)]
-        if self._current is not None and self._driven >= self.interval:
-            self.segments.append(self._finish(labels, indices))
-            self._current = None
+        if self._driven >= self.interval:
+            self.cut(labels, indices)
         if self._current is None:
             self.keyframes.append(pose.copy())
             information, gradient = hessian[np.ix_(stay, stay)], descent[stay]
@@ -137,6 +136,12 @@ class History:
         self._current = Prior(information, gradient, point[stay])
         self._driven += float(np.hypot(*(following[:2] - pose[:2])))
 
+    def cut(self, labels: IntArray, indices: IntArray) -> None:
+        """The segment under way ends here."""
+        if self._current is not None:
+            self.segments.append(self._finish(labels, indices))
+            self._current = None
+
     def _finish(self, labels: IntArray, indices: IntArray) -> Segment:
         assert self._current is not None
         touched = np.diagonal(self._current.information)[: 2 * len(labels) : 2] > 0.0
@@ -144,7 +149,8 @@ class History:
 
     def all_segments(self, labels: IntArray, indices: IntArray) -> list[Segment]:
         """The finished segments and the one that ends at the oldest pose of the window."""
-        return [*self.segments, self._finish(labels, indices)] if self._current is not None else []
+        under_way = [] if self._current is None else [self._finish(labels, indices)]
+        return [*self.segments, *under_way]
 
 
 def relinearized_prior(

@@ -215,6 +215,16 @@ class OdometrySettings(Positive):
 
 
 @dataclass(frozen=True)
+class FarSettings(Positive):
+    """The part of the map that is not solved for in every cycle: changes speed, not results."""
+
+    stretch: float = 10.0
+    """So much of an open curve behind the vehicle (m) becomes far at once."""
+    room: float = 25.0
+    """The near part of a closed curve reaches so far beyond what the vehicle sees (m), so that it lasts."""
+
+
+@dataclass(frozen=True)
 class MapperSettings(Positive):
     """Everything that the estimators can be told; each takes the parts that are its own."""
 
@@ -238,6 +248,8 @@ class MapperSettings(Positive):
     """How ends grow."""
     closing: ClosingSettings = field(default_factory=ClosingSettings)
     """How the loop closes."""
+    far: FarSettings = field(default_factory=FarSettings)
+    """What is not solved for in every cycle."""
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     """Calibration of the odometry."""
     batch: BatchSettings = field(default_factory=BatchSettings)

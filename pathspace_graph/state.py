@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 
 from .boundary import Boundary
-from .window import POSE
+from .window import POSE, without
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -18,7 +18,8 @@ class State:
     """`x = [control points of each boundary | calibration | keyframes | poses, oldest first]`.
 
     Points in the map frame (m); poses (x, y, theta) in the map frame, theta unwrapped (rad); calibration as
-    `integrate_twists` has it. Keyframes are there only while the loop closes.
+    `integrate_twists` has it. Keyframes are those of a loop that closes, or the pose that far control points
+    hang on. What is solved for in a cycle is the *system*: x without the control points that are far.
     """
 
     def __init__(self) -> None:
@@ -26,6 +27,9 @@ class State:
         """(n,) x."""
         self.boundaries: dict[int, Boundary] = {}
         """The curves by label, in the order of their control points."""
+        self.narrowed: dict[int, IntArray] = {}
+        """Where not all of a boundary's control points are in the system, those (k,) that are: one stretch,
+        in driving order."""
         self.stations: dict[int, Array] = {}
         """For each boundary the parameter (P,) of each pose's foot point on it; not wrapped."""
         self.keyframes = 0
@@ -35,6 +39,40 @@ class State:
     def map_size(self) -> int:
         """Entries that are control points."""
         return 2 * sum(boundary.size for boundary in self.boundaries.values())
+
+    @property
+    def near_size(self) -> int:
+        """Entries of the system that are control points."""
+        return 2 * sum(len(self.near(label)) for label in self.boundaries)
+
+    def near(self, label: int) -> IntArray:
+        """(k,) a boundary's control points that are in the system."""
+        return self.narrowed.get(label, self.boundaries[label].everything)
+
+    @property
+    def whole(self) -> bool:
+        """Whether every control point is in the system."""
+        return not self.narrowed
+
+    @property
+    def system(self) -> IntArray:
+        """Columns of x that are in the system, in its order."""
+        points = [self.offset(label) + 2 * self.near(label) for label in self.boundaries]
+        control = [np.stack([x, x + 1], axis=1).ravel() for x in points]
+        return np.concatenate([*control, np.arange(self.map_size, len(self.vector))])
+
+    @property
+    def position(self) -> IntArray:
+        """(n,) place in the system of each entry of x, -1 where it is far."""
+        position = np.full(len(self.vector), -1)
+        system = self.system
+        position[system] = np.arange(len(system))
+        return position
+
+    def near_block(self, label: int) -> slice:
+        """Entries of the system that are a boundary's control points."""
+        start = 2 * sum(len(self.near(b)) for b in self.boundaries if b < label)
+        return slice(start, start + 2 * len(self.near(label)))
 
     @property
     def poses(self) -> Array:
@@ -68,10 +106,10 @@ class State:
         return (self.pose_column(0) + POSE * slots)[:, None] + np.arange(POSE)
 
     def control_ids(self) -> tuple[IntArray, IntArray]:
-        """Boundary and index (n,) of each control point, in the order of x."""
-        sizes = [boundary.size for boundary in self.boundaries.values()]
-        labels = np.repeat(np.array(list(self.boundaries), np.intp), sizes)
-        return labels, np.concatenate([np.arange(n) for n in sizes] or [np.zeros(0, np.intp)])
+        """Boundary and index (n,) of each control point of the system, in its order."""
+        near = [self.near(label) for label in self.boundaries]
+        labels = np.repeat(np.array(list(self.boundaries), np.intp), [len(indices) for indices in near])
+        return labels, np.concatenate([*near, np.zeros(0, np.intp)])
 
     def add_boundary(self, label: int, boundary: Boundary) -> None:
         """Take up a boundary, whose control points are to be inserted next."""
@@ -88,5 +126,19 @@ class State:
     def drop_oldest_pose(self) -> None:
         """The oldest pose leaves the window."""
         low = self.pose_column(0)
-        self.vector = np.delete(self.vector, np.s_[low : low + POSE])
+        self.vector = without(self.vector, low, low + POSE, 0)
+        self._drop_oldest_station()
+
+    def keep_oldest_pose(self) -> None:
+        """The oldest pose leaves the window, and is a keyframe from now on."""
+        self.keyframes += 1
+        self._drop_oldest_station()
+
+    def drop_keyframes(self) -> None:
+        """There are no keyframes any more."""
+        stop = self.pose_column(0)
+        self.vector = without(self.vector, stop - POSE * self.keyframes, stop, 0)
+        self.keyframes = 0
+
+    def _drop_oldest_station(self) -> None:
         self.stations = {label: u[1:] for label, u in self.stations.items()}

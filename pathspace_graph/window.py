@@ -1,6 +1,6 @@
 """The window's linear algebra: whitened rows, a Gaussian prior, a dense solve and the Schur complement.
 
-The state is one vector `x = [control points | calibration | poses, oldest first]`. Everything in it is
+What is solved for is one vector `[control points | calibration | poses, oldest first]`. Everything in it is
 additive: a pose is (x, y, theta) in the map frame with theta unwrapped. The prior stands on a leading block
 of it, so that the oldest pose, which comes right after the map, leaves by a Schur complement.
 """
@@ -38,18 +38,20 @@ class Rows:
     residual: Array
     """(m,) whitened residuals at the linearization point."""
 
+    def at(self, position: IntArray) -> Rows:
+        """The rows on other columns: `position` (n,) says where each has gone."""
+        return Rows(position[self.columns], self.jacobian, self.residual)
+
     def split(self, low: int, high: int) -> tuple[Rows, Rows]:
-        """The rows that touch a column in [low, high); and the others, once those are taken out of the state."""
+        """The rows that touch a column in [low, high), and the others."""
         touches = np.asarray(((self.columns >= low) & (self.columns < high)).any(axis=1))
-        if not touches.any():
-            return self._take(touches), self._without(low, high)
-        return self._take(touches), self._take(~touches)._without(low, high)
+        return self._take(touches), self._take(~touches) if touches.any() else self
 
     def _take(self, rows: NDArray[np.bool_]) -> Rows:
         return Rows(self.columns[rows], self.jacobian[rows], self.residual[rows])
 
-    def _without(self, low: int, high: int) -> Rows:
-        """The columns from `high` on move down to `low`."""
+    def without(self, low: int, high: int) -> Rows:
+        """The rows, none of which touches [low, high), where those columns are taken out of the state."""
         moved = self.columns - (high - low) * (self.columns >= high)
         return Rows(moved, self.jacobian, self.residual)
 

@@ -39,9 +39,11 @@ from .scenes import ahead, bean_track, corridor, exact_log, lap_log, map_log
 
 @pytest.fixture(scope="module")
 def mapper() -> FixedLagMapper:
-    """In a bend, with a full window."""
+    """In a bend, with a full window, all of the map in it."""
     log = lap_log(bean_track())
-    return map_log(replace(log, cycles=log.cycles[:60]))[0]
+    mapper = map_log(replace(log, cycles=log.cycles[:60]))[0]
+    mapper.smoother.join()
+    return mapper
 
 
 def test_the_window_is_the_system_that_the_mapper_solves(mapper: FixedLagMapper) -> None:

@@ -168,6 +168,7 @@ def prior_energy(mapper: FixedLagMapper, x: Array) -> float:
 def test_an_exact_change_of_variables_keeps_the_priors_energy(before: FixedLagMapper) -> None:
     """`C_old = E C_new`: the same energy at every curve of the new space, to a constant."""
     mapper = deepcopy(before)
+    mapper.smoother.join()
     spline = replace(mapper.settings.spline, sigma_simplify=1e-9)
     mapper.smoother.settings = settings = replace(mapper.settings, spline=spline)
     old, state = deepcopy(mapper), mapper.smoother.state
