@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -103,22 +103,6 @@ class _Probe:
     """Newton's -f / f' (m,), or Gauss-Newton's -f / |S'|^2 where f' is not positive: downhill."""
 
 
-@dataclass
-class _Search:
-    """State of the safeguarded Newton iteration, one entry a row; `best` never gets farther away."""
-
-    best: Floats
-    """Parameter of the nearest curve point so far (m,)."""
-    end: Floats
-    """The other end of the bracket (m,), on the side where the distance falls from `best`."""
-    square: Floats
-    """Squared distance at `best` (m,)."""
-    slope: Floats
-    """f at `best` (m,)."""
-    step: Floats
-    """Step proposed at `best` (m,), infinite once it has failed."""
-
-
 def foot_points(
     tables: SpanPolynomials,
     control_points: Floats,
@@ -140,8 +124,8 @@ def foot_points(
     low, high = _stretches(tables, u_low, u_high)
     limits = _limits(tables, low, high)
     start = _nearest_on_grid(curve, points, low, high, coarse_step)
-    u = _descend(curve, points_t, start, limits, coarse_step, iterations)
-    return _finish(tables, control_points, points_t, _probe(curve, points_t, u), limits)
+    probe = _descend(curve, points_t, start, limits, coarse_step, iterations)
+    return _finish(tables, control_points, points_t, probe, limits)
 
 
 def refine_foot_points(
@@ -204,30 +188,29 @@ def _nearest_on_grid(curve: _Curve, points: Floats, low: Floats, high: Floats, s
     first = float(low.min())
     count = max(int(np.ceil((float(high.max()) - first) / step)), 1) + 1
     grid: Floats = first + step * np.arange(count, dtype=np.float64)
-    on_grid = curve.position(grid)
-    rows = max(_CHUNK // count, 1)
-    nearest = np.empty(len(points))
-    for begin in range(0, len(points), rows):
-        part = slice(begin, begin + rows)
-        nearest[part] = _nearest_of(curve, points[part], grid, on_grid, low[part], high[part])
-    return nearest
+    on_curve = curve.position(np.concatenate([grid, low, high]))
+    on_grid, ends = on_curve[:, :count], on_curve[:, count:].reshape(2, 2, -1)
+    offsets = ends - points.T[:, None]
+    at_ends = offsets[0] ** 2 + offsets[1] ** 2
+    index, at_grid = _nearest_of(points, grid, on_grid, low, high)
+    choice = np.concatenate([at_grid[None], at_ends]).argmin(axis=0)
+    return np.asarray(np.choose(choice, [grid[index], low, high]))
 
 
 def _nearest_of(
-    curve: _Curve, points: Floats, grid: Floats, on_grid: Floats, low: Floats, high: Floats
-) -> Floats:
-    """`_nearest_on_grid` for the rows that fit in memory at once."""
-    squares = (points[:, :1] - on_grid[0]) ** 2
-    squares += (points[:, 1:] - on_grid[1]) ** 2
-    squares[(grid < low[:, None]) | (grid > high[:, None])] = np.inf
-    index = squares.argmin(axis=1)
-    candidates = np.stack([grid[index], low, high])
-    ends = np.concatenate([low, high])
-    offsets = curve.position(ends) - np.concatenate([points, points]).T
-    at_ends = np.einsum("dm,dm->m", offsets, offsets).reshape(2, -1)
-    at_grid = squares[np.arange(len(points)), index]
-    choice = np.concatenate([at_grid[None], at_ends]).argmin(axis=0)
-    return np.asarray(np.take_along_axis(candidates, choice[None], axis=0)[0])
+    points: Floats, grid: Floats, on_grid: Floats, low: Floats, high: Floats
+) -> tuple[Ints, Floats]:
+    """Nearest grid point (m,) of each stretch, and its squared distance (m,); so many rows at once as fit."""
+    index, least = np.empty(len(points), np.intp), np.empty(len(points))
+    rows = max(_CHUNK // len(grid), 1)
+    for begin in range(0, len(points), rows):
+        part = slice(begin, begin + rows)
+        squares = (points[part, :1] - on_grid[0]) ** 2
+        squares += (points[part, 1:] - on_grid[1]) ** 2
+        squares[(grid < low[part, None]) | (grid > high[part, None])] = np.inf
+        index[part] = squares.argmin(axis=1)
+        least[part] = squares.min(axis=1)
+    return index, least
 
 
 def _newton(
@@ -245,7 +228,7 @@ def _newton(
             own_limits = (limits[0][farther], limits[1][farther])
             u[farther] = _descend(
                 curve, points_t[:, farther], last.u[farther], own_limits, reach, _SAFEGUARDED_STEPS
-            )
+            ).u
             probe = _probe(curve, points_t, u)
         last = probe
     return last
@@ -258,30 +241,33 @@ def _descend(
     limits: tuple[Floats, Floats],
     reach: float,
     iterations: int,
-) -> Floats:
-    """Newton where its step stays inside the bracket, else its middle; it begins as `reach` downhill."""
+) -> _Probe:
+    """Newton where its step stays inside the bracket, else its middle; it begins as `reach` downhill.
+
+    The bracket is from the nearest so far to where the distance surely rises again, so that no row ever gets
+    farther away.
+    """
     tolerance = _STEP_TOLERANCE * (curve.tables.high - curve.tables.low)
-    probe = _probe(curve, points_t, start)
-    search = _Search(start, start - np.sign(probe.slope) * reach, probe.square, probe.slope, probe.step)
+    best = _probe(curve, points_t, start)
+    end, step = start - np.sign(best.slope) * reach, best.step
     for _ in range(iterations):
-        inside = np.abs(search.step) < np.abs(search.end - search.best)
-        candidate = np.where(inside, search.best + search.step, 0.5 * (search.best + search.end))
+        inside = np.abs(step) < np.abs(end - best.u)
+        candidate = np.where(inside, best.u + step, 0.5 * (best.u + end))
         candidate = np.minimum(np.maximum(candidate, limits[0]), limits[1])
-        if not (np.abs(candidate - search.best) > tolerance).any():
-            return candidate
-        _move(search, _probe(curve, points_t, candidate))
-    return search.best
+        probe = _probe(curve, points_t, candidate)
+        if not (np.abs(candidate - best.u) > tolerance).any():
+            return probe
+        better = _no_farther(probe.square, best.square)
+        passed = probe.slope * best.slope <= 0.0
+        end = np.where(better, np.where(passed, best.u, end), probe.u)
+        step = np.where(better, probe.step, np.inf)
+        best = probe if better.all() else _either(better, probe, best)
+    return best
 
 
-def _move(search: _Search, probe: _Probe) -> None:
-    """The probe becomes the best where it is no farther, else the bracket's end."""
-    better = _no_farther(probe.square, search.square)
-    passed = probe.slope * search.slope <= 0.0
-    search.end = np.where(better, np.where(passed, search.best, search.end), probe.u)
-    search.best = np.where(better, probe.u, search.best)
-    search.square = np.where(better, probe.square, search.square)
-    search.slope = np.where(better, probe.slope, search.slope)
-    search.step = np.where(better, probe.step, np.inf)
+def _either(first: Bools, a: _Probe, b: _Probe) -> _Probe:
+    """Row by row the one or the other."""
+    return _Probe(*(np.where(first, getattr(a, f.name), getattr(b, f.name)) for f in fields(a)))
 
 
 def _no_farther(square: Floats, than: Floats) -> Bools:

@@ -41,7 +41,7 @@ def se2_exp(tangents: Array) -> Array:
     sinc = np.sinc(theta / np.pi)
     cosc = 0.5 * theta * np.sinc(0.5 * theta / np.pi) ** 2
     x, y = tangents[:, 0], tangents[:, 1]
-    return np.column_stack([sinc * x - cosc * y, cosc * x + sinc * y, theta])
+    return np.array([sinc * x - cosc * y, cosc * x + sinc * y, theta]).T
 
 
 def compose(pose: Array, delta: Array) -> Array:
@@ -67,7 +67,7 @@ def integrate_poses(durations: Array, twists: Array) -> Array:
     c, s = np.cos(before), np.sin(before)
     x = np.cumsum(c * steps[:, 0] - s * steps[:, 1])
     y = np.cumsum(s * steps[:, 0] + c * steps[:, 1])
-    return np.column_stack([x, y, heading])
+    return np.array([x, y, heading]).T
 
 
 def integrate_twists(durations: Array, twists: Array, sigma: Array) -> IntegratedOdometry:
@@ -104,7 +104,7 @@ def _midpoints(poses: Array, durations: Array, twists: Array) -> Array:
     back = se2_exp(-0.5 * twists * durations[:, None])
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = poses[:, 0] + c * back[:, 0] - s * back[:, 1], poses[:, 1] + s * back[:, 0] + c * back[:, 1]
-    return np.column_stack([x, y, poses[:, 2] + back[:, 2]])
+    return np.array([x, y, poses[:, 2] + back[:, 2]]).T
 
 
 def _adjoints_to_end(poses: Array, end: Array) -> Array:
@@ -135,7 +135,7 @@ def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> t
     phi = wrap_angle(poses_end[:, 2] - angle)
     a, slope = _inverse_left_terms(phi)
     h = 0.5 * phi
-    residuals = np.column_stack([a * dx + h * dy, a * dy - h * dx, phi])
+    residuals = np.array([a * dx + h * dy, a * dy - h * dx, phi]).T
     by_phi_x, by_phi_y = slope * dx + 0.5 * dy, slope * dy - 0.5 * dx
     by_end = np.zeros((len(deltas), 3, 3))
     by_end[:, 0, 0], by_end[:, 0, 1], by_end[:, 0, 2] = a * c - h * s, a * s + h * c, by_phi_x

@@ -30,7 +30,7 @@ def to_map(points_vehicle: Array, poses: Array) -> Array:
     """`p = R z + t`: points (m, 2) in the vehicle frame of each row's own pose (m, 3) -> map frame (m, 2)."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = points_vehicle[:, 0], points_vehicle[:, 1]
-    return np.column_stack([c * x - s * y + poses[:, 0], s * x + c * y + poses[:, 1]])
+    return np.array([c * x - s * y + poses[:, 0], s * x + c * y + poses[:, 1]]).T
 
 
 def sigma_across(normals: Array, covariances: Array, poses: Array, sigma_model: float) -> Array:
@@ -63,7 +63,7 @@ def project(
     return ProjectionRows(
         residual=foot.distance,
         sigma=sigma_across(n, covariances, poses, sigma_model),
-        by_pose=np.column_stack([n, by_theta]),
+        by_pose=np.concatenate([n, by_theta[:, None]], axis=1),
         by_control=-foot.basis[:, :, None] * n[:, None, :],
     )
 

@@ -74,7 +74,7 @@ class Boundary:
         self._gauge: Gauge | None = None
 
     def gauge_on(self, near: IntArray) -> Gauge:
-        """The gauge between the control points `near` (k,), a stretch in driving order; the last one is kept."""
+        """The gauge between the control points `near` (k,), a stretch in driving order; the last is kept."""
         if self._gauge is None or self._gauge.near is not near:
             self._gauge = self._new_gauge(near)
         return self._gauge

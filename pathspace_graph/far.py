@@ -1,4 +1,4 @@
-"""The far part of the map: control points that nothing in the window touches, as conditionals on the near part.
+"""The far part of the map: control points that nothing in the window touches, conditional on the near ones.
 
 `p(near, far) = p(near) p(far | near)`: what the window measures changes the near part only, and the far part
 follows through its conditional when it is asked for. That is exact, and a cycle costs no more on a longer
@@ -112,7 +112,7 @@ class Far:
         return Prior(information[f:, f:] - w.T @ w, gradient[f:] - y @ w, point[f:])
 
     def refresh(self, x: Array, anchor: Array) -> dict[int, Array]:
-        """Bring the far entries of x up to date, given the last part's anchor (3,); gives all anchors by cycle."""
+        """Bring the far entries of x up to date, given the last part's anchor (3,); all anchors by cycle."""
         anchors = {self.parts[-1].parting.anchor: anchor} if self.parts else {}
         for part in reversed(self.parts):
             parting, k = part.parting, part.parting.frontals
@@ -125,7 +125,7 @@ class Far:
     def joined(
         self, prior: Prior, near: IntArray, x: Array, lead: int, anchors: Mapping[int, Array]
     ) -> Prior:
-        """The prior as if nothing had left, at x and `anchors` (see `refresh`): on x, but for those that left it.
+        """The prior as if nothing had left, at x and `anchors` (see `refresh`).
 
         `near`: columns of x of the given prior's entries before its poses, of which the first one is the last
         part's anchor. Before `lead` x has no poses. The anchors that left the window long ago come there.

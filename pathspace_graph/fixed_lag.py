@@ -17,8 +17,8 @@ from .gating import admit
 from .growth import Growth
 from .labels import LEFT, RIGHT
 from .log import Detections, Odometry
-from .narrowing import narrow
 from .map import Map, SplineBoundary
+from .narrowing import narrow
 from .path import DrivenPath
 from .pose_factors import pose_key
 from .settings import MapperSettings

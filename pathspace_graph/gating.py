@@ -28,10 +28,10 @@ def admit(smoother: Smoother, label: int, retest: bool) -> None:
     """Readings that are not in use and lie on the curve: `d^2 < chi^2 (sigma^2 + g' Sigma g)`.
 
     Those of the newest pose, whose station is found along with them; all in the window where `retest`, since
-    the curve has grown. A reading of unknown colour is used only where no other curve has taken it.
+    the curve has grown. A reading of unknown colour is used only where one curve alone would have it.
     """
     readings, gate = smoother.readings, smoother.settings.gate
-    rows = readings.pending(label)
+    rows = np.concatenate([readings.pending(label), readings.contested(label)])
     if not retest:
         rows = rows[readings.slot[rows] == len(smoother.times) - 1]
     rows, foot, projected = _near_curve(smoother, label, rows)
@@ -45,10 +45,12 @@ def admit(smoother: Smoother, label: int, retest: bool) -> None:
             smoother, label, readings.slot[rows[far]], _take(foot, far), _take(projected, far)
         )
         passes = foot.distance**2 < gate.chi**2 * variance
-    passes &= (readings.label[rows] != UNKNOWN) | (readings.boundary[rows] == UNKNOWN)
+    taken = readings.used[rows]
+    doubtful = rows[passes & taken]
+    readings.used[doubtful], readings.boundary[doubtful] = False, UNKNOWN
+    passes &= ~taken
     chosen = rows[passes]
-    readings.used[chosen] = True
-    readings.boundary[chosen] = label
+    readings.used[chosen], readings.boundary[chosen] = True, label
     readings.u[chosen] = foot.u[passes]
 
 

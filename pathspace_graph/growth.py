@@ -92,6 +92,8 @@ class Growth:
         """Trusted sightings within reach, on their side of the way."""
         indices = self.sightings[label].confirmed()
         points = self.sightings[label].points[indices]
+        if len(points) == 0:
+            return Candidates(points, indices, np.zeros(0), np.zeros(0))
         stations, lateral = way.locate(points)
         found = Candidates(points, indices, stations, SIDES[label] * lateral)
         found = found.where((stations <= way.stations[-1]) & (found.sides > 0.0))

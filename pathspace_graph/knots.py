@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy.linalg
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.bspline import Floats
@@ -110,10 +111,13 @@ def refit(old: BSpline, new: BSpline, u_map: Callable[[Floats], Floats] | None =
     bridge = _BRIDGE * _bending_rows(new)
     stacked = np.concatenate([B_new, bridge])
     target = np.concatenate([B_old, np.zeros((len(bridge), old.size))])
-    return Refit(
-        new_from_old=np.asarray(np.linalg.lstsq(stacked, target, rcond=None)[0], dtype=np.float64),
-        old_from_new=np.asarray(np.linalg.lstsq(B_old, B_new, rcond=None)[0], dtype=np.float64),
-    )
+    return Refit(new_from_old=_least_squares(stacked, target), old_from_new=_least_squares(B_old, B_new))
+
+
+def _least_squares(matrix: Floats, right: Floats) -> Floats:
+    """argmin |M X - R|, the shortest of several; by pivoted QR, several times faster than by SVD."""
+    solution = scipy.linalg.lstsq(matrix, right, lapack_driver="gelsy", check_finite=False)[0]
+    return np.asarray(solution, dtype=np.float64)
 
 
 def _refit_samples(old: BSpline, new: BSpline) -> Floats:

@@ -19,11 +19,18 @@ def narrow(smoother: Smoother) -> None:
     """
     state, room = smoother.state, smoother.settings.far.room
     needed = {label: _needed(smoother, label) for label in state.boundaries}
-    if not all(np.isin(indices, state.near(label)).all() for label, indices in needed.items()):
+    if not all(
+        _holds(state.near(label), indices, state.boundaries[label].size) for label, indices in needed.items()
+    ):
         smoother.join()
     elif not _worthwhile(smoother, needed):
         return
     smoother.part({label: _needed(smoother, label, room) for label in state.boundaries})
+
+
+def _holds(near: IntArray, needed: IntArray, size: int) -> bool:
+    """Whether one stretch of control points holds another; on a closed curve of that size they wrap."""
+    return int(needed[0] - near[0]) % size + len(needed) <= len(near)
 
 
 def _worthwhile(smoother: Smoother, needed: dict[int, IntArray]) -> bool:

@@ -50,6 +50,7 @@ class DrivenPath:
         """Path driven so far, the station of the last position, m."""
         self.curvature = 0.0
         """Smoothed curvature of the path now, left positive, 1/m."""
+        self._last: Array = np.zeros(2)
 
     def update(self, pose: Array) -> None:
         """Drive on to `pose` (3,), map frame."""
@@ -57,7 +58,9 @@ class DrivenPath:
         position = pose[:2]
         if len(self.points) == 0:
             self.points, self.stations = position[None].copy(), np.zeros(1)
+            self._last = position.copy()
             return
+        self._take_back(pose)
         distance = float(np.hypot(*(position - self.points[-1])))
         self.length = float(self.stations[-1]) + distance
         if distance >= self.settings.step:
@@ -65,6 +68,18 @@ class DrivenPath:
             self.stations = np.append(self.stations, self.length)
             keep = self.stations >= self.length - self.settings.memory
             self.points, self.stations = self.points[keep], self.stations[keep]
+
+    def _take_back(self, pose: Array) -> None:
+        """Driving backwards to `pose` (3,) undoes the path that was driven since the vehicle was there."""
+        heading = np.array([np.cos(pose[2]), np.sin(pose[2])])
+        moved = pose[:2] - self._last
+        self._last = pose[:2].copy()
+        reach = float(np.hypot(*moved)) + self.settings.step
+        while moved @ heading < 0.0 and len(self.points) > 1:
+            ahead = self.points[-1] - pose[:2]
+            if ahead @ heading <= 0.0 or np.hypot(*ahead) > reach:
+                return
+            self.points, self.stations = self.points[:-1], self.stations[:-1]
 
     def _keep_beginning(self, pose: Array) -> None:
         if self.length > self.settings.memory:

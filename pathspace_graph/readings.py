@@ -70,3 +70,7 @@ class Readings:
     def pending(self, label: int) -> IntArray:
         """Rows not in use that may belong to the boundary `label`, those of unknown colour included."""
         return np.flatnonzero(~self.used & ((self.label == label) | (self.label == UNKNOWN)))
+
+    def contested(self, label: int) -> IntArray:
+        """Rows of unknown colour that another boundary than `label` has in use."""
+        return np.flatnonzero(self.used & (self.label == UNKNOWN) & (self.boundary != label))

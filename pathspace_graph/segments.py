@@ -165,6 +165,7 @@ def relinearized_prior(
     information[np.ix_(own, own)] += history.first.information
     descent[own] += history.first.descent_at(state[own])
     start = np.array([offsets.get(label, 0) for label in range(max(offsets) + 1)])
+    flat, blocks = [np.zeros(0, np.intp)], [np.zeros(0)]
     for i, segment in enumerate(segments):
         points = start[segment.labels] + 2 * segment.indices
         columns = np.concatenate(
@@ -176,6 +177,8 @@ def relinearized_prior(
             ]
         )
         block, gradient = relinearize(segment, state[columns[:-POSE]], state[columns[-POSE:]])
-        information[np.ix_(columns, columns)] += block
+        flat.append((columns[:, None] * size + columns).ravel())
+        blocks.append(block.ravel())
         descent[columns] += gradient
-    return Prior(information, descent, state[:size].copy())
+    sums = np.bincount(np.concatenate(flat), np.concatenate(blocks), size * size)
+    return Prior(information + sums.reshape(size, size), descent, state[:size].copy())

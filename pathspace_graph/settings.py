@@ -182,9 +182,9 @@ class ClosingSettings(Positive):
     """... and this share of the distance with each further one, down to `inlier_distance`."""
     icp_iterations: int = 7
     """Iterations of the registration."""
-    keyframe_interval: float = 12.0
+    keyframe_interval: float = 15.0
     """Path (m) between the keyframes in whose frames the drive so far is kept until the loop closes."""
-    iterations: int = 3
+    iterations: int = 2
     """Gauss-Newton steps after the tie, and again after simplification, ..."""
     sigma_step: float = 10.0
     """... in which a control point moves so far freely (m): hardly damped."""
@@ -218,7 +218,7 @@ class OdometrySettings(Positive):
 class FarSettings(Positive):
     """The part of the map that is not solved for in every cycle: changes speed, not results."""
 
-    stretch: float = 10.0
+    stretch: float = 15.0
     """So much of an open curve behind the vehicle (m) becomes far at once."""
     room: float = 25.0
     """The near part of a closed curve reaches so far beyond what the vehicle sees (m), so that it lasts."""

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 from .boundary import Boundary
 from .knots import BreakSettings, curvature_weighted_breaks, refit
 from .settings import ClosingSettings, MapperSettings, SplineSettings
 from .smoother import Smoother
 from .spline import BSpline
-from .window import Prior
+from .window import Prior, cholesky
 
 Array = NDArray[np.float64]
 
@@ -152,13 +153,15 @@ def _change(smoother: Smoother, joins: dict[int, Join]) -> Array:
 
 
 def _loosened(prior: Prior, n_old: int, sigma: float) -> tuple[Array, Array]:
-    """The prior where the first n_old entries may be off `E C_new` by sigma (m): `(I + L S)^-1 (L, g)`."""
-    variance = np.zeros(len(prior.point))
-    variance[:n_old] = sigma**2
-    inner = np.eye(len(variance)) + prior.information * variance
-    solved = np.linalg.solve(inner, np.column_stack([prior.information, prior.gradient]))
-    information = solved[:, :-1]
-    return 0.5 * (information + information.T), np.asarray(solved[:, -1])
+    """The prior where the first n_old entries M may be off `E C_new` by sigma (m): less certain there.
+
+    `L - L_:M (I / sigma^2 + L_MM)^-1 L_M:` and `g - L_:M (I / sigma^2 + L_MM)^-1 g_M` (Woodbury).
+    """
+    rows = np.column_stack([prior.information[:n_old], prior.gradient[:n_old]])
+    half = cholesky(prior.information[:n_old, :n_old] + np.eye(n_old) / sigma**2)
+    root, _ = lapack.dtrtrs(half, rows, lower=1)
+    w, y = np.ascontiguousarray(root[:, :-1]), root[:, -1]
+    return prior.information - w.T @ w, prior.gradient - y @ w
 
 
 def _replace(smoother: Smoother, label: int, new: Join) -> None:

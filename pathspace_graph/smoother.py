@@ -124,7 +124,7 @@ class Smoother:
         return self.readings.append(detections, len(self.times) - 1)
 
     def insert_control_points(self, label: int, at: int, points: Array) -> None:
-        """New control points (k, 2) at index `at` of a boundary's, its end, of which the prior knows nothing."""
+        """New control points (k, 2) at index `at`, a boundary's end, of which the prior knows nothing."""
         state, values = self.state, points.ravel()
         column, place = state.offset(label) + 2 * at, state.near_block(label).start + 2 * at
         if label in state.narrowed:

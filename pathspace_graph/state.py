@@ -34,6 +34,8 @@ class State:
         """For each boundary the parameter (P,) of each pose's foot point on it; not wrapped."""
         self.keyframes = 0
         """Poses in x before the window's own."""
+        self._known_near: list[IntArray] = []
+        self._places = (np.zeros(0, np.intp), np.zeros(0, np.intp))
 
     @property
     def map_size(self) -> int:
@@ -57,17 +59,30 @@ class State:
     @property
     def system(self) -> IntArray:
         """Columns of x that are in the system, in its order."""
-        points = [self.offset(label) + 2 * self.near(label) for label in self.boundaries]
-        control = [np.stack([x, x + 1], axis=1).ravel() for x in points]
-        return np.concatenate([*control, np.arange(self.map_size, len(self.vector))])
+        return np.concatenate([self._near_places()[0], np.arange(self.map_size, len(self.vector))])
 
     @property
     def position(self) -> IntArray:
         """(n,) place in the system of each entry of x, -1 where it is far."""
-        position = np.full(len(self.vector), -1)
-        system = self.system
-        position[system] = np.arange(len(system))
-        return position
+        columns, places = self._near_places()
+        rest = len(self.vector) - len(places)
+        return np.concatenate([places, len(columns) + np.arange(rest)])
+
+    def _near_places(self) -> tuple[IntArray, IntArray]:
+        """Columns of the near control points, and each control entry's place among them; kept for next time."""
+        near = [self.near(label) for label in self.boundaries]
+        if len(near) != len(self._known_near) or any(
+            a is not b for a, b in zip(near, self._known_near, strict=True)
+        ):
+            points = [
+                self.offset(label) + 2 * indices for label, indices in zip(self.boundaries, near, strict=True)
+            ]
+            control = [np.stack([x, x + 1], axis=1).ravel() for x in points]
+            columns = np.concatenate([np.zeros(0, np.intp), *control])
+            places = np.full(self.map_size, -1)
+            places[columns] = np.arange(len(columns))
+            self._known_near, self._places = near, (columns, places)
+        return self._places
 
     def near_block(self, label: int) -> slice:
         """Entries of the system that are a boundary's control points."""

@@ -1,4 +1,4 @@
-"""The far part of the map: what leaves and comes back is the same Gaussian, and a cycle's step the same step."""
+"""The far part of the map: what leaves and comes back is the same Gaussian, and a step the same step."""
 
 from __future__ import annotations
 

@@ -112,3 +112,20 @@ def test_stations_move_with_the_frame(angle: float, x: float, y: float) -> None:
     rotation = np.array([[c, s], [-s, c]])
     moved = along_and_across(points @ rotation + [x, y], CORNER @ rotation + [x, y], stations)
     np.testing.assert_allclose(moved, along_and_across(points, CORNER, stations), atol=1e-9)
+
+
+def test_driving_backwards_takes_the_path_back() -> None:
+    path = DrivenPath(PathSettings(step=0.3))
+    for x in [*np.arange(0.0, 6.01, 0.5), *np.arange(5.8, 1.99, -0.2)]:
+        path.update(np.array([x, 0.0, 0.0]))
+    assert path.length == pytest.approx(2.0)
+    assert path.points[:, 0].max() <= 2.0
+
+
+def test_turning_on_the_spot_keeps_the_path() -> None:
+    path = DrivenPath(PathSettings(step=0.3))
+    for x in np.arange(0.0, 6.01, 0.5):
+        path.update(np.array([x, 0.0, 0.0]))
+    for theta in np.linspace(0.0, np.pi, 20):
+        path.update(np.array([6.0 + 1e-3 * np.cos(7.0 * theta), 0.0, theta]))
+    assert path.length == pytest.approx(6.0, abs=0.5)
