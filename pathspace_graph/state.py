@@ -69,7 +69,7 @@ class State:
         return np.concatenate([places, len(columns) + np.arange(rest)])
 
     def _near_places(self) -> tuple[IntArray, IntArray]:
-        """Columns of the near control points, and each control entry's place among them; kept for next time."""
+        """Columns of the near control points, and the place among them of each entry; kept for next time."""
         near = [self.near(label) for label in self.boundaries]
         if len(near) != len(self._known_near) or any(
             a is not b for a, b in zip(near, self._known_near, strict=True)
