@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.odometry import wrap_angle
 from pathspace_graph.factors.projection import to_map
 
 from .path import DrivenPath
@@ -85,15 +86,26 @@ def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool
     return bool((same_way & (away < drift)).any())
 
 
-def register(smoother: Smoother, settings: ClosingSettings) -> Registration | None:
+def register(smoother: Smoother, beginning: Array, settings: ClosingSettings) -> Registration | None:
     """The motion that lays the newest readings on the beginning; None where they don't agree with it.
 
     Iterated closest points on the curves, `min sum (n . (M p - S(u)))^2 / sigma^2 + m' P^-1 m`. The vehicle's
-    own uncertainty P is the prior: along a straight or an arc the readings leave the motion free.
+    own uncertainty P is the prior: along a straight or an arc the readings leave the motion free. Where it is
+    larger than what the iteration can bridge, it starts from the best of the `beginning`, poses (k, 3) of the
+    drive's first stretch.
     """
     recent, points = _recent(smoother, settings.window)
     prior = np.linalg.inv(smoother.pose_covariance() * settings.prior_scale**2)
-    centre, vector = smoother.state.poses[-1, :2].copy(), np.zeros(3)
+    centre = smoother.state.poses[-1, :2].copy()
+    vector = np.zeros(3)
+    if np.linalg.eigvalsh(prior[:2, :2])[0] < settings.icp_reach**-2:
+        pose = smoother.state.poses[-1]
+        starts = [v for v in _motions(pose, beginning, settings) if v @ prior @ v < settings.start_chi2]
+        agreement = [
+            _match(smoother, settings, recent, points, Motion(centre, v), settings.icp_reach).near.sum()
+            for v in [vector, *starts]
+        ]
+        vector = [vector, *starts][int(np.argmax(agreement))]
     for reach in _reaches(settings):
         matches = _match(smoother, settings, recent, points, Motion(centre, vector), reach)
         descent = matches.descent - prior @ vector
@@ -103,6 +115,15 @@ def register(smoother: Smoother, settings: ClosingSettings) -> Registration | No
     if not (_agree(matches, list(labels), settings) and _certain(matches, posterior, settings)):
         return None
     return Registration(Motion(centre, vector), {label: matches.agreeing(label) for label in labels})
+
+
+def _motions(pose: Array, beginning: Array, settings: ClosingSettings) -> list[Array]:
+    """Motions (3,) that take a pose (3,) to places of the beginning (k, 3), `start_step` apart."""
+    along = np.hypot(*np.diff(beginning[:, :2], axis=0, prepend=beginning[:1, :2]).T).cumsum()
+    _, first = np.unique(along // settings.start_step, return_index=True)
+    motions = beginning[first] - pose
+    motions[:, 2] = wrap_angle(motions[:, 2])
+    return list(motions)
 
 
 def _recent(smoother: Smoother, seconds: float) -> tuple[IntArray, Array]:

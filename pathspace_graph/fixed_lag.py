@@ -148,7 +148,7 @@ class FixedLagMapper:
             return False
         self._closing_tried = length
         self.smoother.refresh()
-        registration = register(self.smoother, settings)
+        registration = register(self.smoother, self.path.beginning, settings)
         if registration is None:
             return False
         tie(self.smoother, registration)

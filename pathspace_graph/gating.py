@@ -13,6 +13,7 @@ from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 from pathspace_graph.factors.projection import ProjectionRows, project, to_map
 
+from .boundary import Boundary
 from .labels import UNKNOWN
 from .settings import MapperSettings
 from .smoother import Smoother, Step
@@ -22,6 +23,9 @@ from .window import POSE
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 T = TypeVar("T", FootPoints, ProjectionRows)
+
+SAME_WAY = 0.5
+"""Cosine of the angle between a vehicle's heading and the curve beside it, at least."""
 
 
 def admit(smoother: Smoother, label: int, retest: bool) -> None:
@@ -71,7 +75,11 @@ def _near_curve(
     high = boundary.believed(np.append(stations + gate.view_ahead, expected + ahead))
     sought = np.concatenate([points, state.poses[-1:, :2]])
     foot = boundary.find(state.control_points(label), sought, low, high)
-    _append_station(state, label, foot.u[-1])
+    station = float(foot.u[-1])
+    if boundary.periodic and _lost(foot, state.poses[-1, 2], gate.station_lateral):
+        smoother.refresh()
+        station = relocate(boundary, state.control_points(label), state.poses[-1])
+    _append_station(state, label, station)
     keep = np.flatnonzero(foot.interior[:-1] & (np.abs(foot.distance[:-1]) < gate.rough))
     rows, foot = rows[keep], _take(foot, keep)
     sigma_model = settings.spline.sigma_model
@@ -85,6 +93,24 @@ def _expected_station(state: State, label: int, settings: MapperSettings) -> tup
     if moved < gate.station_step:
         return known, settings.spline.refine_room, settings.spline.refine_room
     return known, gate.station_behind, gate.station_ahead
+
+
+def _lost(foot: FootPoints, heading: float, lateral: float) -> bool:
+    """Whether the last foot point can't be the vehicle's: the curve runs against it there, or is far off."""
+    along = foot.tangent_unit[-1] @ np.array([np.cos(heading), np.sin(heading)])
+    return bool(along < 0.0 or abs(foot.distance[-1]) > lateral)
+
+
+def relocate(boundary: Boundary, control_points: Array, pose: Array) -> float:
+    """Parameter of the nearest point of a closed curve that runs the way of a pose (3,), within 60 degrees."""
+    u = np.arange(boundary.tables.low, boundary.tables.high, boundary.settings.search_step)
+    offset = boundary.evaluate(control_points, u) - pose[:2]
+    tangent = boundary.evaluate(control_points, u, 1)
+    along = tangent @ np.array([np.cos(pose[2]), np.sin(pose[2])])
+    same_way = along > SAME_WAY * np.hypot(tangent[:, 0], tangent[:, 1])
+    distance = np.where(same_way, np.hypot(offset[:, 0], offset[:, 1]), np.inf)
+    start = u[np.argmin(distance)]
+    return float(boundary.refine(control_points, pose[None, :2], np.array([start])).u[0])
 
 
 def _append_station(state: State, label: int, u: float) -> None:

@@ -82,6 +82,9 @@ class GateSettings(Positive):
     """... it is searched for as far ahead of that (m) as this, ..."""
     station_behind: float = 3.0
     """... and so far behind it (m)."""
+    station_lateral: float = 5.5
+    """A closed curve farther from the vehicle than this (m), or running against it, isn't beside it: the
+    vehicle has lost its place, and it is looked for all around."""
 
 
 @dataclass(frozen=True)
@@ -180,9 +183,14 @@ class ClosingSettings(Positive):
     """A reading farther than this from the beginning doesn't pull in the first iteration (m), ..."""
     icp_shrink: float = 0.7
     """... and this share of the distance with each further one, down to `inlier_distance`."""
+    start_step: float = 2.0
+    """Where the vehicle is less certain than that, the registration tries places so far apart (m) on the
+    beginning to start from, ..."""
+    start_chi2: float = 16.3
+    """... as long as the vehicle's uncertainty allows them (chi-square of 3, 99.9 %)."""
     icp_iterations: int = 7
     """Iterations of the registration."""
-    keyframe_interval: float = 15.0
+    keyframe_interval: float = 12.0
     """Path (m) between the keyframes in whose frames the drive so far is kept until the loop closes."""
     iterations: int = 2
     """Gauss-Newton steps after the tie, and again after simplification, ..."""
@@ -218,7 +226,7 @@ class OdometrySettings(Positive):
 class FarSettings(Positive):
     """The part of the map that is not solved for in every cycle: changes speed, not results."""
 
-    stretch: float = 15.0
+    stretch: float = 12.0
     """So much of an open curve behind the vehicle (m) becomes far at once."""
     room: float = 25.0
     """The near part of a closed curve reaches so far beyond what the vehicle sees (m), so that it lasts."""

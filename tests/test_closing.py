@@ -13,6 +13,8 @@ from pathspace_graph.closing import Registration, near_start, register
 from pathspace_graph.eval.metrics import cone_distances
 from pathspace_graph.factors.projection import to_map
 from pathspace_graph.fixed_lag import CycleResult, FixedLagMapper
+from pathspace_graph.gating import relocate
+from pathspace_graph.labels import LEFT
 from pathspace_graph.log import Log
 from pathspace_graph.map import SplineBoundary
 from pathspace_graph.run import split_odometry
@@ -134,7 +136,7 @@ def registered(before: FixedLagMapper, theta: float, shift: Array) -> tuple[Fixe
     centre = mapper.poses[-1, :2].copy()
     mapper.poses[:, :2] = (mapper.poses[:, :2] - centre) @ np.array([[c, s], [-s, c]]) + centre + shift
     mapper.poses[:, 2] += theta
-    registration = register(mapper.smoother, ClosingSettings(sigma_max=10.0))
+    registration = register(mapper.smoother, mapper.path.beginning, ClosingSettings(sigma_max=10.0))
     assert registration is not None
     return mapper, registration
 
@@ -229,3 +231,36 @@ def test_another_way_past_the_beginning_is_no_loop() -> None:
     mapper, _ = map_log(exact_log(twists, *corridor(80.0)))
     assert mapper.path.length > mapper.settings.closing.min_path
     assert not mapper.closed
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_lost_place_is_found_by_position_and_heading(
+    run: tuple[FixedLagMapper, list[CycleResult]], turned: bool
+) -> None:
+    """Where the vehicle faces the other way it can't be beside the nearest stretch."""
+    mapper = run[0]
+    boundary, points = mapper.boundaries[LEFT], mapper.control_points(LEFT)
+    for u in np.linspace(boundary.tables.low, boundary.tables.high, 7)[:-1]:
+        at = np.array([u])
+        position, tangent = boundary.evaluate(points, at)[0], boundary.evaluate(points, at, 1)[0]
+        heading = np.arctan2(tangent[1], tangent[0]) + np.pi * turned
+        pose = np.array([position[0] + 0.5 * tangent[1], position[1] - 0.5 * tangent[0], heading])
+        found = relocate(boundary, points, pose)
+        direction = boundary.evaluate(points, np.array([found]), 1)[0]
+        assert direction @ [np.cos(heading), np.sin(heading)] > 0.0
+        if not turned:
+            away = (found - u + 0.5 * boundary.length) % boundary.length - 0.5 * boundary.length
+            assert abs(away) < 0.1
+
+
+def test_a_window_that_has_drifted_far_is_registered_back(before: FixedLagMapper) -> None:
+    """Farther than the iteration bridges, but within what the vehicle knows of itself."""
+    mapper = deepcopy(before)
+    mapper.poses[:, :2] += [6.0, -5.0]
+    covariance = mapper.smoother.pose_covariance()
+    mapper.smoother.pose_covariance = lambda: covariance + np.diag([25.0, 25.0, 1e-3])  # type: ignore[method-assign]
+    settings = ClosingSettings(sigma_max=10.0)
+    registration = register(mapper.smoother, mapper.path.beginning, settings)
+    assert registration is not None
+    moved = registration.motion.apply(mapper.poses[:, :2])
+    np.testing.assert_allclose(moved, before.poses[:, :2], atol=0.4)
