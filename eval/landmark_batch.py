@@ -1,215 +1,104 @@
-"""A landmark graph over a whole log: every pose and every landmark at once, told which reading saw which."""
+"""The Hungarian landmark graph over a whole log: every pose and landmark at once, associations refreshed."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Final
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
-from pathspace_graph.factors.odometry import integrate_twists
-from pathspace_graph.log import Log, Odometry
+from pathspace_graph.batch_data import integrate_log
+from pathspace_graph.fixed_lag import ODOMETRY_SIGMA
+from pathspace_graph.laps import LapCounter
+from pathspace_graph.log import Log
+from pathspace_graph.run import BatchRun, settings_dict
+from pathspace_graph.settings import MapperSettings
+from pathspace_graph.window import POSE
+
+from .landmark_fixed_lag import point_map
+from .landmark_reassociation import Reassociation, drop_rare, merge_duplicates
+from .landmark_start import as_landmark_readings, start_online, start_told
+from .landmark_state import LandmarkState
+from .landmark_system import LandmarkSystem
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-
-@dataclass(frozen=True, slots=True)
-class LandmarkBatchSettings:
-    """How the batch is solved; its noise is the log's own."""
-
-    max_iterations: int = 100
-    """Levenberg-Marquardt stops after so many."""
-
-    relative_tolerance: float = 1e-8
-    """or where |cost_before - cost_after| <= relative_tolerance * cost_before."""
-
-    odometry_sigma_floor: float = 1e-6
-    """Least standard deviation (m, rad) of the motion between two cycles: a noiseless log stays solvable."""
-
-    first_pose_sigma: float = 1e-6
-    """Standard deviation (m, rad) of the first pose, which is the map frame."""
-
-    min_range: float = 1e-3
-    """A reading nearer (m) than this has no bearing and is left out."""
+NAME: Final = "landmark-batch"
+"""What the command line knows it by."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
-    """Every reading of a log that is of a landmark, flat."""
+class LandmarkResult(BatchRun):
+    """What the landmark batch gives; it has converged where the last round changed hardly any association."""
 
-    cycle: Ints
-    """(k,) index of the perception cycle."""
-
-    landmark: Ints
-    """(k,) index of the landmark, as associated."""
-
-    points_vehicle: Array
-    """(k, 2) m."""
-
-    covariances: Array
-    """(k, 2, 2) m^2, vehicle frame."""
+    rounds: int = 0
+    """Times that the log was associated anew; 0 where the associations were told."""
+    pose_covariances: Array = field(default_factory=lambda: np.zeros((0, POSE, POSE)))
+    """(n, 3, 3) marginal covariance of each pose (x, y, theta), map frame."""
 
 
-@dataclass(frozen=True, eq=False)
-class LandmarkSolution:
-    """The optimum of a landmark batch."""
+class LandmarkBatch:
+    """Cones as points, poses of the whole log; begun at the online run of `LandmarkFixedLag`."""
 
-    trajectory_t: Array
-    """(n,) s, one per perception cycle."""
+    def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
+        self.settings = settings or MapperSettings()
+        self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
 
-    trajectory: Array
-    """(n, 3) [x, y, theta], map frame, smoothed."""
+    def solve(self, log: Log, associations: Ints | None = None) -> LandmarkResult:
+        """The optimum over a log: associate, solve, merge, drop, until no association changes.
 
-    landmark_ids: Ints
-    """(m,) what the associations call each landmark that was seen, ascending."""
+        associations (R,): landmark of each detection in file order, negative for none: told, they are kept;
+        for evaluation only.
+        """
+        with threadpool_limits(limits=1):
+            return self._solve(log, associations)
 
-    landmarks: Array
-    """(m, 2) m, map frame."""
+    def _solve(self, log: Log, associations: Ints | None) -> LandmarkResult:
+        settings = self.settings.landmark
+        chain = integrate_log(log, self.odometry_sigma, self.settings.odometry)
+        readings = as_landmark_readings(log)
+        if associations is None:
+            state = start_online(log, readings, self.settings, self.odometry_sigma)
+        else:
+            state = start_told(readings, chain, associations)
+        system = LandmarkSystem(readings, chain, self.settings)
+        state = system.settle(state)
+        rounds, converged = 0, associations is not None
+        while not converged and rounds < settings.max_rounds:
+            rounds += 1
+            converged = self._refresh(system, state) <= settings.settled * len(readings)
+            state = system.settle(state)
+        return self._result(system, state, rounds, converged)
 
-    covariance: Array | None
-    """(2m, 2m) m^2, joint covariance of the landmarks, or None where it wasn't asked for."""
+    def _refresh(self, system: LandmarkSystem, state: LandmarkState) -> int:
+        """Associate anew, merge, drop; how many readings are of another landmark now."""
+        readings = system.readings
+        before = readings.numbers(state.ids)
+        covariance = system.covariance(state)
+        Reassociation(state, readings, covariance, self.settings, system.chain.stamps).run()
+        merge_duplicates(state, readings, covariance, self.settings)
+        drop_rare(state, readings, self.settings.growth.sightings)
+        return int((before != readings.numbers(state.ids)).sum())
 
-    error: float
-    """Half the squared whitened residuals that are left."""
-
-    iterations: int
-    """Levenberg-Marquardt iterations taken."""
-
-
-def solve_landmarks(
-    log: Log,
-    associations: Ints,
-    *,
-    with_covariance: bool = False,
-    settings: LandmarkBatchSettings | None = None,
-) -> LandmarkSolution:
-    """argmin over poses and landmarks of the odometry's and all readings' squared Mahalanobis distances.
-
-    associations: (R,) landmark of each detection row in file order, negative for none (left out). The first
-    pose, at the first odometry stamp, is (0, 0, 0). Started at the integrated odometry and first sightings.
-    """
-    settings = settings or LandmarkBatchSettings()
-    sightings = collect_sightings(log, associations, settings.min_range)
-    stamps = np.array([cycle.t for cycle in log.cycles])
-    motions, covariances = integrate_between(log.odometry, log.odometry_sigma, stamps)
-    graph = _motion_graph(motions, covariances, settings)
-    _add_sightings(graph, sightings)
-    initial = _initial_values(motions, sightings)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, initial, _parameters(settings))
-    values = optimizer.optimize()
-    ids = np.unique(sightings.landmark)
-    poses = [values.atPose2(X(k + 1)) for k in range(len(stamps))]
-    return LandmarkSolution(
-        trajectory_t=stamps,
-        trajectory=np.array([[pose.x(), pose.y(), pose.theta()] for pose in poses]).reshape(-1, 3),
-        landmark_ids=ids,
-        landmarks=np.array([values.atPoint2(L(int(j))) for j in ids]).reshape(-1, 2),
-        covariance=_joint_covariance(graph, values, ids) if with_covariance else None,
-        error=float(optimizer.error()),
-        iterations=int(optimizer.iterations()),
-    )
-
-
-def collect_sightings(log: Log, associations: Ints, min_range: float) -> Sightings:
-    """The readings of `log` whose association (R,) isn't negative, at least `min_range` m away."""
-    counts = [len(cycle.labels) for cycle in log.cycles]
-    cycle = np.repeat(np.arange(len(counts)), counts)
-    points = np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in log.cycles)])
-    covariances = np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in log.cycles)])
-    kept = (np.asarray(associations) >= 0) & (np.linalg.norm(points, axis=1) >= min_range)
-    return Sightings(cycle[kept], np.asarray(associations)[kept], points[kept], covariances[kept])
-
-
-def integrate_between(odometry: Odometry, sigma: Array, stamps: Array) -> tuple[Array, Array]:
-    """Motions (n, 3) and end-frame covariances (n, 3, 3) up to each of `stamps` (n,), from the one before it.
-
-    The first is from the first odometry stamp.
-    """
-    starts = np.concatenate([odometry.t[:1], stamps[:-1]])
-    steps = [
-        integrate_twists(*held_twists(odometry, start, end), sigma)
-        for start, end in zip(starts, stamps, strict=True)
-    ]
-    return (
-        np.array([step.delta for step in steps]).reshape(-1, 3),
-        np.array([step.covariance for step in steps]).reshape(-1, 3, 3),
-    )
-
-
-def held_twists(odometry: Odometry, start: float, end: float) -> tuple[Array, Array]:
-    """(k,) s and (k, 3): how long each twist is held between `start` and `end`, and the twist.
-
-    Each is held until the next row's time, the last for good; before the first row nothing moves.
-    """
-    held = odometry.between(start, end)
-    return np.diff(np.append(held.t, end)), held.twist
-
-
-def _motion_graph(
-    motions: Array, covariances: Array, settings: LandmarkBatchSettings
-) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph()
-    fixed = gtsam.noiseModel.Isotropic.Sigma(3, settings.first_pose_sigma)
-    graph.add(gtsam.PriorFactorPose2(X(0), gtsam.Pose2(), fixed))
-    floored = covariances + settings.odometry_sigma_floor**2 * np.eye(3)
-    for k, (motion, covariance) in enumerate(zip(motions, floored, strict=True)):
-        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-        graph.add(gtsam.BetweenFactorPose2(X(k), X(k + 1), gtsam.Pose2(*motion), noise))
-    return graph
-
-
-def _add_sightings(graph: gtsam.NonlinearFactorGraph, sightings: Sightings) -> None:
-    """A native bearing-range factor for each reading: C_polar = J K J^T of its full covariance K."""
-    x, y = sightings.points_vehicle.T
-    distances = np.hypot(x, y)
-    jacobians = np.stack(
-        [np.stack([-y, x], axis=1) / distances[:, None] ** 2, np.stack([x, y], axis=1) / distances[:, None]],
-        axis=1,
-    )
-    polar = jacobians @ sightings.covariances @ np.swapaxes(jacobians, 1, 2)
-    bearings = np.arctan2(y, x)
-    for cycle, landmark, bearing, distance, covariance in zip(
-        sightings.cycle.tolist(),
-        sightings.landmark.tolist(),
-        bearings.tolist(),
-        distances.tolist(),
-        polar,
-        strict=True,
-    ):
-        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-        graph.add(gtsam.BearingRangeFactor2D(X(cycle + 1), L(landmark), gtsam.Rot2(bearing), distance, noise))
-
-
-def _initial_values(motions: Array, sightings: Sightings) -> gtsam.Values:
-    values = gtsam.Values()
-    poses = [gtsam.Pose2()]
-    for motion in motions:
-        poses.append(poses[-1].compose(gtsam.Pose2(*motion)))
-    for k, pose in enumerate(poses):
-        values.insert(X(k), pose)
-    landmarks, first = np.unique(sightings.landmark, return_index=True)
-    for landmark, row in zip(landmarks.tolist(), first.tolist(), strict=True):
-        pose = poses[int(sightings.cycle[row]) + 1]
-        values.insert(L(landmark), pose.transformFrom(sightings.points_vehicle[row]))
-    return values
-
-
-def _parameters(settings: LandmarkBatchSettings) -> gtsam.LevenbergMarquardtParams:
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(settings.max_iterations)
-    parameters.setRelativeErrorTol(settings.relative_tolerance)
-    return parameters
-
-
-def _joint_covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ids: Ints) -> Array:
-    """(2m, 2m): the inverse of the information that the poses leave on the landmarks (Schur complement)."""
-    keys = [L(int(j)) for j in ids]
-    ordering = gtsam.Ordering()
-    for key in keys:
-        ordering.push_back(key)
-    information, _ = graph.linearize(values).marginal(keys).hessian(ordering)
-    covariance = np.linalg.inv(information)
-    return 0.5 * (covariance + covariance.T)
+    def _result(
+        self, system: LandmarkSystem, state: LandmarkState, rounds: int, converged: bool
+    ) -> LandmarkResult:
+        laps, covariance = LapCounter(), system.covariance(state)
+        for pose in state.poses:
+            laps.update(pose)
+        joint = covariance.landmarks.reshape(state.map_size, state.map_size)
+        return LandmarkResult(
+            estimator=NAME,
+            settings=settings_dict(self.settings),
+            map=point_map(state, joint, laps.completed > 0),
+            trajectory_t=system.chain.stamps,
+            trajectory=state.poses.copy(),
+            cycles=(),
+            laps=laps.completed,
+            rounds=rounds,
+            converged=converged,
+            pose_covariances=covariance.poses,
+        )

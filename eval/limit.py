@@ -15,7 +15,7 @@ from pathspace_graph.log import Log, Truth
 from pathspace_graph.map import Map, SplineBoundary
 from pathspace_graph.spline import BSpline
 
-from .landmark_batch import LandmarkSolution, solve_landmarks
+from .landmark_told import LandmarkSolution, solve_landmarks
 from .metrics import closest_points, root_mean_square
 
 Array = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""The online estimators by the name that the command line knows them by."""
+"""The estimators by the names that the command line knows them by."""
 
 from __future__ import annotations
 
@@ -9,19 +9,62 @@ from typing import Any, Final
 from .errors import SettingsError
 from .fixed_lag import FixedLagMapper
 from .log import Log
-from .run import OnlineEstimator
+from .run import BatchEstimator, OnlineEstimator
 from .settings import MapperSettings
 
 DEFAULT: Final = "fixed-lag"
-"""The estimator that runs where none is named."""
+"""The online estimator that runs where none is named, ..."""
+DEFAULT_BATCH: Final = "spline"
+"""... and the batch one."""
 
 
 def _fixed_lag(settings: MapperSettings, log: Log) -> OnlineEstimator:
     return FixedLagMapper(settings, log.odometry_sigma)
 
 
-ONLINE: Final[Mapping[str, Callable[[MapperSettings, Log], OnlineEstimator]]] = {DEFAULT: _fixed_lag}
+def _landmark_fixed_lag(settings: MapperSettings, log: Log) -> OnlineEstimator:
+    from pathspace_graph.eval.landmark_fixed_lag import LandmarkFixedLag  # noqa: PLC0415 - eval imports us
+
+    return LandmarkFixedLag(settings, log.odometry_sigma)
+
+
+ONLINE: Final[Mapping[str, Callable[[MapperSettings, Log], OnlineEstimator]]] = {
+    DEFAULT: _fixed_lag,
+    "landmark-fixed-lag": _landmark_fixed_lag,
+}
 """What makes each online estimator for a log, of which it is told the sensors' noise only."""
+
+
+def _spline(settings: MapperSettings, log: Log) -> BatchEstimator:
+    from .batch import BatchMapper  # noqa: PLC0415 - only where it is asked for
+
+    return BatchMapper(settings, log.odometry_sigma)
+
+
+def _landmark_batch(settings: MapperSettings, log: Log) -> BatchEstimator:
+    from pathspace_graph.eval.landmark_batch import LandmarkBatch  # noqa: PLC0415 - eval imports us
+
+    return LandmarkBatch(settings, log.odometry_sigma)
+
+
+BATCH: Final[Mapping[str, Callable[[MapperSettings, Log], BatchEstimator]]] = {
+    DEFAULT_BATCH: _spline,
+    "landmark-batch": _landmark_batch,
+}
+"""The same of the batch estimators."""
+
+
+def check_batch(name: str) -> None:
+    """SettingsError, naming the known ones, where there is no batch estimator of that name."""
+    if name not in BATCH:
+        known = ", ".join(sorted(BATCH))
+        raise SettingsError(f"--estimator: expected a known batch estimator ({known}), found '{name}'")
+
+
+def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:
+    """The batch estimator of that name, for a log."""
+    check_batch(name)
+    return BATCH[name](settings, log)
 
 
 def check_online(name: str) -> None:

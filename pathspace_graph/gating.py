@@ -102,7 +102,7 @@ def _lost(foot: FootPoints, heading: float, lateral: float) -> bool:
 
 
 def relocate(boundary: Boundary, control_points: Array, pose: Array) -> float:
-    """Parameter of the nearest point of a closed curve that runs the way of a pose (3,), within 60 degrees."""
+    """Parameter of the nearest point of a closed curve that runs the way of a pose (3,), to 60 degrees."""
     u = np.arange(boundary.tables.low, boundary.tables.high, boundary.settings.search_step)
     offset = boundary.evaluate(control_points, u) - pose[:2]
     tangent = boundary.evaluate(control_points, u, 1)

@@ -53,6 +53,17 @@ class OnlineEstimator(Protocol):
         """The map as it stands, a copy."""
 
 
+class BatchEstimator(Protocol):
+    """The one face of every batch estimator."""
+
+    @property
+    def settings(self) -> Any:
+        """A frozen dataclass of everything that it was told."""
+
+    def solve(self, log: Log) -> BatchRun:
+        """The optimum over a whole log, whose truth isn't read."""
+
+
 @dataclass(frozen=True)
 class CycleRecord:
     """One row of `cycles.csv` (FORMATS)."""
@@ -97,6 +108,14 @@ class RunResult:
     """(lap, map as it stood at its end) of each complete lap by the estimated trajectory."""
     snapshots: tuple[Map, ...] = ()
     """The map as it stood at each of the times that were asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class BatchRun(RunResult):
+    """What a batch estimator gives; its maps of the laps are all the same one, that of the whole log."""
+
+    converged: bool = True
+    """Whether it ended at an optimum."""
 
 
 def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:

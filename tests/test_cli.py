@@ -219,7 +219,7 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ([], "expected a command (demo, simulate, online, plot)"),
+        ([], f"expected a command ({', '.join(COMMANDS)})"),
         (["fly"], "'fly'"),
         (["online"], "Missing"),
         (["online", "LOG", "--out", "MAP", "--lag", "long"], "--lag"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.landmark_batch import held_twists, integrate_between, solve_landmarks
+from pathspace_graph.eval.landmark_told import solve_landmarks
 from pathspace_graph.eval.limit import (
     Limit,
     driving_order,
@@ -19,6 +19,7 @@ from pathspace_graph.eval.metrics import ate, root_mean_square
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.log import Detections, Log, Odometry, Truth
 from pathspace_graph.map import Map, PointBoundary, SplineBoundary
+from pathspace_graph.settings import MapperSettings, OdometrySettings
 from pathspace_graph.spline import BSpline
 
 Array = NDArray[np.float64]
@@ -101,6 +102,12 @@ def test_with_noise_the_errors_are_as_large_as_the_covariance_says() -> None:
     assert np.mean(ratios) == pytest.approx(1.0, abs=4 * np.sqrt(2 / (6 * 72)))
 
 
+CERTAIN = MapperSettings(
+    odometry=OdometrySettings(sigma_scale=1e-9, sigma_bias=1e-9, sigma_start=1e-6, sigma_start_heading=1e-6)
+)
+"""A vehicle that stands turns by its yaw rate's bias, unless that is known."""
+
+
 def standing_log(readings: Array, covariances: Array) -> Log:
     """A vehicle that stands and knows it, and sees one point once a cycle."""
     n = len(readings)
@@ -118,7 +125,7 @@ def test_a_landmark_seen_standing_is_the_information_weighted_mean() -> None:
     covariances = roots @ np.swapaxes(roots, 1, 2)
     readings = np.array([3.0, -4.0]) + np.einsum("kij,kj->ki", roots, rng.normal(0.0, 1.0, (8, 2)))
     solution = solve_landmarks(
-        standing_log(readings, covariances), np.zeros(8, dtype=int), with_covariance=True
+        standing_log(readings, covariances), np.zeros(8, dtype=int), with_covariance=True, settings=CERTAIN
     )
     weights = np.linalg.inv(covariances)
     covariance = np.linalg.inv(weights.sum(axis=0))
@@ -131,7 +138,7 @@ def test_a_landmark_seen_standing_is_the_information_weighted_mean() -> None:
 def test_false_positives_are_left_out_and_colours_not_looked_at() -> None:
     readings = np.array([[5.0, 1.0], [50.0, 50.0], [5.0, 1.2]])
     covariances = np.tile(1e-4 * np.eye(2), (3, 1, 1))
-    solution = solve_landmarks(standing_log(readings, covariances), np.array([7, -1, 7]))
+    solution = solve_landmarks(standing_log(readings, covariances), np.array([7, -1, 7]), settings=CERTAIN)
     np.testing.assert_array_equal(solution.landmark_ids, [7])
     np.testing.assert_allclose(solution.landmarks, [[5.0, 1.1]], atol=1e-3)
     assert solution.trajectory.shape == (3, 3)
@@ -146,21 +153,6 @@ def test_a_log_in_which_nothing_is_seen_gives_the_odometry() -> None:
     np.testing.assert_allclose(
         solution.trajectory[:, :2], circle_poses(solution.trajectory_t)[:, :2], atol=1e-6
     )
-
-
-def test_twists_are_held_until_the_next_row_and_split_between_cycles() -> None:
-    odometry = Odometry(np.array([1.0, 2.0, 4.0]), np.array([[1.0, 0, 0], [2.0, 0, 0], [3.0, 0, 0]]))
-    dt, twists = held_twists(odometry, 1.5, 4.5)
-    np.testing.assert_allclose(dt, [0.5, 2.0, 0.5])
-    np.testing.assert_allclose(twists[:, 0], [1.0, 2.0, 3.0])
-    dt, twists = held_twists(odometry, 2.0, 4.0)
-    np.testing.assert_allclose((dt[0], twists[0, 0], len(dt)), (2.0, 2.0, 1))
-    assert len(held_twists(odometry, 3.0, 3.0)[0]) == 0
-    motions, covariances = integrate_between(odometry, np.ones(3), np.array([0.5, 1.5, 6.0]))
-    np.testing.assert_allclose(motions[:, 0], [0.0, 0.5, 0.5 + 4.0 + 6.0])
-    assert not covariances[0].any()
-    # one reading is held over 0.5 s: its error of 1 m/s moves the end by 0.5 m
-    np.testing.assert_allclose(covariances[1, 0, 0], 0.25)
 
 
 def exact_ring_map(size: int) -> Map:

@@ -1,0 +1,59 @@
+"""Landmarks that come into being where one thing was sighted often, and go where two are one cone."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.landmark_settings import LandmarkSettings
+from pathspace_graph.settings import GrowthSettings
+
+from .landmark_association import PLANE, Gates, squared_mahalanobis
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+def sighted_by(
+    points: Array, slots: IntArray, landmarks: Array, settings: GrowthSettings
+) -> tuple[IntArray, IntArray]:
+    """Which of the readings (m, 2), map frame, made new landmarks (k, 2): rows, and the landmark of each.
+
+    Those within the merge radius, each of the nearest landmark, and of each pose's (slots (m,)) the nearest.
+    """
+    if len(points) == 0 or len(landmarks) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    offset = points[:, None] - landmarks[None]
+    distances = np.hypot(offset[..., 0], offset[..., 1])
+    nearest = distances.argmin(axis=1)
+    distance = distances[np.arange(len(points)), nearest]
+    rows = np.argsort(distance, kind="stable")
+    rows = rows[distance[rows] < settings.merge_radius]
+    _, first = np.unique(np.column_stack([slots[rows], nearest[rows]]), axis=0, return_index=True)
+    chosen = rows[first]
+    return chosen, nearest[chosen]
+
+
+def near_pairs(landmarks: Array, labels: IntArray, radius: float) -> tuple[IntArray, IntArray]:
+    """Indices (k,) of landmarks and of older ones of the same colour within `radius` (m)."""
+    offset = landmarks[:, None] - landmarks[None]
+    near = (np.hypot(offset[..., 0], offset[..., 1]) < radius) & (labels[:, None] == labels[None])
+    newer, older = np.nonzero(np.tril(near, -1))
+    return newer, older
+
+
+def one_cone(
+    first: IntArray, second: IntArray, offset: Array, spread: Array, settings: LandmarkSettings
+) -> IntArray:
+    """Which pairs (k,) are one cone, by `offset` (k, 2) and its covariance (k, 2, 2): nearest first, each
+    landmark in one pair at most."""
+    distance = squared_mahalanobis(offset, spread + settings.sigma_merge**2 * np.eye(PLANE))
+    gate = Gates.of_probabilities(settings.match, settings.create).match
+    taken: set[int] = set()
+    chosen = []
+    for row in np.argsort(distance)[: int((distance < gate).sum())].tolist():
+        pair = {int(first[row]), int(second[row])}
+        if taken.isdisjoint(pair):
+            taken |= pair
+            chosen.append(row)
+    return np.array(chosen, np.intp)
