@@ -10,3 +10,47 @@ from .positive import Positive
 @dataclass(frozen=True)
 class BatchSettings(Positive):
     """The batch optimization over a whole log."""
+
+    size: int | None = None
+    """Control points of both boundaries together; where not given, the readings decide."""
+    size_share: float = 0.43
+    """Most control points as a share of the distinct cones sighted (the paper has 0.44)."""
+    sigma_model: float = 0.1
+    """How far cones stand off their curve (m, one sigma), added to each reading across it. Online it is
+    larger (`spline.sigma_model`), while a curve is short of readings; here it decides how much all of them
+    say of the heading, which holds the whole map."""
+    sigma_smoothness: float = 0.4
+    """Second difference of control points, as a share of their spacing: stronger than online's, as a curve
+    between cones that were never seen has many shapes that fit as well, and each start ends in its own."""
+    pose_steps: int = 3
+    """Gauss-Newton steps of the poses alone, beside the map that the start has found."""
+    rough_passes: int = 1
+    """Optimizations before the last, knots chosen anew before each: they forget where they began."""
+    rough_rounds: int = 12
+    """Most rounds of each of those, ..."""
+    rough_tolerance: float = 8.0
+    """... which the tolerances below times this end as well."""
+    max_rounds: int = 40
+    """Rounds of new foot points, gates and weights; the last of them is told as not converged."""
+    max_steps: int = 6
+    """Levenberg-Marquardt steps in a round."""
+    loose_gate: float = 8.0
+    """The first round uses readings within so many sigmas of a curve, ..."""
+    gate_factor: float = 0.7
+    """... each further one within this share of that, down to `gate.chi`."""
+    damping: float = 4.0
+    """First hold on control points along the curve (1/m^2), ..."""
+    damping_up: float = 5.0
+    """... times this after a step that made it worse ..."""
+    damping_down: float = 0.1
+    """... and times this after one that made it better, ..."""
+    damping_least: float = 1e-6
+    """... but no less than this (1/m^2)."""
+    damping_most: float = 1e6
+    """Damping (1/m^2) at which no step is left that makes it better."""
+    tolerance_cost: float = 1e-6
+    """Converged where |cost_before - cost_after| <= tolerance * cost_before, ..."""
+    tolerance_curve: float = 2e-3
+    """... no point of a curve moved farther than this across it (m), ..."""
+    tolerance_pose: float = 2e-3
+    """... no pose farther than this (m, and rad), and no reading was taken up or left out."""

@@ -1,0 +1,240 @@
+"""The batch measured: real and generated tracks x seeds, from both starts, against the limit of each run.
+
+`python -m pathspace_graph.eval.batch_table --tracks DIR --seeds 5 --laps 5 --jobs 2 --markdown`
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import tyro
+from joblib import Parallel, delayed, parallel_config
+from rich.console import Console
+
+from pathspace_graph.batch import BatchMapper
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.log import Log
+from pathspace_graph.progress import progress
+from pathspace_graph.settings import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_files import read_track
+from pathspace_graph.sim.track_generator import generate_track
+
+from .limit import limit
+from .metrics import lap_metrics
+from .nees import Nees, curve_nees
+from .online_table import FILE_WIDTH, Case, find_tracks, make_cases, markdown_table, rich_table
+
+SAME_COST: Final = 1e-3
+"""Costs that differ by no more than this share are one optimum's."""
+NOT_WORSE: Final = 1.02
+"""A batch rmse up to this many times the online one's isn't worse."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one run."""
+
+    case: Case
+    """The run."""
+    failure: str = ""
+    """What it failed of; empty where it finished."""
+    converged: tuple[bool, bool] = (False, False)
+    """From the online map, and from odometry alone."""
+    costs: tuple[float, float] = (np.nan, np.nan)
+    """Theirs."""
+    online: float = np.nan
+    """rmse of the online map, m."""
+    rmse: float = np.nan
+    """rmse of the batch's from there, m."""
+    rmse_odometry: float = np.nan
+    """rmse of the batch's from odometry alone, m."""
+    missed: float = np.nan
+    """Missed share of the true cones."""
+    share: float = np.nan
+    """Control points by true cones."""
+    l: float = np.nan  # noqa: E741 - the issue's and the paper's tables call it so
+    """The limit's first part: rmse of the told landmark batch, m."""
+    f: float = np.nan
+    """Its second: what a spline of that size leaves, m."""
+    seconds: tuple[float, float] = (np.nan, np.nan)
+    """Wall time of the batch without the online run, and of that."""
+    nees: Nees | None = None
+    """Of the curves at the true cones."""
+
+    @property
+    def limit(self) -> float:
+        """sqrt(l^2 + f^2), m."""
+        return float(np.hypot(self.l, self.f))
+
+    @property
+    def same_cost(self) -> bool:
+        """Whether both starts came to one optimum."""
+        return bool(abs(self.costs[0] - self.costs[1]) <= SAME_COST * min(self.costs))
+
+
+def run_case(case: Case) -> Outcome:
+    """Simulate, optimize from both starts, evaluate; a failure is an outcome as well."""
+    try:
+        track = (
+            generate_track(np.random.default_rng(case.track))
+            if isinstance(case.track, int)
+            else read_track(case.track)
+        )
+        return evaluate(case, simulate(track, SimulationSettings(laps=case.laps), case.seed))
+    except Exception as error:  # whatever ends a run belongs into the table
+        return Outcome(case, failure=f"{type(error).__name__}: {error}")
+
+
+def evaluate(case: Case, log: Log) -> Outcome:
+    """Both starts on a simulated log, held against its truth."""
+    truth, settings = log.truth, MapperSettings()
+    assert truth is not None
+    mapper = BatchMapper(settings, log.odometry_sigma)
+    begin = time.perf_counter()
+    result = mapper.solve(log)
+    total = time.perf_counter() - begin
+    other = mapper.solve(log, "odometry")
+    assert result.online is not None
+    final = lap_metrics(result.map, truth, case.laps)
+    least = limit(log, result.map)
+    return Outcome(
+        case,
+        converged=(result.convergence.converged, other.convergence.converged),
+        costs=(result.convergence.cost, other.convergence.cost),
+        online=lap_metrics(result.online.map, truth, case.laps).rmse,
+        rmse=final.rmse,
+        rmse_odometry=lap_metrics(other.map, truth, case.laps).rmse,
+        missed=final.missed,
+        share=final.size / int(np.isin(truth.cone_labels, BOUNDARIES).sum()),
+        l=least.l,
+        f=least.f,
+        seconds=(total - result.seconds["start"], result.seconds["start"]),
+        nees=curve_nees(result, truth, result.sigma_cones),
+    )
+
+
+def run_cases(cases: Sequence[Case], jobs: int) -> Iterator[Outcome]:
+    """Outcomes as they come, `jobs` at a time, each on one thread."""
+    with parallel_config(backend="loky", inner_max_num_threads=1):
+        yield from Parallel(n_jobs=jobs, return_as="generator_unordered")(
+            delayed(run_case)(case) for case in cases
+        )
+
+
+# --- tables ----------------------------------------------------------------------------------------------
+
+HEADER: Final = (
+    "track",
+    "converged",
+    "rmse online [m]",
+    "rmse batch [m]",
+    "from odometry [m]",
+    "limit (l, f) [m]",
+    "ratio",
+    "size [% of cones]",
+    "same cost",
+    "batch [s]",
+    "NEES / cones",
+    "in 95 %",
+)
+
+
+def rows(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
+    """A row for each track, and one for all."""
+    names = dict.fromkeys(outcome.case.name for outcome in outcomes)
+    tracks = [_row(name, [o for o in outcomes if o.case.name == name]) for name in names]
+    return [*tracks, _row("all", outcomes)]
+
+
+def _row(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
+    done = [o for o in outcomes if not o.failure]
+
+    def mean(value: Callable[[Outcome], float]) -> float:
+        return float(np.mean([value(o) for o in done])) if done else float("nan")
+
+    checked = [o.nees for o in done if o.nees is not None]
+    return (
+        name,
+        f"{sum(sum(o.converged) for o in done)} of {2 * len(outcomes)}",
+        f"{mean(lambda o: o.online):.3f}",
+        f"{mean(lambda o: o.rmse):.3f}",
+        f"{mean(lambda o: o.rmse_odometry):.3f}",
+        f"{mean(lambda o: o.limit):.3f} ({mean(lambda o: o.l):.3f}, {mean(lambda o: o.f):.3f})",
+        f"{mean(lambda o: o.rmse) / mean(lambda o: o.limit):.2f}",
+        f"{100 * mean(lambda o: o.share):.1f}",
+        f"{sum(o.same_cost for o in done)} of {len(outcomes)}",
+        f"{mean(lambda o: o.seconds[0]):.1f}",
+        f"{np.mean([n.value / n.cones for n in checked]) if checked else float('nan'):.2f}",
+        f"{sum(n.inside() for n in checked)} of {len(outcomes)}",
+    )
+
+
+def worse(outcomes: Sequence[Outcome]) -> list[str]:
+    """Runs whose batch is worse than the online map that it began at."""
+    return [
+        f"{o.case.name}, seed {o.case.seed}: {o.rmse:.3f} m, online {o.online:.3f} m"
+        for o in outcomes
+        if o.rmse > NOT_WORSE * o.online
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchTable:
+    """Measure the batch over tracks and seeds."""
+
+    tracks: Path | None = None
+    """Folder of real tracks, with subfolders pacsim, fssim and eufs."""
+    generated: int = 3
+    """Number of generated tracks."""
+    seeds: int = 5
+    """Drives on each track."""
+    laps: int = 5
+    """Laps of each drive."""
+    jobs: int = 2
+    """Runs at a time."""
+    markdown: bool = False
+    """Print Markdown instead of a table for a terminal."""
+
+    def run(self) -> None:
+        """Run all of it and print the table."""
+        tracks = [] if self.tracks is None else find_tracks(self.tracks)
+        cases = make_cases(tracks, self.generated, self.seeds, self.laps)
+        order = {case: number for number, case in enumerate(cases)}
+        outcomes = []
+        with progress("measuring", len(cases)) as advance:
+            for outcome in run_cases(cases, self.jobs):
+                outcomes.append(outcome)
+                advance()
+        outcomes.sort(key=lambda outcome: order[outcome.case])
+        show(outcomes, self.markdown)
+
+
+def show(outcomes: Sequence[Outcome], markdown: bool) -> None:
+    """Print the table, what is worse than online, and what failed."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=FILE_WIDTH)
+    if markdown:
+        sys.stdout.write(markdown_table(HEADER, rows(outcomes)) + "\n\n")
+    else:
+        console.print(rich_table(HEADER, rows(outcomes)))
+    sys.stdout.writelines(f"worse than online: {line}\n" for line in worse(outcomes))
+    for outcome in outcomes:
+        if outcome.failure:
+            sys.stderr.write(f"{outcome.case.name}, seed {outcome.case.seed}: {outcome.failure}\n")
+
+
+def main() -> None:
+    """The script."""
+    tyro.cli(BatchTable).run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,158 @@
+"""The offline batch: every pose, every reading and both curves of a log, in one least-squares problem."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from .batch_data import Chain, collect_readings, integrate_log
+from .batch_dead_reckoning import start_odometry
+from .batch_knots import reknot, scatter_of_cones
+from .batch_optimizer import Convergence, Optimizer, Schedule
+from .batch_start import start_online
+from .batch_system import BatchSystem, Kernel
+from .fixed_lag import ODOMETRY_SIGMA
+from .labels import LEFT, RIGHT
+from .laps import LapCounter
+from .log import Log
+from .map import Map, SplineBoundary
+from .readings import Readings
+from .run import BatchRun, CycleRecord, RunResult, settings_dict
+from .settings import MapperSettings
+from .state import State
+from .stopwatch import Stopwatch
+
+Array = NDArray[np.float64]
+Start = Literal["online", "odometry"]
+
+NAME = "spline"
+"""What the command line calls this estimator."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BatchResult(BatchRun):
+    """What the batch optimization gives: a run's result, how it ended, and how sure it is."""
+
+    convergence: Convergence
+    """Whether and how it converged."""
+    map_covariance: Array
+    """(2m, 2m) m^2, joint covariance of both boundaries' control points, left first: what the readings say,
+    without the cones' scatter."""
+    sigma_cones: float
+    """How far the sighted cones stand off the curves (m, rms): what no curve of that size follows."""
+    pose_covariances: Array
+    """(n, 3, 3) marginal covariance of each pose (x, y, theta), map frame."""
+    calibration: Array
+    """(2,) scale error of the speeds, bias of the yaw rate (rad/s)."""
+    online: RunResult | None
+    """The online run that it began at, where it did."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Wall time of each stage."""
+
+
+class BatchMapper:
+    """Maps a whole log at once. `odometry_sigma` (3,): standard deviation of a twist (m/s, m/s, rad/s)."""
+
+    def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
+        self.settings = settings or MapperSettings()
+        self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
+
+    def solve(
+        self, log: Log, start: Start = "online", on_round: Callable[[], None] | None = None
+    ) -> BatchResult:
+        """The optimum from an online run's map, or from odometry alone."""
+        with threadpool_limits(limits=1):
+            return self._solve(log, start, on_round)
+
+    def _solve(self, log: Log, start: Start, on_round: Callable[[], None] | None) -> BatchResult:
+        settings, batch, watch = own_settings(self.settings), self.settings.batch, Stopwatch()
+        chain = integrate_log(log, self.odometry_sigma, settings.odometry)
+        readings = collect_readings(log)
+        system = BatchSystem(readings, chain, settings, Kernel(settings.gate.huber, settings.gate.chi))
+        optimizer = Optimizer(system, batch)
+        watch.lap("integrate")
+        online = None
+        if start == "online":
+            state, online = start_online(log, self.settings, self.odometry_sigma)
+        else:
+            state = start_odometry(chain, readings, settings)
+        watch.lap("start")
+        state = optimizer.hold_map(state, batch.pose_steps, batch.loose_gate)
+        watch.lap("poses")
+        rough = Schedule(batch.loose_gate, batch.rough_rounds, batch.rough_tolerance)
+        for _ in range(batch.rough_passes):
+            at, _ = optimizer.run(reknot(state, readings, settings), rough, on_round)
+            state, rough = at.state, replace(rough, gate=settings.gate.chi)
+        watch.lap("rough")
+        fine = Schedule(settings.gate.chi, batch.max_rounds)
+        at, convergence = optimizer.run(reknot(state, readings, settings), fine, on_round)
+        watch.lap("fine")
+        uncertainty = system.normal_equations(at).reduced()
+        joint, marginals = uncertainty.border_covariance(), uncertainty.pose_marginals()
+        sigma_cones = scatter_of_cones(at.state, readings, settings)
+        watch.lap("covariance")
+        return BatchResult(
+            estimator=NAME,
+            settings=settings_dict(self.settings),
+            map=_map(at.state, joint, sigma_cones),
+            sigma_cones=sigma_cones,
+            trajectory_t=chain.stamps,
+            trajectory=at.state.poses.copy(),
+            cycles=_records(at.state, readings, chain, sum(watch.laps.values())),
+            laps=_completed(at.state.poses),
+            converged=convergence.converged,
+            convergence=convergence,
+            map_covariance=joint[: at.state.map_size, : at.state.map_size],
+            pose_covariances=marginals,
+            calibration=at.state.calibration.copy(),
+            online=online,
+            seconds=watch.laps,
+        )
+
+
+def own_settings(settings: MapperSettings) -> MapperSettings:
+    """The settings with the batch's own in place of what they stand for online."""
+    batch = settings.batch
+    return replace(
+        settings,
+        spline=replace(settings.spline, sigma_model=batch.sigma_model),
+        gauge=replace(settings.gauge, sigma_smoothness=batch.sigma_smoothness),
+    )
+
+
+def _map(state: State, joint: Array, sigma: float) -> Map:
+    """The curves with their joint covariance, to which the cones' scatter `sigma` (m) is added."""
+    closed = any(boundary.periodic for boundary in state.boundaries.values())
+    boundaries = {}
+    for label, boundary in state.boundaries.items():
+        block = state.block(label)
+        spline = boundary.spline(state.control_points(label).copy())
+        covariance = joint[block, block] + sigma**2 * np.eye(2 * boundary.size)
+        boundaries[label] = SplineBoundary(spline, covariance)
+    return Map(closed, boundaries)
+
+
+def _records(state: State, readings: Readings, chain: Chain, seconds: float) -> tuple[CycleRecord, ...]:
+    """A record of each cycle: its share of the time, its readings in use, its lap."""
+    left, right = (state.boundaries[b].size if b in state.boundaries else 0 for b in (LEFT, RIGHT))
+    used = np.bincount(readings.slot[readings.used], minlength=len(chain))
+    counter = LapCounter()
+    return tuple(
+        CycleRecord(
+            k, float(t), seconds / len(chain), left, right, int(used[k]), counter.update(state.poses[k])
+        )
+        for k, t in enumerate(chain.stamps)
+    )
+
+
+def _completed(poses: Array) -> int:
+    """Complete laps, one that ends just short of the line included."""
+    counter = LapCounter()
+    for pose in poses:
+        counter.update(pose)
+    return counter.completed

@@ -1,0 +1,87 @@
+"""Which readings of a log belong to which curve: every one tested anew against where the curves are now."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.projection import project, to_map
+
+from .labels import UNKNOWN
+from .readings import Readings
+from .settings import MapperSettings
+from .state import State
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+SAME_WAY = 0.5
+"""Cosine of the largest angle between a vehicle's heading and the direction of the curve beside it."""
+OTHER_WAY = 100.0
+"""A curve that leads another way counts as so much farther (m): taken only where no other does."""
+STATION_STEP = 1.0
+"""Step (m) along a curve at which stations are looked for."""
+
+
+def locate_poses(state: State) -> None:
+    """Stations: the parameter of the nearest point of each curve that leads the way each pose heads.
+
+    Without the heading, the inside of a hairpin is as near at its far leg. Laps of a closed curve add up.
+    """
+    for label, boundary in state.boundaries.items():
+        low, length = boundary.tables.low, boundary.length
+        u = low + length * (np.arange(int(np.ceil(length / STATION_STEP))) + 0.5) / np.ceil(
+            length / STATION_STEP
+        )
+        position, tangent = (boundary.evaluate(state.control_points(label), u, order) for order in (0, 1))
+        tangent /= np.maximum(np.hypot(*tangent.T), np.finfo(float).tiny)[:, None]
+        poses = state.poses
+        offset_x = poses[:, :1] - position[:, 0]
+        offset_y = poses[:, 1:2] - position[:, 1]
+        heading = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+        square = offset_x**2 + offset_y**2
+        square[heading @ tangent.T < SAME_WAY] += OTHER_WAY**2
+        nearest = u[square.argmin(axis=1)]
+        state.stations[label] = np.unwrap(nearest, period=length) if boundary.periodic else nearest
+
+
+def associate(state: State, readings: Readings, settings: MapperSettings, gate: float, strict: bool) -> int:
+    """Put every reading into use that lies within `gate` sigmas of its curve; gives how many changed.
+
+    Searched for in the stretch that is visible from the reading's pose; where `strict`, what isn't explained
+    there is searched for on the whole curve: across the infield a sensor sees stretches that come much later.
+    A label is believed; a reading of unknown colour goes to the curve that it fits better, but not before
+    curves are where they belong: cones of no boundary stand beside them.
+    """
+    before = np.where(readings.used, readings.boundary, UNKNOWN)
+    boundary_of, u = np.full(len(readings), UNKNOWN), readings.u.copy()
+    for whole in (False, True) if strict else (False,):
+        left = boundary_of == UNKNOWN
+        best = np.full(len(readings), gate)
+        for label in state.boundaries:
+            named = (readings.label == label) | (strict & (readings.label == UNKNOWN))
+            rows = np.flatnonzero(left & named)
+            misfit, foot_u = _misfit(state, readings, settings, label, rows, whole)
+            nearer = misfit < best[rows]
+            chosen = rows[nearer]
+            best[chosen], boundary_of[chosen], u[chosen] = misfit[nearer], label, foot_u[nearer]
+    readings.used, readings.u = boundary_of != UNKNOWN, u
+    readings.boundary = np.where(readings.used, boundary_of, readings.label)
+    return int((before != boundary_of).sum())
+
+
+def _misfit(
+    state: State, readings: Readings, settings: MapperSettings, label: int, rows: IntArray, whole: bool
+) -> tuple[Array, Array]:
+    """(m,) distance of readings from a curve in sigmas, infinite where it isn't theirs; foot points (m,)."""
+    boundary, gate, slots = state.boundaries[label], settings.gate, readings.slot[rows]
+    station, poses = state.stations[label][slots], state.poses[slots]
+    points = to_map(readings.point[rows], poses)
+    low, high = station - gate.view_behind, station + gate.view_ahead
+    if whole:
+        low, high = np.full(len(rows), boundary.tables.low), np.full(len(rows), boundary.tables.high)
+    foot = boundary.find(state.control_points(label), points, low, high)
+    projected = project(points, readings.covariance[rows], poses, foot, settings.spline.sigma_model)
+    possible = foot.interior & (np.abs(foot.distance) < gate.rough)
+    return np.where(possible, np.abs(foot.distance) / projected.sigma, np.inf), foot.u

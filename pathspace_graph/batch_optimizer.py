@@ -1,0 +1,212 @@
+"""Levenberg-Marquardt on the whole log, and the rounds about it that refresh what it holds fixed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrowhead import Reduced
+from .batch_gating import associate, locate_poses
+from .batch_settings import BatchSettings
+from .batch_system import BatchSystem, Evaluation, moved
+from .state import State
+from .window import POSE, SingularSystemError
+
+Array = NDArray[np.float64]
+
+CURVE_SAMPLES = 2
+"""Points in each knot interval at which the movement of a curve is looked at."""
+
+
+@dataclass(frozen=True)
+class Movement:
+    """How far a state has moved."""
+
+    curve: float
+    """Largest movement of a curve across itself, m."""
+    pose: float
+    """Largest movement of a pose: the larger of m and rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class Convergence:
+    """How an optimization ended."""
+
+    converged: bool
+    """Whether nothing changed any more."""
+    reason: str
+    """Why it stopped."""
+    rounds: int
+    """Times that foot points, gates and weights were refreshed."""
+    steps: int
+    """Levenberg-Marquardt steps, rejected ones included."""
+    cost: float
+    """Half the sum of squares with robust losses, at the end."""
+    gradient: float
+    """Norm of the gradient there, each entry in units of its own sigma."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How far an optimization goes."""
+
+    gate: float
+    """First gate, sigmas."""
+    rounds: int
+    """Most rounds."""
+    tolerance: float = 1.0
+    """Multiplies every tolerance of the settings."""
+
+
+class Optimizer:
+    """Takes a state down to the optimum."""
+
+    def __init__(self, system: BatchSystem, settings: BatchSettings) -> None:
+        self.system = system
+        self.settings = settings
+        self.steps = 0
+        """Steps tried so far."""
+        self._damping = settings.damping
+
+    def run(
+        self, state: State, schedule: Schedule, on_round: Callable[[], None] | None = None
+    ) -> tuple[Evaluation, Convergence]:
+        """Rounds until nothing changes, the gate graduated from the schedule's to the kernel's own."""
+        system, gate = self.system, schedule.gate
+        system.begin(state)
+        at: Evaluation | None = None
+        for number in range(1, schedule.rounds + 1):
+            gate = max(gate, system.kernel.gate)
+            strict = gate <= system.kernel.gate
+            before = state
+            changed = self._refresh(state, gate, strict)
+            at, cost_before = self._descend(state)
+            state = at.state
+            if on_round is not None:
+                on_round()
+            few = changed <= schedule.tolerance - 1.0
+            still = self._still(_movement(before, state), cost_before - at.cost, at.cost, schedule.tolerance)
+            if strict and few and still:
+                return at, self._report(at, number, "nothing changes any more", True)
+            gate *= self.settings.gate_factor
+        assert at is not None
+        return at, self._report(at, schedule.rounds, "no round left", False)
+
+    def _refresh(self, state: State, gate: float, strict: bool) -> int:
+        """Stations, readings in use and their sigmas, for a round; gives how many readings changed."""
+        system = self.system
+        locate_poses(state)
+        changed = associate(state, system.readings, system.settings, gate, strict)
+        system.hold_sigmas(state)
+        return changed
+
+    def hold_map(self, state: State, steps: int, gate: float) -> State:
+        """Poses alone, the map and the calibration held."""
+        self.system.begin(state)
+        for _ in range(steps):
+            self._refresh(state, gate, False)
+            at = self.system.evaluate(state)
+            reduced = self.system.normal_equations(at).reduced()
+            held = np.zeros(len(reduced.descent))
+            state = moved(state, reduced.poses(held), held)
+        return state
+
+    def _still(self, movement: Movement, gain: float, cost: float, tolerance: float) -> bool:
+        settings = self.settings
+        curve, pose = tolerance * settings.tolerance_curve, tolerance * settings.tolerance_pose
+        still = movement.curve <= curve and movement.pose <= pose
+        return still and gain <= tolerance * settings.tolerance_cost * cost
+
+    def _descend(self, state: State) -> tuple[Evaluation, float]:
+        """A few damped steps with the readings in use held; also the cost before them."""
+        at = self.system.evaluate(state)
+        cost = at.cost
+        self._accept(at)
+        for _ in range(self.settings.max_steps):
+            following = self._step(at)
+            if following is None:
+                break
+            gain, at = at.cost - following.cost, following
+            if gain <= self.settings.tolerance_cost * at.cost:
+                break
+        return at, cost
+
+    def _step(self, at: Evaluation) -> Evaluation | None:
+        """The next state that is better, damped as much as that takes; None where no damping is enough."""
+        settings = self.settings
+        equations = self.system.normal_equations(at).reduced()
+        unit = sliding(at.state)
+        while self._damping <= settings.damping_most:
+            self.steps += 1
+            trial = self._trial(at, equations, self._damping * unit)
+            if trial is not None and trial.cost <= at.cost:
+                self._damping = max(settings.damping_down * self._damping, settings.damping_least)
+                self._accept(trial)
+                return trial
+            self._damping *= settings.damping_up
+        self._damping = settings.damping
+        return None
+
+    def _trial(self, at: Evaluation, equations: Reduced, damping: Array) -> Evaluation | None:
+        try:
+            step = equations.step(damping)
+        except SingularSystemError:
+            return None
+        return self.system.evaluate(moved(at.state, *step))
+
+    def _accept(self, at: Evaluation) -> None:
+        """Foot points are refined from where they are now."""
+        for projected in at.projected.values():
+            self.system.readings.u[projected.rows] = projected.foot.u
+
+    def _report(self, at: Evaluation, rounds: int, reason: str, converged: bool) -> Convergence:
+        equations = self.system.normal_equations(at)
+        scaled = np.concatenate(
+            [
+                equations.descent_poses / np.sqrt(equations.scale_poses),
+                equations.descent_border / np.sqrt(equations.scale_border),
+            ]
+        )
+        return Convergence(converged, reason, rounds, self.steps, at.cost, float(np.linalg.norm(scaled)))
+
+
+ACROSS = 0.01
+"""Damping across a curve, as a share of that along it."""
+
+
+def sliding(state: State) -> Array:
+    """`sum_j t_j t_j'` (n, n), a unit of damping: control points held where readings leave them free.
+
+    t_j is the curve's direction where the point acts. Linearized, they would slide by metres, along tangents
+    that leave the curve where it bends; what moves the curve itself stays nearly free.
+    """
+    n = state.pose_column(0)
+    matrix = np.zeros((n, n))
+    for label, boundary in state.boundaries.items():
+        tangent = boundary.evaluate(state.control_points(label), boundary.abscissae, 1)
+        tangent /= np.maximum(np.hypot(*tangent.T), np.finfo(float).tiny)[:, None]
+        blocks = tangent[:, :, None] * tangent[:, None, :] + ACROSS * np.eye(2)
+        at = state.offset(label) + 2 * np.arange(boundary.size)
+        for i in range(2):
+            for j in range(2):
+                matrix[at + i, at + j] = blocks[:, i, j]
+    return matrix
+
+
+def _movement(before: State, after: State) -> Movement:
+    """Of curves on the same knots: along itself a curve doesn't move."""
+    curve = 0.0
+    for label, boundary in after.boundaries.items():
+        count = max(int(CURVE_SAMPLES * boundary.size), 2)
+        u = np.linspace(boundary.tables.low, boundary.tables.high, count)
+        tangent = boundary.evaluate(after.control_points(label), u, 1)
+        normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+        normal /= np.maximum(np.hypot(*normal.T), np.finfo(float).tiny)[:, None]
+        points = (boundary.evaluate(s.control_points(label), u) for s in (before, after))
+        offset = next(points) - next(points)
+        curve = max(curve, float(np.abs((offset * normal).sum(axis=1)).max()))
+    pose = float(np.abs(after.poses - before.poses).max()) if POSE * len(after.poses) else 0.0
+    return Movement(curve, pose)
