@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.log import Log, Truth
 from pathspace_graph.map import Map
-from pathspace_graph.run import RunResult
+from pathspace_graph.run import BatchRun, RunResult
 
 from .metrics import (
     LapMetrics,
@@ -37,7 +37,7 @@ def summarize(result: RunResult, log: Log) -> dict[str, Any]:
     summary: dict[str, Any] = {
         "estimator": result.estimator,
         "settings": result.settings,
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        "versions": versions(),
         "lap_count": result.laps,
         "closed": result.map.closed,
         "size": result.map.size,
@@ -47,6 +47,11 @@ def summarize(result: RunResult, log: Log) -> dict[str, Any]:
     if log.truth is not None:
         summary |= _map_errors(result, log, log.truth) | _trajectory_errors(result, log.truth)
     return summary
+
+
+def versions() -> dict[str, str]:
+    """Of Python and the libraries that a result depends on."""
+    return {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}}
 
 
 def lap_times(log: Log) -> Array:
@@ -59,10 +64,13 @@ def lap_times(log: Log) -> Array:
 def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
     """The paper's table: at the end of each true lap, or of each estimated one where there is no true path.
 
-    Empty where there are no true cones. `result` has its snapshots at `lap_times`.
+    Empty where there are no true cones. `result` has its snapshots at `lap_times`. A batch has one map, that
+    of all laps: one row.
     """
     if log.truth is None or not _has_cones(log.truth):
         return []
+    if isinstance(result, BatchRun):
+        return laps_metrics([(result.laps, result.map)], log.truth)
     by_truth = tuple(enumerate(result.snapshots, start=1))
     return laps_metrics(by_truth if len(log.truth.poses) else result.lap_maps, log.truth)
 
