@@ -67,7 +67,7 @@ def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
     Empty where there are no true cones. `result` has its snapshots at `lap_times`. A batch has one map, that
     of all laps: one row.
     """
-    if log.truth is None or not _has_cones(log.truth):
+    if log.truth is None or not has_cones(log.truth):
         return []
     if isinstance(result, BatchRun):
         return laps_metrics([(result.laps, result.map)], log.truth)
@@ -87,7 +87,8 @@ def not_mapped(track: Map, log: Log) -> list[str]:
     return lines
 
 
-def _has_cones(truth: Truth) -> bool:
+def has_cones(truth: Truth) -> bool:
+    """Whether any true cone is of a boundary."""
     return bool(np.isin(truth.cone_labels, BOUNDARIES).any())
 
 
@@ -104,7 +105,7 @@ def _timing(result: RunResult) -> dict[str, float] | None:
 
 def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:
     """`laps`, and the same of the map at the end of the log, wherever in a lap that is."""
-    if not _has_cones(truth):
+    if not has_cones(truth):
         return {}
     final = asdict(lap_metrics(result.map, truth, result.laps))
     del final["lap"]

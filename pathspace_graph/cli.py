@@ -40,6 +40,8 @@ COMMANDS: Final = {
     "demo": Command("commands_demo", "Demo", "map a generated track online: a table, a map and its picture"),
     "simulate": Command("commands_simulate", "Simulate", "write the log of a simulated drive, with truth"),
     "online": Command("commands_online", "Online", "map a log online, cycle by cycle"),
+    "batch": Command("commands_batch", "Batch", "optimize a whole log at once: the ground reference"),
+    "ablate": Command("commands_ablate", "Ablate", "run a study: estimators and settings over many drives"),
     "plot": Command("commands_plot", "Plot", "draw a map with its uncertainty band"),
 }
 

@@ -1,0 +1,85 @@
+"""Dotted fields of a settings tree, such as `spline.degree`: which there are, and how some are changed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import fields, is_dataclass, replace
+from difflib import get_close_matches
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from pathspace_graph.errors import SettingsError
+
+T = TypeVar("T")
+Overrides = Mapping[str, Any]
+"""New values by dotted field."""
+
+
+def leaves(settings: Any, prefix: str = "") -> dict[str, Any]:
+    """The value of every dotted field of a settings dataclass, in order."""
+    found: dict[str, Any] = {}
+    for entry in fields(settings):
+        value = getattr(settings, entry.name)
+        name = f"{prefix}{entry.name}"
+        found |= leaves(value, f"{name}.") if is_dataclass(value) else {name: value}
+    return found
+
+
+def flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested tables as dotted names, as TOML's own dotted keys mean them."""
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        name = f"{prefix}{key}"
+        flat |= flatten(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return flat
+
+
+def override(settings: T, overrides: Overrides, where: str) -> T:
+    """The settings with some dotted fields changed; SettingsError for an unknown one, or a wrong value."""
+    known = leaves(settings)
+    for name, value in overrides.items():
+        check_name(name, known, f"{where}: expected a known setting")
+        settings = _set(settings, name.split("."), value, f"{where}.{name}")
+    return settings
+
+
+def check_name(name: Any, known: Iterable[str], expected: str) -> None:
+    """SettingsError, naming the nearest known one, unless `name` is among the known."""
+    known = list(known)
+    if name in known:
+        return
+    near = get_close_matches(str(name), known, n=1, cutoff=0.0)
+    hint = f", the nearest is '{near[0]}'" if near else ""
+    raise SettingsError(f"{expected}, found '{name}'{hint}")
+
+
+def _set(settings: Any, path: list[str], value: Any, where: str) -> Any:
+    name, *rest = path
+    if rest:
+        new = _set(getattr(settings, name), rest, value, where)
+    else:
+        new = as_type(value, get_type_hints(type(settings))[name], where)
+    try:
+        return replace(settings, **{name: new})
+    except SettingsError as error:
+        raise SettingsError(f"{where}: {error}") from error
+
+
+def as_type(value: Any, hint: Any, where: str) -> Any:
+    """A value of TOML as the type that a field has: a list as a tuple, a whole number as a float."""
+    arguments = get_args(hint)
+    if get_origin(hint) is Literal and value in arguments:
+        return value
+    if get_origin(hint) in (Union, UnionType):
+        (hint,) = (entry for entry in arguments if entry is not NoneType)
+        return as_type(value, hint, where)
+    if get_origin(hint) is tuple and isinstance(value, list | tuple):
+        each = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
+        if len(each) == len(value):
+            return tuple(as_type(v, h, where) for v, h in zip(value, each, strict=True))
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(hint, type) and type(value) is hint:
+        return value
+    name = hint.__name__ if isinstance(hint, type) else str(hint)
+    raise SettingsError(f"{where}: expected a value of type {name}, found {value!r}")
