@@ -76,9 +76,9 @@ def _near_curve(
     sought = np.concatenate([points, state.poses[-1:, :2]])
     foot = boundary.find(state.control_points(label), sought, low, high)
     station = float(foot.u[-1])
-    if boundary.periodic and _lost(foot, state.poses[-1, 2], gate.station_lateral):
+    if _lost(foot, state.poses[-1, 2], gate.station_lateral):
         smoother.refresh()
-        station = relocate(boundary, state.control_points(label), state.poses[-1])
+        station = relocate(boundary, state.control_points(label), state.poses[-1], gate.station_room)
     _append_station(state, label, station)
     keep = np.flatnonzero(foot.interior[:-1] & (np.abs(foot.distance[:-1]) < gate.rough))
     rows, foot = rows[keep], _take(foot, keep)
@@ -101,13 +101,22 @@ def _lost(foot: FootPoints, heading: float, lateral: float) -> bool:
     return bool(along < 0.0 or abs(foot.distance[-1]) > lateral)
 
 
-def relocate(boundary: Boundary, control_points: Array, pose: Array) -> float:
-    """Parameter of the nearest point of a closed curve that runs the way of a pose (3,), to 60 degrees."""
-    u = np.arange(boundary.tables.low, boundary.tables.high, boundary.settings.search_step)
+def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float) -> float:
+    """Parameter of the nearest point that runs the way of a pose (3,), to 60 degrees.
+
+    Anywhere on a closed curve. On an open one, which grows with the vehicle, on its last `room` metres, and
+    its end where nothing there runs that way.
+    """
+    low, high = boundary.tables.low, boundary.tables.high
+    if not boundary.periodic:
+        low, high = max(low, boundary.confirmed - room), float(boundary.believed(np.array(high)))
+    u = np.append(np.arange(low, high, boundary.settings.search_step), high)
     offset = boundary.evaluate(control_points, u) - pose[:2]
     tangent = boundary.evaluate(control_points, u, 1)
     along = tangent @ np.array([np.cos(pose[2]), np.sin(pose[2])])
     same_way = along > SAME_WAY * np.hypot(tangent[:, 0], tangent[:, 1])
+    if not same_way.any():
+        return high
     distance = np.where(same_way, np.hypot(offset[:, 0], offset[:, 1]), np.inf)
     start = u[np.argmin(distance)]
     return float(boundary.refine(control_points, pose[None, :2], np.array([start])).u[0])

@@ -83,8 +83,10 @@ class GateSettings(Positive):
     station_behind: float = 3.0
     """... and so far behind it (m)."""
     station_lateral: float = 5.5
-    """A closed curve farther from the vehicle than this (m), or running against it, isn't beside it: the
-    vehicle has lost its place, and it is looked for all around."""
+    """A curve farther from the vehicle than this (m), or running against it, isn't beside it: the vehicle has
+    lost its place, which is looked for all around a closed curve, ..."""
+    station_room: float = 40.0
+    """... and on the last such stretch (m) of an open one."""
 
 
 @dataclass(frozen=True)

@@ -245,7 +245,7 @@ def test_a_lost_place_is_found_by_position_and_heading(
         position, tangent = boundary.evaluate(points, at)[0], boundary.evaluate(points, at, 1)[0]
         heading = np.arctan2(tangent[1], tangent[0]) + np.pi * turned
         pose = np.array([position[0] + 0.5 * tangent[1], position[1] - 0.5 * tangent[0], heading])
-        found = relocate(boundary, points, pose)
+        found = relocate(boundary, points, pose, 40.0)
         direction = boundary.evaluate(points, np.array([found]), 1)[0]
         assert direction @ [np.cos(heading), np.sin(heading)] > 0.0
         if not turned:
