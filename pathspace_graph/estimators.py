@@ -28,9 +28,30 @@ def _landmark_fixed_lag(settings: MapperSettings, log: Log) -> OnlineEstimator:
     return LandmarkFixedLag(settings, log.odometry_sigma)
 
 
+def _ckf(settings: MapperSettings, log: Log) -> OnlineEstimator:
+    from .ckf import CkfMapper  # noqa: PLC0415 - only where it is asked for
+
+    return CkfMapper(settings, log.odometry_sigma)
+
+
+def _landmark_ckf(settings: MapperSettings, log: Log) -> OnlineEstimator:
+    from pathspace_graph.eval.landmark_ckf import LandmarkCkf  # noqa: PLC0415 - eval imports us
+
+    return LandmarkCkf(settings, log.odometry_sigma)
+
+
+def _incremental(settings: MapperSettings, log: Log) -> OnlineEstimator:
+    from .incremental import IncrementalFixedLag  # noqa: PLC0415 - only where it is asked for
+
+    return IncrementalFixedLag(settings, log.odometry_sigma)
+
+
 ONLINE: Final[Mapping[str, Callable[[MapperSettings, Log], OnlineEstimator]]] = {
     DEFAULT: _fixed_lag,
     "landmark-fixed-lag": _landmark_fixed_lag,
+    "ckf": _ckf,
+    "landmark-ckf": _landmark_ckf,
+    "incremental-fixed-lag": _incremental,
 }
 """What makes each online estimator for a log, of which it is told the sensors' noise only."""
 

@@ -1,0 +1,134 @@
+"""The paper's spline filter, PathSpace as written: predict, classify, expand, update, close, simplify."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.odometry import integrate_twists
+
+from .ckf_close import associate_early, simplify, tie
+from .ckf_expand import Expansion
+from .ckf_gating import OnCurve, classify
+from .ckf_state import CurveState
+from .ckf_update import update
+from .closing import near_start
+from .fixed_lag import ODOMETRY_SIGMA
+from .labels import LEFT, RIGHT
+from .log import Detections, Odometry
+from .map import Map, SplineBoundary
+from .path import DrivenPath
+from .settings import MapperSettings
+from .stopwatch import Stopwatch
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class CkfCycle:
+    """The estimate after one perception cycle."""
+
+    t: float
+    """Stamp, s."""
+    pose: Array
+    """(3,) x (m), y (m), theta (rad, not wrapped), map frame."""
+    sizes: tuple[int, int]
+    """Control points or landmarks of the left and the right boundary."""
+    readings: int
+    """How many of the cycle's readings were used."""
+    closed: bool
+    """Whether the loop has closed."""
+    stages: dict[str, float] = field(default_factory=dict)
+    """Time (s) that each stage of the update took, by its name."""
+
+
+class CkfMapper:
+    """Maps a track's two boundaries by a cubature Kalman filter over the pose and all control points.
+
+    What the paper leaves open, and what was chosen, is told in `ckf_fit`. `odometry_sigma` (3,): standard
+    deviation of a twist reading (m/s, m/s, rad/s).
+    """
+
+    def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
+        self.settings = settings or MapperSettings()
+        self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
+        start = self.settings.odometry
+        sigmas = np.array([start.sigma_start, start.sigma_start, start.sigma_start_heading])
+        self.state = CurveState(np.zeros(3), np.diag(sigmas**2), self.settings)
+        """What is estimated."""
+        self.path = DrivenPath(self.settings.path)
+        """The way driven."""
+        self.expansion = Expansion(self.settings)
+        """What isn't on a curve yet."""
+        self.closed = False
+        """Whether the loop has closed, and the map its final size."""
+        self._recent: list[tuple[Array, Detections]] = []
+        self._closing_tried = 0.0
+        self._sigma = self.odometry_sigma * self.settings.ckf.odometry_scale
+
+    def update(self, odometry: Odometry, detections: Detections) -> CkfCycle:
+        """One perception cycle: the twists since the last one, and what was detected now."""
+        watch = Stopwatch()
+        self._predict(odometry, detections.t)
+        watch.lap("predict")
+        found = classify(self.state, detections)
+        watch.lap("classify")
+        found = self._expand(detections, found)
+        watch.lap("expand")
+        update(self.state, detections, found)
+        watch.lap("update")
+        self._close(detections)
+        watch.lap("close")
+        used = sum(len(on.rows) for on in found.values())
+        return self._result(detections.t, used, watch.laps)
+
+    def _predict(self, odometry: Odometry, t: float) -> None:
+        """The pose by the odometry integrated since the last cycle."""
+        durations = np.diff(np.append(odometry.t, t))
+        self.state.belief.predict(integrate_twists(durations, odometry.twist, self._sigma))
+        self.state.locate_vehicle()
+        self.path.update(self.state.pose.copy())
+        self.path.steer(odometry.twist)
+
+    def _expand(self, detections: Detections, found: dict[int, OnCurve]) -> dict[int, OnCurve]:
+        """Lead the ends on; then the readings that lie on the new stretch update it with the rest."""
+        if self.closed:
+            return found
+        self.expansion.sight(self.state, detections)
+        free = np.ones(len(detections.labels), bool)
+        for on in found.values():
+            free[on.rows] = False
+        way = self.path.ahead(self.state.pose, self.settings.ckf.reach)
+        grown = self.expansion.expand(self.state, detections, way, free)
+        return classify(self.state, detections) if grown else found
+
+    def _close(self, detections: Detections) -> None:
+        """Past the shortest lap, look for an early segment; where it is met, both curves become periodic."""
+        settings, state = self.settings.closing, self.state
+        if self.closed:
+            return
+        self._recent.append((state.pose.copy(), detections))
+        self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - settings.window]
+        if len(state.curves) == 0 or not near_start(self.path, state.pose, settings):
+            return
+        if self.path.length - self._closing_tried < settings.check_interval:
+            return
+        self._closing_tried = self.path.length
+        motion = associate_early(state, self._recent, self.path.beginning)
+        if motion is not None:
+            tie(state, motion)
+            simplify(state, self.expansion.sighted)
+            self.closed = True
+
+    def _result(self, t: float, readings: int, stages: dict[str, float]) -> CkfCycle:
+        curves = self.state.curves
+        left, right = (curves[label].size if label in curves else 0 for label in (LEFT, RIGHT))
+        return CkfCycle(t, self.state.pose.copy(), (left, right), readings, self.closed, stages)
+
+    def map(self) -> Map:
+        """The map as it stands, with the joint covariance of each boundary's control points."""
+        state = self.state
+        curves = {b: SplineBoundary(state.spline(b), state.covariance(b)) for b in state.curves}
+        return Map(self.closed, curves)

@@ -1,0 +1,111 @@
+"""Closing and simplification in the paper's filter: an early segment is met, then curves are periodic."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from .ckf_state import CurveState
+from .closing import Motion, register
+from .knots import refit
+from .log import Detections
+from .settings import MapperSettings
+from .simplification import Join, join
+from .smoother import Smoother
+from .spline import BSpline
+from .window import POSE
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+class _Recent(Smoother):
+    """The newest poses and readings, in the shape that the registration takes."""
+
+    def __init__(self, state: CurveState, cycles: list[tuple[Array, Detections]]) -> None:
+        super().__init__(state.settings)
+        self._pose_covariance = state.belief.covariance[:POSE, :POSE].copy()
+        for label in state.curves:
+            self.state.add_boundary(label, state.boundary(label))
+            self.state.insert(self.state.offset(label), state.control_points(label).ravel())
+        for slot, (pose, detections) in enumerate(cycles):
+            self.state.append_pose(pose)
+            self.times.append(detections.t)
+            self.readings.append(detections, slot)
+
+    def pose_covariance(self) -> Array:
+        """(3, 3) of the newest pose, by the filter."""
+        return self._pose_covariance
+
+
+def associate_early(
+    state: CurveState, cycles: list[tuple[Array, Detections]], beginning: Array
+) -> Motion | None:
+    """The motion that lays the newest readings on the beginning of the curves; None where they disagree.
+
+    cycles: pose (3,) and readings of the last few seconds, oldest first; beginning: poses (k, 3) of the
+    drive's first stretch.
+    """
+    found = register(_Recent(state, cycles), beginning, state.settings.closing)
+    return None if found is None else found.motion
+
+
+def tie(state: CurveState, motion: Motion) -> None:
+    """One Kalman update: the end of each curve, where the motion lays it on its beginning, is the beginning.
+
+    `n . (S(u) - S(w)) = 0`, with u along the end, w its association on the early segment, and n the normal
+    there; along the curve the same, but hardly certain.
+    """
+    rows, columns = [], []
+    for label in state.curves:
+        u, w = _overlap(state, label, motion)
+        spline = state.spline(label)
+        basis = spline.basis_matrix(u) - spline.basis_matrix(w)
+        tangents = spline.tangent_unit(w)
+        normals = np.column_stack([-tangents[:, 1], tangents[:, 0]])
+        own = [(basis[:, :, None] * axes[:, None, :]).reshape(len(u), -1) for axes in (normals, tangents)]
+        rows.append(np.concatenate(own))
+        columns.append(state.columns(label, np.arange(spline.size)))
+    matrix = block_diag(*rows)
+    ckf = state.settings.ckf
+    sigma = np.concatenate([np.repeat([ckf.sigma_tie, ckf.sigma_along], len(r) // 2) for r in rows])
+    state.belief.update(
+        np.concatenate(columns), lambda x: x @ matrix.T, np.zeros(len(matrix)), np.diag(sigma**2)
+    )
+
+
+def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Array]:
+    """Parameters (k,) on the end of a curve that the motion lays on its beginning, and theirs (k,) there."""
+    closing, spline = state.settings.closing, state.spline(label)
+    high = spline.domain[1]
+    low = max(high - closing.beginning - closing.join_margin, closing.join_share * high)
+    u = np.arange(low, high, closing.overlap_step)
+    moved = motion.apply(spline.evaluate(u))
+    zero = np.zeros(len(u))
+    foot = state.find(label, moved, zero, zero + min(closing.beginning, closing.beginning_share * high))
+    on = foot.interior & (np.abs(foot.distance) < state.settings.ckf.tie_reach)
+    return u[on], foot.u[on]
+
+
+def simplify(state: CurveState, sighted: dict[int, list[Array]]) -> None:
+    """Both curves become periodic, on curvature-weighted knots (paper: Simplification).
+
+    Sampling the curve and fitting it by least squares is linear in its control points once the knots are
+    determined, so that the cubature transform's mean and covariance are those of the matrix itself.
+    """
+    for label in state.curves:
+        boundary = state.boundary(label)
+        boundary.sighted = sighted[label]
+        joined = join(boundary, state.control_points(label), state.settings)
+        curve, matrix = periodic_refit(state.spline(label), joined, state.settings)
+        state.replace(label, curve, matrix, state.settings.spline.sigma_simplify)
+        state.stations[label] = float(joined.overlap.new_parameter(np.array([state.stations[label]]))[0])
+
+
+def periodic_refit(spline: BSpline, joined: Join, settings: MapperSettings) -> tuple[BSpline, Array]:
+    """The closed curve's knots, and the matrix (m, n) from the open curve's control points to its own."""
+    degree = settings.spline.degree
+    points = np.concatenate([joined.points, joined.points[:degree]])
+    curve = BSpline(joined.knots, points, degree, periodic=True)
+    return curve, refit(spline, curve, joined.overlap.new_parameter).new_from_old
