@@ -63,13 +63,22 @@ class NormalErrors:
 def lap_metrics(track: Map, truth: Truth, lap: int) -> LapMetrics:
     """rmse = sqrt(mean d^2) over the true cones with d <= 3 m, and the share of those with d > 3 m."""
     distances = cone_distances(track, truth)
-    found = distances <= MISSED_DISTANCE
     return LapMetrics(
         lap=lap,
-        rmse=root_mean_square(distances[found]),
-        missed=float(np.mean(~found)) if len(found) else float("nan"),
+        rmse=root_mean_square(distances[distances <= MISSED_DISTANCE]),
+        missed=missed_share(distances),
         size=track.size,
     )
+
+
+def missed_share(distances: Array, threshold: float = MISSED_DISTANCE) -> float:
+    """The share of the true cones (K,) with d > threshold (m); NaN where there are none."""
+    return float(np.mean(distances > threshold)) if len(distances) else float("nan")
+
+
+def capped_rmse(distances: Array, cap: float = MISSED_DISTANCE) -> float:
+    """sqrt(mean min(d, cap)^2), m: every missed cone counts as `cap`, so that missing one never pays."""
+    return root_mean_square(np.minimum(distances, cap))
 
 
 def laps_metrics(lap_maps: Sequence[tuple[int, Map]], truth: Truth) -> list[LapMetrics]:

@@ -112,12 +112,12 @@ def plot_map(
         axes = figure.add_subplot()
         # what is drawn first is named first in the legend; what lies on top is told by zorder
         for label, boundary in sorted(track.boundaries.items()):
-            _draw_boundary(axes, boundary, label, band_scale, style)
+            draw_boundary(axes, boundary, label, band_scale, style)
         if log is not None and log.truth is not None:
-            _draw_truth(axes, log.truth, style)
+            draw_truth(axes, log.truth, style)
         if trajectory is not None and len(trajectory):
-            _draw_trajectory(axes, np.asarray(trajectory), style)
-        _draw_start(axes, style)
+            draw_trajectory(axes, np.asarray(trajectory), style)
+        draw_start(axes, style)
         _finish(figure, axes, title, style)
     return figure
 
@@ -161,7 +161,7 @@ def curve_parameters(spline: BSpline, samples_per_span: int) -> Array:
 # --- layers ----------------------------------------------------------------------------------------------
 
 
-def _draw_boundary(axes: Axes, boundary: Boundary, label: int, band_scale: float, style: PlotStyle) -> None:
+def draw_boundary(axes: Axes, boundary: Boundary, label: int, band_scale: float, style: PlotStyle) -> None:
     if isinstance(boundary, PointBoundary):
         _draw_landmarks(axes, boundary, label, band_scale, style)
     else:
@@ -230,7 +230,7 @@ def _draw_landmarks(
     )
 
 
-def _draw_trajectory(axes: Axes, trajectory: Array, style: PlotStyle) -> None:
+def draw_trajectory(axes: Axes, trajectory: Array, style: PlotStyle) -> None:
     axes.plot(
         trajectory[:, 0],
         trajectory[:, 1],
@@ -241,7 +241,7 @@ def _draw_trajectory(axes: Axes, trajectory: Array, style: PlotStyle) -> None:
     )
 
 
-def _draw_truth(axes: Axes, truth: Truth, style: PlotStyle) -> None:
+def draw_truth(axes: Axes, truth: Truth, style: PlotStyle) -> None:
     if len(truth.poses):
         axes.plot(
             *truth.poses[:, :2].T,
@@ -264,7 +264,7 @@ def _draw_truth(axes: Axes, truth: Truth, style: PlotStyle) -> None:
         )
 
 
-def _draw_start(axes: Axes, style: PlotStyle) -> None:
+def draw_start(axes: Axes, style: PlotStyle) -> None:
     axes.plot(
         0.0,
         0.0,

@@ -41,7 +41,11 @@ COMMANDS: Final = {
     "simulate": Command("commands_simulate", "Simulate", "write the log of a simulated drive, with truth"),
     "online": Command("commands_online", "Online", "map a log online, cycle by cycle"),
     "batch": Command("commands_batch", "Batch", "optimize a whole log at once: the ground reference"),
+    "compare": Command(
+        "commands_compare", "Compare", "every estimator on one log or many: the paper's table"
+    ),
     "ablate": Command("commands_ablate", "Ablate", "run a study: estimators and settings over many drives"),
+    "figures": Command("commands_figures", "Figures", "the paper's isolated tests as figures"),
     "plot": Command("commands_plot", "Plot", "draw a map with its uncertainty band"),
 }
 

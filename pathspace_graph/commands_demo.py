@@ -7,14 +7,18 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from joblib import Parallel, delayed, parallel_config
 from rich.console import Console
 
+from pathspace_graph.eval.comparison import run_estimator
+from pathspace_graph.eval.comparison_table import side_by_side
 from pathspace_graph.eval.plot import PlotStyle, plot_map, save_plot
-from pathspace_graph.eval.summary import summarize
+from pathspace_graph.eval.summary import laps_of, not_mapped, summarize
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
-from .commands_online import map_online, report
+from .commands_online import map_online, outline
 from .commands_simulate import describe, generated_track
+from .estimators import DEFAULT
 from .files import atomic_folder, check_target
 from .log import Log, write_log
 from .map import write_result
@@ -22,6 +26,8 @@ from .progress import progress
 from .run import RunResult
 from .settings import MapperSettings
 
+RIVAL: Final = "landmark-fixed-lag"
+"""The estimator whose table stands beside ours."""
 PICTURE: Final = "track.png"
 PICTURE_STYLE: Final = PlotStyle(dpi=150.0)
 """Of a size that suits a web page."""
@@ -29,7 +35,7 @@ PICTURE_STYLE: Final = PlotStyle(dpi=150.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Demo:
-    """Simulate a Formula Student track, map it online; show the paper's table and a picture of the map."""
+    """Simulate a track, map it online: the paper's table beside the landmark graph's, and a picture."""
 
     out: Path = field(default_factory=lambda: Path("pathspace-demo"))
     """Folder for the log, the map and the picture; an earlier demo there is kept as a numbered backup."""
@@ -45,10 +51,26 @@ class Demo:
             log = simulate(generated_track(self.seed), SimulationSettings(laps=self.laps), self.seed)
         say = partial(Console().print, highlight=False, soft_wrap=True, markup=False)
         say(f"a generated track, {self.laps} times around: {describe(log)}")
-        result = map_online(log, MapperSettings())
+        result, rival = map_with_both(log)
         write_demo(self.out, log, result)
-        report(result, log)
+        table = side_by_side({run.estimator: laps_of(run, log) for run in (result, rival)})
+        if table.rows:
+            Console().print(table.rich())
+        say(outline(result))
+        for line in not_mapped(result.map, log):
+            say(line)
         say(f"log, map and {PICTURE} are in {self.out}")
+
+
+def map_with_both(log: Log) -> tuple[RunResult, RunResult]:
+    """The log mapped by us, with progress, and meanwhile, in a process of its own, by the landmark graph."""
+    settings = MapperSettings()
+    with parallel_config(backend="loky", inner_max_num_threads=1):
+        # with one job it would be run here, and first
+        rival = Parallel(n_jobs=2, return_as="generator")([delayed(run_estimator)(RIVAL, settings, log)])
+        result = map_online(log, settings, DEFAULT)
+        with progress(RIVAL):
+            return result, next(rival)
 
 
 def write_demo(out: Path, log: Log, result: RunResult) -> None:

@@ -1,0 +1,147 @@
+"""How the isolated figures look: one font, one set of colours, letters for panels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class FigureStyle:
+    """Lengths in inches, lines and markers in points."""
+
+    width: float = 7.0
+    """Of a figure: two columns of a paper."""
+    font_size: float = 8.0
+    """Of all text."""
+    curve_color: str = "#0067A9"
+    """Of the state's curve."""
+    fitted_color: str = "#7B3294"
+    """Of what is fitted or updated: the paper's purple."""
+    other_color: str = "#D98200"
+    """Of what it is held against."""
+    reading_color: str = "#009E73"
+    """Of readings."""
+    sigma_color: str = "#CC0000"
+    """Of sigma points and of what is marked."""
+    faint_color: str = "#B0B0B0"
+    """Of samples."""
+    truth_color: str = "#4D4D4D"
+    """Of what is true."""
+    curve_width: float = 1.3
+    """Of a curve."""
+    thin_width: float = 0.5
+    """Of one sample among many."""
+    marker_size: float = 4.0
+    """Of control points and readings."""
+    alpha: float = 0.25
+    """Of filled areas."""
+
+
+@contextmanager
+def figure_context(style: FigureStyle) -> Iterator[None]:
+    """Fonts and lines of all figures."""
+    size = style.font_size
+    with mpl.rc_context(
+        {
+            "font.size": size,
+            "axes.titlesize": size,
+            "legend.fontsize": size - 0.5,
+            "axes.linewidth": 0.6,
+            "axes.titlelocation": "left",
+            "xtick.major.width": 0.6,
+            "ytick.major.width": 0.6,
+            "xtick.major.size": 2.5,
+            "ytick.major.size": 2.5,
+            "legend.frameon": False,
+        }
+    ):
+        yield
+
+
+def draw_ellipses(axes: Axes, centres: Array, covariances: Array, color: str, style: FigureStyle) -> None:
+    """The 2-sigma ellipses of points (k, 2) with covariances (k, 2, 2)."""
+    variances, vectors = np.linalg.eigh(covariances)
+    widths, heights = 4.0 * np.sqrt(np.maximum(variances, 0.0)).T
+    angles = np.degrees(np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0]))
+    axes.add_collection(
+        EllipseCollection(
+            widths,
+            heights,
+            angles,
+            units="xy",
+            offsets=centres,
+            offset_transform=axes.transData,
+            facecolor=color,
+            edgecolor=color,
+            alpha=style.alpha,
+            linewidth=0.5,
+            zorder=1,
+        )
+    )
+
+
+def draw_control_points(axes: Axes, points: Array, color: str, style: FigureStyle, label: str = "") -> None:
+    """Squares, and their polygon as a thin line."""
+    axes.plot(*points.T, color=color, linewidth=style.thin_width, linestyle=(0, (4, 3)), zorder=2)
+    axes.plot(
+        *points.T,
+        linestyle="none",
+        marker="s",
+        markersize=style.marker_size,
+        markerfacecolor="white",
+        markeredgecolor=color,
+        markeredgewidth=0.8,
+        zorder=4,
+        label=label or None,
+    )
+
+
+def draw_readings(axes: Axes, points: Array, color: str, style: FigureStyle, label: str) -> None:
+    """Filled circles."""
+    axes.plot(
+        *points.T,
+        linestyle="none",
+        marker="o",
+        markersize=style.marker_size,
+        color=color,
+        zorder=6,
+        label=label,
+    )
+
+
+def point_blocks(covariance: Array) -> Array:
+    """(m, 2, 2) marginals of the joint covariance (2m, 2m) over x0, y0, x1, y1 ..."""
+    m = len(covariance) // 2
+    index = np.arange(m)
+    return np.asarray(covariance.reshape(m, 2, m, 2)[index, :, index, :])
+
+
+def frame(axes: Axes, low: tuple[float, float], high: tuple[float, float]) -> None:
+    """Metres, as wide as high."""
+    axes.set_aspect("equal")
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_xlabel("x [m]")
+
+
+def legend_below(figure: Figure, columns: int) -> None:
+    """One legend below all panels, each entry once."""
+    entries: dict[str, Any] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    figure.legend(
+        entries.values(), entries.keys(), loc="outside lower center", ncols=columns, handlelength=1.8
+    )

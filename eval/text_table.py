@@ -1,0 +1,79 @@
+"""A table of text, for a terminal, for Markdown and for LaTeX."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from rich.table import Table
+from rich.text import Text
+
+from .online_table import markdown_table
+
+_LATEX: Final = {
+    "\\": r"\textbackslash{}",
+    **{character: f"\\{character}" for character in "&%$#_{}"},
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "–": "--",
+    "σ": r"$\sigma$",
+    "−": "$-$",
+    "±": r"$\pm$",
+}
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """Rows of text under a header: first names, to the left, then numbers, to the right."""
+
+    title: str
+    """A sentence above it."""
+    header: tuple[str, ...]
+    """A title for each column."""
+    rows: tuple[tuple[str, ...], ...]
+    """As long as the header each."""
+    groups: tuple[int, ...] = ()
+    """Numbers of the rows that a new group of rows begins at."""
+    names: int = 1
+    """How many of the columns are names."""
+
+    def rich(self) -> Table:
+        """For a terminal, without the title; a unit in brackets isn't taken for markup."""
+        table = Table()
+        for number, name in enumerate(self.header):
+            table.add_column(Text(name), justify="left" if number < self.names else "right")
+        for number, row in enumerate(self.rows):
+            table.add_row(*map(Text, row), end_section=number + 1 in self.groups)
+        return table
+
+    def markdown(self) -> str:
+        """For a README."""
+        rows = [tuple(cell.replace("|", r"\|") for cell in row) for row in self.rows]
+        return f"{self.title}\n\n{markdown_table(self.header, rows)}\n"
+
+    def latex(self) -> str:
+        """For a paper, with the package booktabs."""
+        columns = "l" * self.names + "r" * (len(self.header) - self.names)
+        lines = [
+            r"% \usepackage{booktabs}",
+            r"\begin{table}",
+            r"  \centering",
+            rf"  \caption{{{latex_text(self.title)}}}",
+            rf"  \begin{{tabular}}{{{columns}}}",
+            r"    \toprule",
+            _latex_row(self.header),
+        ]
+        for number, row in enumerate(self.rows):
+            if number == 0 or number in self.groups:
+                lines.append(r"    \midrule")
+            lines.append(_latex_row(row))
+        return "\n".join([*lines, r"    \bottomrule", r"  \end{tabular}", r"\end{table}", ""])
+
+
+def latex_text(text: str) -> str:
+    """The same text where some characters are commands."""
+    return "".join(_LATEX.get(character, character) for character in text)
+
+
+def _latex_row(cells: tuple[str, ...]) -> str:
+    return f"    {' & '.join(map(latex_text, cells))} \\\\"
