@@ -1,6 +1,8 @@
 """The online mapper's speed, held against GTSAM's own linear algebra on the same windows, in one run.
 
-`python -m pathspace_graph.eval.benchmark --laps 5 --seed 0 --json FILE`
+`python -m pathspace_graph.eval.benchmark --laps 5 --seed 0 --json FILE`, and with `--compare` what got worse
+than the committed baseline (exit code 1 then), which `--write-baseline` writes. Only ratios are in it, as
+times are the machine's.
 
 What GTSAM is timed on is the mapper's window after a cycle, already linearized, so that neither linearization
 nor the building of a graph counts: `optimize()` and `marginal(control points, calibration, next pose)`, once
@@ -29,6 +31,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from pathspace_graph.errors import PathspaceError
 from pathspace_graph.factors.linear_graph import (
     LinearRows,
     WindowKeys,
@@ -47,6 +50,9 @@ from pathspace_graph.settings import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 from pathspace_graph.window import POSE, accumulate
+
+from .benchmark_baseline import BASELINE, baseline_table, compare, read_baseline, write_baseline
+from .benchmark_metric import Metric
 
 Array = NDArray[np.float64]
 
@@ -68,29 +74,16 @@ LAP_RATIO: Final = 1.1
 """Mean cycle of the last lap at most so many times that of lap 2."""
 CLOSING_MILLISECONDS: Final = 100.0
 """The cycle that closes the loop."""
-
-
-@dataclass(frozen=True)
-class Metric:
-    """One figure, and what it is held to."""
-
-    key: str
-    """Name, for a baseline to be compared with."""
-    value: float
-    """NaN where the run was too short for it."""
-    unit: str
-    """Empty for a ratio."""
-    direction: Literal["lower", "higher"] = "lower"
-    """Which way is better."""
-    bound: float | None = None
-    """Worst value allowed; None where nothing is asked."""
-
-    @property
-    def holds(self) -> bool:
-        """Whether the bound is kept; a value that isn't known keeps none."""
-        if self.bound is None:
-            return True
-        return self.value <= self.bound if self.direction == "lower" else self.value >= self.bound
+WORSE: Final = 1
+"""Exit code where a figure is worse than the baseline, ..."""
+BAD_INPUT: Final = 2
+"""... and where a file can't be read or written."""
+MEAN_TOLERANCE: Final = 0.2
+"""How much worse than the baseline, as a share of it, a ratio of two means over the whole run may be, ..."""
+LAP_TOLERANCE: Final = 0.15
+"""... one of two laps' means, ..."""
+TAIL_TOLERANCE: Final = 0.5
+"""... and one of a tail or of a single cycle."""
 
 
 # --- GTSAM on the mapper's window ------------------------------------------------------------------------
@@ -269,15 +262,18 @@ def metrics(measurement: Measurement) -> tuple[Metric, ...]:
     """Every figure, those that something is asked of first."""
     cycles, best = measurement.cycles, measurement.gtsam
     times = np.array([record.seconds for record in cycles])
+    mean, p99 = _mean(times[WARM_UP:]), float(np.quantile(times, 0.99))
     reference = best.optimize + best.marginal
     laps = _lap_means(cycles, measurement.laps)
     slowdown = laps[-1] / laps[REFERENCE_LAP - 1] if len(laps) > REFERENCE_LAP else float("nan")
     closing = times[measurement.closing] if measurement.closing is not None else float("nan")
     return (
-        Metric("mean_by_gtsam", _mean(times[WARM_UP:]) / reference, "", bound=MEAN_RATIO),
-        Metric("p99", 1e3 * float(np.quantile(times, 0.99)), "ms", bound=P99_MILLISECONDS),
-        Metric("last_lap_by_lap_2", slowdown, "", bound=LAP_RATIO),
+        Metric("mean_by_gtsam", mean / reference, "", bound=MEAN_RATIO, tolerance=MEAN_TOLERANCE),
+        Metric("p99", 1e3 * p99, "ms", bound=P99_MILLISECONDS),
+        Metric("last_lap_by_lap_2", slowdown, "", bound=LAP_RATIO, tolerance=LAP_TOLERANCE),
         Metric("closing", 1e3 * float(closing), "ms", bound=CLOSING_MILLISECONDS),
+        Metric("p99_by_mean", p99 / mean, "", tolerance=TAIL_TOLERANCE),
+        Metric("closing_by_mean", float(closing) / mean, "", tolerance=TAIL_TOLERANCE),
         Metric("mean", 1e3 * _mean(times), "ms"),
         Metric("median", 1e3 * float(np.median(times)), "ms"),
         Metric("slowest", 1e3 * float(times.max()), "ms"),
@@ -318,6 +314,20 @@ class Benchmark:
     """Of the track, the drive and its noise."""
     json: Path | None = None
     """File to write the figures to."""
+    compare: bool = False
+    """Say what is worse than the baseline by more than its tolerance; exit code 1 where anything is."""
+    write_baseline: bool = False
+    """Make this run's ratios the baseline."""
+    baseline: Path = BASELINE
+    """The baseline's file: the one that comes with the package where none is named."""
+
+    def check(self) -> None:
+        """Before anything runs: OutputError or InputError where a file can't be written or read."""
+        for file in (self.json, self.baseline if self.write_baseline else None):
+            if file is not None:
+                check_file_target(file)
+        if self.compare:
+            read_baseline(self.baseline)
 
     def measure(self) -> Measurement:
         """The run."""
@@ -355,18 +365,35 @@ def _asked(metric: Metric) -> str:
 
 
 def main() -> None:
-    """The script."""
+    """The script: exit code 1 where a figure is worse than the baseline, 2 on bad files."""
     benchmark = tyro.cli(Benchmark)
-    if benchmark.json is not None:
-        check_file_target(benchmark.json)
+    try:
+        worse = _run(benchmark)
+    except PathspaceError as error:
+        Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(f"benchmark: {error}")
+        raise SystemExit(BAD_INPUT) from error
+    if worse:
+        raise SystemExit(WORSE)
+
+
+def _run(benchmark: Benchmark) -> bool:
+    """Measure, write, report; whether anything is worse than the baseline."""
+    benchmark.check()
     measurement = benchmark.measure()
     figures = metrics(measurement)
     if benchmark.json is not None:
         write_json(benchmark.json, figures)
-    console = Console()
+    console = Console(highlight=False)
     console.print(rich_table(figures))
     best = measurement.gtsam
     console.print(f"GTSAM at its best over {best.samples} windows: {best.candidate}")
+    found = compare(figures, read_baseline(benchmark.baseline)) if benchmark.compare else ()
+    if benchmark.compare:
+        console.print(baseline_table(found))
+    if benchmark.write_baseline:
+        write_baseline(benchmark.baseline, figures)
+        console.print(f"baseline written to {benchmark.baseline}", soft_wrap=True)
+    return any(comparison.worse for comparison in found)
 
 
 if __name__ == "__main__":

@@ -46,6 +46,7 @@ COMMANDS: Final = {
     ),
     "ablate": Command("commands_ablate", "Ablate", "run a study: estimators and settings over many drives"),
     "figures": Command("commands_figures", "Figures", "the paper's isolated tests as figures"),
+    "scale": Command("commands_scale", "Scale", "time per update against map size, readings and laps"),
     "plot": Command("commands_plot", "Plot", "draw a map with its uncertainty band"),
 }
 

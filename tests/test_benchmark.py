@@ -7,18 +7,20 @@ import json
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import gtsam
 import numpy as np
 import pytest
 from rich.console import Console
 
+from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.eval import benchmark
 from pathspace_graph.eval.benchmark import (
     CUTS,
     Cut,
     Gtsam,
     Measurement,
-    Metric,
     gaussian_graph,
     linear_window,
     marginal_keys,
@@ -29,6 +31,15 @@ from pathspace_graph.eval.benchmark import (
     time_gtsam,
     write_json,
 )
+from pathspace_graph.eval.benchmark_baseline import (
+    BASELINE,
+    baseline_table,
+    compare,
+    ratios,
+    read_baseline,
+    write_baseline,
+)
+from pathspace_graph.eval.benchmark_metric import Metric
 from pathspace_graph.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleRecord
 from pathspace_graph.settings import MapperSettings
@@ -159,9 +170,99 @@ def test_output(tmp_path: Path) -> None:
     figures = [Metric("mean_by_gtsam", 1.234, "", bound=2.0), Metric("closing", float("nan"), "ms")]
     write_json(tmp_path / "figures.json", figures)
     rows = json.loads((tmp_path / "figures.json").read_text())
-    assert rows[0] == {"key": "mean_by_gtsam", "value": 1.234, "unit": "", "direction": "lower", "bound": 2.0}
+    assert rows[0] == {
+        "key": "mean_by_gtsam",
+        "value": 1.234,
+        "unit": "",
+        "direction": "lower",
+        "bound": 2.0,
+        "tolerance": None,
+    }
     assert rows[1]["value"] is None
     console = Console(width=100, file=io.StringIO(), record=True)
     console.print(rich_table(figures))
     lines = console.export_text().splitlines()
     assert any("mean_by_gtsam" in line and "1.23" in line and "<= 2" in line for line in lines)
+
+
+# --- baseline --------------------------------------------------------------------------------------------
+
+
+def ratio(value: float, key: str = "a", direction: Literal["lower", "higher"] = "lower") -> Metric:
+    return Metric(key, value, "", direction, tolerance=0.1)
+
+
+def test_worse_is_beyond_the_tolerance_in_the_bad_direction() -> None:
+    assert not ratio(2.19).worse_than(2.0)
+    assert ratio(2.21).worse_than(2.0)
+    assert not ratio(0.5).worse_than(2.0)
+    assert not ratio(1.81, direction="higher").worse_than(2.0)
+    assert ratio(1.79, direction="higher").worse_than(2.0)
+    assert not ratio(5.0, direction="higher").worse_than(2.0)
+    assert ratio(float("nan")).worse_than(2.0)
+
+
+def test_only_ratios_are_compared() -> None:
+    figures = [ratio(2.5), Metric("time", 9.0, "ms", tolerance=0.1), Metric("b", 1.0, "")]
+    assert [metric.key for metric in ratios(figures)] == ["a"]
+    found = {c.key: c for c in compare([*figures, ratio(1.0, "new")], {"a": 2.0, "gone": 1.0})}
+    assert {key: c.worse for key, c in found.items()} == {"a": True, "new": False, "gone": True}
+    console = Console(width=100, file=io.StringIO(), record=True)
+    console.print(baseline_table(list(found.values())))
+    lines = console.export_text().splitlines()
+    assert any("a" in line and "+25 %" in line and "WORSE" in line for line in lines)
+    assert any("new" in line and "WORSE" not in line for line in lines)
+
+
+def test_a_baseline_is_read_as_written(tmp_path: Path) -> None:
+    file = tmp_path / "baseline.json"
+    write_baseline(file, [ratio(1.23456789), Metric("time", 3.0, "ms")])
+    assert read_baseline(file) == {"a": 1.2346}
+    with pytest.raises(SettingsError, match="found none"):
+        write_baseline(file, [ratio(float("nan"))])
+    assert read_baseline(file) == {"a": 1.2346}
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", "{}", '{"format": "pathspace-benchmark-baseline/1", "ratios": [1]}']
+)
+def test_what_is_no_baseline_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "bad.json").write_text(text)
+    with pytest.raises(InputError, match="expected"):
+        read_baseline(tmp_path / "bad.json")
+    with pytest.raises(InputError, match="no file"):
+        read_baseline(tmp_path / "none.json")
+
+
+def test_the_committed_baseline_is_of_this_benchmark() -> None:
+    """The same figures as a run gives, all ratios, and within what is asked of them."""
+    cycles = tuple(record(k, 0.002, 1 + k // 100) for k in range(300))
+    figures = {m.key: m for m in ratios(metrics(Measurement(cycles, 3, 99, Gtsam("any", 0.001, 0.001, 25))))}
+    baseline = read_baseline(BASELINE)
+    assert set(baseline) == set(figures)
+    assert all(replace(figures[key], value=value).holds for key, value in baseline.items())
+
+
+@pytest.mark.parametrize(("times", "code"), [(1.0, None), (2.0, 1)])
+def test_the_script_ends_with_1_where_it_got_worse(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, times: float, code: int | None
+) -> None:
+    def measured(factor: float) -> Measurement:
+        cycles = [record(k, 0.002 * factor, 1 + k // 100) for k in range(300)]
+        return Measurement(tuple(cycles), 3, 99, Gtsam("any", 0.001, 0.001, 25))
+
+    def run(factor: float, *options: str) -> None:
+        monkeypatch.setattr(benchmark.Benchmark, "measure", lambda self: measured(factor))
+        monkeypatch.setattr("sys.argv", ["benchmark", "--baseline", str(tmp_path / "b.json"), *options])
+        benchmark.main()
+
+    with pytest.raises(SystemExit) as missing:
+        run(1.0, "--compare")
+    assert missing.value.code == benchmark.BAD_INPUT
+    run(1.0, "--write-baseline")
+    if code is None:
+        run(times, "--compare")
+        return
+    with pytest.raises(SystemExit) as end:
+        run(times, "--compare")
+    assert end.value.code == code
