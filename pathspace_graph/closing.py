@@ -217,7 +217,7 @@ def bend(smoother: Smoother) -> None:
     for _ in range(settings.iterations):
         smoother.prior = _relinearized(history, segments, state)
         smoother.step(settings.sigma_step)
-    smoother.prior = _without_keyframes(_relinearized(history, segments, state), state)
+    smoother.prior = _without_keyframes(smoother.prior, state)
     smoother.history = None
 
 

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.bspline import Floats
@@ -18,8 +19,10 @@ _SAMPLES_PER_BREAK: Final = 40
 """Curvature samples for each break wanted, equally spaced along the curve."""
 _SAMPLES_PER_SPAN: Final = 8
 """Least-squares samples on each span of a refit: enough for any degree up to 7."""
-_BRIDGE: Final = 1e-6
-"""Weight of the refit's second differences beside its samples: decides only where there is no sample."""
+_BRIDGE: Final = 1e-3
+"""Weight of the refit's second differences beside its samples, where a span has too few of them."""
+_BENDING_PER_SPAN: Final = 3
+"""Second differences taken on each span."""
 
 
 @dataclass(frozen=True)
@@ -108,16 +111,16 @@ def refit(old: BSpline, new: BSpline, u_map: Callable[[Floats], Floats] | None =
     u = _refit_samples(old, new)
     w = u if u_map is None else u_map(u)
     B_old, B_new = old.basis_matrix(u), new.basis_matrix(w)
-    bridge = _BRIDGE * _bending_rows(new)
+    bridge = _BRIDGE * _bending_rows(new)[np.repeat(_sparse_spans(new, w), _BENDING_PER_SPAN)]
     stacked = np.concatenate([B_new, bridge])
     target = np.concatenate([B_old, np.zeros((len(bridge), old.size))])
     return Refit(new_from_old=_least_squares(stacked, target), old_from_new=_least_squares(B_old, B_new))
 
 
 def _least_squares(matrix: Floats, right: Floats) -> Floats:
-    """argmin |M X - R|, the shortest of several; by pivoted QR, several times faster than by SVD."""
-    solution = scipy.linalg.lstsq(matrix, right, lapack_driver="gelsy", check_finite=False)[0]
-    return np.asarray(solution, dtype=np.float64)
+    """argmin |M X - R| by normal equations: for a B-spline basis sampled all along, of a small condition."""
+    factor = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
+    return np.asarray(scipy.linalg.cho_solve(factor, matrix.T @ right, check_finite=False))
 
 
 def _refit_samples(old: BSpline, new: BSpline) -> Floats:
@@ -129,14 +132,21 @@ def _refit_samples(old: BSpline, new: BSpline) -> Floats:
     return (old.breaks[:-1, None] + widths[:, None] * offsets).ravel()
 
 
+def _sparse_spans(spline: BSpline, u: Floats) -> NDArray[np.bool_]:
+    """(spans,) where a spline's own span has fewer samples than it has control points."""
+    low, high = spline.domain
+    inside = low + np.mod(u - low, high - low) if spline.periodic else u
+    return np.histogram(inside, spline.breaks)[0] <= spline.degree
+
+
 def _bending_rows(spline: BSpline) -> Floats:
-    """h^2 S''(u) onto the distinct control points, at the middle of thirds of every span of width h."""
+    """h^2 S''(u) onto the distinct control points, at the middle of equal parts of every span of width h."""
     breaks = spline.breaks
     width = np.diff(breaks)
-    offsets = (np.arange(3) + 0.5) / 3.0
+    offsets = (np.arange(_BENDING_PER_SPAN) + 0.5) / _BENDING_PER_SPAN
     u = (breaks[:-1, None] + width[:, None] * offsets).ravel()
     order = min(2, spline.degree)
-    scale = np.repeat(width, 3) ** order
+    scale = np.repeat(width, _BENDING_PER_SPAN) ** order
     return np.asarray(spline.basis_matrix(u, order) * scale[:, None])
 
 

@@ -165,7 +165,6 @@ def relinearized_prior(
     information[np.ix_(own, own)] += history.first.information
     descent[own] += history.first.descent_at(state[own])
     start = np.array([offsets.get(label, 0) for label in range(max(offsets) + 1)])
-    flat, blocks = [np.zeros(0, np.intp)], [np.zeros(0)]
     for i, segment in enumerate(segments):
         points = start[segment.labels] + 2 * segment.indices
         columns = np.concatenate(
@@ -177,8 +176,6 @@ def relinearized_prior(
             ]
         )
         block, gradient = relinearize(segment, state[columns[:-POSE]], state[columns[-POSE:]])
-        flat.append((columns[:, None] * size + columns).ravel())
-        blocks.append(block.ravel())
+        information[columns[:, None], columns] += block
         descent[columns] += gradient
-    sums = np.bincount(np.concatenate(flat), np.concatenate(blocks), size * size)
-    return Prior(information + sums.reshape(size, size), descent, state[:size].copy())
+    return Prior(information, descent, state[:size].copy())

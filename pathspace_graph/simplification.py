@@ -123,15 +123,20 @@ def _on_beginning(boundary: Boundary, control_points: Array, u: Array, room: flo
 
 
 def substitute(smoother: Smoother, joins: dict[int, Join]) -> None:
-    """`x_old = M x_new`, so `L <- M' L M` and `g <- M' (g - L (M x_new - x0))`: closed curves for open."""
+    """`x_old = M x_new`, so `L <- M' L M` and `g <- M' (g - L (M x_new - x0))`: closed curves for open.
+
+    Less what the old control points being a little off that takes from both.
+    """
     prior, state = smoother.prior, smoother.state
     q, n_old = len(prior.point), state.map_size
     change = _change(smoother, joins)
     points = np.concatenate([j.points.ravel() for j in joins.values()])
     point = np.concatenate([points, state.vector[n_old:q]])
-    information, gradient = _loosened(prior, n_old, smoother.settings.spline.sigma_simplify)
-    gradient = gradient - information @ (change @ point - prior.point)
-    smoother.prior = Prior(change.T @ information @ change, change.T @ gradient, point)
+    descent = prior.gradient - prior.information @ (change @ point - prior.point)
+    onto_new = np.column_stack([prior.information @ change, descent])
+    sigma = smoother.settings.spline.sigma_simplify
+    reduced = change.T @ onto_new - _slack(prior.information[:n_old, :n_old], onto_new[:n_old], sigma)
+    smoother.prior = Prior(reduced[:, :-1], reduced[:, -1], point)
     state.vector = np.concatenate([points, state.vector[n_old:]])
     for label, new in joins.items():
         _replace(smoother, label, new)
@@ -152,16 +157,16 @@ def _change(smoother: Smoother, joins: dict[int, Join]) -> Array:
     return change
 
 
-def _loosened(prior: Prior, n_old: int, sigma: float) -> tuple[Array, Array]:
-    """The prior where the first n_old entries M may be off `E C_new` by sigma (m): less certain there.
+def _slack(information: Array, onto_new: Array, sigma: float) -> Array:
+    """What is known less, since the old control points M may be off `E C_new` by sigma (m).
 
-    `L - L_:M (I / sigma^2 + L_MM)^-1 L_M:` and `g - L_:M (I / sigma^2 + L_MM)^-1 g_M` (Woodbury).
+    `A_M' (I / sigma^2 + L_MM)^-1 A_M` (k, k + 1) with L_MM `information` (n, n) and A_M `onto_new` (n, k + 1),
+    the rows of `[L M | -gradient]` that are theirs (Woodbury).
     """
-    rows = np.column_stack([prior.information[:n_old], prior.gradient[:n_old]])
-    half = cholesky(prior.information[:n_old, :n_old] + np.eye(n_old) / sigma**2)
-    root, _ = lapack.dtrtrs(half, rows, lower=1)
-    w, y = np.ascontiguousarray(root[:, :-1]), root[:, -1]
-    return prior.information - w.T @ w, prior.gradient - y @ w
+    half = cholesky(information + np.eye(len(information)) / sigma**2)
+    root, _ = lapack.dtrtrs(half, onto_new, lower=1)
+    root = np.ascontiguousarray(root)
+    return np.asarray(root[:, :-1].T @ root)
 
 
 def _replace(smoother: Smoother, label: int, new: Join) -> None:
