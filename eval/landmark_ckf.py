@@ -4,8 +4,9 @@ The paper gives it "a similarly structured state and overall implementation styl
 distance as the cost of the assignment. What it doesn't say was chosen so that it isn't weaker than it has to
 be: the gates are the landmark graph's (match, create, between: leave out); colours are respected; a reading
 makes a landmark once the same thing was seen `ckf.sightings` times, since our sensor, unlike their front
-end, has false detections (1: every reading beyond the gate makes one, as the description has it). There is no
-merging: ghosts stay, as the paper says of it.
+end, has false detections (1: every reading beyond the gate makes one, as the description has it). The
+odometry's constant errors are in its state too. There is no merging and no closing: ghosts stay, as the paper
+says of it, and where the drift of a lap is more than the cones' distance, a whole lap of them may.
 """
 
 from __future__ import annotations
@@ -42,11 +43,8 @@ class LandmarkCkf:
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
         self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
-        self._sigma = self.odometry_sigma * self.settings.ckf.odometry_scale
-        start = self.settings.odometry
-        sigmas = np.array([start.sigma_start, start.sigma_start, start.sigma_start_heading])
-        self.belief = Belief(np.zeros(3), np.diag(sigmas**2))
-        """`x = [pose | landmarks]`."""
+        self.belief = Belief.at_start(self.settings.odometry)
+        """`x = [pose | calibration | landmarks]`."""
         self.labels: IntArray = np.zeros(0, np.intp)
         """(n,) colour of each landmark."""
         self.sightings = {label: Sightings(self.settings.growth) for label in BOUNDARIES}
@@ -56,7 +54,7 @@ class LandmarkCkf:
         """One perception cycle: the twists since the last one, and what was detected now."""
         watch = Stopwatch()
         durations = np.diff(np.append(odometry.t, detections.t))
-        self.belief.predict(integrate_twists(durations, odometry.twist, self._sigma))
+        self.belief.predict(integrate_twists(durations, odometry.twist, self.odometry_sigma))
         watch.lap("predict")
         found = self._associate(detections)
         watch.lap("associate")

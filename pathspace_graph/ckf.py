@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import integrate_twists
 
+from .ckf_belief import Belief
 from .ckf_close import associate_early, simplify, tie
 from .ckf_expand import Expansion
 from .ckf_gating import OnCurve, classify
@@ -54,9 +55,7 @@ class CkfMapper:
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
         self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
-        start = self.settings.odometry
-        sigmas = np.array([start.sigma_start, start.sigma_start, start.sigma_start_heading])
-        self.state = CurveState(np.zeros(3), np.diag(sigmas**2), self.settings)
+        self.state = CurveState(Belief.at_start(self.settings.odometry), self.settings)
         """What is estimated."""
         self.path = DrivenPath(self.settings.path)
         """The way driven."""
@@ -66,7 +65,6 @@ class CkfMapper:
         """Whether the loop has closed, and the map its final size."""
         self._recent: list[tuple[Array, Detections]] = []
         self._closing_tried = 0.0
-        self._sigma = self.odometry_sigma * self.settings.ckf.odometry_scale
 
     def update(self, odometry: Odometry, detections: Detections) -> CkfCycle:
         """One perception cycle: the twists since the last one, and what was detected now."""
@@ -87,7 +85,7 @@ class CkfMapper:
     def _predict(self, odometry: Odometry, t: float) -> None:
         """The pose by the odometry integrated since the last cycle."""
         durations = np.diff(np.append(odometry.t, t))
-        self.state.belief.predict(integrate_twists(durations, odometry.twist, self._sigma))
+        self.state.belief.predict(integrate_twists(durations, odometry.twist, self.odometry_sigma))
         self.state.locate_vehicle()
         self.path.update(self.state.pose.copy())
         self.path.steer(odometry.twist)
@@ -117,8 +115,7 @@ class CkfMapper:
             return
         self._closing_tried = self.path.length
         motion = associate_early(state, self._recent, self.path.beginning)
-        if motion is not None:
-            tie(state, motion)
+        if motion is not None and tie(state, motion):
             simplify(state, self.expansion.sighted)
             self.closed = True
 

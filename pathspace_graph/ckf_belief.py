@@ -3,35 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import block_diag, lapack
 
-from pathspace_graph.factors.odometry import IntegratedOdometry
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 
 from .cubature import Transformed, square_root, transform
+from .settings import OdometrySettings
 from .window import POSE
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-PLANE = 2
+PLANE: Final = 2
 """Entries of a point."""
+HEAD: Final = POSE + CALIBRATION_SIZE
+"""Entries before the points."""
 
 
 class Belief:
-    """`x = [pose | points]`, Gaussian: pose (x, y, theta) and points (x, y) in the map frame, m and rad.
+    """`x = [pose | calibration | points]`, Gaussian: pose (x, y, theta) and points (x, y) in the map frame, m
+    and rad; the odometry's calibration (scale error of the speeds, bias of the yaw rate, rad/s).
 
     A step's function depends on few entries. Cubature points are laid through those only; all others follow
-    by the joint covariance, which is exact for a Gaussian and saves the cubic cost of the full rule.
+    by the joint covariance, which is what the full rule would give for them, without its cubic cost.
     """
 
-    def __init__(self, pose: Array, covariance: Array) -> None:
-        self.mean: Array = np.array(pose, float)
+    def __init__(self, pose: Array, covariance: Array, calibration_sigma: Array | None = None) -> None:
+        sigma = np.zeros(CALIBRATION_SIZE) if calibration_sigma is None else calibration_sigma
+        self.mean: Array = np.concatenate([pose, np.zeros(CALIBRATION_SIZE)])
         """(n,) x."""
-        self.covariance: Array = np.array(covariance, float)
+        self.covariance: Array = block_diag(covariance, np.diag(sigma**2))
         """(n, n)."""
+
+    @classmethod
+    def at_start(cls, settings: OdometrySettings) -> Belief:
+        """The vehicle at the first odometry stamp, no map."""
+        sigmas = np.array([settings.sigma_start, settings.sigma_start, settings.sigma_start_heading])
+        calibration = np.array([settings.sigma_scale, settings.sigma_bias])
+        return cls(np.zeros(POSE), np.diag(sigmas**2), calibration)
 
     @property
     def pose(self) -> Array:
@@ -41,19 +54,21 @@ class Belief:
     @property
     def points(self) -> Array:
         """(m, 2) a view of x."""
-        return self.mean[POSE:].reshape(-1, PLANE)
+        return self.mean[HEAD:].reshape(-1, PLANE)
 
     def predict(self, odometry: IntegratedOdometry) -> None:
-        """`pose <- pose * delta * error`, the error's covariance that of the integrated odometry."""
-        noise = slice(POSE, 2 * POSE)
-        augmented = np.zeros((2 * POSE, 2 * POSE))
-        augmented[:POSE, :POSE] = self.covariance[:POSE, :POSE]
-        augmented[noise, noise] = odometry.covariance
-        mean = np.append(self.pose, np.zeros(POSE))
-        moved = transform(
-            lambda x: compose_rows(compose_rows(x[:, :POSE], odometry.delta), x[:, noise]), mean, augmented
-        )
-        cross = moved.slope[:, :POSE] @ self.covariance[:POSE, POSE:]
+        """`pose <- pose * delta * (error - J calibration)`, with the covariance of the odometry's error."""
+        drift, size = odometry.calibration_jacobian, HEAD + POSE
+        augmented = np.zeros((size, size))
+        augmented[:HEAD, :HEAD] = self.covariance[:HEAD, :HEAD]
+        augmented[HEAD:, HEAD:] = odometry.covariance
+
+        def drive(x: Array) -> Array:
+            error = x[:, HEAD:] - x[:, POSE:HEAD] @ drift.T
+            return compose_rows(compose_rows(x[:, :POSE], odometry.delta), error)
+
+        moved = transform(drive, np.append(self.mean[:HEAD], np.zeros(POSE)), augmented)
+        cross = moved.slope[:, :HEAD] @ self.covariance[:HEAD, POSE:]
         self.mean[:POSE] = moved.mean
         self.covariance[:POSE, :POSE] = moved.covariance
         self.covariance[:POSE, POSE:] = cross
@@ -100,7 +115,7 @@ class Belief:
 
         sigma (k,): what is added to each of them, m. The rule's own result, since the change is linear.
         """
-        low, high = POSE + PLANE * start, POSE + PLANE * stop
+        low, high = HEAD + PLANE * start, HEAD + PLANE * stop
         full = np.kron(matrix, np.eye(PLANE))
         mean, covariance = self.mean, self.covariance
         cross = full @ covariance[low:high]
@@ -117,7 +132,7 @@ class Belief:
 
     def reorder(self, points: IntArray) -> None:
         """The points in another order, or some of them."""
-        columns = np.concatenate([np.arange(POSE), point_columns(points)])
+        columns = np.concatenate([np.arange(HEAD), point_columns(points)])
         self.mean = self.mean[columns]
         self.covariance = self.covariance[np.ix_(columns, columns)]
 
@@ -127,7 +142,7 @@ class Belief:
 
 def point_columns(points: IntArray) -> IntArray:
     """(2 k,) entries of x of points (k,)."""
-    return (POSE + PLANE * points[:, None] + np.arange(PLANE)).ravel()
+    return (HEAD + PLANE * points[:, None] + np.arange(PLANE)).ravel()
 
 
 def compose_rows(poses: Array, deltas: Array) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
@@ -47,19 +49,25 @@ def associate_early(
     cycles: pose (3,) and readings of the last few seconds, oldest first; beginning: poses (k, 3) of the
     drive's first stretch.
     """
-    found = register(_Recent(state, cycles), beginning, state.settings.closing)
+    ckf = state.settings.ckf
+    closing = replace(state.settings.closing, sigma_reading=ckf.sigma_match, patience=ckf.patience)
+    found = register(_Recent(state, cycles), beginning, closing)
     return None if found is None else found.motion
 
 
-def tie(state: CurveState, motion: Motion) -> None:
+def tie(state: CurveState, motion: Motion) -> bool:
     """One Kalman update: the end of each curve, where the motion lays it on its beginning, is the beginning.
 
     `n . (S(u) - S(w)) = 0`, with u along the end, w its association on the early segment, and n the normal
-    there; along the curve the same, but hardly certain.
+    there. Along the curve the same, but that is one fact however many points say it, the registration's; so
+    each of k points says it with sqrt(k) times that sigma. False, and nothing done, where the end of a curve
+    hasn't reached its beginning yet.
     """
+    overlaps = {label: _overlap(state, label, motion) for label in state.curves}
+    if not all(len(u) for u, _ in overlaps.values()):
+        return False
     rows, columns = [], []
-    for label in state.curves:
-        u, w = _overlap(state, label, motion)
+    for label, (u, w) in overlaps.items():
         spline = state.spline(label)
         basis = spline.basis_matrix(u) - spline.basis_matrix(w)
         tangents = spline.tangent_unit(w)
@@ -68,11 +76,13 @@ def tie(state: CurveState, motion: Motion) -> None:
         rows.append(np.concatenate(own))
         columns.append(state.columns(label, np.arange(spline.size)))
     matrix = block_diag(*rows)
-    ckf = state.settings.ckf
-    sigma = np.concatenate([np.repeat([ckf.sigma_tie, ckf.sigma_along], len(r) // 2) for r in rows])
+    across, along = state.settings.ckf.sigma_tie, state.settings.closing.sigma_max
+    counts = [len(r) // 2 for r in rows]
+    sigma = np.concatenate([np.repeat([across, along * np.sqrt(k)], k) for k in counts])
     state.belief.update(
         np.concatenate(columns), lambda x: x @ matrix.T, np.zeros(len(matrix)), np.diag(sigma**2)
     )
+    return True
 
 
 def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Array]:

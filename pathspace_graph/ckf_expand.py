@@ -83,7 +83,7 @@ class Expansion:
         end = None
         if label in state.curves:
             end = _end(state, label, way)
-            found = found.where(self._beyond(state, label, found, end))
+            found = found.where(self._beyond(state, label, found, end)) if len(found.points) else found
         return found.where(chain(found, settings, end))
 
     def _beyond(self, state: CurveState, label: int, found: Candidates, end: End) -> NDArray[np.bool_]:

@@ -1,19 +1,36 @@
 """S_z: the readings of one cycle as one reading of a spline's control points (paper: Update).
 
-Where the paper leaves something open or contradicts itself, this is what was chosen; every other choice is a
-setting, so that its effect can be shown.
+Where the paper leaves something open or contradicts itself, this is what was chosen for the whole filter; the
+other choice is a setting.
 
-- Its cost squares L, its solution does not. The solution is taken (`ckf.penalty`).
+- Its cost squares L, its solution doesn't. The solution is taken (`ckf.penalty`).
+- The prediction of S_z isn't given. Held against the control points as they are, what the fit keeps of the
+  prior would count as evidence for the prior, and a control point out of the readings' reach, whose spread is
+  zero, would be known exactly. So the prediction goes through the same fit: it is the S_z of readings that
+  lie on the curve (`ckf.prediction`; direct: against the control points, with `ckf.sigma_kept`). Then both
+  sides of the innovation have the same full-rank gain, which cancels: the update is that of a filter on the
+  readings themselves, and neither lambda nor the power of L makes a difference.
 - B holds the basis at the foot points of the readings themselves, and the sigma points are fitted with it, as
   the solution is written; foot points of their own would give S_z no spread along the curve at all.
 - A reading says nothing of where along the curve its cone stands; the foot point is only the nearest one. So
   the reading's covariance is widened along the tangent (`ckf.sigma_along`; tiny: as written).
-- The prediction of S_z isn't given. Held against the control points as they are, what the fit keeps of the
-  prior would count as evidence for the prior, and a control point out of the readings' reach, whose spread is
-  zero, would be known exactly. So the prediction goes through the same fit: it is the S_z of readings that
-  lie on the curve (`ckf.prediction`; direct: against the control points, with `ckf.sigma_kept`).
 - It is held against the control points as the vehicle sees them, like the landmarks of its baseline:
   otherwise the map would never correct the pose.
+- The odometry's constant errors are in the state, of the baseline too, as they are in that of every other
+  estimator (`odometry.sigma_scale` and `sigma_bias`; tiny: as written). Taken for white noise, they make the
+  filter drift several times farther than it believes.
+- Its front end has no false detections. Here a reading is gated, and what was seen only once doesn't expand a
+  curve (`ckf_expand`). An extension leaves the end's bending open, and multiplies what is open of it, so that
+  end gets a prior of little bending (`ckf.sigma_bend`; large: as written).
+
+What the other choices do at the end of lap 2, one simulated drive on each of seven tracks (rmse, missed,
+loops closed):
+
+    as it is                                    0.33 m    0.0 %   7 of 7
+    prediction direct                           0.89 m    3.5 %   5 of 7
+    prediction direct, penalty cost             0.96 m   12.0 %   5 of 7
+    sigma_along 0.05 m                          0.36 m    0.0 %   7 of 7
+    sigma_scale 1e-7, sigma_bias 1e-8 rad/s     0.50 m    0.5 %   7 of 7
 """
 
 from __future__ import annotations

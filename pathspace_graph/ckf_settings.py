@@ -25,16 +25,13 @@ class CkfSettings(Positive):
     """A control point is updated where the basis of the readings adds up to this at least (-)."""
     sigma_model: float = 0.25
     """How far cones stand off a smooth curve (m, one sigma): added to each reading."""
-    odometry_scale: float = 1.0
-    """The odometry's sigmas are multiplied by this: a filter without calibration has to take its constant
-    errors for white ones."""
     sigma_along: float = 1.0
     """How far along the curve from its foot point a cone may stand (m, one sigma): added to the reading."""
-    reach: float = 12.0
+    reach: float = 9.0
     """How far ahead of the vehicle along its path (m) a curve is led."""
-    threshold: float = 6.0
+    threshold: float = 4.0
     """Growth threshold (m): a reading nearer to the end than this updates the curve instead."""
-    separation: float = 6.0
+    separation: float = 4.0
     """An extension keeps this distance from the last control point but one (m)."""
     stretch: float = 12.0
     """Longest extension at once (m): a farther one takes several."""
@@ -48,6 +45,11 @@ class CkfSettings(Positive):
     where nothing holds it. Large: as written."""
     sigma_tie: float = 0.15
     """How far apart the end of a curve and its beginning may be where the loop closes (m, one sigma)."""
+    sigma_match: float = 0.6
+    """Deviation (m) of a reading from the early segment that it is associated with: more than in the mapper's
+    own closing, since the filter's early segment is the worse, ..."""
+    patience: float = 30.0
+    """... so that a stretch driven again (m), rather than certainty of the place, closes the loop."""
     tie_reach: float = 1.0
     """Points of the end that the registration leaves farther from the beginning (m) aren't tied to it."""
     sightings: int = 3

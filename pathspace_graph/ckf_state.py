@@ -11,6 +11,7 @@ from pathspace_graph.factors.gauge import greville, smoothness_matrix
 
 from .boundary import Boundary
 from .ckf_belief import PLANE, Belief, point_columns
+from .gating import relocate
 from .settings import MapperSettings
 from .spline import BSpline
 
@@ -19,11 +20,11 @@ IntArray = NDArray[np.intp]
 
 
 class CurveState:
-    """`x = [pose | control points of the left curve | of the right curve]`, and the curves' knots."""
+    """`x = [pose | calibration | left control points | right control points]`, and the curves' knots."""
 
-    def __init__(self, pose: Array, covariance: Array, settings: MapperSettings) -> None:
+    def __init__(self, belief: Belief, settings: MapperSettings) -> None:
         self.settings = settings
-        self.belief = Belief(pose, covariance)
+        self.belief = belief
         """Mean and covariance of x."""
         self.curves: dict[int, BSpline] = {}
         """The curves by label; of their control points only the number is up to date, see `spline`."""
@@ -65,11 +66,15 @@ class CurveState:
         )
 
     def locate_vehicle(self) -> None:
-        """The vehicle's station on each curve, near the last one."""
+        """The vehicle's station on each curve: near the last one, or anew where that can't be its own."""
         gate = self.settings.gate
+        heading = np.array([np.cos(self.pose[2]), np.sin(self.pose[2])])
         for label, station in self.stations.items():
             low, high = np.array([station - gate.station_behind]), np.array([station + gate.station_ahead])
-            u = float(self.find(label, self.pose[None, :2], low, high).u[0])
+            foot = self.find(label, self.pose[None, :2], low, high)
+            u = float(foot.u[0])
+            if foot.tangent_unit[0] @ heading < 0.0 or abs(foot.distance[0]) > gate.station_lateral:
+                u = relocate(self.boundary(label), self.control_points(label), self.pose, gate.station_room)
             if self.curves[label].periodic:
                 begin, end = self.curves[label].domain
                 u += (end - begin) * round((station - u) / (end - begin))

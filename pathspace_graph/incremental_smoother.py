@@ -74,9 +74,15 @@ class IncrementalSmoother(Smoother):
         """Every control point stays in the system."""
 
     def step(self, sigma_step: float) -> None:
-        """One update of GTSAM's smoother with what is new; the estimate is its own."""
+        """One update of GTSAM's smoother with what is new; the estimate is its own.
+
+        While the loop is being closed the parent's steps are taken: one undamped step through the whole loop,
+        which is what a new smoother begins with, may throw a curve off for good.
+        """
         estimate = self.state.vector.copy()
         super().step(sigma_step)
+        if sigma_step == self.settings.closing.sigma_step:
+            return
         self.state.vector = estimate
         if self._moved():
             self._restart()
@@ -224,7 +230,7 @@ def _control_keys(label: int, size: int) -> Sequence[int]:
 def _parameters() -> gtsam.ISAM2Params:
     """Every variable that isn't frozen is relinearized in every update; unused factor slots are filled."""
     parameters = gtsam.ISAM2Params()
-    parameters.setRelinearizeThreshold(0.01)
+    parameters.setRelinearizeThreshold(0.0)
     parameters.relinearizeSkip = 1
     parameters.findUnusedFactorSlots = True
     parameters.setFactorization("QR")  # the first pose is known 1e7 times better than an unseen control point
