@@ -160,7 +160,7 @@ def _change(smoother: Smoother, joins: dict[int, Join]) -> Array:
 def _slack(information: Array, onto_new: Array, sigma: float) -> Array:
     """What is known less, since the old control points M may be off `E C_new` by sigma (m).
 
-    `A_M' (I / sigma^2 + L_MM)^-1 A_M` (k, k + 1) with L_MM `information` (n, n) and A_M `onto_new` (n, k + 1):
+    `A_M' (I / sigma^2 + L_MM)^-1 A_M` (k, k + 1), L_MM `information` (n, n) and A_M `onto_new` (n, k + 1):
     their rows of `[L M | -gradient]` (Woodbury).
     """
     half = cholesky(information + np.eye(len(information)) / sigma**2)
