@@ -15,9 +15,9 @@ from pathspace_graph.settings import MapperSettings
 
 from .blind_spot import find_blind_spot
 from .comparison import Comparison, NamedLog, Outcome
+from .comparison_paired import paired_frame, paired_table
 from .comparison_plot import plot_blind_spot, plot_maps
-from .comparison_table import final_table, paired_table, paper_frame, paper_table
-from .paired import paired_frame
+from .comparison_table import final_table, paper_frame, paper_table
 from .plot import save_plot
 from .summary import summarize, versions
 from .text_table import TextTable

@@ -17,8 +17,8 @@ from pathspace_graph.map import Map
 
 from .blind_spot import BlindSpot
 from .comparison import Outcome
-from .comparison_metrics import METRIC
-from .legend import grouped_legend
+from .comparison_metrics import PAPER
+from .legend import fit_height, grouped_legend
 from .plot import PlotStyle, draw_boundary, draw_start, draw_truth
 from .true_curve import mapped_points
 
@@ -35,14 +35,14 @@ class ComparisonStyle:
     """Panels beside each other: as few of these as fit on the page, ..."""
     max_height: float = 10.0
     """... whose height this is."""
-    panel_title: float = 0.46
+    panel_title: float = 0.6
     """Height of a panel's title and its free space."""
     tick_labels: float = 0.48
     """Width and height of the outer tick labels and axis titles."""
+    legend: float = 2.0
+    """Height that is more than enough for the legend; what it doesn't take is cut off."""
     gap: float = 0.12
     """Between panels."""
-    legend_row: float = 0.15
-    """Height of a line of the legend."""
     missed_color: str = "#CC0000"
     """Of the rings around missed cones."""
     ring_size: float = 8.0
@@ -63,7 +63,7 @@ def plot_maps(outcomes: Sequence[Outcome], log: Log, style: ComparisonStyle | No
             _draw_map(axes, track, log.truth, style.map)
             axes.set_title(_caption(outcome))
             _frame(axes, low, high)
-        _finish(figure, panels, len(drawn), columns, style)
+        _finish(figure, panels, len(drawn), columns)
     return figure
 
 
@@ -77,11 +77,11 @@ def plot_blind_spot(
     with mpl.rc_context(_RC | {"font.size": large.font_size, "axes.titlesize": large.font_size}):
         figure, panels, columns = _panels(len(maps), half, style)
         for axes, (name, track), missed in zip(panels, maps, spot.missed, strict=False):
-            _draw_map(axes, track, truth, large)
+            _draw_map(axes, track, truth, large, start=bool((np.abs(spot.centre) < half).all()))
             _draw_missed(axes, missed, spot.distance, style)
             axes.set_title(f"{name}\n{len(missed)} of {spot.cones} true cones missed here")
             _frame(axes, spot.centre - half, spot.centre + half)
-        _finish(figure, panels, len(maps), columns, style)
+        _finish(figure, panels, len(maps), columns)
     return figure
 
 
@@ -93,7 +93,7 @@ def _panels(count: int, half_size: Array, style: ComparisonStyle) -> tuple[Figur
         height = rows * (width * half_size[1] / half_size[0] + style.panel_title) + style.tick_labels
         if height <= style.max_height:
             break
-    figure = Figure((style.map.width, float(height)), layout="compressed")
+    figure = Figure((style.map.width, float(height) + style.legend), layout="compressed")
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     return figure, list(panels.flat), columns
 
@@ -104,12 +104,11 @@ def _frame(axes: Axes, low: Array, high: Array) -> None:
     axes.set_ylim(low[1], high[1])
 
 
-def _finish(figure: Figure, panels: list[Axes], used: int, columns: int, style: ComparisonStyle) -> None:
+def _finish(figure: Figure, panels: list[Axes], used: int, columns: int) -> None:
     """Axis titles, the legend, and the room that it takes."""
     _label_outer(panels, used, columns)
-    rows = grouped_legend(figure, panels)
-    width, height = figure.get_size_inches()
-    figure.set_size_inches(width, height + (rows + 1) * style.legend_row)
+    grouped_legend(figure, panels)
+    fit_height(figure)
 
 
 def _draw_missed(axes: Axes, missed: Array, distance: float, style: ComparisonStyle) -> None:
@@ -123,28 +122,30 @@ def _draw_missed(axes: Axes, missed: Array, distance: float, style: ComparisonSt
         markeredgecolor=style.missed_color,
         markeredgewidth=1.0,
         zorder=8,
-        label=f"true cones with nothing\nmapped within {distance:g} m",
+        label=f"missed: nothing within {distance:g} m",
     )
 
 
-def _draw_map(axes: Axes, track: Map, truth: Truth | None, style: PlotStyle) -> None:
+def _draw_map(axes: Axes, track: Map, truth: Truth | None, style: PlotStyle, start: bool = True) -> None:
     for label, boundary in sorted(track.boundaries.items()):
         draw_boundary(axes, boundary, label, 1.0, style)
     if truth is not None:
         draw_truth(axes, truth, style)
-    draw_start(axes, style)
+    if start:
+        draw_start(axes, style)
     axes.tick_params(width=0.6, length=2.5)
 
 
 def _caption(outcome: Outcome) -> str:
     """Name and the paper's metrics, where they are known."""
     row = outcome.rows[-1]
-    known = [(METRIC[name], row[name]) for name in ("rmse", "missed", "size") if name in row]
-    words = []
-    for metric, value in known:
-        name, _, unit = metric.title.removesuffix("]").partition(" [")
-        words.append(f"{name} {metric.text(float(value))} {unit}".strip())
-    return f"{outcome.estimator}\n{', '.join(words)}"
+    words = {}
+    for metric in PAPER:
+        if metric.name in row:
+            name, _, unit = metric.title.removesuffix("]").partition(" [")
+            words[name] = f"{name} {metric.text(float(row[metric.name]))} {unit}".strip()
+    size = words.pop("size")
+    return "\n".join([outcome.estimator, ", ".join(words.values()), size])
 
 
 def _extent(maps: Sequence[Map], truth: Truth | None, margin: float) -> tuple[Array, Array]:

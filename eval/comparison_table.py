@@ -1,4 +1,4 @@
-"""The tables of a comparison: the paper's Table 1, every metric at the end, differences with intervals."""
+"""The tables of a comparison: the paper's Table 1, and every metric at the end."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 
 from .comparison import Comparison
-from .comparison_metrics import METRIC, METRICS, PAPER, Metric
+from .comparison_metrics import METRICS, PAPER, Metric
 from .metrics import LapMetrics
+from .summary import has_cones
 from .text_table import TextTable
 
 NO_TRUTH: Final = "the log has no true cones: only what needs none is told"
@@ -20,19 +21,6 @@ _AT_END: Final = "end"
 """In place of a lap, where none was completed."""
 _SPACE: Final = "   "
 """Between figures that share a column."""
-_COMPARED: Final = (
-    "rmse",
-    "rmse_capped",
-    "missed",
-    "missed_2m",
-    "missed_1m",
-    "two_way",
-    "ghost_share",
-    "size",
-    "ate",
-    "ms_mean",
-)
-"""Metrics whose differences are printed; the file has all."""
 
 
 def paper_frame(comparison: Comparison) -> pd.DataFrame:
@@ -91,21 +79,6 @@ def final_table(comparison: Comparison) -> TextTable:
     return TextTable(title, ("metric", *comparison.estimators), rows)
 
 
-def paired_table(comparison: Comparison, paired: pd.DataFrame) -> TextTable:
-    """Differences from the reference with their intervals: a row per metric, a column per other estimator."""
-    others = [name for name in comparison.estimators if name != comparison.reference]
-    rows = []
-    for metric in (METRIC[name] for name in _COMPARED):
-        of = paired[paired["metric"] == metric.name].set_index("estimator")
-        if len(of) and of["mean"].notna().any():
-            rows.append((metric.title, *(_interval(metric, of.loc[name]) for name in others)))
-    title = (
-        f"Difference from {comparison.reference}, mean [95 % interval] over {len(comparison.logs)} logs, "
-        "paired; * where 0 is outside of it. Positive: the reference has less."
-    )
-    return TextTable(title, ("metric", *others), tuple(rows))
-
-
 def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
     """The paper's Table 1 as the paper has it: a row per lap, the estimators beside each other.
 
@@ -127,9 +100,8 @@ def _three(row: LapMetrics | None) -> str:
 
 
 def has_truth(comparison: Comparison) -> bool:
-    """Whether any log has true cones that a map was held against."""
-    frame = comparison.frame()
-    return "rmse" in frame
+    """Whether any log has true cones that a map can be held against."""
+    return any(n.log.truth is not None and has_cones(n.log.truth) for n in comparison.logs)
 
 
 def _title(comparison: Comparison, when: str) -> str:
@@ -151,13 +123,3 @@ def _cell(metric: Metric, row: Any) -> str:
         return metric.text(float("nan"))
     value = getattr(row, metric.name) if isinstance(row, LapMetrics) else row[metric.name]
     return metric.text(float(value))
-
-
-def _interval(metric: Metric, row: Any) -> str:
-    """mean [low, high], in the metric's own unit."""
-    mean, low, high = (metric.factor * float(row[name]) for name in ("mean", "low", "high"))
-    if np.isnan(mean):
-        return "–"
-    digits = max(metric.digits, 2)
-    mark = "*" if low > 0.0 or high < 0.0 else ""
-    return f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]{mark}"

@@ -25,9 +25,9 @@ from .figure_style import (
     draw_readings,
     figure_context,
     frame,
-    legend_below,
 )
 from .figure_uncertainty import posterior
+from .legend import fit_height, legend_below
 from .plot import uncertainty_band
 
 Array = NDArray[np.float64]
@@ -183,6 +183,7 @@ def plot_expansion(data: Expansion, style: FigureStyle | None = None) -> Figure:
         for axes in panels[:-1]:
             axes.set_xlabel("")
         legend_below(figure, 4)
+        fit_height(figure)
     return figure
 
 

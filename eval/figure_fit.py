@@ -21,9 +21,9 @@ from .figure_style import (
     draw_readings,
     figure_context,
     frame,
-    legend_below,
     point_blocks,
 )
+from .legend import fit_height, legend_below
 
 Array = NDArray[np.float64]
 
@@ -140,6 +140,7 @@ def plot_fit(data: Fit, style: FigureStyle | None = None) -> Figure:
             axes.set_ylabel("y [m]")
         basis.set_box_aspect((high[1] - low[1]) / (high[0] - low[0]))
         legend_below(figure, 5)
+        fit_height(figure)
     return figure
 
 

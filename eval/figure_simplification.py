@@ -143,7 +143,7 @@ def _draw_errors(axes: Axes, data: Simplification, style: FigureStyle) -> None:
             data.length, 100 * simplified.errors, color=color, linestyle=line, linewidth=0.9, label=label
         )
     axes.set_xlim(0.0, data.old.length())
-    axes.set_ylim(0.0, 140.0 * float(data.uniform.errors.max()))
+    axes.set_ylim(0.0, 170.0 * float(data.uniform.errors.max()))
     axes.set_ylabel("distance [cm]")
     axes.tick_params(labelbottom=False)
     axes.set_title("(c) distance between before and after")

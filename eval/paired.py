@@ -1,4 +1,4 @@
-"""Differences between estimators, paired over logs, with their confidence interval."""
+"""Means over runs, differences between runs that are paired, and what of them may be chance."""
 
 from __future__ import annotations
 
@@ -6,33 +6,39 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import pandas as pd
-from numpy.typing import ArrayLike
-from scipy.stats import ttest_rel
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import t as student
 
-from .comparison import Comparison
-from .comparison_metrics import METRICS
+Array = NDArray[np.float64]
 
 LEVEL: Final = 0.95
-"""Of the intervals."""
+"""Of the intervals; a difference is significant where its p is below what is left of 1."""
+CORRECTION: Final = "Holm"
+"""Correction for multiple comparisons."""
 _FEWEST: Final = 2
-"""Pairs that have an interval."""
-_NOT_PAIRED: Final = ("nees_low", "nees_high")
-"""Metrics whose differences say nothing."""
+"""Runs that have an interval."""
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
-    """Mean of value - reference's value over the logs that both have one on."""
+class Estimate:
+    """A mean and its 95 % interval, Student's t over runs."""
 
     mean: float
-    """NaN of no pairs."""
-    low: float
-    """95 % interval of the mean, by Student's t over the pairs: from here ..."""
-    high: float
-    """... to here; NaN of fewer than two pairs."""
-    pairs: int
-    """How many."""
+    """NaN of nothing."""
+    half: float
+    """Half the interval; NaN of fewer than two runs."""
+    count: int
+    """Runs, or pairs of them."""
+
+    @property
+    def low(self) -> float:
+        """The interval is from here ..."""
+        return self.mean - self.half
+
+    @property
+    def high(self) -> float:
+        """... to here."""
+        return self.mean + self.half
 
     @property
     def significant(self) -> bool:
@@ -40,36 +46,42 @@ class Difference:
         return bool(self.low > 0.0 or self.high < 0.0)
 
 
-def difference(values: ArrayLike, reference: ArrayLike) -> Difference:
-    """mean(d) -+ t(0.975, n - 1) s(d) / sqrt(n) of d = values - reference (n,) where both are finite."""
+def estimate(values: Array) -> Estimate:
+    """mean -+ t(0.975, n - 1) s / sqrt(n) of the values (n,)."""
+    n = len(values)
+    if n < _FEWEST:
+        return Estimate(float(values[0]) if n else float("nan"), float("nan"), n)
+    return Estimate(float(np.mean(values)), float(student.ppf(0.5 + LEVEL / 2, n - 1)) * _error(values), n)
+
+
+def difference(values: ArrayLike, reference: ArrayLike) -> Estimate:
+    """The estimate of values - reference (n,), pair by pair where both are finite."""
     own, others = np.asarray(values, dtype=float), np.asarray(reference, dtype=float)
     both = np.isfinite(own) & np.isfinite(others)
-    own, others = own[both], others[both]
-    n = len(own)
-    mean = float(np.mean(own - others)) if n else float("nan")
+    return estimate(own[both] - others[both])
+
+
+def paired_p(differences: Array) -> float:
+    """Two-sided p of the paired t-test that the mean difference is 0; NaN of fewer than two pairs."""
+    n = len(differences)
     if n < _FEWEST:
-        return Difference(mean, float("nan"), float("nan"), n)
-    if np.ptp(own - others) == 0.0:  # no spread, for which the t-test has no number
-        return Difference(mean, mean, mean, n)
-    interval = ttest_rel(own, others).confidence_interval(LEVEL)
-    return Difference(mean, float(interval.low), float(interval.high), n)
+        return float("nan")
+    mean, error = float(np.mean(differences)), _error(differences)
+    if error == 0.0:
+        return 1.0 if mean == 0.0 else 0.0
+    return float(2.0 * student.sf(abs(mean) / error, n - 1))
 
 
-def paired_frame(comparison: Comparison) -> pd.DataFrame:
-    """A tidy row per estimator and metric of the whole logs: the difference from the reference."""
-    frame = comparison.frame()
-    final = frame[frame["scope"] == "log"].set_index(["log", "estimator"])
-    names = [m.name for m in METRICS if m.name in frame and m.name not in _NOT_PAIRED]
-    logs = [named.name for named in comparison.logs]
-    found = []
-    for estimator in comparison.estimators:
-        for name in names if estimator != comparison.reference else ():
-            column = final[name].astype(float)
-            own, reference = (
-                column.reindex([(log, who) for log in logs]).to_numpy()
-                for who in (estimator, comparison.reference)
-            )
-            d = difference(own, reference)
-            row = {"metric": name, "mean": d.mean, "low": d.low, "high": d.high, "pairs": d.pairs}
-            found.append({"estimator": estimator, "reference": comparison.reference} | row)
-    return pd.DataFrame(found, columns=["estimator", "reference", "metric", "mean", "low", "high", "pairs"])
+def holm(p: Array) -> Array:
+    """p of each comparison after Holm: `max over j <= i of (m - j) p_(j)`, j from 0, at most 1; NaN stays."""
+    corrected = np.full(len(p), np.nan)
+    known = np.flatnonzero(~np.isnan(p))
+    order = known[np.argsort(p[known], kind="stable")]
+    factors = len(order) - np.arange(len(order))
+    corrected[order] = np.minimum(np.maximum.accumulate(factors * p[order]), 1.0)
+    return corrected
+
+
+def _error(values: Array) -> float:
+    """s / sqrt(n), the standard error of the mean."""
+    return float(np.std(values, ddof=1) / np.sqrt(len(values)))

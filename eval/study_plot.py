@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from .study import Study
 from .study_metrics import METRICS
-from .study_statistics import Comparison, compare
+from .study_statistics import Contrast, contrasts
 
 ACCURACY: Final = "rmse"
 SIZE: Final = "size"
@@ -72,52 +72,65 @@ def figures(study: Study, frame: pd.DataFrame, style: StudyPlotStyle | None = No
 
 def plot_differences(study: Study, frame: pd.DataFrame, style: StudyPlotStyle) -> Figure | None:
     """A row for each combination, a panel for each of the first metrics: every pair, mean and interval."""
-    panels = [_differing(compare(study, frame, metric)) for metric in study.metrics if metric in frame]
-    panels = [panel for panel in panels if panel][: style.panels]
+    panels = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
+    panels = [panel for panel in panels if _differs(panel)][: style.panels]
     if not panels:
         return None
-    height = style.furniture + style.row * max(map(len, panels))
-    figure = Figure(figsize=(style.width, height), layout="constrained")
-    all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axes, comparisons in zip(all_axes, panels, strict=True):
-        _draw_differences(axes, comparisons, style)
-        axes.set_yticks(range(len(comparisons)), ["" for _ in comparisons])
-    all_axes[0].set_yticks(range(len(panels[0])), _row_names(study, panels[0]))
+    rows = [i for i in range(len(panels[0])) if any(_is_known(panel[i]) for panel in panels)]
+    figure = Figure(figsize=(style.width, style.furniture + style.row * len(rows)), layout="constrained")
+    all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, panel in zip(all_axes, panels, strict=True):
+        _draw_differences(axes, [panel[i] for i in rows], style)
+    all_axes[0].set_yticks(range(len(rows)), [_row_name(study, panels[0][i]) for i in rows])
+    all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
     told = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
     figure.supxlabel(told, fontsize=style.font_size)
     return figure
 
 
-def _differing(comparisons: Sequence[Comparison]) -> list[Comparison]:
-    """All but the baseline; none where no run differs from it."""
-    against = [c for c in comparisons if c.difference is not None and c.difference.count]
-    return against if any(d != 0.0 for c in against for d in c.differences) else []
+def _is_known(contrast: Contrast) -> bool:
+    """Whether it isn't the baseline itself, and there are pairs."""
+    return contrast.difference is not None and contrast.difference.count > 0
 
 
-def _draw_differences(axes: Axes, comparisons: Sequence[Comparison], style: StudyPlotStyle) -> None:
-    metric = METRICS[comparisons[0].metric]
+def _differs(panel: Sequence[Contrast]) -> bool:
+    """Whether any run differs from the baseline."""
+    return any(d != 0.0 for contrast in panel for d in contrast.differences)
+
+
+def _draw_differences(axes: Axes, rows: Sequence[Contrast], style: StudyPlotStyle) -> None:
+    metric = METRICS[rows[0].metric]
     rng = np.random.default_rng(JITTER_SEED)
     axes.axvline(0.0, color=style.line_color, linewidth=0.6, zorder=1)
-    for row, comparison in enumerate(comparisons):
-        assert comparison.difference is not None
-        color = style.color if comparison.significant else style.quiet_color
-        pairs = metric.factor * np.array(comparison.differences)
+    for row, contrast in enumerate(rows):
+        if contrast.difference is None or not contrast.difference.count:
+            continue
+        color = style.color if contrast.significant else style.quiet_color
+        pairs = metric.factor * np.array(contrast.differences)
         scattered = row + rng.uniform(-style.jitter, style.jitter, len(pairs))
         axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=style.point_size, zorder=2)
-        mean, half = metric.factor * comparison.difference.mean, metric.factor * comparison.difference.half
+        mean, half = metric.factor * contrast.difference.mean, metric.factor * contrast.difference.half
         bar = None if np.isnan(half) else half
         axes.errorbar(
             mean, row, xerr=bar, fmt="o", color=color, markersize=style.marker_size, elinewidth=1.0, zorder=3
         )
-    axes.set_ylim(len(comparisons) - 0.5, -0.5)
     axes.set_title(metric.title, fontsize=style.font_size)
     axes.tick_params(width=0.6, length=2.5)
     axes.grid(axis="x", linewidth=0.3, alpha=0.5)
 
 
-def _row_names(study: Study, comparisons: Sequence[Comparison]) -> list[str]:
+def _row_name(study: Study, contrast: Contrast) -> str:
     several = [name for name in ("noise", "estimator", "variant") if len(_of(study, name)) > 1]
-    return [", ".join(getattr(comparison, name) for name in several) for comparison in comparisons]
+    return _brief(study, ", ".join(getattr(contrast, name) for name in several))
+
+
+def _brief(study: Study, name: str) -> str:
+    """`sigma_spacing=1` for `gauge.sigma_spacing=1`, where no other group's setting is called so."""
+    last = {field: field.rpartition(".")[2] for field in study.varied}
+    if len(set(last.values())) == len(last):
+        for field, short in last.items():
+            name = name.replace(f"{field}=", f"{short}=")
+    return name
 
 
 def _of(study: Study, name: str) -> Sequence[str]:
@@ -131,7 +144,7 @@ def plot_against(study: Study, frame: pd.DataFrame, metric: str, style: StudyPlo
     """Mean accuracy of each combination against the mean of another metric, with both intervals."""
     if metric not in frame or ACCURACY not in frame:
         return None
-    across, up = compare(study, frame, metric), compare(study, frame, ACCURACY)
+    across, up = contrasts(study, frame, metric), contrasts(study, frame, ACCURACY)
     figure = Figure(figsize=(style.width, style.scatter_height * len(study.noise)), layout="constrained")
     all_axes = figure.subplots(len(study.noise), 1, squeeze=False)[:, 0]
     for axes, noise in zip(all_axes, study.noise, strict=True):
@@ -149,7 +162,7 @@ def plot_against(study: Study, frame: pd.DataFrame, metric: str, style: StudyPlo
 
 
 def _draw_point(
-    axes: Axes, across: Comparison, up: Comparison, index: int, label: str, style: StudyPlotStyle
+    axes: Axes, across: Contrast, up: Contrast, index: int, label: str, style: StudyPlotStyle
 ) -> None:
     x, y = METRICS[across.metric], METRICS[up.metric]
     axes.errorbar(
@@ -165,6 +178,6 @@ def _draw_point(
     )
 
 
-def _label(study: Study, comparison: Comparison) -> str:
+def _label(study: Study, contrast: Contrast) -> str:
     several = [name for name in ("estimator", "variant") if len(_of(study, name)) > 1]
-    return ", ".join(getattr(comparison, name) for name in several) or comparison.name
+    return _brief(study, ", ".join(getattr(contrast, name) for name in several) or contrast.name)

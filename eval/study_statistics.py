@@ -3,39 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from scipy.stats import t as student
 
+from .paired import LEVEL, Estimate, estimate, holm, paired_p
 from .study import Study
 from .study_frame import COMBINATION, RUN, last_laps
 
-Array = NDArray[np.float64]
 Runs = dict[tuple[Any, ...], dict[tuple[Any, ...], float]]
 
-LEVEL: Final = 0.95
-"""Of the intervals; a difference is significant where its corrected p is below what is left of 1."""
-CORRECTION: Final = "Holm"
-"""Correction for multiple comparisons, over all comparisons of one metric in the study."""
-
 
 @dataclass(frozen=True)
-class Estimate:
-    """A mean and its 95 % interval, Student's t over runs."""
-
-    mean: float
-    """NaN of nothing."""
-    half: float
-    """Half the interval; NaN of fewer than two runs."""
-    count: int
-    """Runs, or pairs of them."""
-
-
-@dataclass(frozen=True)
-class Comparison:
+class Contrast:
     """One metric of one combination, and its difference from the baseline on the same runs."""
 
     noise: str
@@ -66,8 +47,11 @@ class Comparison:
         return bool(self.p < 1.0 - LEVEL)
 
 
-def compare(study: Study, frame: pd.DataFrame, metric: str) -> list[Comparison]:
-    """Every combination against the baseline of its noise, in the study's order, p corrected after Holm."""
+def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
+    """Every combination against the baseline of its noise, in the study's order.
+
+    p is corrected after Holm over all comparisons of the metric in the study.
+    """
     runs = _runs(last_laps(frame), metric)
     found = []
     for noise in study.noise:
@@ -76,8 +60,8 @@ def compare(study: Study, frame: pd.DataFrame, metric: str) -> list[Comparison]:
             for variant in study.points:
                 key = (noise, estimator, variant)
                 found.append(_compare(key, metric, runs, None if key == base else base))
-    corrected = holm(np.array([comparison.p for comparison in found]))
-    return [replace(comparison, p=float(p)) for comparison, p in zip(found, corrected, strict=True)]
+    corrected = holm(np.array([contrast.p for contrast in found]))
+    return [replace(contrast, p=float(p)) for contrast, p in zip(found, corrected, strict=True)]
 
 
 def _runs(last: pd.DataFrame, metric: str) -> Runs:
@@ -93,41 +77,11 @@ def _runs(last: pd.DataFrame, metric: str) -> Runs:
 
 def _compare(
     key: tuple[str, str, str], metric: str, runs: Runs, base: tuple[str, str, str] | None
-) -> Comparison:
+) -> Contrast:
     own = runs.get(key, {})
     value = estimate(np.array(list(own.values())))
     if base is None:
-        return Comparison(*key, metric, value, None)
+        return Contrast(*key, metric, value, None)
     against = runs.get(base, {})
     pairs = np.array([own[run] - against[run] for run in own if run in against])
-    return Comparison(*key, metric, value, estimate(pairs), tuple(pairs.tolist()), paired_p(pairs))
-
-
-def estimate(values: Array) -> Estimate:
-    """mean +- t(0.975, n - 1) s / sqrt(n)."""
-    n = len(values)
-    if n < 2:
-        return Estimate(float(values[0]) if n else float("nan"), float("nan"), n)
-    error = float(np.std(values, ddof=1) / np.sqrt(n))
-    return Estimate(float(np.mean(values)), float(student.ppf(0.5 + LEVEL / 2, n - 1)) * error, n)
-
-
-def paired_p(differences: Array) -> float:
-    """Two-sided p of the paired t-test that the mean difference is 0; NaN of fewer than two pairs."""
-    n = len(differences)
-    if n < 2:
-        return float("nan")
-    mean, error = float(np.mean(differences)), float(np.std(differences, ddof=1) / np.sqrt(n))
-    if error == 0.0:
-        return 1.0 if mean == 0.0 else 0.0
-    return float(2.0 * student.sf(abs(mean) / error, n - 1))
-
-
-def holm(p: Array) -> Array:
-    """p of each comparison after Holm: `max over j <= i of (m - j) p_(j)`, j from 0, at most 1; NaN stays."""
-    corrected = np.full(len(p), np.nan)
-    known = np.flatnonzero(~np.isnan(p))
-    order = known[np.argsort(p[known], kind="stable")]
-    factors = len(order) - np.arange(len(order))
-    corrected[order] = np.minimum(np.maximum.accumulate(factors * p[order]), 1.0)
-    return corrected
+    return Contrast(*key, metric, value, estimate(pairs), tuple(pairs.tolist()), paired_p(pairs))

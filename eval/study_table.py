@@ -3,38 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import pandas as pd
 
-from .online_table import markdown_table
+from .paired import CORRECTION, LEVEL, Estimate
 from .study import Study
 from .study_frame import COMBINATION, RUN
 from .study_metrics import METRICS
-from .study_statistics import CORRECTION, LEVEL, Comparison, Estimate, compare
+from .study_statistics import Contrast, contrasts
+from .text_table import TextTable
 
 SMALLEST_P: Final = 0.001
 """A p below it is only told to be."""
 FIGURES: Final = ("runs", "mean", "95 %", "difference", "95 %", "p", "")
 """Columns of every table, after those that name the combination."""
-Rows = list[tuple[str, ...]]
 
 
-@dataclass(frozen=True)
-class SummaryTable:
-    """One metric of every combination, as text."""
-
-    title: str
-    """The metric with its unit."""
-    header: tuple[str, ...]
-    """Of the columns."""
-    rows: Rows
-    """One for each combination."""
-
-
-def summary_tables(study: Study, frame: pd.DataFrame) -> list[SummaryTable]:
+def summary_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
     """A table for each metric of the study that its runs have."""
     return [_table(study, frame, metric) for metric in study.metrics if metric in frame]
 
@@ -53,23 +41,22 @@ def caption(study: Study, frame: pd.DataFrame) -> str:
     )
 
 
-def _table(study: Study, frame: pd.DataFrame, metric: str) -> SummaryTable:
+def _table(study: Study, frame: pd.DataFrame, metric: str) -> TextTable:
     several = [name for name in COMBINATION if frame[name].nunique() > 1] or ["variant"]
     header = (*several, *FIGURES)
     style = METRICS[metric]
 
-    def row(comparison: Comparison) -> tuple[str, ...]:
-        names = tuple(getattr(comparison, name) for name in several)
-        value, difference = comparison.value, comparison.difference
+    def row(contrast: Contrast) -> tuple[str, ...]:
+        names = tuple(getattr(contrast, name) for name in several)
+        value, difference = contrast.value, contrast.difference
         figures = (str(value.count), *_figures(value, style.factor, style.digits, ""))
         if difference is None:
             return (*names, *figures, "baseline", "", "", "")
         by = _figures(difference, style.factor, style.digits, "+")
-        return (*names, *figures, *by, _p(comparison.p), "*" if comparison.significant else "")
+        return (*names, *figures, *by, _p(contrast.p), "*" if contrast.significant else "")
 
-    return SummaryTable(
-        style.title, header, [row(comparison) for comparison in compare(study, frame, metric)]
-    )
+    rows = tuple(row(contrast) for contrast in contrasts(study, frame, metric))
+    return TextTable(style.title, header, rows, names=len(several))
 
 
 def _p(p: float) -> str:
@@ -86,71 +73,17 @@ def _figures(estimated: Estimate, factor: float, digits: int, sign: str) -> tupl
     return mean, half
 
 
-def as_text(tables: Sequence[SummaryTable], told: str) -> str:
+def as_text(tables: Sequence[TextTable], told: str) -> str:
     """Columns aligned by blanks."""
-    return "\n\n".join([told, *(f"{table.title}\n{_aligned(table)}" for table in tables)]) + "\n"
+    return "\n\n".join([told, *(f"{table.title}\n{table.text()}" for table in tables)]) + "\n"
 
 
-def _aligned(table: SummaryTable) -> str:
-    lines = [table.header, *table.rows]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(table.header))]
-    names = len(table.header) - len(FIGURES)
-
-    def join(line: tuple[str, ...]) -> str:
-        cells = (
-            f"{text:<{width}}" if i < names else f"{text:>{width}}"
-            for i, (text, width) in enumerate(zip(line, widths, strict=True))
-        )
-        return "  ".join(cells).rstrip()
-
-    return "\n".join([join(table.header), "-" * (sum(widths) + 2 * len(widths) - 2), *map(join, table.rows)])
-
-
-def as_markdown(tables: Sequence[SummaryTable], told: str) -> str:
+def as_markdown(tables: Sequence[TextTable], told: str) -> str:
     """For a README or an issue."""
-    parts = [f"**{table.title}**\n\n{markdown_table(table.header, table.rows)}" for table in tables]
-    return "\n\n".join([told.replace("*", r"\*"), *parts]) + "\n"
+    bold = (replace(table, title=f"**{table.title}**") for table in tables)
+    return "\n".join([told.replace("*", r"\*") + "\n", *(table.markdown() for table in bold)])
 
 
-_LATEX: Final = str.maketrans(
-    {
-        "%": r"\%",
-        "_": r"\_",
-        "&": r"\&",
-        "#": r"\#",
-        "±": r"$\pm$",
-        "σ": r"$\sigma$",
-        "²": r"$^2$",
-        "×": r"$\times$",
-    }
-)
-"""What text means in LaTeX."""
-
-
-def as_latex(tables: Sequence[SummaryTable], told: str) -> str:
-    """A `table` for each metric; needs booktabs."""
-    return "\n".join(_latex(table, told) for table in tables)
-
-
-def _latex(table: SummaryTable, told: str) -> str:
-    left = len(table.header) - len(FIGURES)
-    columns = "l" * left + "r" * (len(table.header) - left)
-    lines = [
-        " & ".join(line).translate(_LATEX | {ord("&"): "&"}) + r" \\" for line in (table.header, *table.rows)
-    ]
-    return "\n".join(
-        [
-            r"\begin{table}",
-            r"\centering",
-            rf"\caption{{{f'{table.title}. {told}'.translate(_LATEX)}}}",
-            rf"\begin{{tabular}}{{{columns}}}",
-            r"\toprule",
-            lines[0],
-            r"\midrule",
-            *lines[1:],
-            r"\bottomrule",
-            r"\end{tabular}",
-            r"\end{table}",
-            "",
-        ]
-    )
+def as_latex(tables: Sequence[TextTable], told: str) -> str:
+    """A `table` for each metric, each with its own caption."""
+    return "\n".join(replace(table, title=f"{table.title}. {told}").latex() for table in tables)

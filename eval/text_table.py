@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 from rich.table import Table
@@ -10,6 +11,10 @@ from rich.text import Text
 
 from .online_table import markdown_table
 
+_BORDER: Final = 3
+"""Characters between two columns in a terminal."""
+_SPACE: Final = "  "
+"""Between two columns of plain text."""
 _LATEX: Final = {
     "\\": r"\textbackslash{}",
     **{character: f"\\{character}" for character in "&%$#_{}"},
@@ -19,7 +24,12 @@ _LATEX: Final = {
     "σ": r"$\sigma$",
     "−": "$-$",
     "±": r"$\pm$",
+    "<": r"$<$",
+    ">": r"$>$",
+    "²": r"$^2$",
+    "×": r"$\times$",
 }
+"""What text means in LaTeX."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +47,21 @@ class TextTable:
     names: int = 1
     """How many of the columns are names."""
 
+    def parts(self, width: int) -> list[TextTable]:
+        """Tables of `width` characters at most, each with the names and some of the other columns."""
+        needed = [max(map(len, column)) + _BORDER for column in zip(self.header, *self.rows, strict=True)]
+        shared = sum(needed[: self.names]) + 1
+        groups: list[list[int]] = [[]]
+        for number in range(self.names, len(self.header)):
+            if groups[-1] and shared + sum(needed[k] for k in (*groups[-1], number)) > width:
+                groups.append([])
+            groups[-1].append(number)
+        return [self._only([*range(self.names), *group]) for group in groups]
+
+    def _only(self, columns: Sequence[int]) -> TextTable:
+        rows = tuple(tuple(row[k] for k in columns) for row in self.rows)
+        return replace(self, header=tuple(self.header[k] for k in columns), rows=rows)
+
     def rich(self) -> Table:
         """For a terminal, without the title; a unit in brackets isn't taken for markup."""
         table = Table()
@@ -45,6 +70,18 @@ class TextTable:
         for number, row in enumerate(self.rows):
             table.add_row(*map(Text, row), end_section=number + 1 in self.groups)
         return table
+
+    def text(self) -> str:
+        """For a file to look at, without the title: columns aligned by blanks."""
+        widths = [max(map(len, column)) for column in zip(self.header, *self.rows, strict=True)]
+
+        def line(cells: tuple[str, ...]) -> str:
+            names = map(str.ljust, cells[: self.names], widths)
+            numbers = map(str.rjust, cells[self.names :], widths[self.names :])
+            return _SPACE.join([*names, *numbers]).rstrip()
+
+        rule = "-" * (sum(widths) + len(_SPACE) * (len(widths) - 1))
+        return "\n".join([line(self.header), rule, *map(line, self.rows)])
 
     def markdown(self) -> str:
         """For a README."""

@@ -68,6 +68,46 @@ def project(
     )
 
 
+@dataclass(frozen=True)
+class PointRows:
+    """Two rows a reading, whitened: how far it is from its foot point, and their Jacobian blocks."""
+
+    residual: Array
+    """(m, 2) whitened offset from the foot point."""
+    by_pose: Array
+    """(m, 2, 3) derivative by the pose (x, y, theta) in the map frame."""
+    by_control: Array
+    """(m, 2, degree + 1, 2) derivative by the control points of the foot point's span."""
+
+
+def project_to_point(
+    points_map: Array, covariances: Array, poses: Array, foot: FootPoints, sigma_model: float
+) -> PointRows:
+    """`r = W (p - S(u))`, `W^T W = (R K R^T + sigma_model^2 I)^-1`, with `u` held where the foot point is.
+
+    For comparison with `project`, whose arguments it has: at the foot point both see the same distance, but
+    this one also holds the curve and the pose along the curve, of which the reading says nothing:
+
+        dr/dt = W,   dr/dtheta = W J R z,   dr/dc_j = -beta_j(u) W      (J: the quarter turn)
+    """
+    W = _whiteners(covariances, poses, sigma_model)
+    offset, arm = points_map - foot.position, points_map - poses[:, :2]
+    turned = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+    return PointRows(
+        residual=np.einsum("mij,mj->mi", W, offset),
+        by_pose=np.concatenate([W, np.einsum("mij,mj->mi", W, turned)[:, :, None]], axis=2),
+        by_control=-foot.basis[:, None, :, None] * W[:, :, None, :],
+    )
+
+
+def _whiteners(covariances: Array, poses: Array, sigma_model: float) -> Array:
+    """`L^-1` (m, 2, 2) of `L L^T = R K R^T + sigma_model^2 I`, L lower triangular."""
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    rotation = np.moveaxis(np.array([[c, -s], [s, c]]), -1, 0)
+    turned = rotation @ covariances @ rotation.transpose(0, 2, 1)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(turned + sigma_model**2 * np.eye(2))))
+
+
 def huber_weights(whitened: Array, threshold: float) -> Array:
     """`w = min(1, threshold / |z|)` per row: the weight of a whitened residual in a Gauss-Newton step.
 

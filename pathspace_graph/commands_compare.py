@@ -77,7 +77,8 @@ class Compare:
             console = Console(width=FILE_WIDTH)
         for table in tables(comparison).values():
             console.print(table.title, highlight=False, markup=False)
-            console.print(table.rich())
+            for part in table.parts(console.width):
+                console.print(part.rich())
         console.print(f"written to {self.out}", highlight=False, soft_wrap=True, markup=False)
         say = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
         for outcome in comparison.outcomes:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.gauge import spacing_residuals
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, odometry_residuals
-from pathspace_graph.factors.projection import huber_weights, project, to_map
+from pathspace_graph.factors.projection import huber_weights, project, project_to_point, to_map
 
 from .readings import Readings
 from .settings import MapperSettings
@@ -37,7 +38,7 @@ def reading_rows(
     """`w_i n_i . (R z_i + t - S(u_i)) / sigma_i` of every reading in use on a boundary (paper: Update).
 
     Columns [pose | control points of the span]; w the root of its Huber weight, zero where the foot point is
-    not interior. The readings are left as they are.
+    not interior. The readings are left as they are. Of the residual `point` two rows each.
     """
     boundary = state.boundaries[label]
     rows = readings.used_on(label)
@@ -45,16 +46,39 @@ def reading_rows(
     poses = state.poses[slots]
     points = to_map(readings.point[rows], poses)
     foot = boundary.refine(state.control_points(label), points, readings.u[rows])
-    projected = project(points, readings.covariance[rows], poses, foot, settings.spline.sigma_model)
+    base = state.offset(label) + 2 * boundary.columns(foot.span)
+    by_control = np.stack([base, base + 1], axis=2).reshape(len(rows), 2 * base.shape[1])
+    columns = np.concatenate([state.pose_columns(slots), by_control], axis=1)
+    if settings.spline.residual == "point":
+        jacobian, residual = _to_point(points, readings.covariance[rows], poses, foot, settings)
+        columns = np.repeat(columns, 2, axis=0)
+    else:
+        jacobian, residual = _across(points, readings.covariance[rows], poses, foot, settings)
+    return Rows(columns, jacobian, residual), FootParameters(rows, foot.u)
+
+
+def _across(
+    points: Array, covariances: Array, poses: Array, foot: FootPoints, settings: MapperSettings
+) -> tuple[Array, Array]:
+    """Weighted Jacobian (m, 3 + 2 (degree + 1)) and residual (m,) of the distances across the curve."""
+    projected = project(points, covariances, poses, foot, settings.spline.sigma_model)
     whitened = projected.residual / projected.sigma
     weight = np.sqrt(huber_weights(whitened, settings.gate.huber)) * foot.interior / projected.sigma
-    base = state.offset(label) + 2 * boundary.columns(foot.span)
-    shape = len(rows), 2 * base.shape[1]
-    by_control = np.stack([base, base + 1], axis=2).reshape(shape)
-    columns = np.concatenate([state.pose_columns(slots), by_control], axis=1)
-    jacobian = np.concatenate([projected.by_pose, projected.by_control.reshape(shape)], axis=1)
-    whitened_rows = Rows(columns, jacobian * weight[:, None], projected.residual * weight)
-    return whitened_rows, FootParameters(rows, foot.u)
+    by_control = projected.by_control.reshape(len(points), 2 * foot.basis.shape[1])
+    jacobian = np.concatenate([projected.by_pose, by_control], axis=1)
+    return jacobian * weight[:, None], projected.residual * weight
+
+
+def _to_point(
+    points: Array, covariances: Array, poses: Array, foot: FootPoints, settings: MapperSettings
+) -> tuple[Array, Array]:
+    """The same (2 m, ...) and (2 m,) of the offsets from the foot points, a reading's two rows together."""
+    projected = project_to_point(points, covariances, poses, foot, settings.spline.sigma_model)
+    size = np.hypot(projected.residual[:, 0], projected.residual[:, 1])
+    weight = np.repeat(np.sqrt(huber_weights(size, settings.gate.huber)) * foot.interior, 2)
+    by_control = projected.by_control.reshape(len(weight), 2 * foot.basis.shape[1])
+    jacobian = np.concatenate([projected.by_pose.reshape(len(weight), POSE), by_control], axis=1)
+    return jacobian * weight[:, None], projected.residual.ravel() * weight
 
 
 def spacing_rows(state: State, label: int, sigma_share: float) -> Rows:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from .batch_settings import BatchSettings
 from .ckf_settings import CkfSettings
@@ -27,6 +28,9 @@ class SplineSettings(Positive):
     sigma_model: float = 0.25
     """Added to each reading across the curve (m, one sigma): how far cones stand off it. That error is the
     same every time a cone is seen, which is why it is larger than the offsets themselves, about 0.1 m."""
+    residual: Literal["across", "point"] = "across"
+    """What a reading says online: its distance across the curve, or how far it is from its foot point in both
+    directions, as if that were a landmark (for comparison only)."""
     sigma_shape: float = 0.1
     """What a curve of so few control points can't follow (m, one sigma): added to the covariance of a closed
     map, since no number of readings averages it out."""

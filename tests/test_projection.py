@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +12,13 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.bspline import SpanPolynomials, clamped_knots, periodic_knots, uniform_knots
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
-from pathspace_graph.factors.projection import huber_weights, project, sigma_across, to_map
+from pathspace_graph.factors.projection import (
+    huber_weights,
+    project,
+    project_to_point,
+    sigma_across,
+    to_map,
+)
 
 from .jacobians import assert_jacobians
 
@@ -211,6 +219,54 @@ def test_sigma_across_against_monte_carlo() -> None:
     samples = turned @ normal + rng.normal(0.0, SIGMA_MODEL, count)
     sigma = sigma_across(normal[None], covariance[None], np.array([[5.0, -3.0, theta]]), SIGMA_MODEL)
     assert abs(samples.std() / sigma[0] - 1.0) < 5.0 / np.sqrt(2.0 * count)
+
+
+# --- both directions, the foot point held ----------------------------------------------------------------
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), degree=st.integers(1, 4), kind=st.sampled_from(["open", "periodic"]))
+def test_jacobians_of_the_offset_from_a_held_foot_point(seed: int, degree: int, kind: str) -> None:
+    """Isotropic readings, whose whitening doesn't turn with the pose; foot points metres away, then held."""
+    rng = np.random.default_rng(seed)
+    tables, distinct = random_curve(rng, degree, kind)
+    pose = np.append(rng.uniform(-20.0, 20.0, 2), rng.uniform(-np.pi, np.pi))
+    points, u = readings_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 15))
+    found, vehicle = find(tables, distinct, points, u), to_vehicle(points, pose)
+    covariances = np.tile(0.01 * np.eye(2), (len(u), 1, 1))
+    columns = control_columns(tables, found.span)
+
+    def function(pose: Array, control: Array) -> tuple[Array, Array, Array]:
+        position = np.einsum("mj,mjd->md", found.basis, control.reshape(-1, 2)[columns])
+        held, poses = replace(found, position=position), np.tile(pose, (len(u), 1))
+        rows = project_to_point(to_map(vehicle, poses), covariances, poses, held, SIGMA_MODEL)
+        by_control = np.zeros((len(u), 2, len(distinct), 2))
+        for row, at in enumerate(columns):
+            np.add.at(by_control[row], (slice(None), at), rows.by_control[row])
+        return rows.residual.ravel(), rows.by_pose.reshape(-1, 3), by_control.reshape(2 * len(u), -1)
+
+    assert_jacobians(function, [pose, distinct.ravel()])
+
+
+def test_the_offset_is_as_unlikely_as_the_reading_and_turns_with_it() -> None:
+    """|r|^2 is the squared Mahalanobis distance by the covariance in the map frame; both see one distance."""
+    rng = np.random.default_rng(7)
+    tables, distinct = random_curve(rng, 3, "open")
+    points, u = readings_beside(rng, tables, distinct, rng.uniform(-3.0, 3.0, 20))
+    foot, poses = find(tables, distinct, points, u), np.column_stack([*points.T, rng.uniform(-3, 3, len(u))])
+    covariances = np.tile(np.array([[0.04, 0.015], [0.015, 0.01]]), (len(u), 1, 1))
+    rows = project_to_point(points, covariances, poses, foot, SIGMA_MODEL)
+    for row, theta in enumerate(poses[:, 2]):
+        R = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+        S = R @ covariances[row] @ R.T + SIGMA_MODEL**2 * np.eye(2)
+        d = foot.distance[row] * foot.normal_unit[row]
+        assert np.sum(rows.residual[row] ** 2) == pytest.approx(d @ np.linalg.solve(S, d))
+    round_ones = np.tile(0.01 * np.eye(2), (len(u), 1, 1))
+    across = project(points, round_ones, poses, foot, SIGMA_MODEL)
+    both = project_to_point(points, round_ones, poses, foot, SIGMA_MODEL)
+    np.testing.assert_allclose(
+        np.linalg.norm(both.residual, axis=1), np.abs(across.residual) / across.sigma, rtol=1e-6
+    )
 
 
 def test_huber_weights_bound_the_pull_of_a_row() -> None:

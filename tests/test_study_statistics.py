@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
-from scipy import stats
 
 from pathspace_graph.eval.study import Baseline, Study
 from pathspace_graph.eval.study_frame import last_laps
 from pathspace_graph.eval.study_plot import figures
-from pathspace_graph.eval.study_statistics import compare, estimate, holm, paired_p
+from pathspace_graph.eval.study_statistics import contrasts
 from pathspace_graph.eval.study_table import as_latex, as_markdown, as_text, caption, summary_tables
 
 STUDY = Study(
@@ -59,7 +60,7 @@ def test_the_last_lap_of_each_run_that_finished() -> None:
 def test_differences_are_paired() -> None:
     """Tracks differ by metres, variants by a tenth: only pairs can tell."""
     frame = rows({"default": 0.0, "lag=1": 0.1, "lag=2": 0.0})
-    nominal = [c for c in compare(STUDY, frame, "rmse") if c.noise == "nominal"]
+    nominal = [c for c in contrasts(STUDY, frame, "rmse") if c.noise == "nominal"]
     base, worse, same = nominal
     assert base.difference is None
     assert worse.difference is not None and same.difference is not None
@@ -72,7 +73,7 @@ def test_differences_are_paired() -> None:
 
 def test_a_failed_run_is_left_out_with_its_pair() -> None:
     frame = rows({"default": 0.0, "lag=1": 0.1, "lag=2": 0.0}, failed=(3, 1))
-    _, worse, _ = (c for c in compare(STUDY, frame, "rmse") if c.noise == "nominal")
+    _, worse, _ = (c for c in contrasts(STUDY, frame, "rmse") if c.noise == "nominal")
     assert worse.value.count == 7
     assert worse.difference is not None
     assert worse.difference.count == 7
@@ -83,7 +84,7 @@ def test_a_failed_run_is_left_out_with_its_pair() -> None:
 def test_each_noise_has_its_own_baseline() -> None:
     loud = rows({"default": 3.0, "lag=1": 3.5, "lag=2": 3.0}, noise="loud_one")
     frame = pd.concat([rows({"default": 0.0, "lag=1": 0.1, "lag=2": 0.0}), loud])
-    by = {(c.noise, c.variant): c.difference for c in compare(STUDY, frame, "rmse") if c.difference}
+    by = {(c.noise, c.variant): c.difference for c in contrasts(STUDY, frame, "rmse") if c.difference}
     assert by["nominal", "lag=1"].mean == pytest.approx(0.1, abs=0.02)
     assert by["loud_one", "lag=1"].mean == pytest.approx(0.5, abs=0.02)
 
@@ -97,38 +98,9 @@ def test_one_estimator_can_be_the_baseline_of_all() -> None:
         for seed in (0, 1)
         for name, value in zip(names, (1.0, 3.0), strict=True)
     )
-    first, second = compare(made, frame, "rmse")
+    first, second = contrasts(made, frame, "rmse")
     assert first.difference is None
     assert second.differences == (2.0, 2.0)
-
-
-def test_the_interval_and_p_are_those_of_scipy() -> None:
-    values = np.random.default_rng(1).normal(0.3, 1.0, 12)
-    made = estimate(values)
-    low, high = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
-    assert made.mean - made.half == pytest.approx(low)
-    assert made.mean + made.half == pytest.approx(high)
-    assert paired_p(values) == pytest.approx(stats.ttest_1samp(values, 0.0).pvalue)
-
-
-@pytest.mark.parametrize(("values", "p"), [([], None), ([1.0], None), ([0.0, 0.0], 1.0), ([2.0, 2.0], 0.0)])
-def test_p_where_there_is_no_spread(values: list[float], p: float | None) -> None:
-    found = paired_p(np.array(values))
-    assert np.isnan(found) if p is None else found == p
-
-
-def test_holm_by_hand() -> None:
-    """Sorted 0.01, 0.02, 0.03, 0.4 times 4, 3, 2, 1, never falling; what isn't known isn't counted."""
-    corrected = holm(np.array([0.03, 0.01, np.nan, 0.4, 0.02]))
-    np.testing.assert_allclose(corrected, [0.06, 0.04, np.nan, 0.4, 0.06])
-    np.testing.assert_allclose(holm(np.array([0.9, 0.8])), [1.0, 1.0])
-
-
-def test_holm_keeps_false_alarms_of_a_whole_study_rare() -> None:
-    rng, alarms = np.random.default_rng(2), 0
-    for _ in range(400):
-        alarms += bool((holm(np.array([paired_p(rng.standard_normal(6)) for _ in range(10)])) < 0.05).any())
-    assert alarms / 400 < 0.08
 
 
 # --- text and figures ------------------------------------------------------------------------------------
@@ -148,7 +120,7 @@ def test_tables_tell_the_same_in_every_form(frame: pd.DataFrame) -> None:
     assert "Holm" in told
     assert "paired" in told
     text, markdown, latex = as_text(tables, told), as_markdown(tables, told), as_latex(tables, told)
-    worse = compare(STUDY, frame, "rmse")[1].difference
+    worse = contrasts(STUDY, frame, "rmse")[1].difference
     assert worse is not None
     for written in (text, markdown, latex):
         assert "lag=1" in written
@@ -181,3 +153,25 @@ def test_figures_of_what_differs(frame: pd.DataFrame) -> None:
     ]
     assert len(drawn["accuracy_time"].axes) == 2
     assert "differences" not in figures(STUDY, rows({"default": 0.0}))
+
+
+def test_rows_of_all_panels_are_the_same_where_one_metric_lacks_some() -> None:
+    frame = rows({"default": 0.0, "lag=1": 0.1, "lag=2": 0.0})
+    frame.loc[frame["variant"] == "lag=1", "missed"] = np.nan
+    frame.loc[frame["variant"] == "lag=2", "missed"] = 0.5
+    first, second = figures(STUDY, frame)["differences"].axes
+    assert [label.get_text() for label in first.get_yticklabels()] == ["nominal, lag=1", "nominal, lag=2"]
+    means = [container.lines[0].get_ydata().tolist() for container in second.containers]
+    assert means == [[1]]
+
+
+def test_a_figure_names_settings_without_their_group_where_that_is_enough() -> None:
+    shift = {"default": 0.0, "spline.degree=2, lag=1": 0.1}
+    named = rows(shift)
+
+    def label(study: Study) -> str:
+        (panel,) = figures(study, named)["differences"].axes
+        return str(panel.get_yticklabels()[0].get_text())
+
+    study = replace(STUDY, noise={"nominal": {}}, grids=({"spline.degree": [2], "lag": [1.0]},))
+    assert label(study) == "degree=2, lag=1"
