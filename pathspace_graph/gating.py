@@ -41,14 +41,14 @@ def admit(smoother: Smoother, label: int, retest: bool) -> None:
     rows, foot, projected = _near_curve(smoother, label, rows)
     if len(rows) == 0 or smoother.last_step is None:
         return
-    variance = projected.sigma**2 + gate.sigma_floor**2
-    passes = foot.distance**2 < gate.chi**2 * variance
-    if not passes.all():  # what the joint uncertainty adds matters to the others only
-        far = np.flatnonzero(~passes)
+    variance, unknown = projected.sigma**2 + gate.sigma_floor**2, readings.label[rows] == UNKNOWN
+    passes = foot.distance**2 < np.where(unknown, gate.chi_unknown, gate.chi) ** 2 * variance
+    far = np.flatnonzero(~passes & ~unknown)
+    if len(far):  # what the joint uncertainty adds matters to these only
         variance[far] += joint_variance(
             smoother, label, readings.slot[rows[far]], _take(foot, far), _take(projected, far)
         )
-        passes = foot.distance**2 < gate.chi**2 * variance
+        passes[far] = foot.distance[far] ** 2 < gate.chi**2 * variance[far]
     taken = readings.used[rows]
     doubtful = rows[passes & taken]
     readings.used[doubtful], readings.boundary[doubtful] = False, UNKNOWN

@@ -70,6 +70,9 @@ class GateSettings(Positive):
 
     chi: float = 3.0
     """A reading joins the curve within this many sigmas of its joint uncertainty."""
+    chi_unknown: float = 1.5
+    """The same of a reading of unknown colour, by its own uncertainty alone: the large cones of a start line
+    stand beside the boundary, and would bend it."""
     sigma_floor: float = 0.1
     """Added to that uncertainty (m): what the model doesn't know of its own errors."""
     rough: float = 3.0

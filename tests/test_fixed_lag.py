@@ -172,7 +172,7 @@ def test_unknown_labels_alone_map_nothing() -> None:
 
 def test_unknown_readings_that_either_curve_would_take_are_left_out() -> None:
     """Rows so near to each other that every gate takes both."""
-    cones, labels = corridor(60.0, half_width=0.3)
+    cones, labels = corridor(60.0, half_width=0.15)
     labels = np.where(np.arange(len(labels)) % 3 == 0, UNKNOWN, labels)
     mapper, _ = map_log(exact_log(ahead(8.0, 4.0), cones, labels))
     assert set(mapper.boundaries) == {LEFT, RIGHT}
@@ -191,6 +191,20 @@ def test_unknown_readings_on_a_curve_are_used() -> None:
     np.testing.assert_array_equal(readings.boundary[used], np.where(y > 0.0, LEFT, RIGHT))
     for label, line in ((LEFT, 2.0), (RIGHT, -2.0)):
         assert straightness(mapper.map(), label, line, 60.0) < 0.02
+
+
+def test_cones_of_a_start_line_beside_the_boundary_do_not_bend_it() -> None:
+    """Two of unknown colour, 0.75 m outside of each row: within three sigmas of it, which is not enough."""
+    cones, labels = corridor(100.0)
+    gate = np.array([[x, y] for x in (4.7, 7.3) for y in (2.75, -2.75)])
+    log = exact_log(
+        ahead(8.0, 8.0), np.concatenate([cones, gate]), np.append(labels, np.full(len(gate), UNKNOWN))
+    )
+    mapper, _ = map_log(log)
+    readings = mapper.smoother.readings
+    assert not readings.used[readings.label == UNKNOWN].any()
+    for label, line in ((LEFT, 2.0), (RIGHT, -2.0)):
+        assert straightness(mapper.map(), label, line, 60.0) < 1e-6
 
 
 @pytest.mark.parametrize("cycles", [1, 2])
