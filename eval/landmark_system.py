@@ -10,7 +10,8 @@ from scipy.linalg import lapack
 
 from pathspace_graph.arrowhead import Arrowhead, Reduced
 from pathspace_graph.batch_data import Chain
-from pathspace_graph.batch_system import BatchSystem, Evaluation, Kernel, moved
+from pathspace_graph.batch_kernel import Kernel
+from pathspace_graph.batch_system import BatchSystem, Evaluation, moved
 from pathspace_graph.factors.landmark import landmark_residuals, whiteners
 from pathspace_graph.factors.projection import huber_weights
 from pathspace_graph.settings import MapperSettings
@@ -49,7 +50,7 @@ class LandmarkSystem(BatchSystem):
 
     def __init__(self, readings: LandmarkReadings, chain: Chain, settings: MapperSettings) -> None:
         # the associations are held: a reading of no landmark costs nothing
-        super().__init__(readings, chain, settings, Kernel(settings.gate.huber, gate=0.0))
+        super().__init__(readings, chain, settings, Kernel(gate=0.0, huber=settings.gate.huber))
 
     def evaluate(self, state: LandmarkState) -> Evaluation:  # type: ignore[override]  # a state of landmarks
         """The cost at a state."""

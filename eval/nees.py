@@ -32,14 +32,15 @@ class Nees:
         return bool(chi2.ppf(tail, self.cones) <= self.value <= chi2.ppf(1.0 - tail, self.cones))
 
 
-def curve_nees(result: BatchResult, truth: Truth, sigma_cone: float) -> Nees:
+def curve_nees(result: BatchResult, truth: Truth) -> Nees:
     """Errors of both curves together across themselves at the true cones.
 
     e_i = n_i . (cone_i - S(u_i)), its covariance that of the curves, B Sigma B' with B the derivative by all
-    control points, plus `sigma_cone` (m): a true cone stands off any smooth curve. Errors along a curve, and
-    of one curve and the other, hang together, above all by the heading of the whole map.
+    control points, plus the variance of `Scatter`: a true cone stands off any smooth curve, one that was
+    never seen the more. Errors along a curve, and of one curve and the other, hang together, above all by the
+    heading of the whole map.
     """
-    errors, designs, offset = [np.zeros(0)], [], 0
+    errors, sigmas, designs, offset = [np.zeros(0)], [np.zeros(0)], [], 0
     size = len(result.map_covariance)
     for label, boundary in sorted(result.map.boundaries.items()):
         assert isinstance(boundary, SplineBoundary)
@@ -49,8 +50,9 @@ def curve_nees(result: BatchResult, truth: Truth, sigma_cone: float) -> Nees:
         design[:, offset : offset + 2 * boundary.size : 2] = basis * feet.normal_unit[:, :1]
         design[:, offset + 1 : offset + 2 * boundary.size : 2] = basis * feet.normal_unit[:, 1:]
         errors.append(feet.distance)
+        sigmas.append(result.scatter.sigma(label, feet.u))
         designs.append(design)
         offset += 2 * boundary.size
     e, B = np.concatenate(errors), np.concatenate([np.zeros((0, size)), *designs])
-    covariance = B @ result.map_covariance @ B.T + sigma_cone**2 * np.eye(len(e))
+    covariance = B @ result.map_covariance @ B.T + np.diag(np.concatenate(sigmas) ** 2)
     return Nees(float(e @ np.linalg.solve(covariance, e)), len(e))

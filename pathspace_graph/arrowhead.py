@@ -75,11 +75,21 @@ class Arrowhead:
         matrix[n:, :n], matrix[:n, n:] = self.coupling, self.coupling.T
         return matrix, np.concatenate([self.descent_border, self.descent_poses])
 
-    def reduced(self) -> Reduced:
-        """`A = L L'` and `C - B' A^-1 B`; SingularSystemError where A isn't positive definite."""
+    def factor(self) -> Array:
+        """(6, 3 P) lower banded L with `A = L L'`; SingularSystemError where there is none."""
         chain, info = lapack.dpbtrf(self.banded(), lower=1, overwrite_ab=1)
         if info != 0:
             raise SingularSystemError(f"expected a positive definite chain, found pivot {info} not positive")
+        return np.asarray(chain)
+
+    def poses_alone(self) -> Array:
+        """(3 P,) `A^-1 a`: the poses' solution beside a border that is held."""
+        step, _ = lapack.dpbtrs(self.factor(), self.descent_poses[:, None], lower=1)
+        return np.asarray(step[:, 0])
+
+    def reduced(self) -> Reduced:
+        """`A = L L'` and `C - B' A^-1 B`; SingularSystemError where A isn't positive definite."""
+        chain = self.factor()
         columns = np.empty((len(self.coupling), len(self.border) + 1), order="F")
         columns[:, :-1], columns[:, -1] = self.coupling, self.descent_poses
         half, _ = lapack.dtbtrs(chain, columns, uplo="L", overwrite_b=1)
@@ -93,7 +103,7 @@ def empty_arrowhead(poses: int, border: int) -> Arrowhead:
     return Arrowhead(
         diagonal=np.zeros((poses, POSE, POSE)),
         following=np.zeros((max(poses - 1, 0), POSE, POSE)),
-        coupling=np.zeros((POSE * poses, border)),
+        coupling=np.zeros((POSE * poses, border), order="F"),
         border=np.zeros((border, border)),
         descent_poses=np.zeros(POSE * poses),
         descent_border=np.zeros(border),

@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from .batch_cones import cone_counts
 from .batch_data import Chain, collect_readings, integrate_log
 from .batch_dead_reckoning import start_odometry
-from .batch_knots import reknot, scatter_of_cones
+from .batch_kernel import Biweight
+from .batch_knots import reknot
 from .batch_optimizer import Convergence, Optimizer, Schedule
+from .batch_scatter import Scatter, scatter_of_cones
 from .batch_start import start_online
-from .batch_system import BatchSystem, Kernel
+from .batch_system import BatchSystem, Evaluation
 from .fixed_lag import ODOMETRY_SIGMA
 from .labels import LEFT, RIGHT
 from .laps import LapCounter
@@ -43,8 +46,8 @@ class BatchResult(BatchRun):
     map_covariance: Array
     """(2m, 2m) m^2, joint covariance of both boundaries' control points, left first: what the readings say,
     without the cones' scatter."""
-    sigma_cones: float
-    """How far the sighted cones stand off the curves (m, rms): what no curve of that size follows."""
+    scatter: Scatter
+    """How far cones stand off the curves: what no curve of that size follows."""
     pose_covariances: Array
     """(n, 3, 3) marginal covariance of each pose (x, y, theta), map frame."""
     calibration: Array
@@ -73,7 +76,7 @@ class BatchMapper:
         settings, batch, watch = own_settings(self.settings), self.settings.batch, Stopwatch()
         chain = integrate_log(log, self.odometry_sigma, settings.odometry)
         readings = collect_readings(log)
-        system = BatchSystem(readings, chain, settings, Kernel(settings.gate.huber, settings.gate.chi))
+        system = BatchSystem(readings, chain, settings, Biweight(batch.loose_gate))
         optimizer = Optimizer(system, batch)
         watch.lap("integrate")
         online = None
@@ -84,23 +87,17 @@ class BatchMapper:
         watch.lap("start")
         state = optimizer.hold_map(state, batch.pose_steps, batch.loose_gate)
         watch.lap("poses")
-        rough = Schedule(batch.loose_gate, batch.rough_rounds, batch.rough_tolerance)
-        for _ in range(batch.rough_passes):
-            at, _ = optimizer.run(reknot(state, readings, settings), rough, on_round)
-            state, rough = at.state, replace(rough, gate=settings.gate.chi)
-        watch.lap("rough")
-        fine = Schedule(settings.gate.chi, batch.max_rounds)
-        at, convergence = optimizer.run(reknot(state, readings, settings), fine, on_round)
-        watch.lap("fine")
+        at, convergence = _with_knots(optimizer, state, readings, settings, on_round)
+        watch.lap("optimum")
         uncertainty = system.normal_equations(at).reduced()
         joint, marginals = uncertainty.border_covariance(), uncertainty.pose_marginals()
-        sigma_cones = scatter_of_cones(at.state, readings, settings)
+        scatter = scatter_of_cones(at.state, readings, settings)
         watch.lap("covariance")
         return BatchResult(
             estimator=NAME,
             settings=settings_dict(self.settings),
-            map=_map(at.state, joint, sigma_cones),
-            sigma_cones=sigma_cones,
+            map=_map(at.state, joint, scatter),
+            scatter=scatter,
             trajectory_t=chain.stamps,
             trajectory=at.state.poses.copy(),
             cycles=_records(at.state, readings, chain, sum(watch.laps.values())),
@@ -115,6 +112,33 @@ class BatchMapper:
         )
 
 
+def _with_knots(
+    optimizer: Optimizer,
+    state: State,
+    readings: Readings,
+    settings: MapperSettings,
+    on_round: Callable[[], None] | None,
+) -> tuple[Evaluation, Convergence]:
+    """The optimum on knots that the cones ask for as they stand on curves that meet them all.
+
+    So knots don't depend on the start: a curve of few knots, and so the poses and cones beside it, leans to
+    one side or the other as its knots happen to lie, one of nearly a knot for each cone doesn't. Once more
+    where a cone was missing or put down twice.
+    """
+    batch = settings.batch
+    rough = Schedule(batch.loose_gate, batch.rough_rounds, batch.rough_tolerance)
+    at, _ = optimizer.run(reknot(state, readings, settings), rough, on_round)
+    dense = Schedule(batch.gate, batch.rough_rounds, batch.dense_tolerance)
+    fine = Schedule(batch.gate, batch.max_rounds)
+    for _ in range(batch.knot_passes):
+        at, _ = optimizer.run(reknot(at.state, readings, settings, dense=True), dense, on_round)
+        cones = cone_counts(at.state, readings, settings)
+        at, convergence = optimizer.run(reknot(at.state, readings, settings), fine, on_round)
+        if cone_counts(at.state, readings, settings) == cones:
+            break
+    return at, convergence
+
+
 def own_settings(settings: MapperSettings) -> MapperSettings:
     """The settings with the batch's own in place of what they stand for online."""
     batch = settings.batch
@@ -125,14 +149,15 @@ def own_settings(settings: MapperSettings) -> MapperSettings:
     )
 
 
-def _map(state: State, joint: Array, sigma: float) -> Map:
-    """The curves with their joint covariance, to which the cones' scatter `sigma` (m) is added."""
+def _map(state: State, joint: Array, scatter: Scatter) -> Map:
+    """The curves with their joint covariance, to which the cones' scatter is added."""
     closed = any(boundary.periodic for boundary in state.boundaries.values())
     boundaries = {}
     for label, boundary in state.boundaries.items():
         block = state.block(label)
         spline = boundary.spline(state.control_points(label).copy())
-        covariance = joint[block, block] + sigma**2 * np.eye(2 * boundary.size)
+        sigma = np.repeat(scatter.sigma(label, boundary.abscissae), 2)
+        covariance = joint[block, block] + np.diag(sigma**2)
         boundaries[label] = SplineBoundary(spline, covariance)
     return Map(closed, boundaries)
 

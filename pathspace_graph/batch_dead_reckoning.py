@@ -10,17 +10,18 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.projection import to_map
 
-from .arrowhead import empty_arrowhead
+from .arrowhead import Arrowhead, empty_arrowhead
+from .batch_cones import cluster
 from .batch_data import Chain
+from .batch_equations import add_odometry, add_priors, calibration_information, odometry_terms
 from .batch_gating import locate_poses
-from .batch_knots import cluster, exact_settings, fit_through
-from .batch_system import add_odometry, add_priors, calibration_information, odometry_terms
+from .batch_knots import exact_settings, fit_through
 from .boundary import Boundary
 from .growth import SIDES
 from .labels import BOUNDARIES
 from .path import along_and_across
 from .readings import Readings
-from .settings import MapperSettings
+from .settings import ClosingSettings, MapperSettings
 from .state import State
 from .window import POSE
 
@@ -76,37 +77,53 @@ def start_odometry(chain: Chain, readings: Readings, settings: MapperSettings) -
 # --- the lap ---------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """The way driven at equal steps along it."""
+
+    position: Array
+    """(n, 2) m."""
+    heading: Array
+    """(n,) rad, not wrapped."""
+    curvature: Array
+    """(n,) averaged over a stretch, 1/m."""
+
+    def likeness(self, lag: int, settings: ClosingSettings) -> float:
+        """Correlation of the curvature with itself `lag` steps later; -inf where that is somewhere else."""
+        away = np.hypot(*(self.position[lag:] - self.position[:-lag]).T)
+        turned = self.heading[lag:] - self.heading[:-lag]
+        off = np.abs(turned - 2.0 * np.pi * np.round(turned / (2.0 * np.pi)))
+        near = settings.radius + settings.drift * lag * PROFILE_STEP
+        if np.median(away) >= near or np.median(off) >= settings.heading:
+            return -np.inf
+        first, second = self.curvature[:-lag], self.curvature[lag:]
+        power = np.mean(first**2) + np.mean(second**2)
+        return float(1.0 - np.mean((first - second) ** 2) / max(power, np.finfo(float).tiny))
+
+
 def find_recurrence(poses: Array, settings: MapperSettings) -> Recurrence:
     """The shortest way after which the curvature repeats itself, back at about the same place and heading."""
     driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-    s = np.arange(0.0, driven[-1], PROFILE_STEP)
-    if len(s) < 2:
+    profile = _profile(poses, driven)
+    first, last = int(settings.closing.min_path / PROFILE_STEP), int(LEAST_OVERLAP / PROFILE_STEP)
+    lags = np.arange(first, len(profile.heading) - last)
+    scores = np.array([profile.likeness(int(lag), settings.closing) for lag in lags])
+    if not scores.max(initial=-np.inf) > 0.0:
         return Recurrence(driven, np.inf, 0.0)
-    x, y, heading = (np.interp(s, driven, poses[:, k]) for k in range(POSE))
-    half = max(int(0.5 * SMOOTHING / PROFILE_STEP), 1)
-    later, before = np.minimum(np.arange(len(s)) + half, len(s) - 1), np.maximum(np.arange(len(s)) - half, 0)
-    curvature = (heading[later] - heading[before]) / SMOOTHING
-    lags = np.arange(
-        int(settings.closing.min_path / PROFILE_STEP), len(s) - int(LEAST_OVERLAP / PROFILE_STEP)
-    )
-    scores = np.full(len(lags), -np.inf)
-    for i, lag in enumerate(lags.tolist()):
-        away = np.hypot(x[lag:] - x[:-lag], y[lag:] - y[:-lag])
-        turned = heading[lag:] - heading[:-lag]
-        off = np.abs(turned - 2.0 * np.pi * np.round(turned / (2.0 * np.pi)))
-        near = settings.closing.radius + settings.closing.drift * lag * PROFILE_STEP
-        if np.median(away) < near and np.median(off) < settings.closing.heading:
-            first, second = curvature[:-lag], curvature[lag:]
-            difference = np.mean((first - second) ** 2)
-            scores[i] = 1.0 - difference / max(np.mean(first**2) + np.mean(second**2), np.finfo(float).tiny)
-    if len(scores) == 0 or not scores.max(initial=-np.inf) > 0.0:
-        return Recurrence(driven, np.inf, 0.0)
-    good = scores >= LEAST_CORRELATION * scores.max()
-    first_good = int(np.argmax(good))
+    begin = int(np.argmax(scores >= LEAST_CORRELATION * scores.max()))
     reach = int(settings.closing.radius / PROFILE_STEP)
-    lag = int(lags[first_good + int(np.argmax(scores[first_good : first_good + reach]))])
-    turn = float(np.median(heading[lag:] - heading[:-lag]))
+    lag = int(lags[begin + int(np.argmax(scores[begin : begin + reach]))])
+    turn = float(np.median(profile.heading[lag:] - profile.heading[:-lag]))
     return Recurrence(driven, lag * PROFILE_STEP, turn)
+
+
+def _profile(poses: Array, driven: Array) -> Profile:
+    """Poses (P, 3), so far driven (P,), at equal steps."""
+    s = np.arange(0.0, driven[-1], PROFILE_STEP)
+    x, y, heading = (np.interp(s, driven, poses[:, k]) for k in range(POSE))
+    half, number = max(int(0.5 * SMOOTHING / PROFILE_STEP), 1), np.arange(len(s))
+    later, before = np.minimum(number + half, len(s) - 1), np.maximum(number - half, 0)
+    return Profile(np.column_stack([x, y]), heading, (heading[later] - heading[before]) / SMOOTHING)
 
 
 def _bias(chain: Chain, recurrence: Recurrence) -> Array:
@@ -117,6 +134,32 @@ def _bias(chain: Chain, recurrence: Recurrence) -> Array:
     return np.array([0.0, (recurrence.turn - whole) / seconds])
 
 
+@dataclass(frozen=True, eq=False)
+class Ties:
+    """Poses that pass a reference pose, each of a lap."""
+
+    cycles: IntArray
+    """(k,) the poses."""
+    reference: IntArray
+    """(k,) the reference pose that each passes."""
+    turns: Array
+    """(k,) what the heading has gained in whole laps, rad."""
+    count: int
+    """Reference poses."""
+
+    def add_to(self, system: Arrowhead, poses: Array, border: Array) -> None:
+        """`(x_k - reference) / TIE` added to normal equations whose border begins with the references."""
+        residual = poses[self.cycles] - border[: POSE * self.count].reshape(-1, POSE)[self.reference]
+        residual[:, 2] -= self.turns
+        for k, weight in enumerate(TIE**-2.0):
+            rows, columns = POSE * self.cycles + k, POSE * self.reference + k
+            system.diagonal[self.cycles, k, k] += weight
+            np.add.at(system.border, (columns, columns), weight)
+            system.coupling[rows, columns] -= weight
+            system.descent_poses[rows] -= weight * residual[:, k]
+            np.add.at(system.descent_border, columns, weight * residual[:, k])
+
+
 def tie_laps(
     chain: Chain, recurrence: Recurrence, calibration: Array, settings: MapperSettings
 ) -> tuple[Array, Array]:
@@ -124,36 +167,30 @@ def tie_laps(
 
     The reference poses are unknown themselves; they are the border of the same arrowhead as the map is.
     """
+    ties, poses = _ties(recurrence), chain.dead_reckoned(calibration)
+    first = np.array([np.flatnonzero(ties.reference == r)[0] for r in range(ties.count)])
+    references = poses[ties.cycles[first]] - ties.turns[first, None] * [0.0, 0.0, 1.0]
+    border = np.append(references.ravel(), calibration)
+    information = calibration_information(settings.odometry)
+    for _ in range(TIE_STEPS):
+        calibration = border[-CALIBRATION_SIZE:]
+        system = empty_arrowhead(len(chain), len(border))
+        add_odometry(system, *odometry_terms(chain, poses, calibration))
+        add_priors(system, chain, poses[0], calibration, information)
+        ties.add_to(system, poses, border)
+        step_poses, step_border = system.reduced().step(np.zeros_like(system.border))
+        poses, border = poses + step_poses.reshape(-1, POSE), border + step_border
+    return poses, border[-CALIBRATION_SIZE:]
+
+
+def _ties(recurrence: Recurrence) -> Ties:
+    """A reference pose every so many metres of a lap, and the poses nearest to where it is passed."""
     count = max(int(np.ceil(recurrence.lap / REFERENCE_STEP)), 1)
     places = recurrence.driven / recurrence.lap * count
     cycles = _nearest_cycles(places)
     reference = np.mod(np.round(places[cycles]).astype(np.intp), count)
-    poses = chain.dead_reckoned(calibration)
     whole = 2.0 * np.pi * np.round(recurrence.turn / (2.0 * np.pi))
-    turns = whole * np.round((places[cycles] - reference) / count)
-    information = calibration_information(settings.odometry)
-    border = np.zeros(POSE * count + CALIBRATION_SIZE)
-    first = np.array([np.flatnonzero(reference == r)[0] for r in range(count)])
-    border[: POSE * count] = (poses[cycles[first]] - turns[first, None] * [0.0, 0.0, 1.0]).ravel()
-    border[-CALIBRATION_SIZE:] = calibration
-    for _ in range(TIE_STEPS):
-        system = empty_arrowhead(len(chain), len(border))
-        add_odometry(system, *odometry_terms(chain, poses, border[-CALIBRATION_SIZE:]))
-        add_priors(system, chain, poses[0], border[-CALIBRATION_SIZE:], information)
-        residual = poses[cycles] - border[: POSE * count].reshape(-1, POSE)[reference]
-        residual[:, 2] -= turns
-        weight = TIE**-2.0
-        for k in range(POSE):
-            rows, columns = POSE * cycles + k, POSE * reference + k
-            system.diagonal[cycles, k, k] += weight[k]
-            np.add.at(system.border, (columns, columns), weight[k])
-            system.coupling[rows, columns] -= weight[k]
-            system.descent_poses[rows] -= weight[k] * residual[:, k]
-            np.add.at(system.descent_border, columns, weight[k] * residual[:, k])
-        reduced = system.reduced()
-        step_poses, step_border = reduced.step(np.zeros_like(system.border))
-        poses, border = poses + step_poses.reshape(-1, POSE), border + step_border
-    return poses, border[-CALIBRATION_SIZE:]
+    return Ties(cycles, reference, whole * np.round((places[cycles] - reference) / count), count)
 
 
 def _nearest_cycles(places: Array) -> IntArray:
@@ -177,27 +214,14 @@ def _begin_boundary(
 ) -> None:
     """A curve through what was seen of a boundary in the first lap, beside the path of that lap."""
     closed = bool(np.isfinite(recurrence.lap))
-    cycles = np.flatnonzero(recurrence.driven < recurrence.lap)
-    path = poses[cycles, :2]
-    stations = recurrence.driven[cycles]
-    if closed:
-        path, stations = np.concatenate([path, path[:1]]), np.append(stations, recurrence.lap)
-    rows = np.flatnonzero((readings.label == label) & (readings.slot < len(cycles)))
-    if len(rows) == 0 or len(path) < 2:
+    first = recurrence.driven < recurrence.lap
+    rows = np.flatnonzero((readings.label == label) & first[readings.slot])
+    if len(rows) == 0 or first.sum() < 2:
         return
     points = to_map(readings.point[rows], poses[readings.slot[rows]])
-    station, lateral = along_and_across(points, path, stations)
-    side = SIDES[label] * lateral
-    length = recurrence.lap if closed else float(stations[-1]) + settings.growth.reach
-    kept = (side > settings.growth.min_lateral) & (side < settings.growth.max_lateral)
-    ahead = (
-        station - recurrence.driven[readings.slot[rows]]
-    )  # else it is of a stretch that comes later, or again
-    kept &= (ahead > -settings.gate.view_behind) & (ahead < settings.gate.view_ahead)
-    kept &= (station >= 0.0) & (station < length)
-    rows, points, station = rows[kept], points[kept], station[kept]
-    weight = 1.0 / np.trace(readings.covariance[rows], axis1=1, axis2=2)
-    cones = cluster(points, station, weight, length, closed, settings)
+    station, kept, length = _beside_path(points, readings.slot[rows], label, poses, recurrence, settings)
+    weight = 1.0 / np.trace(readings.covariance[rows[kept]], axis1=1, axis2=2)
+    cones = cluster(points[kept], station[kept], weight, length, closed, settings)
     if len(cones.points) < LEAST_CONES:
         return
     spline = fit_through(cones.points, closed, settings, settings.batch.size_share)
@@ -206,3 +230,25 @@ def _begin_boundary(
     boundary.confirmed = boundary.tables.high
     state.add_boundary(label, boundary)
     state.insert(state.offset(label), spline.distinct_control_points.ravel())
+
+
+def _beside_path(
+    points: Array,
+    slots: IntArray,
+    label: int,
+    poses: Array,
+    recurrence: Recurrence,
+    settings: MapperSettings,
+) -> tuple[Array, NDArray[np.bool_], float]:
+    """Stations (m,) of points (m, 2) along the first lap, which are beside it, and how far it goes (m)."""
+    closed, first = bool(np.isfinite(recurrence.lap)), recurrence.driven < recurrence.lap
+    path, stations = poses[first, :2], recurrence.driven[first]
+    if closed:
+        path, stations = np.concatenate([path, path[:1]]), np.append(stations, recurrence.lap)
+    station, lateral = along_and_across(points, path, stations)
+    length = recurrence.lap if closed else float(stations[-1]) + settings.growth.reach
+    side, gate = SIDES[label] * lateral, settings.gate
+    kept = (side > settings.growth.min_lateral) & (side < settings.growth.max_lateral)
+    ahead = station - recurrence.driven[slots]  # else it is of a stretch that comes later, or again
+    kept &= (ahead > -gate.view_behind) & (ahead < gate.view_ahead)
+    return station, np.asarray(kept & (station >= 0.0) & (station < length)), length

@@ -9,7 +9,7 @@ from pathspace_graph.factors.projection import project, to_map
 
 from .labels import UNKNOWN
 from .readings import Readings
-from .settings import MapperSettings
+from .settings import GateSettings, MapperSettings
 from .state import State
 
 Array = NDArray[np.float64]
@@ -75,13 +75,25 @@ def _misfit(
     state: State, readings: Readings, settings: MapperSettings, label: int, rows: IntArray, whole: bool
 ) -> tuple[Array, Array]:
     """(m,) distance of readings from a curve in sigmas, infinite where it isn't theirs; foot points (m,)."""
-    boundary, gate, slots = state.boundaries[label], settings.gate, readings.slot[rows]
-    station, poses = state.stations[label][slots], state.poses[slots]
+    boundary, poses = state.boundaries[label], state.poses[readings.slot[rows]]
     points = to_map(readings.point[rows], poses)
-    low, high = station - gate.view_behind, station + gate.view_ahead
     if whole:
         low, high = np.full(len(rows), boundary.tables.low), np.full(len(rows), boundary.tables.high)
-    foot = boundary.find(state.control_points(label), points, low, high)
+        foot = boundary.find(state.control_points(label), points, low, high)
+    else:
+        begin = _nearest_in_view(state, readings.slot[rows], points, label, settings.gate)
+        foot = boundary.refine(state.control_points(label), points, begin)
     projected = project(points, readings.covariance[rows], poses, foot, settings.spline.sigma_model)
-    possible = foot.interior & (np.abs(foot.distance) < gate.rough)
+    possible = foot.interior & (np.abs(foot.distance) < settings.gate.rough)
     return np.where(possible, np.abs(foot.distance) / projected.sigma, np.inf), foot.u
+
+
+def _nearest_in_view(state: State, slots: IntArray, points: Array, label: int, gate: GateSettings) -> Array:
+    """(m,) the parameter nearest to each point (m, 2) among those that its pose sees, a step apart."""
+    boundary = state.boundaries[label]
+    ahead = np.arange(-gate.view_behind, gate.view_ahead + STATION_STEP, STATION_STEP)
+    u = state.stations[label][:, None] + ahead
+    seen = boundary.evaluate(state.control_points(label), u.ravel()).reshape(*u.shape, 2)
+    square = (seen[slots, :, 0] - points[:, :1]) ** 2
+    square += (seen[slots, :, 1] - points[:, 1:]) ** 2
+    return np.asarray(u[slots, square.argmin(axis=1)])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .arrowhead import Reduced
 from .batch_gating import associate, locate_poses
+from .batch_kernel import Biweight
 from .batch_settings import BatchSettings
 from .batch_system import BatchSystem, Evaluation, moved
 from .state import State
@@ -74,44 +75,44 @@ class Optimizer:
     def run(
         self, state: State, schedule: Schedule, on_round: Callable[[], None] | None = None
     ) -> tuple[Evaluation, Convergence]:
-        """Rounds until nothing changes, the gate graduated from the schedule's to the kernel's own."""
+        """Rounds until nothing changes, the gate graduated from the schedule's to the settings' own."""
         system, gate = self.system, schedule.gate
         system.begin(state)
+        locate_poses(state)
         at: Evaluation | None = None
+        cost = np.inf
         for number in range(1, schedule.rounds + 1):
-            gate = max(gate, system.kernel.gate)
-            strict = gate <= system.kernel.gate
-            before = state
-            changed = self._refresh(state, gate, strict)
-            at, cost_before = self._descend(state)
-            state = at.state
+            gate = max(gate, self.settings.gate)
+            strict = gate <= self.settings.gate
+            system.kernel = Biweight(gate)
+            before, cost_before = state, cost
+            self._refresh(state, gate, strict)
+            at = self._descend(state)
+            state, cost = at.state, at.cost
             if on_round is not None:
                 on_round()
-            few = changed <= schedule.tolerance - 1.0
-            still = self._still(_movement(before, state), cost_before - at.cost, at.cost, schedule.tolerance)
-            if strict and few and still:
+            still = self._still(_movement(before, state), abs(cost_before - cost), cost, schedule.tolerance)
+            if strict and still:
                 return at, self._report(at, number, "nothing changes any more", True)
             gate *= self.settings.gate_factor
         assert at is not None
         return at, self._report(at, schedule.rounds, "no round left", False)
 
-    def _refresh(self, state: State, gate: float, strict: bool) -> int:
-        """Stations, readings in use and their sigmas, for a round; gives how many readings changed."""
+    def _refresh(self, state: State, gate: float, strict: bool) -> None:
+        """Stations, readings in use and their sigmas, for a round."""
         system = self.system
-        locate_poses(state)
-        changed = associate(state, system.readings, system.settings, gate, strict)
+        if not strict:
+            locate_poses(state)
+        associate(state, system.readings, system.settings, gate, strict)
         system.hold_sigmas(state)
-        return changed
 
     def hold_map(self, state: State, steps: int, gate: float) -> State:
         """Poses alone, the map and the calibration held."""
         self.system.begin(state)
         for _ in range(steps):
             self._refresh(state, gate, False)
-            at = self.system.evaluate(state)
-            reduced = self.system.normal_equations(at).reduced()
-            held = np.zeros(len(reduced.descent))
-            state = moved(state, reduced.poses(held), held)
+            equations = self.system.normal_equations(self.system.evaluate(state))
+            state = moved(state, equations.poses_alone(), np.zeros(len(equations.border)))
         return state
 
     def _still(self, movement: Movement, gain: float, cost: float, tolerance: float) -> bool:
@@ -120,10 +121,9 @@ class Optimizer:
         still = movement.curve <= curve and movement.pose <= pose
         return still and gain <= tolerance * settings.tolerance_cost * cost
 
-    def _descend(self, state: State) -> tuple[Evaluation, float]:
-        """A few damped steps with the readings in use held; also the cost before them."""
+    def _descend(self, state: State) -> Evaluation:
+        """A few damped steps with the readings in use held."""
         at = self.system.evaluate(state)
-        cost = at.cost
         self._accept(at)
         for _ in range(self.settings.max_steps):
             following = self._step(at)
@@ -132,13 +132,13 @@ class Optimizer:
             gain, at = at.cost - following.cost, following
             if gain <= self.settings.tolerance_cost * at.cost:
                 break
-        return at, cost
+        return at
 
     def _step(self, at: Evaluation) -> Evaluation | None:
         """The next state that is better, damped as much as that takes; None where no damping is enough."""
         settings = self.settings
         equations = self.system.normal_equations(at).reduced()
-        unit = sliding(at.state)
+        unit = damped(at.state)
         while self._damping <= settings.damping_most:
             self.steps += 1
             trial = self._trial(at, equations, self._damping * unit)
@@ -173,27 +173,9 @@ class Optimizer:
         return Convergence(converged, reason, rounds, self.steps, at.cost, float(np.linalg.norm(scaled)))
 
 
-ACROSS = 0.01
-"""Damping across a curve, as a share of that along it."""
-
-
-def sliding(state: State) -> Array:
-    """`sum_j t_j t_j'` (n, n), a unit of damping: control points held where readings leave them free.
-
-    t_j is the curve's direction where the point acts. Linearized, they would slide by metres, along tangents
-    that leave the curve where it bends; what moves the curve itself stays nearly free.
-    """
-    n = state.pose_column(0)
-    matrix = np.zeros((n, n))
-    for label, boundary in state.boundaries.items():
-        tangent = boundary.evaluate(state.control_points(label), boundary.abscissae, 1)
-        tangent /= np.maximum(np.hypot(*tangent.T), np.finfo(float).tiny)[:, None]
-        blocks = tangent[:, :, None] * tangent[:, None, :] + ACROSS * np.eye(2)
-        at = state.offset(label) + 2 * np.arange(boundary.size)
-        for i in range(2):
-            for j in range(2):
-                matrix[at + i, at + j] = blocks[:, i, j]
-    return matrix
+def damped(state: State) -> Array:
+    """(n, n) ones of the control points, zeros of the calibration: a unit of damping."""
+    return np.diag((np.arange(state.pose_column(0)) < state.map_size).astype(np.float64))
 
 
 def _movement(before: State, after: State) -> Movement:

@@ -22,24 +22,32 @@ class BatchSettings(Positive):
     sigma_smoothness: float = 0.4
     """Second difference of control points, as a share of their spacing: stronger than online's, as a curve
     between cones that were never seen has many shapes that fit as well, and each start ends in its own."""
+    sigma_slide: float = 0.2
+    """How far (m) a control point slides along its curve from beside the pose that it began beside."""
+    gate: float = 4.0
+    """Width of Tukey's loss: a reading farther than so many sigmas from its curve says nothing."""
     pose_steps: int = 3
     """Gauss-Newton steps of the poses alone, beside the map that the start has found."""
-    rough_passes: int = 1
-    """Optimizations before the last, knots chosen anew before each: they forget where they began."""
     rough_rounds: int = 12
-    """Most rounds of each of those, ..."""
+    """Most rounds of a first optimization, on knots that the start decides, ..."""
     rough_tolerance: float = 8.0
     """... which the tolerances below times this end as well."""
+    dense_share: float = 0.8
+    """Control points by cones of the curves of a second one: they meet the cones, where ..."""
+    dense_tolerance: float = 2.0
+    """... the tolerances below times this end it, and the last one's knots are chosen by those cones."""
+    knot_passes: int = 2
+    """Most times that those two follow one another: once, unless the cones' number has changed then."""
     max_rounds: int = 40
     """Rounds of new foot points, gates and weights; the last of them is told as not converged."""
-    max_steps: int = 6
+    max_steps: int = 3
     """Levenberg-Marquardt steps in a round."""
     loose_gate: float = 8.0
     """The first round uses readings within so many sigmas of a curve, ..."""
     gate_factor: float = 0.7
-    """... each further one within this share of that, down to `gate.chi`."""
-    damping: float = 4.0
-    """First hold on control points along the curve (1/m^2), ..."""
+    """... each further one within this share of that, down to `gate`."""
+    damping: float = 1e-2
+    """First hold on control points (1/m^2), ..."""
     damping_up: float = 5.0
     """... times this after a step that made it worse ..."""
     damping_down: float = 0.1
@@ -53,4 +61,4 @@ class BatchSettings(Positive):
     tolerance_curve: float = 2e-3
     """... no point of a curve moved farther than this across it (m), ..."""
     tolerance_pose: float = 2e-3
-    """... no pose farther than this (m, and rad), and no reading was taken up or left out."""
+    """... and no pose farther than this (m, and rad)."""

@@ -213,7 +213,7 @@ def _fit_on(
     count = len(breaks) - 1
     build = BSpline.periodic_from if periodic else BSpline.clamped_from
     frame = build(breaks, np.zeros((count if periodic else count + p, 2)), p)
-    bending = np.sqrt(settings.smoothness) * _energy_rows(frame)
+    bending = np.sqrt(settings.smoothness) * energy_rows(frame)
     zeros = np.zeros((len(bending), 2))
     reach = (breaks[-1] - breaks[0]) / max(count, len(points))
     rmse = np.inf
@@ -227,7 +227,7 @@ def _fit_on(
     return frame, u, rmse
 
 
-def _energy_rows(spline: BSpline) -> Floats:
+def energy_rows(spline: BSpline) -> Floats:
     """Rows R with |R c|^2 = integral of |S''|^2 (exact up to degree 4), of |S'|^2 for degree 1."""
     nodes, weights = np.polynomial.legendre.leggauss(3)
     breaks = spline.breaks

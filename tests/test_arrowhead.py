@@ -60,6 +60,7 @@ def test_poses_beside_a_held_border() -> None:
     matrix, right = system.dense()
     expected = np.linalg.solve(matrix[3:, 3:], right[3:])
     np.testing.assert_allclose(system.reduced().poses(np.zeros(3)), expected, atol=1e-9)
+    np.testing.assert_allclose(system.poses_alone(), expected, atol=1e-9)
 
 
 @given(st.integers(0, 1000), st.integers(1, 9), st.integers(1, 7))

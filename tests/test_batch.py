@@ -114,6 +114,19 @@ def test_a_log_that_stops_in_the_middle_of_a_lap(share: float) -> None:
     assert np.abs(errors[:, :2]).max() < 0.3
 
 
+def test_several_laps_that_stop_in_the_middle_of_one() -> None:
+    """Two and a half: the map is closed, and every lap's poses stand beside the same curves."""
+    log = noisy(lap_log(bean_track(), overrun=160.0), seed=4)
+    result = BatchMapper(None, log.odometry_sigma).solve(log, "odometry")
+    assert result.convergence.converged
+    assert result.map.closed
+    assert result.laps == 2
+    assert log.truth is not None
+    assert result.map.size <= 0.44 * len(log.truth.cones)
+    errors = result.trajectory - true_poses(log)
+    assert np.abs(errors[:, :2]).max() < 0.25
+
+
 def test_a_log_without_readings_is_its_odometry() -> None:
     log = bean()
     empty = replace(
@@ -157,3 +170,5 @@ def test_what_did_not_converge_is_written_and_told(tmp_path: Path) -> None:
     assert end.value.code == NOT_CONVERGED
     summary = json.loads((tmp_path / "map" / "summary.json").read_text())
     assert not summary["convergence"]["converged"]
+    assert summary["convergence"]["reason"] == "no round left"
+    assert read_map(tmp_path / "map").size > 0

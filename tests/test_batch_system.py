@@ -12,7 +12,8 @@ from pathspace_graph.batch import own_settings
 from pathspace_graph.batch_data import Chain, collect_readings, integrate_log
 from pathspace_graph.batch_dead_reckoning import start_odometry
 from pathspace_graph.batch_gating import associate, locate_poses
-from pathspace_graph.batch_system import BatchSystem, Evaluation, Kernel, linear_graph_of, moved
+from pathspace_graph.batch_kernel import Kernel
+from pathspace_graph.batch_system import BatchSystem, Evaluation, linear_graph_of, moved
 from pathspace_graph.factors.linear_graph import window_keys
 from pathspace_graph.settings import MapperSettings
 from pathspace_graph.state import State
@@ -30,7 +31,7 @@ def small_system() -> tuple[BatchSystem, State]:
     readings = collect_readings(log)
     readings.point = readings.point + np.random.default_rng(1).normal(0.0, 0.1, readings.point.shape)
     state = start_odometry(chain, readings, settings)
-    system = BatchSystem(readings, chain, settings, Kernel(settings.gate.huber, settings.gate.chi))
+    system = BatchSystem(readings, chain, settings, Kernel(settings.gate.chi, settings.gate.huber))
     system.begin(state)
     state.vector = state.vector + np.random.default_rng(2).normal(0.0, 0.01, len(state.vector))
     locate_poses(state)

@@ -1,0 +1,95 @@
+"""Knots where cones ask for them: one at each cone, and those taken out that are missed least."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .knots import FitSettings, energy_rows
+from .spline import BSpline
+from .window import cholesky, solve
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Thinned:
+    """A least-squares spline through ordered points, on fewer and fewer breaks."""
+
+    breaks: Array
+    """(b + 1,) of the parameter."""
+    size: int
+    """Distinct control points."""
+    rss: float
+    """Sum of squared distances of the points, m^2."""
+    crossed: float
+    """The same of each point from the curve that is fitted without it, m^2: cross-validation."""
+
+
+def chosen_breaks(points: Array, periodic: bool, fit: FitSettings, least: int, most: int) -> Thinned:
+    """Of `thin`'s curves of `least` to `most` control points the one that foretells a cone left out best.
+
+    The largest, unless a smaller one is better by a margin: which of nearly equal ones is best is chance.
+    Cross-validation, as the other criterion, `n log(rss / n) + p log(n)` (BIC), took a knot for every cone on
+    all 22 boundaries of eleven tracks: with so many knots rss, and with it the noise that BIC reckons with,
+    vanishes. At a given size the curve is nearer to the cones than one whose knots
+    follow the curvature: 0.066 m in place of 0.107 m on cones with 3 cm of noise.
+    """
+    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
+    high = float(along[-1] + (np.hypot(*(points[0] - points[-1])) if periodic else 0.0))
+    path = list(thin(points, along, high, periodic, fit, least))
+    within = [curve for curve in path if curve.size <= most] or path[-1:]
+    return min(within, key=lambda curve: (1.0 if curve is within[0] else 1.0 + MARGIN) * curve.crossed)
+
+
+MARGIN = 0.1
+"""So much better (of the sum of squares) a smaller curve must be."""
+
+
+def thin(
+    points: Array, u: Array, high: float, periodic: bool, fit: FitSettings, least: int
+) -> Iterator[Thinned]:
+    """From a break at each of the points (k, 2), at u (k,) in [0, high], down to `least` control points.
+
+    A knot t is no knot any more where the p-th derivative doesn't jump there: a linear constraint a'c = 0. It
+    costs `|a'c|^2 / (a' G^-1 a)`, G the normal equations, so that one inverse tells of all knots which is
+    missed least.
+    """
+    breaks = np.unique(np.concatenate([[0.0], u, [high]]))
+    while True:
+        frame = _frame(breaks, periodic, fit.degree)
+        B = frame.basis_matrix(u)
+        bending = energy_rows(frame)
+        factor = cholesky(B.T @ B + fit.smoothness * bending.T @ bending)
+        inverse = solve(factor, np.eye(B.shape[1]))
+        control = inverse @ (B.T @ points)
+        yield _judged(breaks, points, B, inverse, control)
+        if frame.distinct_control_points.shape[0] <= least:
+            return
+        jumps = _jumps(frame)
+        price = ((jumps @ control) ** 2).sum(axis=1) / ((jumps @ inverse) * jumps).sum(axis=1)
+        breaks = np.delete(breaks, 1 + int(price.argmin()))
+
+
+def _frame(breaks: Array, periodic: bool, degree: int) -> BSpline:
+    count = len(breaks) - 1
+    build = BSpline.periodic_from if periodic else BSpline.clamped_from
+    return build(breaks, np.zeros((count if periodic else count + degree, 2)), degree)
+
+
+def _jumps(frame: BSpline) -> Array:
+    """(b - 1, m) jump of the highest derivative at each inner break, by the distinct control points."""
+    breaks = frame.breaks
+    highest = frame.basis_matrix(0.5 * (breaks[1:] + breaks[:-1]), frame.degree)
+    return np.asarray(np.diff(highest, axis=0))
+
+
+def _judged(breaks: Array, points: Array, B: Array, inverse: Array, control: Array) -> Thinned:
+    residual = points - B @ control
+    leverage = ((B @ inverse) * B).sum(axis=1)
+    rss = float((residual**2).sum())
+    crossed = float(((residual / (1.0 - leverage)[:, None]) ** 2).sum())
+    return Thinned(breaks, len(control), rss, crossed)

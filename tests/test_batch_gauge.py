@@ -1,0 +1,68 @@
+"""What holds control points along their curve: its Jacobians, and that the map stays as free as it was."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.batch_gauge import CurveGauge, curve_gauge
+from pathspace_graph.state import State
+from tests.batch_scenes import straight
+
+Array = NDArray[np.float64]
+
+
+@cache
+def scene() -> tuple[State, CurveGauge]:
+    _, state = straight()
+    return state, curve_gauge(state.boundaries[0], state.control_points(0), state.poses, 0.2)
+
+
+def test_it_begins_at_rest() -> None:
+    state, gauge = scene()
+    np.testing.assert_allclose(gauge.beside(state.control_points(0), state.poses, 0).residual, 0.0, atol=1e-9)
+
+
+def test_each_control_point_is_held_beside_the_nearest_pose() -> None:
+    """Within half a cycle's way, where the drive has been; else beside its first or last pose."""
+    state, gauge = scene()
+    boundary, poses = state.boundaries[0], state.poses
+    x = boundary.evaluate(state.control_points(0), boundary.abscissae)[:, 0]
+    there = (x > poses[0, 0]) & (x < poses[-1, 0])
+    assert there.sum() > 3
+    assert np.abs(x[there] - poses[gauge.slot[there], 0]).max() < 0.31
+
+
+def test_its_jacobians_are_its_derivatives() -> None:
+    state, gauge = scene()
+    rng = np.random.default_rng(0)
+    points = state.control_points(0) + rng.normal(0.0, 0.5, state.control_points(0).shape)
+    poses = state.poses + rng.normal(0.0, 0.3, state.poses.shape)
+    rows, h = gauge.beside(points, poses, 0), 1e-6
+    for k in range(3):
+        step = h * np.eye(3)[k]
+        slope = (
+            gauge.beside(points, poses + step, 0).residual - gauge.beside(points, poses - step, 0).residual
+        )
+        np.testing.assert_allclose(rows.by_pose[:, k], slope / (2.0 * h), atol=1e-6)
+    for k in range(2):
+        step = h * np.eye(2)[k]
+        slope = (
+            gauge.beside(points + step, poses, 0).residual - gauge.beside(points - step, poses, 0).residual
+        )
+        np.testing.assert_allclose(rows.by_border[:, k], slope / (2.0 * h), atol=1e-6)
+
+
+def test_a_map_that_moves_with_its_drive_costs_nothing() -> None:
+    """Turned and shifted as a whole."""
+    state, gauge = scene()
+    c, s = np.cos(0.7), np.sin(0.7)
+    rotation, shift = np.array([[c, -s], [s, c]]), np.array([3.0, -5.0])
+    points = state.control_points(0) @ rotation.T + shift
+    poses = np.column_stack([state.poses[:, :2] @ rotation.T + shift, state.poses[:, 2] + 0.7])
+    np.testing.assert_allclose(gauge.beside(points, poses, 0).residual, 0.0, atol=1e-9)
+    np.testing.assert_allclose(
+        gauge.cost(points, poses), gauge.cost(state.control_points(0), state.poses), atol=1e-6
+    )
