@@ -17,6 +17,7 @@ from .batch_kernel import Biweight
 from .batch_knots import reknot
 from .batch_optimizer import Convergence, Optimizer, Schedule
 from .batch_scatter import Scatter, scatter_of_cones
+from .batch_simplification import simplified
 from .batch_start import start_online
 from .batch_system import BatchSystem, Evaluation
 from .fixed_lag import ODOMETRY_SIGMA
@@ -91,20 +92,22 @@ class BatchMapper:
         watch.lap("optimum")
         uncertainty = system.normal_equations(at).reduced()
         joint, marginals = uncertainty.border_covariance(), uncertainty.pose_marginals()
-        scatter = scatter_of_cones(at.state, readings, settings)
         watch.lap("covariance")
+        state, joint = simplified(at.state, joint, readings, settings)
+        scatter = scatter_of_cones(state, readings, settings)
+        watch.lap("simplify")
         return BatchResult(
             estimator=NAME,
             settings=settings_dict(self.settings),
-            map=_map(at.state, joint, scatter),
+            map=_map(state, joint, scatter),
             scatter=scatter,
             trajectory_t=chain.stamps,
             trajectory=at.state.poses.copy(),
-            cycles=_records(at.state, readings, chain, sum(watch.laps.values())),
+            cycles=_records(state, readings, chain, sum(watch.laps.values())),
             laps=_completed(at.state.poses),
             converged=convergence.converged,
             convergence=convergence,
-            map_covariance=joint[: at.state.map_size, : at.state.map_size],
+            map_covariance=joint,
             pose_covariances=marginals,
             calibration=at.state.calibration.copy(),
             online=online,
@@ -119,21 +122,17 @@ def _with_knots(
     settings: MapperSettings,
     on_round: Callable[[], None] | None,
 ) -> tuple[Evaluation, Convergence]:
-    """The optimum on knots that the cones ask for as they stand on curves that meet them all.
+    """The optimum on curves of nearly a knot for each cone, which meet them all.
 
-    So knots don't depend on the start: a curve of few knots, and so the poses and cones beside it, leans to
-    one side or the other as its knots happen to lie, one of nearly a knot for each cone doesn't. Once more
-    where a cone was missing or put down twice.
+    Chosen anew where a cone was missing or put down twice.
     """
     batch = settings.batch
     rough = Schedule(batch.loose_gate, batch.rough_rounds, batch.rough_tolerance)
     at, _ = optimizer.run(reknot(state, readings, settings), rough, on_round)
-    dense = Schedule(batch.gate, batch.rough_rounds, batch.dense_tolerance)
     fine = Schedule(batch.gate, batch.max_rounds)
     for _ in range(batch.knot_passes):
-        at, _ = optimizer.run(reknot(at.state, readings, settings, dense=True), dense, on_round)
         cones = cone_counts(at.state, readings, settings)
-        at, convergence = optimizer.run(reknot(at.state, readings, settings), fine, on_round)
+        at, convergence = optimizer.run(reknot(at.state, readings, settings, dense=True), fine, on_round)
         if cone_counts(at.state, readings, settings) == cones:
             break
     return at, convergence

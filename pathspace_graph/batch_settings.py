@@ -15,10 +15,9 @@ class BatchSettings(Positive):
     """Control points of both boundaries together; where not given, the readings decide."""
     size_share: float = 0.43
     """Most control points as a share of the distinct cones sighted (the paper has 0.44)."""
-    sigma_model: float = 0.1
-    """How far cones stand off their curve (m, one sigma), added to each reading across it. Online it is
-    larger (`spline.sigma_model`), while a curve is short of readings; here it decides how much all of them
-    say of the heading, which holds the whole map."""
+    sigma_model: float = 0.05
+    """How far cones stand off the curve that is solved for (m, one sigma), added to each reading across it.
+    Online it is larger (`spline.sigma_model`), as the curve has fewer control points there."""
     sigma_smoothness: float = 0.4
     """Second difference of control points, as a share of their spacing: stronger than online's, as a curve
     between cones that were never seen has many shapes that fit as well, and each start ends in its own."""
@@ -32,12 +31,11 @@ class BatchSettings(Positive):
     """Most rounds of a first optimization, on knots that the start decides, ..."""
     rough_tolerance: float = 8.0
     """... which the tolerances below times this end as well."""
-    dense_share: float = 0.8
-    """Control points by cones of the curves of a second one: they meet the cones, where ..."""
-    dense_tolerance: float = 2.0
-    """... the tolerances below times this end it, and the last one's knots are chosen by those cones."""
+    dense_share: float = 1.0
+    """Control points by cones of the curves that are solved for: they meet the cones. The map's own, fewer,
+    are fitted to them in the end."""
     knot_passes: int = 2
-    """Most times that those two follow one another: once, unless the cones' number has changed then."""
+    """Most times that they are solved for: once, unless the cones' number has changed then."""
     max_rounds: int = 40
     """Rounds of new foot points, gates and weights; the last of them is told as not converged."""
     max_steps: int = 3
