@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
@@ -29,7 +29,6 @@ from .metrics import (
 from .summary import has_cones, lap_times
 
 Row = dict[str, float | int | str | bool]
-Scope = Literal["lap", "log"]
 
 
 @dataclass(frozen=True)

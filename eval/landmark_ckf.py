@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from pathspace_graph.ckf import CkfCycle
 from pathspace_graph.ckf_belief import PLANE, Belief, point_columns, to_vehicle_rows
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.projection import to_map
-from pathspace_graph.fixed_lag import ODOMETRY_SIGMA
+from pathspace_graph.fixed_lag import ODOMETRY_SIGMA, CycleResult
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.log import Detections, Odometry
 from pathspace_graph.map import Map, PointBoundary
@@ -50,7 +49,7 @@ class LandmarkCkf:
         self.sightings = {label: Sightings(self.settings.growth) for label in BOUNDARIES}
         """What isn't a landmark yet."""
 
-    def update(self, odometry: Odometry, detections: Detections) -> CkfCycle:
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """One perception cycle: the twists since the last one, and what was detected now."""
         watch = Stopwatch()
         durations = np.diff(np.append(odometry.t, detections.t))
@@ -64,7 +63,7 @@ class LandmarkCkf:
         watch.lap("create")
         left, right = (int((self.labels == label).sum()) for label in (LEFT, RIGHT))
         used = int((found.landmark != NONE).sum())
-        return CkfCycle(detections.t, self.belief.pose.copy(), (left, right), used, False, watch.laps)
+        return CycleResult(detections.t, self.belief.pose.copy(), (left, right), used, False, watch.laps)
 
     def _associate(self, detections: Detections) -> Association:
         """The assignment over the landmarks that are near any reading, on the joint uncertainty."""

@@ -88,7 +88,7 @@ class BatchMapper:
         watch.lap("start")
         state = optimizer.hold_map(state, batch.pose_steps, batch.loose_gate)
         watch.lap("poses")
-        at, convergence = _with_knots(optimizer, state, readings, settings, on_round)
+        at, convergence = _optimum(optimizer, state, readings, settings, on_round)
         watch.lap("optimum")
         uncertainty = system.normal_equations(at).reduced()
         joint, marginals = uncertainty.border_covariance(), uncertainty.pose_marginals()
@@ -115,7 +115,7 @@ class BatchMapper:
         )
 
 
-def _with_knots(
+def _optimum(
     optimizer: Optimizer,
     state: State,
     readings: Readings,

@@ -79,16 +79,6 @@ class Boundary:
             self._gauge = self._new_gauge(near)
         return self._gauge
 
-    @property
-    def gauge_hessian(self) -> Array:
-        """(2m, 2m) smoothness and anchor between all control points."""
-        return self.gauge_on(self.everything).hessian
-
-    @property
-    def smooth_only(self) -> Array:
-        """(2m, 2m) smoothness between all control points."""
-        return self.gauge_on(self.everything).smooth
-
     def _new_gauge(self, near: IntArray) -> Gauge:
         """`D' D / (sigma_smoothness spacing)^2 + I / sigma_anchor^2`, and the neighbours to keep apart."""
         whole = self.periodic and len(near) == self.size

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +14,7 @@ from .ckf_gating import OnCurve, classify
 from .ckf_state import CurveState
 from .ckf_update import update
 from .closing import near_start
-from .fixed_lag import ODOMETRY_SIGMA
+from .fixed_lag import ODOMETRY_SIGMA, CycleResult
 from .labels import LEFT, RIGHT
 from .log import Detections, Odometry
 from .map import Map, SplineBoundary
@@ -25,24 +23,6 @@ from .settings import MapperSettings
 from .stopwatch import Stopwatch
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class CkfCycle:
-    """The estimate after one perception cycle."""
-
-    t: float
-    """Stamp, s."""
-    pose: Array
-    """(3,) x (m), y (m), theta (rad, not wrapped), map frame."""
-    sizes: tuple[int, int]
-    """Control points or landmarks of the left and the right boundary."""
-    readings: int
-    """How many of the cycle's readings were used."""
-    closed: bool
-    """Whether the loop has closed."""
-    stages: dict[str, float] = field(default_factory=dict)
-    """Time (s) that each stage of the update took, by its name."""
 
 
 class CkfMapper:
@@ -66,7 +46,7 @@ class CkfMapper:
         self._recent: list[tuple[Array, Detections]] = []
         self._closing_tried = 0.0
 
-    def update(self, odometry: Odometry, detections: Detections) -> CkfCycle:
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """One perception cycle: the twists since the last one, and what was detected now."""
         watch = Stopwatch()
         self._predict(odometry, detections.t)
@@ -119,10 +99,10 @@ class CkfMapper:
             simplify(state, self.expansion.sighted)
             self.closed = True
 
-    def _result(self, t: float, readings: int, stages: dict[str, float]) -> CkfCycle:
+    def _result(self, t: float, readings: int, stages: dict[str, float]) -> CycleResult:
         curves = self.state.curves
         left, right = (curves[label].size if label in curves else 0 for label in (LEFT, RIGHT))
-        return CkfCycle(t, self.state.pose.copy(), (left, right), readings, self.closed, stages)
+        return CycleResult(t, self.state.pose.copy(), (left, right), readings, self.closed, stages)
 
     def map(self) -> Map:
         """The map as it stands, with the joint covariance of each boundary's control points."""

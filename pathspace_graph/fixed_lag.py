@@ -42,7 +42,7 @@ class CycleResult:
     pose: Array
     """(3,) x (m), y (m), theta (rad, not wrapped), map frame."""
     sizes: tuple[int, int]
-    """Control points of the left and the right boundary."""
+    """Control points, or landmarks, of the left and the right boundary."""
     readings: int
     """How many of the cycle's readings were used."""
     closed: bool
