@@ -94,7 +94,7 @@ class LandmarkSystem(BatchSystem):
         """The optimum with the associations held, by Levenberg-Marquardt with the map damped."""
         settings, at = self.settings.batch, self.evaluate(state)
         damping = settings.damping
-        for _ in range(settings.max_rounds * settings.max_steps):
+        for _ in range(settings.max_rounds):
             reduced = self.normal_equations(at).reduced()
             trial = self._trial(at, reduced, damping)
             if trial.cost > at.cost:

@@ -128,7 +128,7 @@ def _optimum(
     """
     batch = settings.batch
     rough = Schedule(batch.loose_gate, batch.rough_rounds, batch.rough_tolerance)
-    at, _ = optimizer.run(reknot(state, readings, settings), rough, on_round)
+    at, _ = optimizer.run(reknot(state, readings, settings, dense=True), rough, on_round)
     fine = Schedule(batch.gate, batch.max_rounds)
     for _ in range(batch.knot_passes):
         cones = cone_counts(at.state, readings, settings)

@@ -63,7 +63,8 @@ def sighted_cones(state: State, readings: Readings, label: int, settings: Mapper
 
     What is seen again and again beside a curve, but too far from it to be used, is a cone of it as well: the
     curve cuts a corner there. On a closed curve they are counted from where the drive began, so that it
-    doesn't matter where the curve's own parameter begins.
+    doesn't matter where the curve's own parameter begins; and they are passed in the order in which the
+    vehicle passed them, as a curve may have taken two of them in the wrong one in a hairpin.
     """
     boundary = state.boundaries[label]
     rows = np.flatnonzero(readings.label == label)
@@ -86,7 +87,27 @@ def sighted_cones(state: State, readings: Readings, label: int, settings: Mapper
     alone = beside & ~ending & _far_from(points, cones.points, settings.growth.merge_radius)
     apart = heaped(alone)
     apart = apart.kept(apart.count >= SELDOM_APART * np.median(cones.count))
-    return unfolded(cones.joined(apart), boundary.periodic)
+    cones = cones.joined(apart)
+    if boundary.periodic:
+        cones = as_passed(cones, last_lap(state, label))
+    return unfolded(cones, boundary.periodic)
+
+
+def last_lap(state: State, label: int) -> Array:
+    """(l, 3) the poses of the last way around a closed curve, map frame."""
+    stations = state.stations[label]
+    return np.asarray(state.poses[stations > stations[-1] - state.boundaries[label].length])
+
+
+def as_passed(cones: SightedCones, lap: Array) -> SightedCones:
+    """In the order of the way driven, poses (l, 3), abeam of each: from the nearest pose, ahead or behind."""
+    driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(lap[:, :2], axis=0).T)))
+    offset = cones.points[:, None] - lap[:, :2]
+    nearest = (offset**2).sum(axis=2).argmin(axis=1)
+    dx, dy = offset[np.arange(len(nearest)), nearest].T
+    ahead = dx * np.cos(lap[nearest, 2]) + dy * np.sin(lap[nearest, 2])
+    order = np.argsort(driven[nearest] + ahead, kind="stable")
+    return SightedCones(cones.points[order], cones.u[order], cones.count[order])
 
 
 def cone_counts(state: State, readings: Readings, settings: MapperSettings) -> list[int]:

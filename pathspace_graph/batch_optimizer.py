@@ -71,6 +71,8 @@ class Optimizer:
         self.steps = 0
         """Steps tried so far."""
         self._damping = settings.damping
+        self._border: Array | None = None
+        """What the step before moved the border by."""
 
     def run(
         self, state: State, schedule: Schedule, on_round: Callable[[], None] | None = None
@@ -79,6 +81,7 @@ class Optimizer:
         system, gate = self.system, schedule.gate
         system.begin(state)
         locate_poses(state)
+        self._border = None
         at: Evaluation | None = None
         cost = np.inf
         for number in range(1, schedule.rounds + 1):
@@ -87,7 +90,7 @@ class Optimizer:
             system.kernel = Biweight(gate)
             before, cost_before = state, cost
             self._refresh(state, gate, strict)
-            at = self._descend(state)
+            at = self._step(system.evaluate(state))
             state, cost = at.state, at.cost
             if on_round is not None:
                 on_round()
@@ -121,41 +124,38 @@ class Optimizer:
         still = movement.curve <= curve and movement.pose <= pose
         return still and gain <= tolerance * settings.tolerance_cost * cost
 
-    def _descend(self, state: State) -> Evaluation:
-        """A few damped steps with the readings in use held."""
-        at = self.system.evaluate(state)
-        self._accept(at)
-        for _ in range(self.settings.max_steps):
-            following = self._step(at)
-            if following is None:
-                break
-            gain, at = at.cost - following.cost, following
-            if gain <= self.settings.tolerance_cost * at.cost:
-                break
-        return at
-
-    def _step(self, at: Evaluation) -> Evaluation | None:
-        """The next state that is better, damped as much as that takes; None where no damping is enough."""
+    def _step(self, at: Evaluation) -> Evaluation:
+        """The next state that is better, damped as much as it takes; the same where none is enough."""
         settings = self.settings
+        self._accept(at)
         equations = self.system.normal_equations(at).reduced()
         unit = damped(at.state)
         while self._damping <= settings.damping_most:
             self.steps += 1
             trial = self._trial(at, equations, self._damping * unit)
-            if trial is not None and trial.cost <= at.cost:
+            if trial is not None:
                 self._damping = max(settings.damping_down * self._damping, settings.damping_least)
                 self._accept(trial)
                 return trial
             self._damping *= settings.damping_up
         self._damping = settings.damping
-        return None
+        return at
 
     def _trial(self, at: Evaluation, equations: Reduced, damping: Array) -> Evaluation | None:
+        """The state after a step, if it is better."""
         try:
-            step = equations.step(damping)
+            poses, border = equations.step(damping)
         except SingularSystemError:
             return None
-        return self.system.evaluate(moved(at.state, *step))
+        trial = self.system.evaluate(moved(at.state, poses, border))
+        if trial.cost > at.cost:
+            return None
+        before, self._border = self._border, border
+        length = 1.0 if before is None else whole_way(border, before, self.settings)
+        if length > 1.0:
+            farther = self.system.evaluate(moved(at.state, length * poses, length * border))
+            trial = min(trial, farther, key=lambda evaluation: evaluation.cost)
+        return trial
 
     def _accept(self, at: Evaluation) -> None:
         """Foot points are refined from where they are now."""
@@ -171,6 +171,18 @@ class Optimizer:
             ]
         )
         return Convergence(converged, reason, rounds, self.steps, at.cost, float(np.linalg.norm(scaled)))
+
+
+def whole_way(step: Array, before: Array, settings: BatchSettings) -> float:
+    """How many times so long a step (n,) is to go where each is a share r of the one before: 1 / (1 - r).
+
+    Aitken's process for vectors, r by least squares; 1 where r isn't between the settings' bounds. Robust
+    weights, held sigmas and foot points on a curve that bends leave Gauss-Newton converging linearly, slowest
+    where few readings hold the curve.
+    """
+    square = float(before @ before)
+    share = float(step @ before) / square if square > 0.0 else 0.0
+    return 1.0 / (1.0 - share) if settings.share_least < share < settings.share_most else 1.0
 
 
 def damped(state: State) -> Array:

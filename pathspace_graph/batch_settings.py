@@ -27,7 +27,7 @@ class BatchSettings(Positive):
     """Width of Tukey's loss: a reading farther than so many sigmas from its curve says nothing."""
     pose_steps: int = 3
     """Gauss-Newton steps of the poses alone, beside the map that the start has found."""
-    rough_rounds: int = 12
+    rough_rounds: int = 24
     """Most rounds of a first optimization, on knots that the start decides, ..."""
     rough_tolerance: float = 8.0
     """... which the tolerances below times this end as well."""
@@ -36,10 +36,8 @@ class BatchSettings(Positive):
     are fitted to them in the end."""
     knot_passes: int = 2
     """Most times that they are solved for: once, unless the cones' number has changed then."""
-    max_rounds: int = 40
-    """Rounds of new foot points, gates and weights; the last of them is told as not converged."""
-    max_steps: int = 3
-    """Levenberg-Marquardt steps in a round."""
+    max_rounds: int = 80
+    """Steps, each with new foot points, gates and weights; the last of them is told as not converged."""
     loose_gate: float = 8.0
     """The first round uses readings within so many sigmas of a curve, ..."""
     gate_factor: float = 0.7
@@ -54,6 +52,10 @@ class BatchSettings(Positive):
     """... but no less than this (1/m^2)."""
     damping_most: float = 1e6
     """Damping (1/m^2) at which no step is left that makes it better."""
+    share_least: float = 0.3
+    """A step that goes on from the one before, of more than this share of it, ..."""
+    share_most: float = 0.97
+    """... but less than this, is tried as far as all that would follow lead together."""
     tolerance_cost: float = 1e-6
     """Converged where |cost_before - cost_after| <= tolerance * cost_before, ..."""
     tolerance_curve: float = 2e-3

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from .batch_gating import associate, locate_poses
 from .batch_knots import reknot
 from .boundary import Boundary
+from .knots import refit
 from .readings import Readings
 from .settings import MapperSettings
 from .state import State
 
 Array = NDArray[np.float64]
-
-SAMPLES = 8
-"""Points of a curve by its control points, at which another one is fitted to it."""
 
 
 def simplified(
@@ -42,10 +39,9 @@ def simplified(
 
 def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:
     """F (m_new, m_old), least squares over points of the old curve and their foot points on the new one."""
-    u = np.linspace(old.tables.low, old.tables.high, SAMPLES * old.size, endpoint=not old.periodic)
-    low, high = np.full(len(u), new.tables.low), np.full(len(u), new.tables.high)
-    foot = new.find(new_points, old.evaluate(old_points, u), low, high)
-    basis_new = new.spline(new_points).basis_matrix(foot.u)
-    basis_old = old.spline(old_points).basis_matrix(u)
-    solution = scipy.linalg.lstsq(basis_new, basis_old, lapack_driver="gelsy", check_finite=False)[0]
-    return np.asarray(solution, np.float64)
+
+    def foot_on_new(u: Array) -> Array:
+        low, high = np.full(len(u), new.tables.low), np.full(len(u), new.tables.high)
+        return new.find(new_points, old.evaluate(old_points, u), low, high).u
+
+    return refit(old.spline(old_points), new.spline(new_points), foot_on_new).new_from_old

@@ -97,3 +97,10 @@ def test_a_smaller_curve_is_taken_where_it_foretells_better() -> None:
 @pytest.mark.parametrize("periodic", [True, False])
 def test_the_budget_is_kept(periodic: bool) -> None:
     assert chosen_breaks(circle(40, 0.01), periodic, FIT, 8, 17).size <= 17
+
+
+def test_knots_of_a_straight_that_needs_none_stay_spread() -> None:
+    """Every knot is then missed equally little, but for rounding: none may leave a long interval behind."""
+    points = np.column_stack([4.0 * np.arange(16.0), np.zeros(16)])
+    *_, last = thin(points, points[:, 0], 60.0, False, FIT, 8)
+    assert np.diff(last.breaks).max() <= 4 * 4.0 + 1e-9

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch_cones import SightedCones, cluster, sighted_cones, unfolded
+from pathspace_graph.batch_cones import SightedCones, as_passed, cluster, sighted_cones, unfolded
 from pathspace_graph.batch_scatter import Scatter, left_out
 from pathspace_graph.labels import LEFT
 from pathspace_graph.settings import MapperSettings
@@ -79,3 +79,20 @@ def test_left_out_is_what_a_missing_cone_is_missed_by() -> None:
     assert len(left_out(circle, True, SETTINGS, 0.43)) == 40
     assert np.abs(left_out(circle, True, SETTINGS, 0.43)).max() < 0.05
     assert np.sqrt(np.mean(left_out(zigzag, True, SETTINGS, 0.43) ** 2)) > 0.3
+
+
+def test_cones_are_passed_in_the_order_of_the_drive() -> None:
+    """Around a hairpin whose curve had taken its cones in another order."""
+    phi = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 20)
+    bend = np.column_stack([10.0 + 4.0 * np.cos(phi), 4.0 * np.sin(phi), phi + 0.5 * np.pi])
+    out = np.column_stack([np.arange(0.0, 10.0), np.full(10, -4.0), np.zeros(10)])
+    back = np.column_stack([np.arange(9.0, -1.0, -1.0), np.full(10, 4.0), np.full(10, np.pi)])
+    lap = np.concatenate([out, bend, back])
+    true = np.array(
+        [[1.2, -1.5], [5.0, -1.5], [10.0, -1.5], [11.5, 0.2], [10.0, 1.5], [5.3, 1.5], [1.0, 1.5]]
+    )
+    wrong = np.array([0, 1, 4, 3, 2, 5, 6])
+    cones = SightedCones(true[wrong], np.arange(7.0), wrong)
+    passed = as_passed(cones, lap)
+    np.testing.assert_array_equal(passed.points, true)
+    np.testing.assert_array_equal(passed.count, np.arange(7))

@@ -15,7 +15,7 @@ from tests.batch_scenes import drawn, settled, straight
 Array = NDArray[np.float64]
 
 DRAWS = 200
-SITES = np.arange(8.0, 36.0, 9.0)
+SITES = np.arange(5.0, 33.0, 9.0)
 """Parameters (m) of the points on each curve at which errors are looked at."""
 
 
