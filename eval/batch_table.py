@@ -181,7 +181,7 @@ def _row(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
 def worse(outcomes: Sequence[Outcome]) -> list[str]:
     """Runs whose batch is worse than the online map that it began at."""
     return [
-        f"{o.case.name}, seed {o.case.seed}: {o.rmse:.3f} m, online {o.online:.3f} m"
+        f"{o.case.name}, seed {o.case.seed}: {o.rmse:.3f} m, online {o.online:.3f} m, limit {o.limit:.3f} m"
         for o in outcomes
         if o.rmse > NOT_WORSE * o.online
     ]

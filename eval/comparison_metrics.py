@@ -72,6 +72,8 @@ METRICS: Final = (
     Metric("ate", "trajectory error (ATE) [m]", 3),
     Metric("along", "trajectory error along [m]", 3),
     Metric("across", "trajectory error across [m]", 3),
+    Metric("gap_curves", "gap to batch, curves [m]", 3, truth=False),
+    Metric("gap_trajectory", "gap to batch, trajectory [m]", 3, truth=False),
     Metric("nees", "NEES per degree of freedom", 2),
     Metric("nees_low", "its 95 % interval, from", 2),
     Metric("nees_high", "its 95 % interval, to", 2),

@@ -10,6 +10,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from pathspace_graph.eval.comparison import Comparison, choose, choose_reference, compare, read_logs
+from pathspace_graph.eval.comparison_gap import with_gaps
 from pathspace_graph.eval.comparison_output import MARKER, tables, write_comparison
 from pathspace_graph.eval.ghosts import GhostSettings
 from pathspace_graph.eval.study_workers import check_jobs
@@ -68,6 +69,7 @@ class Compare:
                 on_run=advance,
             )
         with progress("writing"):
+            comparison = with_gaps(comparison)
             write_comparison(self.out, comparison, self.settings, self.jobs)
         self._report(comparison)
 

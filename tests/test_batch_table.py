@@ -61,7 +61,7 @@ def test_another_optimum_is_told() -> None:
 
 def test_what_is_worse_than_online_is_named() -> None:
     assert worse([outcome(0, 0.203), outcome(1, 0.3)]) == [
-        f"{Case(0, 1, 2).name}, seed 1: 0.300 m, online 0.200 m"
+        f"{Case(0, 1, 2).name}, seed 1: 0.300 m, online 0.200 m, limit 0.500 m"
     ]
 
 
