@@ -7,29 +7,23 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 import tyro
-from joblib import Parallel, delayed, parallel_config
-from rich.console import Console
 
 from pathspace_graph.batch import BatchMapper
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.log import Log
-from pathspace_graph.progress import progress
 from pathspace_graph.settings import MapperSettings
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track_files import read_track
-from pathspace_graph.sim.track_generator import generate_track
 
+from .cases import Case, CaseOptions, by_track, measure, show
 from .limit import limit
 from .metrics import lap_metrics
 from .nees import Nees, curve_nees
-from .online_table import FILE_WIDTH, Case, find_tracks, make_cases, markdown_table, rich_table
+from .text_table import TextTable
 
 SAME_COST: Final = 1e-3
 """Costs that differ by no more than this share are one optimum's."""
@@ -82,12 +76,7 @@ class Outcome:
 def run_case(case: Case) -> Outcome:
     """Simulate, optimize from both starts, evaluate; a failure is an outcome as well."""
     try:
-        track = (
-            generate_track(np.random.default_rng(case.track))
-            if isinstance(case.track, int)
-            else read_track(case.track)
-        )
-        return evaluate(case, simulate(track, SimulationSettings(laps=case.laps), case.seed))
+        return evaluate(case, case.simulated())
     except Exception as error:  # whatever ends a run belongs into the table
         return Outcome(case, failure=f"{type(error).__name__}: {error}")
 
@@ -122,14 +111,6 @@ def evaluate(case: Case, log: Log) -> Outcome:
     )
 
 
-def run_cases(cases: Sequence[Case], jobs: int) -> Iterator[Outcome]:
-    """Outcomes as they come, `jobs` at a time, each on one thread."""
-    with parallel_config(backend="loky", inner_max_num_threads=1):
-        yield from Parallel(n_jobs=jobs, return_as="generator_unordered")(
-            delayed(run_case)(case) for case in cases
-        )
-
-
 # --- tables ----------------------------------------------------------------------------------------------
 
 HEADER: Final = (
@@ -150,9 +131,7 @@ HEADER: Final = (
 
 def rows(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
     """A row for each track, and one for all."""
-    names = dict.fromkeys(outcome.case.name for outcome in outcomes)
-    tracks = [_row(name, [o for o in outcomes if o.case.name == name]) for name in names]
-    return [*tracks, _row("all", outcomes)]
+    return [*(_row(name, of) for name, of in by_track(outcomes).items()), _row("all", outcomes)]
 
 
 def _row(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
@@ -188,49 +167,14 @@ def worse(outcomes: Sequence[Outcome]) -> list[str]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BatchTable:
+class BatchTable(CaseOptions):
     """Measure the batch over tracks and seeds."""
 
-    tracks: Path | None = None
-    """Folder of real tracks, with subfolders pacsim, fssim and eufs."""
-    generated: int = 3
-    """Number of generated tracks."""
-    seeds: int = 5
-    """Drives on each track."""
-    laps: int = 5
-    """Laps of each drive."""
-    jobs: int = 2
-    """Runs at a time."""
-    markdown: bool = False
-    """Print Markdown instead of a table for a terminal."""
-
     def run(self) -> None:
-        """Run all of it and print the table."""
-        tracks = [] if self.tracks is None else find_tracks(self.tracks)
-        cases = make_cases(tracks, self.generated, self.seeds, self.laps)
-        order = {case: number for number, case in enumerate(cases)}
-        outcomes = []
-        with progress("measuring", len(cases)) as advance:
-            for outcome in run_cases(cases, self.jobs):
-                outcomes.append(outcome)
-                advance()
-        outcomes.sort(key=lambda outcome: order[outcome.case])
-        show(outcomes, self.markdown)
-
-
-def show(outcomes: Sequence[Outcome], markdown: bool) -> None:
-    """Print the table, what is worse than online, and what failed."""
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=FILE_WIDTH)
-    if markdown:
-        sys.stdout.write(markdown_table(HEADER, rows(outcomes)) + "\n\n")
-    else:
-        console.print(rich_table(HEADER, rows(outcomes)))
-    sys.stdout.writelines(f"worse than online: {line}\n" for line in worse(outcomes))
-    for outcome in outcomes:
-        if outcome.failure:
-            sys.stderr.write(f"{outcome.case.name}, seed {outcome.case.seed}: {outcome.failure}\n")
+        """Run all of it; print the table, and what is worse than online."""
+        outcomes = measure(run_case, self.cases(), self.jobs)
+        show([TextTable("", HEADER, tuple(rows(outcomes)))], outcomes, self.markdown)
+        sys.stdout.writelines(f"worse than online: {line}\n" for line in worse(outcomes))
 
 
 def main() -> None:

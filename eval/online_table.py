@@ -6,57 +6,25 @@
 from __future__ import annotations
 
 import csv
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import tyro
-from joblib import Parallel, delayed, parallel_config
-from rich.console import Console
-from rich.table import Table
 
-from pathspace_graph.errors import InputError
 from pathspace_graph.files import atomic_file, check_file_target
 from pathspace_graph.fixed_lag import FixedLagMapper
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.log import Log, Truth
-from pathspace_graph.progress import progress
 from pathspace_graph.run import CycleRecord, RunResult, run_online
 from pathspace_graph.settings import MapperSettings
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track import Track
-from pathspace_graph.sim.track_files import read_track
-from pathspace_graph.sim.track_generator import generate_track
 
+from .cases import Case, CaseOptions, by_track, measure, show
 from .limit import limit
 from .metrics import LapMetrics, lap_end_times, laps_metrics, normal_errors
-
-FOLDERS: Final = ("pacsim", "fssim", "eufs")
-"""Where the real Formula Student tracks are, in the folder that is given."""
-SUFFIXES: Final = (".yaml", ".yml", ".csv")
-"""Of track files."""
-FILE_WIDTH: Final = 140
-"""Characters in a line of a table that goes to a file."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """One run: a track, driven with one seed."""
-
-    track: Path | int
-    """Track file, or the seed of a generated track."""
-    seed: int
-    """Of the drive and its noise."""
-    laps: int
-    """Laps driven."""
-
-    @property
-    def name(self) -> str:
-        """What the track is called in the table."""
-        return f"generated {self.track}" if isinstance(self.track, int) else self.track.stem
+from .text_table import TextTable
 
 
 @dataclass(frozen=True)
@@ -113,26 +81,10 @@ class Outcome:
 # --- runs ------------------------------------------------------------------------------------------------
 
 
-def find_tracks(folder: Path) -> list[Path]:
-    """The track files of the known subfolders, in order; InputError where there are none."""
-    files = [
-        file for name in FOLDERS for file in sorted((folder / name).glob("*")) if file.suffix in SUFFIXES
-    ]
-    if not files:
-        raise InputError(folder, f"expected track files in {', '.join(FOLDERS)}, found none")
-    return files
-
-
-def make_cases(tracks: Sequence[Path], generated: int, seeds: int, laps: int) -> list[Case]:
-    """Every track, and `generated` generated ones, with every seed."""
-    every = [*tracks, *range(generated)]
-    return [Case(track, seed, laps) for track in every for seed in range(seeds)]
-
-
 def run_case(case: Case) -> Outcome:
     """Simulate, map online, evaluate; a failure is an outcome as well."""
     try:
-        return evaluate(case, simulate(_track(case), SimulationSettings(laps=case.laps), case.seed))
+        return evaluate(case, case.simulated())
     except Exception as error:  # whatever ends a run belongs into the table
         return Outcome(case, failure=f"{type(error).__name__}: {error}")
 
@@ -158,12 +110,6 @@ def evaluate(case: Case, log: Log) -> Outcome:
     )
 
 
-def _track(case: Case) -> Track:
-    if isinstance(case.track, int):
-        return generate_track(np.random.default_rng(case.track))
-    return read_track(case.track)
-
-
 def _truth(log: Log) -> Truth:
     if log.truth is None:
         raise ValueError("expected a simulated log, found one without truth")
@@ -182,14 +128,6 @@ def _lap_milliseconds(result: RunResult) -> tuple[float, ...]:
         1e3 * float(np.mean([record.seconds for record in result.cycles if counts(record, lap)]))
         for lap in laps
     )
-
-
-def run_cases(cases: Sequence[Case], jobs: int) -> Iterator[Outcome]:
-    """Outcomes as they come, `jobs` at a time, each on one thread."""
-    with parallel_config(backend="loky", inner_max_num_threads=1):
-        yield from Parallel(n_jobs=jobs, return_as="generator_unordered")(
-            delayed(run_case)(case) for case in cases
-        )
 
 
 # --- tables ----------------------------------------------------------------------------------------------
@@ -214,8 +152,7 @@ SUMMARY_HEADER: Final = ("over all runs", "value")
 
 def track_rows(outcomes: Sequence[Outcome]) -> Rows:
     """A row for each track: means over its seeds."""
-    names = dict.fromkeys(outcome.case.name for outcome in outcomes)
-    return [_track_row(name, [o for o in outcomes if o.case.name == name]) for name in names]
+    return [_track_row(name, of) for name, of in by_track(outcomes).items()]
 
 
 def _track_row(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
@@ -289,20 +226,12 @@ def _max(values: Sequence[float]) -> float:
     return float(np.max(values)) if len(values) else float("nan")
 
 
-def rich_table(header: Sequence[str], rows: Rows) -> Table:
-    """For a terminal."""
-    table = Table(header[0])
-    for name in header[1:]:
-        table.add_column(name, justify="right")
-    for row in rows:
-        table.add_row(*row)
-    return table
-
-
-def markdown_table(header: Sequence[str], rows: Rows) -> str:
-    """For a README."""
-    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+def tables(outcomes: Sequence[Outcome]) -> list[TextTable]:
+    """Both."""
+    return [
+        TextTable("", TRACK_HEADER, tuple(track_rows(outcomes))),
+        TextTable("", SUMMARY_HEADER, tuple(summary_rows(outcomes))),
+    ]
 
 
 def csv_rows(outcomes: Sequence[Outcome]) -> list[dict[str, object]]:
@@ -338,60 +267,20 @@ def write_csv(file: Path, outcomes: Sequence[Outcome]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnlineTable:
+class OnlineTable(CaseOptions):
     """Measure the online mapper over tracks and seeds."""
 
-    tracks: Path | None = None
-    """Folder of real tracks, with subfolders pacsim, fssim and eufs."""
-    generated: int = 3
-    """Number of generated tracks."""
-    seeds: int = 5
-    """Drives on each track."""
-    laps: int = 5
-    """Laps of each drive."""
-    jobs: int = 2
-    """Runs at a time."""
     out: Path | None = None
     """CSV file to write: one row per run and lap."""
-    markdown: bool = False
-    """Print Markdown instead of tables for a terminal."""
 
     def run(self) -> None:
         """Run all of it and print both tables."""
         if self.out is not None:
             check_file_target(self.out)
-        tracks = [] if self.tracks is None else find_tracks(self.tracks)
-        cases = make_cases(tracks, self.generated, self.seeds, self.laps)
-        outcomes = measure(cases, self.jobs)
+        outcomes = measure(run_case, self.cases(), self.jobs)
         if self.out is not None:
             write_csv(self.out, outcomes)
-        show(outcomes, self.markdown)
-
-
-def measure(cases: Sequence[Case], jobs: int) -> list[Outcome]:
-    """Outcomes in the order of the cases, with progress."""
-    order = {case: number for number, case in enumerate(cases)}
-    outcomes = []
-    with progress("measuring", len(cases)) as advance:
-        for outcome in run_cases(cases, jobs):
-            outcomes.append(outcome)
-            advance()
-    return sorted(outcomes, key=lambda outcome: order[outcome.case])
-
-
-def show(outcomes: Sequence[Outcome], markdown: bool) -> None:
-    """Print both tables, and what failed."""
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=FILE_WIDTH)
-    for header, rows in ((TRACK_HEADER, track_rows(outcomes)), (SUMMARY_HEADER, summary_rows(outcomes))):
-        if markdown:
-            sys.stdout.write(markdown_table(header, rows) + "\n\n")
-        else:
-            console.print(rich_table(header, rows))
-    for outcome in outcomes:
-        if outcome.failure:
-            sys.stderr.write(f"{outcome.case.name}, seed {outcome.case.seed}: {outcome.failure}\n")
+        show(tables(outcomes), outcomes, self.markdown)
 
 
 def main() -> None:

@@ -9,8 +9,6 @@ from typing import Final
 from rich.table import Table
 from rich.text import Text
 
-from .online_table import markdown_table
-
 _BORDER: Final = 3
 """Characters between two columns in a terminal."""
 _SPACE: Final = "  "
@@ -85,8 +83,10 @@ class TextTable:
 
     def markdown(self) -> str:
         """For a README."""
-        rows = [tuple(cell.replace("|", r"\|") for cell in row) for row in self.rows]
-        return f"{self.title}\n\n{markdown_table(self.header, rows)}\n"
+        aligned = ["---"] * self.names + ["---:"] * (len(self.header) - self.names)
+        rows = [[cell.replace("|", r"\|") for cell in row] for row in self.rows]
+        lines = [f"| {' | '.join(line)} |\n" for line in (self.header, aligned, *rows)]
+        return "".join([f"{self.title}\n\n"] * bool(self.title) + lines)
 
     def latex(self) -> str:
         """For a paper, with the package booktabs."""

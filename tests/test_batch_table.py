@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.batch_table import HEADER, Outcome, evaluate, rows, show, worse
+from pathspace_graph.eval.batch_table import HEADER, BatchTable, Outcome, evaluate, rows, worse
+from pathspace_graph.eval.cases import Case
 from pathspace_graph.eval.nees import Nees
-from pathspace_graph.eval.online_table import Case
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 
@@ -65,8 +65,12 @@ def test_what_is_worse_than_online_is_named() -> None:
     ]
 
 
-def test_a_failure_counts_against_the_rate(capsys: pytest.CaptureFixture[str]) -> None:
-    show([outcome(0, 0.1), Outcome(Case(0, 1, 2), failure="RuntimeError: lost")], markdown=True)
+def test_a_failure_counts_against_the_rate(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = [outcome(0, 0.1), Outcome(Case(0, 1, 2), failure="RuntimeError: lost")]
+    monkeypatch.setattr("pathspace_graph.eval.batch_table.measure", lambda *_: made)
+    BatchTable(generated=1, seeds=2, markdown=True).run()
     printed = capsys.readouterr()
     assert "2 of 4" in printed.out
     assert "seed 1: RuntimeError: lost" in printed.err

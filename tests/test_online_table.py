@@ -9,19 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathspace_graph.errors import InputError
+from pathspace_graph.eval.cases import Case, measure
 from pathspace_graph.eval.metrics import LapMetrics
 from pathspace_graph.eval.online_table import (
-    SUMMARY_HEADER,
     TRACK_HEADER,
-    Case,
     OnlineTable,
     Outcome,
     evaluate,
-    find_tracks,
-    make_cases,
-    markdown_table,
-    measure,
+    run_case,
     summary_rows,
     track_rows,
     write_csv,
@@ -70,16 +65,9 @@ def test_one_short_lap_for_real() -> None:
     assert done.milliseconds_p99 >= done.milliseconds[0] > 0.0
 
 
-def test_cases_are_every_track_with_every_seed() -> None:
-    cases = make_cases([Path("a.yaml")], generated=2, seeds=3, laps=5)
-    assert len(cases) == 9
-    assert len(set(cases)) == 9
-    assert [case.name for case in cases[::3]] == ["a", "generated 0", "generated 1"]
-
-
 def test_a_run_that_fails_is_an_outcome() -> None:
     cases = [Case(Path(f"none-{number}.yaml"), 0, 1) for number in range(3)]
-    outcomes = measure(cases, jobs=1)
+    outcomes = measure(run_case, cases, jobs=1)
     assert [outcome.case for outcome in outcomes] == cases
     assert all("InputError: none-" in outcome.failure for outcome in outcomes)
     assert value(summary_rows(outcomes), "runs finished") == "0 of 3"
@@ -115,11 +103,6 @@ def test_a_track_has_the_means_of_its_seeds() -> None:
     assert named["update [ms]"] == "3.00"
 
 
-def test_markdown_has_a_line_for_each_row() -> None:
-    lines = markdown_table(SUMMARY_HEADER, [("a", "1"), ("b", "2")]).splitlines()
-    assert lines == ["| over all runs | value |", "| --- | ---: |", "| a | 1 |", "| b | 2 |"]
-
-
 def test_the_csv_has_a_row_for_each_run_and_lap(tmp_path: Path) -> None:
     write_csv(tmp_path / "runs.csv", [outcome(0, 0, 0.4), failed(0, 1)])
     with (tmp_path / "runs.csv").open(newline="") as file:
@@ -127,15 +110,6 @@ def test_the_csv_has_a_row_for_each_run_and_lap(tmp_path: Path) -> None:
     assert [(row["seed"], row["lap"]) for row in rows] == [("0", "1"), ("0", "2"), ("1", "")]
     assert float(rows[1]["rmse"]) == 0.4
     assert rows[2]["failure"] == "RuntimeError: lost"
-
-
-def test_tracks_are_found_in_their_folders(tmp_path: Path) -> None:
-    for name in ("pacsim/b.yaml", "pacsim/a.yaml", "eufs/c.csv", "eufs/LICENSE.txt", "tum/d.csv"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).touch()
-    assert [track.name for track in find_tracks(tmp_path)] == ["a.yaml", "b.yaml", "c.csv"]
-    with pytest.raises(InputError, match="expected track files"):
-        find_tracks(tmp_path / "tum")
 
 
 @pytest.mark.parametrize("markdown", [False, True])
