@@ -162,6 +162,7 @@ def curve_parameters(spline: BSpline, samples_per_span: int) -> Array:
 
 
 def draw_boundary(axes: Axes, boundary: Boundary, label: int, band_scale: float, style: PlotStyle) -> None:
+    """A curve with its band and control points, or landmarks with their ellipses, in the map frame (m)."""
     if isinstance(boundary, PointBoundary):
         _draw_landmarks(axes, boundary, label, band_scale, style)
     else:
@@ -231,6 +232,7 @@ def _draw_landmarks(
 
 
 def draw_trajectory(axes: Axes, trajectory: Array, style: PlotStyle) -> None:
+    """Poses (n, 3) or positions (n, 2) as a line, map frame (m)."""
     axes.plot(
         trajectory[:, 0],
         trajectory[:, 1],
@@ -242,6 +244,7 @@ def draw_trajectory(axes: Axes, trajectory: Array, style: PlotStyle) -> None:
 
 
 def draw_truth(axes: Axes, truth: Truth, style: PlotStyle) -> None:
+    """The true path dashed and the true cones as crosses, as far as they are known, map frame (m)."""
     if len(truth.poses):
         axes.plot(
             *truth.poses[:, :2].T,
@@ -265,6 +268,7 @@ def draw_truth(axes: Axes, truth: Truth, style: PlotStyle) -> None:
 
 
 def draw_start(axes: Axes, style: PlotStyle) -> None:
+    """The origin of the map frame: where the vehicle stood first, heading along x."""
     axes.plot(
         0.0,
         0.0,

@@ -210,13 +210,13 @@ def bend(smoother: Smoother) -> None:
     segments = history.all_segments(*state.control_ids()) if history is not None else []
     if history is None or not segments:
         for _ in range(settings.iterations):
-            smoother.step(settings.sigma_step)
+            smoother.settle()
         return
     state.insert(state.pose_column(0), np.concatenate(history.keyframes))
     state.keyframes = len(segments)
     for _ in range(settings.iterations):
         smoother.prior = _relinearized(history, segments, state)
-        smoother.step(settings.sigma_step)
+        smoother.settle()
     smoother.prior = _without_keyframes(smoother.prior, state)
     smoother.history = None
 

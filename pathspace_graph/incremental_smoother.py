@@ -74,15 +74,9 @@ class IncrementalSmoother(Smoother):
         """Every control point stays in the system."""
 
     def step(self, sigma_step: float) -> None:
-        """One update of GTSAM's smoother with what is new; the estimate is its own.
-
-        While the loop is being closed the parent's steps are taken: one undamped step through the whole loop,
-        which is what a new smoother begins with, may throw a curve off for good.
-        """
+        """One update of GTSAM's smoother with what is new; the estimate is its own."""
         estimate = self.state.vector.copy()
         super().step(sigma_step)
-        if sigma_step == self.settings.closing.sigma_step:
-            return
         self.state.vector = estimate
         if self._moved():
             self._restart()
@@ -92,6 +86,14 @@ class IncrementalSmoother(Smoother):
             self._add_control_points(label)
             self._add_readings(label)
         self._solve()
+
+    def settle(self) -> None:
+        """The parent's step, estimate included.
+
+        One undamped step through the whole loop, which is what a new smoother begins with, may throw a curve
+        off for good.
+        """
+        super().step(self.settings.closing.sigma_step)
 
     def _moved(self) -> bool:
         """Whether the poses were moved, or a curve closed, since the last step: the loop is being closed."""

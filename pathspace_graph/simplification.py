@@ -57,7 +57,7 @@ def simplify(smoother: Smoother) -> None:
     joins = {b: join(boundary, state.control_points(b), settings) for b, boundary in state.boundaries.items()}
     substitute(smoother, joins)
     for _ in range(settings.closing.iterations):
-        smoother.step(settings.closing.sigma_step)
+        smoother.settle()
 
 
 def join(boundary: Boundary, control_points: Array, settings: MapperSettings) -> Join:

@@ -177,6 +177,10 @@ class Smoother:
         self.last_step = Step(groups, point, factor, state.position, first_pose)
         state.vector[system] += solve(factor, descent)
 
+    def settle(self) -> None:
+        """A step while the loop is being closed, where control points may move farther."""
+        self.step(self.settings.closing.sigma_step)
+
     # --- what is far -------------------------------------------------------------------------------------
 
     def part(self, near: dict[int, IntArray]) -> None:
