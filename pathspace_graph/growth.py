@@ -219,7 +219,7 @@ def _end(smoother: Smoother, label: int, way: Way) -> End:
     boundary = smoother.state.boundaries[label]
     u = np.array([boundary.confirmed])
     position = boundary.evaluate(smoother.state.control_points(label), u)
-    station, lateral = way.locate(position)
+    station, lateral = way.since(way.driven - smoother.settings.growth.end_behind).locate(position)
     return End(position[0], float(station[0]), SIDES[label] * float(lateral[0]))
 
 
