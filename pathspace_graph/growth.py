@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.projection import to_map
 
 from .boundary import open_boundary
-from .labels import BOUNDARIES, LEFT, RIGHT
+from .labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from .path import Way
 from .settings import GrowthSettings
 from .sightings import Sightings
@@ -88,22 +88,28 @@ class Growth:
         for sightings in self.sightings.values():
             sightings.clear()
 
-    def _candidates(self, label: int, way: Way) -> Candidates:
-        """Trusted sightings within reach, on their side of the way."""
-        indices = self.sightings[label].confirmed()
+    def _candidates(self, smoother: Smoother, label: int, way: Way, end: End | None) -> Candidates:
+        """Trusted sightings within reach that follow one another, from an end on where there is one."""
+        settings, indices = self.settings, self.sightings[label].confirmed()
         points = self.sightings[label].points[indices]
         if len(points) == 0:
             return Candidates(points, indices, np.zeros(0), np.zeros(0))
         stations, lateral = way.locate(points)
         found = Candidates(points, indices, stations, SIDES[label] * lateral)
         found = found.where((stations <= way.stations[-1]) & (found.sides > 0.0))
-        return found.where(np.argsort(found.stations))
+        if end is None:
+            found = found.where(found.sides < settings.max_lateral)
+        else:
+            far = np.hypot(*(found.points - end.position).T) > settings.threshold
+            found = found.where(far & (found.stations > end.station + settings.station_margin))
+        if len(found.points):
+            found = found.where(undisputed(smoother, label, found.points, settings.merge_radius))
+        found = found.where(np.argsort(found.stations))
+        return found.where(chain(found, settings, end))
 
     def _begin(self, smoother: Smoother, label: int, way: Way) -> None:
         """A new curve through the first sightings."""
-        found = self._candidates(label, way)
-        found = found.where(found.sides < self.settings.max_lateral)
-        found = found.where(chain(found, self.settings, None))
+        found = self._candidates(smoother, label, way, None)
         if len(found.points) < 2:
             return
         state, settings = smoother.state, smoother.settings
@@ -121,10 +127,7 @@ class Growth:
         """Extend by every sighting that comes next, or carry a stranded end on; True where it grew."""
         settings = self.settings
         end = _end(smoother, label, way)
-        found = self._candidates(label, way)
-        far = np.hypot(*(found.points - end.position).T) > settings.threshold
-        found = found.where(far & (found.stations > end.station + settings.station_margin))
-        found = found.where(chain(found, settings, end))
+        found = self._candidates(smoother, label, way, end)
         if len(found.points):
             known = smoother.state.boundaries[label].confirmed
             lead(smoother, label, end.position, found.points)
@@ -150,6 +153,21 @@ class Growth:
         high = boundary.believed(np.full(len(rows), np.inf))
         readings.used[rows] = True
         readings.u[rows] = boundary.find(state.control_points(label), points, low, high).u
+
+
+def undisputed(smoother: Smoother, label: int, points: Array, radius: float) -> NDArray[np.bool_]:
+    """Which places (n, 2) have no more readings of the other boundary's label around them than of their own.
+
+    A sensor that takes a cone for one of the other boundary now and then sees it in its true colour oftener.
+    Readings in the window count, in use or not, within `radius` (m).
+    """
+    readings = smoother.readings
+    rows = np.flatnonzero(readings.label != UNKNOWN)
+    seen = to_map(readings.point[rows], smoother.state.poses[readings.slot[rows]])
+    offset = points[:, None] - seen
+    near = offset[:, :, 0] ** 2 + offset[:, :, 1] ** 2 < radius**2
+    votes = near @ np.where(readings.label[rows] == label, 1, -1)
+    return np.asarray(votes >= 0)
 
 
 def chain(found: Candidates, settings: GrowthSettings, end: End | None) -> IntArray:
@@ -201,7 +219,7 @@ def _end(smoother: Smoother, label: int, way: Way) -> End:
     boundary = smoother.state.boundaries[label]
     u = np.array([boundary.confirmed])
     position = boundary.evaluate(smoother.state.control_points(label), u)
-    station, lateral = way.locate(position)
+    station, lateral = way.since(way.driven - smoother.settings.growth.end_behind).locate(position)
     return End(position[0], float(station[0]), SIDES[label] * float(lateral[0]))
 
 

@@ -27,6 +27,11 @@ class Way:
         """Stations (m,) and signed distances (m,), left positive, of points (m, 2)."""
         return along_and_across(points, self.points, self.stations)
 
+    def since(self, station: float) -> Way:
+        """What of it comes after a station (m), from the last position before that on."""
+        first = max(int(self.stations.searchsorted(station)) - 1, 0)
+        return Way(self.points[first:], self.stations[first:], self.driven)
+
     def beside(self, station: float, lateral: float) -> Array:
         """(2,) the point at about a station, so far to the left of the way."""
         i = int(np.clip(np.searchsorted(self.stations, station), 1, len(self.stations) - 1))
@@ -115,18 +120,17 @@ def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array
 
     Past the last position the station runs on along the last segment.
     """
-    start, segment = path[:-1], np.diff(path, axis=0)
-    length2 = np.maximum((segment**2).sum(axis=1), np.finfo(float).tiny)
-    offset = points[:, None, :] - start[None]
-    share = np.clip((offset * segment).sum(axis=2) / length2, 0.0, 1.0)
-    to = offset - share[:, :, None] * segment
-    distance2 = (to**2).sum(axis=2)
+    (x, y), (ex, ey) = path[:-1].T, np.diff(path, axis=0).T
+    length2 = np.maximum(ex**2 + ey**2, np.finfo(float).tiny)
+    dx, dy = points[:, :1] - x, points[:, 1:] - y
+    share = np.clip((dx * ex + dy * ey) / length2, 0.0, 1.0)
+    distance2 = (dx - share * ex) ** 2 + (dy - share * ey) ** 2
     best = distance2.argmin(axis=1)
     rows = np.arange(len(points))
-    e, d = segment[best], offset[rows, best]
-    overshoot = np.where(best == len(segment) - 1, (d * e).sum(axis=1) / length2[best] - 1.0, 0.0)
+    ex, ey, dx, dy = ex[best], ey[best], dx[rows, best], dy[rows, best]
+    overshoot = np.where(best == len(length2) - 1, (dx * ex + dy * ey) / length2[best] - 1.0, 0.0)
     at = np.where(overshoot > 0.0, 1.0 + overshoot, share[rows, best])
-    side = e[:, 0] * d[:, 1] - e[:, 1] * d[:, 0]
+    side = ex * dy - ey * dx
     across = np.sign(side) * np.sqrt(distance2[rows, best])
     lateral = np.where(overshoot > 0.0, side / np.sqrt(length2[best]), across)
     return stations[best] + at * (stations[best + 1] - stations[best]), lateral

@@ -140,6 +140,9 @@ class GrowthSettings(Positive):
     """... those are left out that stand so much farther from it than the nearest (m)."""
     station_margin: float = 0.3
     """A sighting must lie so far past the end of the curve (m along the path) to extend it."""
+    end_behind: float = 5.0
+    """An end is no farther behind the vehicle than this (m along the path), as a stranded one is carried on;
+    that it may be nearer to an older stretch of the path, across the infield, says nothing."""
     stranded: float = 2.0
     """An end so far behind the vehicle (m along the path), nothing ahead, is carried along it, ..."""
     stranded_left: float = 0.5

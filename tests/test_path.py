@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pathspace_graph.path import DrivenPath, along_and_across
+from pathspace_graph.path import DrivenPath, Way, along_and_across
 from pathspace_graph.settings import PathSettings
 
 Array = NDArray[np.float64]
@@ -60,6 +60,17 @@ def test_the_prediction_of_a_straight_goes_on_straight() -> None:
     np.testing.assert_array_equal(way.points[:, 1], 0.0)
     assert way.driven == 3.0
     np.testing.assert_allclose(way.beside(3.4, -2.0), [3.5, -2.0])
+
+
+@pytest.mark.parametrize(("station", "first"), [(-1.0, 0), (0.5, 0), (1.0, 0), (1.5, 1), (2.0, 1), (9.0, 3)])
+def test_the_way_since_a_station_begins_at_the_last_position_before_it(station: float, first: int) -> None:
+    """Positions a metre apart, but for one gap of 4 m: the segment that holds the station is kept whole."""
+    stations = np.array([0.0, 1.0, 2.0, 6.0])
+    points = np.column_stack([stations, np.zeros(4)])
+    since = Way(points, stations, 2.0).since(station)
+    np.testing.assert_array_equal(since.stations, stations[first:])
+    np.testing.assert_array_equal(since.points, points[first:])
+    assert since.driven == 2.0
 
 
 @pytest.mark.parametrize("radius", [10.0, -4.0])
