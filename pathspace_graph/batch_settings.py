@@ -56,7 +56,7 @@ class BatchSettings(Positive):
     """A step that goes on from the one before, of more than this share of it, ..."""
     share_most: float = 0.97
     """... but less than this, is tried as far as all that would follow lead together."""
-    tolerance_cost: float = 1e-6
+    tolerance_cost: float = 1e-5
     """Converged where |cost_before - cost_after| <= tolerance * cost_before, ..."""
     tolerance_curve: float = 2e-3
     """... no point of a curve moved farther than this across it (m), ..."""

@@ -73,7 +73,7 @@ class Expansion:
         """Readings of trusted sightings that come next along the way; their indices are the cycle's rows."""
         settings, sightings = self.settings.growth, self.sightings[label]
         points = to_map(detections.points_vehicle[rows], np.tile(state.pose, (len(rows), 1)))
-        trusted = sightings.points[sightings.confirmed()]
+        trusted = sightings.points[self._undisputed(label, sightings.confirmed())]
         offset = points[:, None] - trusted[None]
         near = np.hypot(offset[..., 0], offset[..., 1]).min(axis=1, initial=np.inf) < settings.merge_radius
         stations, lateral = way.locate(points)
@@ -82,9 +82,18 @@ class Expansion:
         found = found.where(np.argsort(found.stations))
         end = None
         if label in state.curves:
-            end = _end(state, label, way)
+            end = _end(state, label, way, self.settings.growth.end_behind)
             found = found.where(self._beyond(state, label, found, end)) if len(found.points) else found
         return found.where(chain(found, settings, end))
+
+    def _undisputed(self, label: int, indices: IntArray) -> IntArray:
+        """Those sightings that aren't seen oftener in another colour, as in the other estimators."""
+        own, votes = self.sightings[label], self.sightings[label].counts[indices].astype(np.float64)
+        for other in (self.sightings[b] for b in BOUNDARIES if b != label):
+            offset = own.points[indices, None] - other.points
+            near = np.hypot(offset[..., 0], offset[..., 1]) < self.settings.growth.merge_radius
+            votes -= near @ other.counts
+        return indices[votes >= 0.0]
 
     def _beyond(self, state: CurveState, label: int, found: Candidates, end: End) -> NDArray[np.bool_]:
         """The paper's three conditions: nearest to the end, far enough from it, and from C_{n-1}."""
@@ -128,7 +137,8 @@ class Expansion:
 
     def _carry_on(self, state: CurveState, label: int, way: Way) -> bool:
         """The vehicle has passed a stranded end: lead it beside the way nearly as far as the vehicle is."""
-        settings, end = self.settings.growth, _end(state, label, way)
+        settings = self.settings.growth
+        end = _end(state, label, way, settings.end_behind)
         if end.station >= way.driven - settings.stranded:
             return False
         side = SIDES[label] * max(end.side, settings.min_lateral)
@@ -163,7 +173,8 @@ def _end_position(state: CurveState, label: int) -> Array:
     return np.array(state.control_points(label)[-1])
 
 
-def _end(state: CurveState, label: int, way: Way) -> End:
+def _end(state: CurveState, label: int, way: Way, behind: float) -> End:
+    """The end of a curve, beside the latest stretch of the way, from `behind` (m) on."""
     position = _end_position(state, label)
-    station, lateral = way.locate(position[None])
+    station, lateral = way.since(way.driven - behind).locate(position[None])
     return End(position, float(station[0]), SIDES[label] * float(lateral[0]))
