@@ -183,7 +183,9 @@ class ClosingSettings(Positive):
     sigma_max: float = 0.3
     """The registered position must be this certain (m, one sigma along its worst direction) ..."""
     patience: float = 40.0
-    """... until so much of the beginning (m) has been driven again."""
+    """... or, once so much of the beginning (m) has been driven again, ..."""
+    sigma_patience: float = 0.6
+    """... this certain: a straight says nothing along it, however much of it is driven again."""
     beginning: float = 60.0
     """Stretch of the curves (m) that counts as their beginning, ..."""
     beginning_share: float = 0.6
