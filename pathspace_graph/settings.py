@@ -60,8 +60,9 @@ class GaugeSettings(Positive):
     """Deviation of neighbouring control points from their nominal distance, as a share of it."""
     sigma_smoothness: float = 1.0
     """Second difference of control points, as a share of their spacing (1: a circle of that radius)."""
-    sigma_anchor: float = 100.0
-    """Weak hold of every control point where it is (m): keeps the system regular, too weak to be seen."""
+    sigma_anchor: float = 1e4
+    """Weak hold of every control point where it is (m): keeps the system regular, too weak to be seen, also
+    where the thousand of them on a long track hold its heading together."""
 
 
 @dataclass(frozen=True)
