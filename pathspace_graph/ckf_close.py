@@ -50,7 +50,12 @@ def associate_early(
     drive's first stretch.
     """
     ckf = state.settings.ckf
-    closing = replace(state.settings.closing, sigma_reading=ckf.sigma_match, patience=ckf.patience)
+    closing = replace(
+        state.settings.closing,
+        sigma_reading=ckf.sigma_match,
+        patience=ckf.patience,
+        sigma_patience=ckf.sigma_patience,
+    )
     found = register(_Recent(state, cycles), beginning, closing)
     return None if found is None else found.motion
 

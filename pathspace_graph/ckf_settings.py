@@ -49,7 +49,9 @@ class CkfSettings(Positive):
     """Deviation (m) of a reading from the early segment that it is associated with: more than in the mapper's
     own closing, since the filter's early segment is the worse, ..."""
     patience: float = 30.0
-    """... so that a stretch driven again (m), rather than certainty of the place, closes the loop."""
+    """... so that a stretch driven again (m), rather than certainty of the place, closes the loop, ..."""
+    sigma_patience: float = 1000.0
+    """... however uncertain that is then (m)."""
     tie_reach: float = 1.0
     """Points of the end that the registration leaves farther from the beginning (m) aren't tied to it."""
     sightings: int = 3

@@ -182,10 +182,10 @@ def _agree(matches: Matches, labels: list[int], settings: ClosingSettings) -> bo
 
 
 def _certain(matches: Matches, posterior: Array, settings: ClosingSettings) -> bool:
-    """The motion is certain in every direction, or so much is driven again that no more will be known."""
+    """The motion is certain in every direction: less so where no more will be known of it."""
     sigma = float(np.sqrt(np.linalg.eigvalsh(posterior[:2, :2])[-1]))
     driven_again = float(np.median(matches.u[matches.near]))
-    return sigma <= settings.sigma_max or driven_again >= settings.patience
+    return sigma <= (settings.sigma_max if driven_again < settings.patience else settings.sigma_patience)
 
 
 def tie(smoother: Smoother, registration: Registration) -> None:

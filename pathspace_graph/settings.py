@@ -60,8 +60,9 @@ class GaugeSettings(Positive):
     """Deviation of neighbouring control points from their nominal distance, as a share of it."""
     sigma_smoothness: float = 1.0
     """Second difference of control points, as a share of their spacing (1: a circle of that radius)."""
-    sigma_anchor: float = 100.0
-    """Weak hold of every control point where it is (m): keeps the system regular, too weak to be seen."""
+    sigma_anchor: float = 1e4
+    """Weak hold of every control point where it is (m): keeps the system regular, too weak to be seen, also
+    where the thousand of them on a long track hold its heading together."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +187,9 @@ class ClosingSettings(Positive):
     sigma_max: float = 0.3
     """The registered position must be this certain (m, one sigma along its worst direction) ..."""
     patience: float = 40.0
-    """... until so much of the beginning (m) has been driven again."""
+    """... or, once so much of the beginning (m) has been driven again, ..."""
+    sigma_patience: float = 0.6
+    """... this certain: a straight says nothing along it, however much of it is driven again."""
     beginning: float = 60.0
     """Stretch of the curves (m) that counts as their beginning, ..."""
     beginning_share: float = 0.6

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.closing import Registration, near_start, register
+from pathspace_graph.closing import Matches, Registration, _certain, near_start, register
 from pathspace_graph.eval.metrics import cone_distances
 from pathspace_graph.factors.projection import to_map
 from pathspace_graph.fixed_lag import CycleResult, FixedLagMapper
@@ -231,6 +231,18 @@ def test_another_way_past_the_beginning_is_no_loop() -> None:
     mapper, _ = map_log(exact_log(twists, *corridor(80.0)))
     assert mapper.path.length > mapper.settings.closing.min_path
     assert not mapper.closed
+
+
+@pytest.mark.parametrize(
+    ("again", "sigma", "certain"),
+    [(10.0, 0.2, True), (10.0, 0.5, False), (50.0, 0.5, True), (50.0, 5.0, False)],
+)
+def test_a_straight_driven_again_tells_no_place_along_it(again: float, sigma: float, certain: bool) -> None:
+    """However long it is: only as far as the place is known to about half a metre."""
+    rows, near = np.arange(30), np.ones(30, bool)
+    matches = Matches(rows, rows % 2, np.full(30, again), near, np.eye(3), np.zeros(3))
+    posterior = np.diag([sigma**2, 0.01, 1e-4])
+    assert _certain(matches, posterior, ClosingSettings()) is certain
 
 
 @pytest.mark.parametrize("turned", [False, True])

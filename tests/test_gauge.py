@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.bspline import SpanPolynomials, uniform_knots
 from pathspace_graph.factors.gauge import greville, smoothness_matrix, spacing_residuals
+from pathspace_graph.settings import MapperSettings
 
 from .jacobians import assert_jacobians
 
@@ -124,3 +125,11 @@ def test_greville_abscissae_give_the_parameter_back(degree: int) -> None:
     assert len(abscissae) == 8
     columns = span[:, None] + np.arange(-degree, 1)
     np.testing.assert_allclose(np.sum(values[0] * abscissae[columns], axis=1), u, atol=1e-12)
+
+
+def test_the_anchors_of_a_long_track_leave_its_heading_to_the_odometry() -> None:
+    """All of them together on a circle of 2.3 km, against a bias of the yaw rate after a lap at 12 m/s."""
+    settings, length = MapperSettings(), 2300.0
+    count = 2 * length / settings.spline.spacing
+    by_anchors = settings.gauge.sigma_anchor / (np.sqrt(count) * length / (2.0 * np.pi))
+    assert by_anchors > 1.5 * settings.odometry.sigma_bias * length / 12.0
