@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.fixed_lag import FixedLagMapper
-from pathspace_graph.labels import BOUNDARIES, LEFT
+from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.linearizer import reading_rows
 from pathspace_graph.settings import MapperSettings, SplineSettings
 from pathspace_graph.window import POSE, Rows
@@ -31,7 +31,7 @@ def mapper() -> FixedLagMapper:
 
 
 def rows_of(mapper: FixedLagMapper, settings: MapperSettings) -> Rows:
-    return reading_rows(mapper.smoother.state, mapper.smoother.readings, LEFT, settings)[0]
+    return reading_rows(mapper.smoother.state, mapper.smoother.readings, settings)[0]
 
 
 def test_an_offset_is_two_rows_whose_part_across_the_curve_is_the_distance_s(mapper: FixedLagMapper) -> None:
