@@ -396,7 +396,7 @@ def _finish(
         distance=-_dot(normal, probe.offset),
         interior=_interior(spans, probe, stretch),
         basis=spans.basis(probe.number, probe.s),
-        span=probe.number + spans.degree,
+        span=probe.number + (spans.first + spans.degree),
         columns=columns,
     )
 

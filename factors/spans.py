@@ -157,6 +157,8 @@ class Spans:
     """(k,) from each curve's own parameter to the axis; none for the first."""
     interval: Floats
     """Mean knot interval (k,) of each."""
+    first: int
+    """Spans of the first curve that are left out before it."""
     columns: Ints
     """(n, p + 1) control points that matter on each span."""
     starts: Floats
@@ -221,6 +223,7 @@ def lay_out(
         high=np.array([curve.high for curve in curves]) + shift,
         shift=shift,
         interval=np.array([(curve.high - curve.low) / len(curve.starts) for curve in curves]),
+        first=offsets[0],
         columns=np.concatenate(columns),
         starts=np.concatenate(starts),
         inverse_widths=np.concatenate(widths),

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.footpoint import FootPoints, foot_points, refine_foot_points
+from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_foot_points
 from pathspace_graph.factors.gauge import greville, smoothness_matrix
-from pathspace_graph.factors.spans import SpanPolynomials
+from pathspace_graph.factors.spans import SpanPolynomials, Spans, lay_out
 
 from .settings import GaugeSettings, SplineSettings
 from .spline import BSpline
@@ -128,9 +128,14 @@ class Boundary:
 
     def find(self, control_points: Array, points: Array, low: Array, high: Array) -> FootPoints:
         """Foot points of points (m, 2) in their stretches, searched for globally."""
-        s = self.settings
-        unwrapped = self.extended(control_points)
-        return foot_points(self.tables, unwrapped, points, low, high, s.search_step, s.search_iterations)
+        s, spans = self.settings, self._spans_from(float(np.min(low, initial=np.inf)))
+        alone, search = np.zeros(len(points), np.intp), (s.search_step, s.search_iterations)
+        return joint_foot_points(spans, control_points, points, alone, low, high, *search)
+
+    def _spans_from(self, u: float) -> Spans:
+        """The curve's spans; of an open one those from u on, since the others are not looked at."""
+        first = 0 if self.periodic else int(self.tables.locate(np.array([u]))[0][0])
+        return lay_out([self.tables.tail(first) if first else self.tables], [first], [self.size])
 
     def refine(self, control_points: Array, points: Array, u: Array) -> FootPoints:
         """Foot points of points (m, 2) near the parameters (m,) they had."""

@@ -58,7 +58,7 @@ class Curves:
     def believed(self, curve: IntArray, high: Array) -> Array:
         """Upper limits of stretches (m,), kept off what open curves only extrapolate."""
         trusted = np.array([boundary.trusted for boundary in self.boundaries])
-        return np.minimum(high, trusted[curve])
+        return np.asarray(np.minimum(high, trusted[curve]))
 
     def find(
         self, control_points: Array, points: Array, curve: IntArray, low: Array, high: Array

@@ -86,12 +86,12 @@ def _find(smoother: Smoother, rows: IntArray, curve: IntArray, points: Array) ->
         np.append(seen_from - gate.view_behind, known[:, -1] - behind),
         np.append(seen_from + gate.view_ahead, known[:, -1] + ahead),
     )
-    beside = foot.where(len(rows) + all_curves)
+    beside = foot.where(slice(len(rows), None))
     along = beside.tangent_unit @ np.array([np.cos(pose[2]), np.sin(pose[2])])
     lost = (along < 0.0) | (np.abs(beside.distance) > gate.station_lateral)
     for label, u, is_lost in zip(state.boundaries, beside.u.tolist(), lost.tolist(), strict=True):
         _append_station(state, label, _sought_again(smoother, label) if is_lost else u)
-    return foot.where(np.arange(len(rows)))
+    return foot.where(slice(len(rows)))
 
 
 def _station_room(state: State, settings: MapperSettings) -> tuple[float, float]:

@@ -115,15 +115,15 @@ def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array
 
     Past the last position the station runs on along the last segment.
     """
-    start, segment = path[:-1], np.diff(path, axis=0)
-    length2 = np.maximum((segment**2).sum(axis=1), np.finfo(float).tiny)
-    offset = points[:, None, :] - start[None]
-    share = np.clip((offset * segment).sum(axis=2) / length2, 0.0, 1.0)
-    to = offset - share[:, :, None] * segment
-    distance2 = (to**2).sum(axis=2)
+    segment = path[1:] - path[:-1]
+    ex, ey = np.ascontiguousarray(segment.T)
+    length2 = np.maximum(ex * ex + ey * ey, np.finfo(float).tiny)
+    dx, dy = points.T[:, :, None] - path.T[:, None, :-1]
+    share = np.minimum(np.maximum((dx * ex + dy * ey) / length2, 0.0), 1.0)
+    distance2 = (dx - share * ex) ** 2 + (dy - share * ey) ** 2
     best = distance2.argmin(axis=1)
     rows = np.arange(len(points))
-    e, d = segment[best], offset[rows, best]
+    e, d = segment[best], points - path[best]
     overshoot = np.where(best == len(segment) - 1, (d * e).sum(axis=1) / length2[best] - 1.0, 0.0)
     at = np.where(overshoot > 0.0, 1.0 + overshoot, share[rows, best])
     side = e[:, 0] * d[:, 1] - e[:, 1] * d[:, 0]
