@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .bspline import Floats, Ints
 from .spans import SpanPolynomials, Spans
+from .stretch import Stretch, stretch_of
 
 Bools = NDArray[np.bool_]
 
@@ -78,39 +79,6 @@ class _Curves:
         return _horner(self.coefficients.take(number, axis=-1), s)
 
 
-@dataclass(frozen=True, eq=False)
-class _Stretch:
-    """Where on the axis each row looks for its foot point."""
-
-    begin: Floats
-    """Domain (m,) of the row's curve, from ..."""
-    end: Floats
-    """... to."""
-    low: Floats
-    """Stretch (m,), from ..."""
-    high: Floats
-    """... to."""
-    floor: Floats
-    """Limits (m,) that the iteration must keep, from ..."""
-    ceiling: Floats
-    """... to: none for a stretch that is a whole period."""
-    interval: Floats
-    """Mean knot interval (m,) of the row's curve."""
-
-    @property
-    def length(self) -> Floats:
-        """Length (m,) of the row's curve."""
-        return self.end - self.begin
-
-    def inside(self, v: Floats) -> Floats:
-        """v (m,) moved to the floor or the ceiling, where it isn't between them."""
-        return np.minimum(np.maximum(v, self.floor), self.ceiling)
-
-    def where(self, rows: Bools) -> _Stretch:
-        """Of some rows."""
-        return _Stretch(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-
 def _horner(terms: Floats, s: Floats) -> Floats:
     """sum_k terms[k] s^k (..., m) of terms (p + 1, ..., m)."""
     total: Floats = terms[-1] * s
@@ -177,7 +145,7 @@ def joint_foot_points(
     """`foot_points` on several curves at once, `curve` (m,) each row's own, of those that are laid out."""
     curves = _Curves(spans, spans.curve_coefficients(control_points))
     points_t = np.ascontiguousarray(points.T)
-    stretch = _stretch(spans, curve, u_low, u_high)
+    stretch = stretch_of(spans, curve, u_low, u_high)
     start = _nearest_on_grid(curves, points, curve, stretch, coarse_step)
     probe = _descend(curves, points_t, start, stretch, np.full(len(points), coarse_step), iterations)
     return _finish(spans, control_points, points_t, curve, probe, stretch)
@@ -216,45 +184,13 @@ def refine_joint_foot_points(
     """`refine_foot_points` on several curves at once, `curve` (m,) each row's own."""
     curves = _Curves(spans, spans.curve_coefficients(control_points))
     points_t = np.ascontiguousarray(points.T)
-    stretch = _stretch(spans, curve, u_low, u_high)
-    start = _into_stretch(spans, stretch, u_start + spans.shift.take(curve))
+    stretch = stretch_of(spans, curve, u_low, u_high)
+    start = stretch.moved_into(u_start + spans.shift.take(curve))
     probe = _newton(curves, points_t, start, stretch, iterations)
     return _finish(spans, control_points, points_t, curve, probe, stretch)
 
 
-def _stretch(spans: Spans, curve: Ints, u_low: Floats, u_high: Floats) -> _Stretch:
-    """Stretches inside an open domain, or begun in a periodic one; never reversed."""
-    begin, end, shift = spans.low.take(curve), spans.high.take(curve), spans.shift.take(curve)
-    interval = spans.interval.take(curve)
-    low, high = u_low + shift, u_high + shift
-    if not spans.periodic:
-        low = np.minimum(np.maximum(low, begin), end)
-        high = np.maximum(low, np.minimum(high, end))
-        return _Stretch(begin, end, low, high, low, high, interval)
-    period = end - begin
-    whole = ~(high - low < period)
-    if whole.any():
-        low, high = np.where(whole, begin, low), np.where(whole, end, high)
-    turns = period * np.floor((low - begin) / period)
-    low, high = low - turns, np.maximum(low, high) - turns
-    floor, ceiling = (
-        (np.where(whole, -np.inf, low), np.where(whole, np.inf, high)) if whole.any() else (low, high)
-    )
-    return _Stretch(begin, end, low, high, floor, ceiling, interval)
-
-
-def _into_stretch(spans: Spans, stretch: _Stretch, v: Floats) -> Floats:
-    """v moved into the stretch: by whole periods where periodic, else to the nearest limit."""
-    low, high = stretch.low, stretch.high
-    if not spans.periodic:
-        return np.minimum(np.maximum(v, low), high)
-    period = stretch.length
-    inside = low + np.mod(v - low, period)
-    nearest = np.where(inside - high < low + period - inside, high, low)
-    return np.where(inside <= high, inside, nearest)
-
-
-def _nearest_on_grid(curves: _Curves, points: Floats, curve: Ints, stretch: _Stretch, step: float) -> Floats:
+def _nearest_on_grid(curves: _Curves, points: Floats, curve: Ints, stretch: Stretch, step: float) -> Floats:
     """The nearest to each point (m,) among the places of a shared grid in its stretch, and its limits."""
     if len(points) == 0:
         return np.zeros(0)
@@ -299,13 +235,13 @@ def _nearest_of(
     return index, least
 
 
-def _newton(curves: _Curves, points_t: Floats, start: Floats, stretch: _Stretch, iterations: int) -> _Probe:
+def _newton(curves: _Curves, points_t: Floats, start: Floats, stretch: Stretch, iterations: int) -> _Probe:
     """Newton steps no longer than a knot interval; a row that would get farther away is safeguarded."""
     reach = stretch.interval
     last = _probe(curves, points_t, start)
     for _ in range(iterations):
         step = np.minimum(np.maximum(last.step, -reach), reach)
-        v = stretch.inside(last.v + step)
+        v = stretch.within(last.v + step)
         probe = _probe(curves, points_t, v)
         farther = ~_no_farther(probe.square, last.square)
         if farther.any():
@@ -322,7 +258,7 @@ def _descend(
     curves: _Curves,
     points_t: Floats,
     start: Floats,
-    stretch: _Stretch,
+    stretch: Stretch,
     reach: Floats,
     iterations: int,
 ) -> _Probe:
@@ -336,7 +272,7 @@ def _descend(
     end, step = start - np.sign(best.slope) * reach, best.step
     for _ in range(iterations):
         inside = np.abs(step) < np.abs(end - best.v)
-        candidate = stretch.inside(np.where(inside, best.v + step, 0.5 * (best.v + end)))
+        candidate = stretch.within(np.where(inside, best.v + step, 0.5 * (best.v + end)))
         probe = _probe(curves, points_t, candidate)
         if not (np.abs(candidate - best.v) > tolerance).any():
             return probe
@@ -380,7 +316,7 @@ def _dot(a: Floats, b: Floats) -> Floats:
 
 
 def _finish(
-    spans: Spans, control_points: Floats, points_t: Floats, curve: Ints, probe: _Probe, stretch: _Stretch
+    spans: Spans, control_points: Floats, points_t: Floats, curve: Ints, probe: _Probe, stretch: Stretch
 ) -> FootPoints:
     """All outputs at the places found."""
     columns = spans.columns.take(probe.number, axis=0)
@@ -389,23 +325,16 @@ def _finish(
     np.negative(tangent[1], out=normal[0])
     normal[1] = tangent[0]
     return FootPoints(
-        u=_own_parameter(spans, probe.v, stretch) - spans.shift.take(curve),
+        u=stretch.in_domain(probe.v) - spans.shift.take(curve),
         position=(points_t + probe.offset).T,
         tangent_unit=tangent.T,
         normal_unit=normal.T,
         distance=-_dot(normal, probe.offset),
-        interior=_interior(spans, probe, stretch),
+        interior=_interior(probe, stretch),
         basis=spans.basis(probe.number, probe.s),
         span=probe.number + (spans.first + spans.degree),
         columns=columns,
     )
-
-
-def _own_parameter(spans: Spans, v: Floats, stretch: _Stretch) -> Floats:
-    """v (m,) wrapped into the domain where periodic, else clipped to it."""
-    if spans.periodic:
-        v = v - stretch.length * np.floor((v - stretch.begin) / stretch.length)
-    return np.minimum(np.maximum(v, stretch.begin), stretch.end)
 
 
 def _unit_tangent(control_points: Floats, first: Floats, columns: Ints, length: Floats) -> Floats:
@@ -423,13 +352,13 @@ def _unit_tangent(control_points: Floats, first: Floats, columns: Ints, length: 
     return direction / norm
 
 
-def _interior(spans: Spans, probe: _Probe, stretch: _Stretch) -> Bools:
+def _interior(probe: _Probe, stretch: Stretch) -> Bools:
     """False at an end of an open domain, and at a limit of the stretch where the distance falls outward."""
     tolerance = _END_TOLERANCE * stretch.length
     at_low = probe.v - stretch.floor <= tolerance
     at_high = stretch.ceiling - probe.v <= tolerance
     outside = (at_low & (probe.slope > 0.0)) | (at_high & (probe.slope < 0.0))
-    if not spans.periodic:
+    if not stretch.periodic:
         outside |= probe.v <= stretch.begin + tolerance
         outside |= probe.v >= stretch.end - tolerance
     return ~outside

@@ -80,6 +80,11 @@ class SpanPolynomials:
         return self._laid["alone"]
 
     @property
+    def length(self) -> float:
+        """Length of the domain."""
+        return self.high - self.low
+
+    @property
     def occupied(self) -> int:
         """Spans up to the last that is not empty."""
         return len(self._breaks) + 1
@@ -202,35 +207,44 @@ def lay_out(
 
     `sizes`: so many control points of periodic curves are distinct, the others not there; else unwrapped.
     """
-    degree, periodic = curves[0].degree, curves[0].periodic
-    shifts, starts, widths, numbers, columns, end, count = [], [], [], [], [], 0.0, 0
-    for k, curve in enumerate(curves):
-        laps = np.arange(-1, 2) if periodic else np.zeros(1)
-        period, n = curve.high - curve.low, curve.occupied
-        own = curve.starts[:n] + period * laps[:, None]
-        shifts.append(float(np.ceil(end - own[0, 0] + 1.0)) if k else 0.0)
-        starts.append(own.ravel() + shifts[-1])
-        widths.append(np.tile(curve.inverse_widths[:n], len(laps)))
-        numbers.append(np.tile(count + np.arange(n), len(laps)))
-        window = curve.windows[:n]
-        columns.append(offsets[k] + (window % sizes[k] if sizes is not None and periodic else window))
-        end, count = curve.high + period * laps[-1] + shifts[-1], count + n
-    shift = np.array(shifts)
+    periodic, counts = curves[0].periodic, [curve.occupied for curve in curves]
+    periods = np.arange(-1.0, 2.0) if periodic else np.zeros(1)
+    shift = np.array(_shifts(curves, periods))
+    columns = [curve.windows[:n] for curve, n in zip(curves, counts, strict=True)]
+    if periodic and sizes is not None:
+        columns = [window % size for window, size in zip(columns, sizes, strict=True)]
+    starts = [
+        (curve.starts[:n] + curve.length * periods[:, None]).ravel() + moved
+        for curve, n, moved in zip(curves, counts, shift, strict=True)
+    ]
+    first = np.cumsum([0, *counts[:-1]])
+    number = [np.tile(k + np.arange(n), len(periods)) for k, n in zip(first, counts, strict=True)]
+    inverse_widths = np.concatenate([c.inverse_widths[:n] for c, n in zip(curves, counts, strict=True)])
+    laid = np.concatenate(number)
     return Spans(
-        degree=degree,
+        degree=curves[0].degree,
         periodic=periodic,
         low=np.array([curve.low for curve in curves]) + shift,
         high=np.array([curve.high for curve in curves]) + shift,
         shift=shift,
-        interval=np.array([(curve.high - curve.low) / len(curve.starts) for curve in curves]),
+        interval=np.array([curve.length / len(curve.starts) for curve in curves]),
         first=offsets[0],
-        columns=np.concatenate(columns),
+        columns=np.concatenate([k + window for k, window in zip(offsets, columns, strict=True)]),
         starts=np.concatenate(starts),
-        inverse_widths=np.concatenate(widths),
-        number=np.concatenate(numbers),
-        by_span=np.concatenate([curve.polynomials(2)[: curve.occupied] for curve in curves]),
-        values=np.concatenate([curve.coefficients[:, : curve.occupied] for curve in curves], axis=1),
+        inverse_widths=inverse_widths[laid],
+        number=laid,
+        by_span=np.concatenate([c.polynomials(2)[:n] for c, n in zip(curves, counts, strict=True)]),
+        values=np.concatenate([c.coefficients[:, :n] for c, n in zip(curves, counts, strict=True)], axis=1),
     )
+
+
+def _shifts(curves: Sequence[SpanPolynomials], periods: Floats) -> list[float]:
+    """How far each curve is moved, the first not at all, so that none overlaps; whole, which rounds least."""
+    shifts, end = [0.0], curves[0].high + curves[0].length * periods[-1]
+    for curve in curves[1:]:
+        shifts.append(float(np.ceil(end - (curve.low + curve.length * periods[0]) + 1.0)))
+        end = curve.high + curve.length * periods[-1] + shifts[-1]
+    return shifts
 
 
 def _span_coefficients(knots: Floats, degree: int) -> Floats:

@@ -41,10 +41,11 @@ def reading_rows(state: State, readings: Readings, settings: MapperSettings) -> 
     not interior. The readings are left as they are. Of the residual `point` two rows each.
     """
     rows = np.flatnonzero(readings.used)
-    slots, curve = readings.slot[rows], state.curves.number(readings.boundary[rows])
+    curves, slots = state.curves, readings.slot[rows]
+    curve = curves.number(readings.boundary[rows])
     poses = state.poses[slots]
     points = to_map(readings.point[rows], poses)
-    foot = state.curves.refine(state.map_points, points, curve, readings.u[rows])
+    foot = curves.refine(state.map_points, points, curve, readings.u[rows])
     base = 2 * foot.columns
     by_control = np.stack([base, base + 1], axis=2).reshape(len(rows), 2 * base.shape[1])
     columns = np.concatenate([state.pose_columns(slots), by_control], axis=1)
@@ -53,7 +54,7 @@ def reading_rows(state: State, readings: Readings, settings: MapperSettings) -> 
         columns = np.repeat(columns, 2, axis=0)
     else:
         jacobian, residual = _across(points, readings.covariance[rows], poses, foot, settings)
-    return Rows(columns, jacobian, residual), FootParameters(rows, foot.u, state.curves.cut_off(curve, foot))
+    return Rows(columns, jacobian, residual), FootParameters(rows, foot.u, curves.cut_off(curve, foot))
 
 
 def _across(
@@ -82,7 +83,8 @@ def _to_point(
 
 def spacing_rows(state: State, sigma_share: float) -> Rows:
     """`(|c_{j+1} - c_j| - nominal_j) / (sigma_share nominal_j)`: near control points keep their distance."""
-    pairs, nominal = state.curves.pairs, state.curves.nominal
+    curves = state.curves
+    pairs, nominal = curves.pairs, curves.nominal
     first, second = state.map_points[pairs[:, ::2].T // 2]
     residual, direction = pair_residuals(first, second, nominal)
     sigma = sigma_share * nominal

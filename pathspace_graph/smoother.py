@@ -155,7 +155,8 @@ class Smoother:
             groups += self.factors.rows(state.poses, self.first_cycle, state.pose_column(0))
         if state.whole:
             return groups, feet
-        groups = [rows.at(state.position) for rows in groups]
+        position = state.position
+        groups = [rows.at(position) for rows in groups]
         if (feet and feet.cut_off) or (groups[0].columns < 0).any():
             self.join()  # a reading has slid to where the map is far: rare, since the near part is generous
             return self._linearize()
