@@ -55,6 +55,16 @@ def test_an_offset_holds_the_vehicle_along_a_straight_curve_and_a_distance_does_
     assert np.linalg.norm(rows_of(mapper, POINT).jacobian[:, :POSE] @ along) > 5.0
 
 
+def test_a_reading_that_slides_to_where_an_open_map_is_far_brings_all_of_it_back() -> None:
+    found, _ = map_log(exact_log(ahead(6.0, 9.0), *corridor(80.0)))
+    smoother = found.smoother
+    assert not smoother.state.whole
+    before = [len(rows.residual) for rows in smoother.linearize()]
+    smoother.readings.u[np.flatnonzero(smoother.readings.used)[-1]] = 1.0
+    assert [len(rows.residual) for rows in smoother.linearize()][0] == before[0]
+    assert smoother.state.whole
+
+
 def test_a_drive_without_noise_is_mapped_with_either() -> None:
     log = exact_log(ahead(6.0, 5.0), *corridor(50.0))
     for settings in (ACROSS, replace(POINT, lag=1.0)):
