@@ -61,7 +61,7 @@ def test_a_reading_that_slides_to_where_an_open_map_is_far_brings_all_of_it_back
     assert not smoother.state.whole
     before = [len(rows.residual) for rows in smoother.linearize()]
     smoother.readings.u[np.flatnonzero(smoother.readings.used)[-1]] = 1.0
-    assert [len(rows.residual) for rows in smoother.linearize()][0] == before[0]
+    assert [len(rows.residual) for rows in smoother.linearize()] >= before
     assert smoother.state.whole
 
 
