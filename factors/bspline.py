@@ -1,4 +1,4 @@
-"""B-spline basis functions on plain arrays: Cox-de Boor values, derivatives, and per-span polynomials.
+"""B-spline basis functions on plain arrays: Cox-de Boor values and derivatives.
 
 A spline of degree p over n control points has n + p + 1 non-decreasing knots and the domain
 [knots[p], knots[n]]. On the span knots[i] <= u < knots[i + 1] only the control points i - p .. i matter.
@@ -7,9 +7,6 @@ last p repeat the first, over one period of knots and p more on either side.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass, field
-from math import factorial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +86,7 @@ def _differentiate(window: Floats, degree: int, q: int, level: Floats) -> Floats
     return raised
 
 
-def _positive(width: Floats) -> Floats:
+def positive(width: Floats) -> Floats:
     """The width, or infinity where it is zero, so that 0 / 0 := 0."""
     return np.where(width > 0.0, width, np.inf)
 
@@ -164,124 +161,3 @@ def _blossom(knots: Floats, degree: int, span: int, arguments: Floats) -> Floats
         share = ((x - lower) / (upper - lower))[:, None]
         weights = (1.0 - share) * weights[:-1] + share * weights[1:]
     return np.asarray(weights[0])
-
-
-@dataclass(frozen=True, eq=False)
-class SpanPolynomials:
-    """Basis functions as polynomials of s = (u - t_i) / (t_{i+1} - t_i) on each span: `basis`, but faster."""
-
-    knots: Floats
-    """Non-decreasing knots (n + p + 1,), unwrapped if periodic."""
-    degree: int
-    """Degree p >= 1."""
-    periodic: bool = False
-    """Parameters are taken modulo the domain's length instead of clipped to it."""
-    low: float = field(init=False)
-    """Left end of the domain."""
-    high: float = field(init=False)
-    """Right end of the domain."""
-    coefficients: Floats = field(init=False, repr=False)
-    """(p + 1 powers, n - p spans, p + 1 columns): N_{i-p+j}(u) = sum_k coefficients[k, i - p, j] s^k."""
-    starts: Floats = field(init=False, repr=False)
-    """Left knot of each span (n - p,)."""
-    inverse_widths: Floats = field(init=False, repr=False)
-    """1 / (t_{i+1} - t_i) of each span (n - p,), zero for an empty span."""
-    _breaks: Floats = field(init=False, repr=False)
-    _by_span: dict[int, Floats] = field(init=False, repr=False, default_factory=dict)
-    _windows: Ints = field(init=False, repr=False)
-    _stacks: dict[int, Floats] = field(init=False, repr=False, default_factory=dict)
-
-    def __post_init__(self) -> None:
-        knots = np.ascontiguousarray(self.knots, dtype=np.float64)
-        low, high = domain(knots, self.degree)
-        end = len(knots) - self.degree - 1
-        last = int(np.searchsorted(knots[self.degree : end], high, side="left")) - 1
-        set_field = object.__setattr__
-        set_field(self, "knots", knots)
-        set_field(self, "low", low)
-        set_field(self, "high", high)
-        set_field(self, "starts", knots[self.degree : end])
-        widths = np.diff(knots[self.degree : end + 1])
-        set_field(self, "inverse_widths", np.where(widths > 0.0, 1.0 / _positive(widths), 0.0))
-        set_field(self, "coefficients", _span_coefficients(knots, self.degree))
-        set_field(self, "_windows", np.arange(len(widths))[:, None] + np.arange(self.degree + 1))
-        set_field(self, "_breaks", knots[self.degree + 1 : self.degree + 1 + max(last, 0)])
-
-    def inside(self, u: Floats) -> Floats:
-        """u wrapped into the domain where periodic, else clipped to it."""
-        if self.periodic:
-            return wrap(self.knots, self.degree, u)
-        return np.minimum(np.maximum(u, self.low), self.high)
-
-    def locate(self, u: Floats) -> tuple[Ints, Floats]:
-        """Span number span - p in [0, n - p) and s in [0, 1] of each u (m,), wrapped or clipped."""
-        inside = self.inside(u)
-        number = self._breaks.searchsorted(inside, side="right")
-        return number, (inside - self.starts.take(number)) * self.inverse_widths.take(number)
-
-    def evaluate(self, u: Floats, derivatives: int = 0) -> tuple[Floats, Ints]:
-        """As `basis`: values (derivatives + 1, m, p + 1) and spans (m,), with u wrapped or clipped."""
-        number, s = self.locate(u)
-        return self.evaluate_located(number, s, derivatives), number + self.degree
-
-    def evaluate_located(self, number: Ints, s: Floats, derivatives: int = 0) -> Floats:
-        """Basis values (derivatives + 1, m, p + 1) at what `locate` gave, by Horner's rule."""
-        stack = self._stack(derivatives)
-        column = s[:, None]
-        values: Floats = stack[-1].take(number, axis=0)
-        for power in range(self.degree - 1, -1, -1):
-            values *= column
-            values += stack[power].take(number, axis=0)
-        return values.reshape(len(s), derivatives + 1, self.degree + 1).transpose(1, 0, 2)
-
-    def curve_coefficients(self, control_points: Floats, derivatives: int = 0) -> Floats:
-        """(p + 1, derivatives + 1, 2, n - p): d^r S / du^r = sum_k coefficients[k, r, :, i - p] s^k.
-
-        control_points (n, 2), unwrapped where periodic.
-        """
-        by_span = np.matmul(self._rows(derivatives), control_points[self._windows])
-        shape = (len(by_span), self.degree + 1, derivatives + 1, 2)
-        return np.ascontiguousarray(by_span.reshape(shape).transpose(1, 2, 3, 0))
-
-    def _rows(self, derivatives: int) -> Floats:
-        """(n - p spans, (p + 1) (derivatives + 1), p + 1 columns): the polynomials of `_stack` by span."""
-        if derivatives not in self._by_span:
-            by_span = self._stack(derivatives).transpose(1, 0, 2)
-            self._by_span[derivatives] = by_span.reshape(by_span.shape[0], -1, self.degree + 1)
-        return self._by_span[derivatives]
-
-    def _stack(self, derivatives: int) -> Floats:
-        """(p + 1 powers, n - p spans, (derivatives + 1) (p + 1)): polynomials of all orders side by side."""
-        if derivatives not in self._stacks:
-            orders = [_derivative(self.coefficients, r, self.inverse_widths) for r in range(derivatives + 1)]
-            self._stacks[derivatives] = np.ascontiguousarray(np.concatenate(orders, axis=2))
-        return self._stacks[derivatives]
-
-
-def _span_coefficients(knots: Floats, degree: int) -> Floats:
-    """The Cox-de Boor recurrence on polynomials of s: (p + 1 powers, n - p spans, p + 1 columns)."""
-    spans = np.arange(degree, len(knots) - degree - 1)
-    start = knots[spans]
-    width = knots[spans + 1] - start
-    window = knots[spans + np.arange(1 - degree, degree + 1)[:, None]]
-    level = np.zeros((degree + 1, 1, len(spans)))
-    level[0] = 1.0
-    for q in range(1, degree + 1):
-        lower, upper = window[degree - q : degree], window[degree : degree + q]
-        ratio = level / _positive(upper - lower)
-        raised = np.zeros((degree + 1, q + 1, len(spans)))
-        raised[:, :-1] = (upper - start) * ratio
-        raised[:, 1:] += (start - lower) * ratio
-        raised[1:, :-1] -= width * ratio[:-1]
-        raised[1:, 1:] += width * ratio[:-1]
-        level = raised
-    return np.ascontiguousarray(level.transpose(0, 2, 1))
-
-
-def _derivative(coefficients: Floats, order: int, inverse_widths: Floats) -> Floats:
-    """d^r/du^r of the polynomials of s = (u - start) / width: same shape, high powers zero."""
-    derived = np.zeros_like(coefficients)
-    for power in range(order, len(coefficients)):
-        derived[power - order] = coefficients[power] * (factorial(power) // factorial(power - order))
-    derived *= (inverse_widths**order)[:, None]
-    return derived

@@ -8,7 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from .bspline import Floats, Ints, SpanPolynomials
+from .bspline import Floats, Ints
+from .spans import SpanPolynomials, Spans
+from .stretch import Stretch, stretch_of
 
 Bools = NDArray[np.bool_]
 
@@ -49,21 +51,27 @@ class FootPoints:
     basis: Floats
     """Basis values (m, p + 1) at u; column j is of control point span - p + j (modulo m where periodic)."""
     span: Ints
-    """Knot span (m,) of u."""
+    """Knot span (m,) of u; those of several curves are counted through."""
+    columns: Ints
+    """Control points (m, p + 1) that the basis values belong to."""
+
+    def where(self, rows: Ints | Bools | slice) -> FootPoints:
+        """Of some rows."""
+        return FootPoints(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
-class _Curve:
-    """A curve as polynomials on each span, evaluated component-first."""
+class _Curves:
+    """Curves as polynomials on each span, evaluated component-first."""
 
-    tables: SpanPolynomials
+    spans: Spans
     """The basis."""
     coefficients: Floats
-    """(p + 1, 3, 2, n - p) of `SpanPolynomials.curve_coefficients`: S, S', S''."""
+    """(p + 1, 3, 2, n) of `Spans.curve_coefficients`: S, S', S''."""
 
-    def position(self, u: Floats) -> Floats:
-        """S(u) (2, m)."""
-        number, s = self.tables.locate(u)
+    def position(self, v: Floats) -> Floats:
+        """S (2, m) at places on the axis."""
+        number, s = self.spans.locate(v)
         return _horner(self.coefficients[:, 0].take(number, axis=-1), s)
 
     def derivatives(self, number: Ints, s: Floats) -> Floats:
@@ -85,10 +93,10 @@ def _horner(terms: Floats, s: Floats) -> Floats:
 class _Probe:
     """The curve and the distances to it at one parameter for each row."""
 
-    u: Floats
-    """Parameters (m,)."""
+    v: Floats
+    """Places (m,) on the axis."""
     number: Ints
-    """Span numbers (m,) of `SpanPolynomials.locate`."""
+    """Span numbers (m,) of `Spans.locate`."""
     s: Floats
     """Local coordinates (m,)."""
     offset: Floats
@@ -119,13 +127,28 @@ def foot_points(
     long as the period has no limits. `coarse_step` is the grid's step in u. It stops once all rows converged.
     Finite input gives finite output, also where the tangent vanishes, at centres of curvature and at kinks.
     """
-    curve = _Curve(tables, tables.curve_coefficients(control_points, 2))
+    curve = np.zeros(len(points), np.intp)
+    search = (coarse_step, iterations)
+    return joint_foot_points(tables.alone, control_points, points, curve, u_low, u_high, *search)
+
+
+def joint_foot_points(
+    spans: Spans,
+    control_points: Floats,
+    points: Floats,
+    curve: Ints,
+    u_low: Floats,
+    u_high: Floats,
+    coarse_step: float,
+    iterations: int = 50,
+) -> FootPoints:
+    """`foot_points` on several curves at once, `curve` (m,) each row's own, of those that are laid out."""
+    curves = _Curves(spans, spans.curve_coefficients(control_points))
     points_t = np.ascontiguousarray(points.T)
-    low, high = _stretches(tables, u_low, u_high)
-    limits = _limits(tables, low, high)
-    start = _nearest_on_grid(curve, points, low, high, coarse_step)
-    probe = _descend(curve, points_t, start, limits, coarse_step, iterations)
-    return _finish(tables, control_points, points_t, probe, limits)
+    stretch = stretch_of(spans, curve, u_low, u_high)
+    start = _nearest_on_grid(curves, points, curve, stretch, coarse_step)
+    probe = _descend(curves, points_t, start, stretch, np.full(len(points), coarse_step), iterations)
+    return _finish(spans, control_points, points_t, curve, probe, stretch)
 
 
 def refine_foot_points(
@@ -142,59 +165,58 @@ def refine_foot_points(
     As `foot_points`, but from a known parameter (m,), moved into the stretch where it lies outside; a step
     never goes farther than one mean knot interval, and no row ends farther from the curve than it began.
     """
-    curve = _Curve(tables, tables.curve_coefficients(control_points, 2))
+    curve = np.zeros(len(points), np.intp)
+    return refine_joint_foot_points(
+        tables.alone, control_points, points, curve, u_start, u_low, u_high, iterations
+    )
+
+
+def refine_joint_foot_points(
+    spans: Spans,
+    control_points: Floats,
+    points: Floats,
+    curve: Ints,
+    u_start: Floats,
+    u_low: Floats,
+    u_high: Floats,
+    iterations: int = 2,
+) -> FootPoints:
+    """`refine_foot_points` on several curves at once, `curve` (m,) each row's own."""
+    curves = _Curves(spans, spans.curve_coefficients(control_points))
     points_t = np.ascontiguousarray(points.T)
-    low, high = _stretches(tables, u_low, u_high)
-    limits = _limits(tables, low, high)
-    start = _into_stretch(tables, u_start, low, high)
-    probe = _newton(curve, points_t, start, limits, iterations)
-    return _finish(tables, control_points, points_t, probe, limits)
+    stretch = stretch_of(spans, curve, u_low, u_high)
+    start = stretch.moved_into(u_start + spans.shift.take(curve))
+    probe = _newton(curves, points_t, start, stretch, iterations)
+    return _finish(spans, control_points, points_t, curve, probe, stretch)
 
 
-def _stretches(tables: SpanPolynomials, u_low: Floats, u_high: Floats) -> tuple[Floats, Floats]:
-    """Stretch limits (m,): inside an open domain, or begun in a periodic one; never reversed."""
-    if not tables.periodic:
-        low = np.minimum(np.maximum(u_low, tables.low), tables.high)
-        return low, np.maximum(low, np.minimum(u_high, tables.high))
-    period = tables.high - tables.low
-    whole = ~(u_high - u_low < period)
-    turns = period * np.floor((np.where(whole, tables.low, u_low) - tables.low) / period)
-    low = np.where(whole, tables.low, u_low - turns)
-    return low, np.where(whole, tables.high, np.maximum(low, u_high - turns))
-
-
-def _limits(tables: SpanPolynomials, low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """The limits that the iteration must keep: none for a stretch that is a whole period."""
-    if not tables.periodic:
-        return low, high
-    whole = high - low >= tables.high - tables.low
-    return np.where(whole, -np.inf, low), np.where(whole, np.inf, high)
-
-
-def _into_stretch(tables: SpanPolynomials, u: Floats, low: Floats, high: Floats) -> Floats:
-    """u moved into the stretch: by whole periods where periodic, else to the nearest limit."""
-    if not tables.periodic:
-        return np.minimum(np.maximum(u, low), high)
-    period = tables.high - tables.low
-    inside = low + np.mod(u - low, period)
-    nearest = np.where(inside - high < low + period - inside, high, low)
-    return np.where(inside <= high, inside, nearest)
-
-
-def _nearest_on_grid(curve: _Curve, points: Floats, low: Floats, high: Floats, step: float) -> Floats:
-    """The nearest to each point (m,) among the parameters of a shared grid in its stretch, and its limits."""
+def _nearest_on_grid(curves: _Curves, points: Floats, curve: Ints, stretch: Stretch, step: float) -> Floats:
+    """The nearest to each point (m,) among the places of a shared grid in its stretch, and its limits."""
     if len(points) == 0:
         return np.zeros(0)
-    first = float(low.min())
-    count = max(int(np.ceil((float(high.max()) - first) / step)), 1) + 1
-    grid: Floats = first + step * np.arange(count, dtype=np.float64)
-    on_curve = curve.position(np.concatenate([grid, low, high]))
+    low, high = stretch.low, stretch.high
+    grid = np.concatenate([_grid(low[of], high[of], step) for of in _by_curve(curve, len(curves.spans.low))])
+    count = len(grid)
+    on_curve = curves.position(np.concatenate([grid, low, high]))
     on_grid, ends = on_curve[:, :count], on_curve[:, count:].reshape(2, 2, -1)
     offsets = ends - points.T[:, None]
     at_ends = offsets[0] ** 2 + offsets[1] ** 2
     index, at_grid = _nearest_of(points, grid, on_grid, low, high)
     choice = np.concatenate([at_grid[None], at_ends]).argmin(axis=0)
     return np.asarray(np.choose(choice, [grid[index], low, high]))
+
+
+def _by_curve(curve: Ints, count: int) -> list[Bools]:
+    """The rows (m,) of each curve that has any."""
+    of_each = (curve == k for k in range(count))
+    return [rows for rows in of_each if rows.any()]
+
+
+def _grid(low: Floats, high: Floats, step: float) -> Floats:
+    """Evenly spaced places from the lowest to the highest of stretches (m,) on a curve."""
+    first = float(low.min())
+    count = max(int(np.ceil((float(high.max()) - first) / step)), 1) + 1
+    return np.asarray(first + step * np.arange(count, dtype=np.float64))
 
 
 def _nearest_of(
@@ -213,53 +235,50 @@ def _nearest_of(
     return index, least
 
 
-def _newton(
-    curve: _Curve, points_t: Floats, start: Floats, limits: tuple[Floats, Floats], iterations: int
-) -> _Probe:
+def _newton(curves: _Curves, points_t: Floats, start: Floats, stretch: Stretch, iterations: int) -> _Probe:
     """Newton steps no longer than a knot interval; a row that would get farther away is safeguarded."""
-    reach = (curve.tables.high - curve.tables.low) / len(curve.tables.starts)
-    last = _probe(curve, points_t, start)
+    reach = stretch.interval
+    last = _probe(curves, points_t, start)
     for _ in range(iterations):
         step = np.minimum(np.maximum(last.step, -reach), reach)
-        u = np.minimum(np.maximum(last.u + step, limits[0]), limits[1])
-        probe = _probe(curve, points_t, u)
+        v = stretch.within(last.v + step)
+        probe = _probe(curves, points_t, v)
         farther = ~_no_farther(probe.square, last.square)
         if farther.any():
-            own_limits = (limits[0][farther], limits[1][farther])
-            u[farther] = _descend(
-                curve, points_t[:, farther], last.u[farther], own_limits, reach, _SAFEGUARDED_STEPS
-            ).u
-            probe = _probe(curve, points_t, u)
+            own, start = stretch.where(farther), last.v[farther]
+            v[farther] = _descend(
+                curves, points_t[:, farther], start, own, own.interval, _SAFEGUARDED_STEPS
+            ).v
+            probe = _probe(curves, points_t, v)
         last = probe
     return last
 
 
 def _descend(
-    curve: _Curve,
+    curves: _Curves,
     points_t: Floats,
     start: Floats,
-    limits: tuple[Floats, Floats],
-    reach: float,
+    stretch: Stretch,
+    reach: Floats,
     iterations: int,
 ) -> _Probe:
-    """Newton where its step stays inside the bracket, else its middle; it begins as `reach` downhill.
+    """Newton where its step stays inside the bracket, else its middle; it begins as `reach` (m,) downhill.
 
     The bracket is from the nearest so far to where the distance surely rises again, so that no row ever gets
     farther away.
     """
-    tolerance = _STEP_TOLERANCE * (curve.tables.high - curve.tables.low)
-    best = _probe(curve, points_t, start)
+    tolerance = _STEP_TOLERANCE * stretch.length
+    best = _probe(curves, points_t, start)
     end, step = start - np.sign(best.slope) * reach, best.step
     for _ in range(iterations):
-        inside = np.abs(step) < np.abs(end - best.u)
-        candidate = np.where(inside, best.u + step, 0.5 * (best.u + end))
-        candidate = np.minimum(np.maximum(candidate, limits[0]), limits[1])
-        probe = _probe(curve, points_t, candidate)
-        if not (np.abs(candidate - best.u) > tolerance).any():
+        inside = np.abs(step) < np.abs(end - best.v)
+        candidate = stretch.within(np.where(inside, best.v + step, 0.5 * (best.v + end)))
+        probe = _probe(curves, points_t, candidate)
+        if not (np.abs(candidate - best.v) > tolerance).any():
             return probe
         better = _no_farther(probe.square, best.square)
         passed = probe.slope * best.slope <= 0.0
-        end = np.where(better, np.where(passed, best.u, end), probe.u)
+        end = np.where(better, np.where(passed, best.v, end), probe.v)
         step = np.where(better, probe.step, np.inf)
         best = probe if better.all() else _either(better, probe, best)
     return best
@@ -275,10 +294,10 @@ def _no_farther(square: Floats, than: Floats) -> Bools:
     return square <= than + _EQUAL_SQUARE * (1.0 + than)
 
 
-def _probe(curve: _Curve, points_t: Floats, u: Floats) -> _Probe:
-    """The curve and the distances of points (2, m) at u."""
-    number, s = curve.tables.locate(u)
-    orders = curve.derivatives(number, s)
+def _probe(curves: _Curves, points_t: Floats, v: Floats) -> _Probe:
+    """The curve and the distances of points (2, m) at v."""
+    number, s = curves.spans.locate(v)
+    orders = curves.derivatives(number, s)
     offset, first = orders[0], orders[1]
     offset -= points_t
     products = orders * offset
@@ -287,7 +306,7 @@ def _probe(curve: _Curve, points_t: Floats, u: Floats) -> _Probe:
     bend = speed + centripetal
     divisor = np.where(bend > _FLAT * speed, bend, speed)
     step = -slope / np.maximum(divisor, _TINY)
-    return _Probe(u, number, s, offset, first, square, slope, step)
+    return _Probe(v, number, s, offset, first, square, slope, step)
 
 
 def _dot(a: Floats, b: Floats) -> Floats:
@@ -297,39 +316,35 @@ def _dot(a: Floats, b: Floats) -> Floats:
 
 
 def _finish(
-    tables: SpanPolynomials,
-    control_points: Floats,
-    points_t: Floats,
-    probe: _Probe,
-    limits: tuple[Floats, Floats],
+    spans: Spans, control_points: Floats, points_t: Floats, curve: Ints, probe: _Probe, stretch: Stretch
 ) -> FootPoints:
-    """All outputs at the parameters found."""
-    span = probe.number + tables.degree
-    tangent = _unit_tangent(tables, control_points, probe.first, span)
+    """All outputs at the places found."""
+    columns = spans.columns.take(probe.number, axis=0)
+    tangent = _unit_tangent(control_points, probe.first, columns, stretch.length)
     normal = np.empty_like(tangent)
     np.negative(tangent[1], out=normal[0])
     normal[1] = tangent[0]
     return FootPoints(
-        u=tables.inside(probe.u),
+        u=stretch.in_domain(probe.v) - spans.shift.take(curve),
         position=(points_t + probe.offset).T,
         tangent_unit=tangent.T,
         normal_unit=normal.T,
         distance=-_dot(normal, probe.offset),
-        interior=_interior(tables, probe, limits),
-        basis=tables.evaluate_located(probe.number, probe.s)[0],
-        span=span,
+        interior=_interior(probe, stretch),
+        basis=spans.basis(probe.number, probe.s),
+        span=probe.number + (spans.first + spans.degree),
+        columns=columns,
     )
 
 
-def _unit_tangent(tables: SpanPolynomials, control_points: Floats, first: Floats, span: Ints) -> Floats:
+def _unit_tangent(control_points: Floats, first: Floats, columns: Ints, length: Floats) -> Floats:
     """S' / |S'| (2, m); where S' vanishes the direction of the control polygon, or else of the x axis."""
     norm = np.sqrt(_dot(first, first))
-    smallest = _NO_TANGENT * np.abs(control_points).max(initial=0.0) / (tables.high - tables.low)
-    vanishing = ~(norm > smallest)
+    vanishing = ~(norm * length > _NO_TANGENT * np.abs(control_points).max(initial=0.0))
     if not vanishing.any():
         return first / norm
-    spans = span[vanishing]
-    chord = (control_points[spans] - control_points[spans - tables.degree]).T
+    ends = columns[vanishing]
+    chord = (control_points[ends[:, -1]] - control_points[ends[:, 0]]).T
     chord[0, ~chord.any(axis=0)] = 1.0
     direction = first.copy()
     direction[:, vanishing] = chord
@@ -337,13 +352,13 @@ def _unit_tangent(tables: SpanPolynomials, control_points: Floats, first: Floats
     return direction / norm
 
 
-def _interior(tables: SpanPolynomials, probe: _Probe, limits: tuple[Floats, Floats]) -> Bools:
+def _interior(probe: _Probe, stretch: Stretch) -> Bools:
     """False at an end of an open domain, and at a limit of the stretch where the distance falls outward."""
-    tolerance = _END_TOLERANCE * (tables.high - tables.low)
-    at_low = probe.u - limits[0] <= tolerance
-    at_high = limits[1] - probe.u <= tolerance
+    tolerance = _END_TOLERANCE * stretch.length
+    at_low = probe.v - stretch.floor <= tolerance
+    at_high = stretch.ceiling - probe.v <= tolerance
     outside = (at_low & (probe.slope > 0.0)) | (at_high & (probe.slope < 0.0))
-    if not tables.periodic:
-        outside |= probe.u <= tables.low + tolerance
-        outside |= probe.u >= tables.high - tolerance
+    if not stretch.periodic:
+        outside |= probe.v <= stretch.begin + tolerance
+        outside |= probe.v >= stretch.end - tolerance
     return ~outside

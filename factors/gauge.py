@@ -15,7 +15,12 @@ def spacing_residuals(control_points: Array, nominal: Array, periodic: bool) -> 
     which are dr/dc_{j+1} = -dr/dc_j. Coinciding points have a zero direction.
     """
     following = np.roll(control_points, -1, axis=0) if periodic else control_points[1:]
-    offset = following - control_points[: len(following)]
+    return pair_residuals(control_points[: len(following)], following, nominal)
+
+
+def pair_residuals(first: Array, second: Array, nominal: Array) -> tuple[Array, Array]:
+    """`|b_j - a_j| - nominal_j` (k,) of any pairs of points (k, 2), and the directions as above."""
+    offset = second - first
     length = np.hypot(offset[:, 0], offset[:, 1])
     return length - nominal, offset / np.maximum(length, np.finfo(float).tiny)[:, None]
 
@@ -36,9 +41,9 @@ def smoothness_matrix(abscissae: Array, period: float | None, spacing: float | N
     before, after = gaps[:-1], gaps[1:]
     matrix = np.zeros((len(rows), m))
     scale = 2.0 * mean**2 / (before + after)
-    np.add.at(matrix, (rows, rows), scale / before)
-    np.add.at(matrix, (rows, (rows + 1) % m), -scale / before - scale / after)
-    np.add.at(matrix, (rows, (rows + 2) % m), scale / after)
+    matrix[rows, rows] += scale / before
+    matrix[rows, (rows + 1) % m] -= scale / before + scale / after
+    matrix[rows, (rows + 2) % m] += scale / after
     return matrix
 
 

@@ -12,11 +12,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .bspline import SpanPolynomials
 from .footpoint import FootPoints, foot_points
 from .linear_graph import jacobian_factor, rotation
 from .odometry import IntegratedOdometry, odometry_residuals
 from .projection import huber_weights, project, to_map
+from .spans import SpanPolynomials
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]

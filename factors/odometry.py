@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 Array = NDArray[np.float64]
 
@@ -37,10 +38,10 @@ def wrap_angle(angle: Array) -> Array:
 
 def se2_exp(tangents: Array) -> Array:
     """Exponential of SE(2), row by row: (k, 3) tangents (vx, vy, wz) times time -> (k, 3) relative poses."""
-    theta = tangents[:, 2]
-    sinc = np.sinc(theta / np.pi)
-    cosc = 0.5 * theta * np.sinc(0.5 * theta / np.pi) ** 2
-    x, y = tangents[:, 0], tangents[:, 1]
+    x, y, theta = tangents.T
+    half = np.where(theta == 0.0, np.finfo(float).tiny, 0.5 * theta)  # so that sin(half) / half is 1
+    sine, cosine = np.sin(half), np.cos(half)
+    sinc, cosc = sine * cosine / half, sine * sine / half
     return np.array([sinc * x - cosc * y, cosc * x + sinc * y, theta]).T
 
 
@@ -85,18 +86,18 @@ def integrate_twists(durations: Array, twists: Array, sigma: Array) -> Integrate
     poses = integrate_poses(durations, twists)
     end = poses[-1]
     adjoints = _adjoints_to_end(_midpoints(poses, durations, twists), end)
-    scaled = adjoints * (durations[:, None] * sigma)[:, None, :]
-    covariance = np.einsum("kij,klj->il", scaled, scaled)
-    by_scale = np.einsum("kij,kj,k->i", adjoints[:, :, :2], twists[:, :2], durations)
-    by_bias = durations @ adjoints[:, :, 2]
-    return _integrated(end, covariance, np.column_stack([by_scale, by_bias]))
+    scaled = (adjoints * (durations[:, None] * sigma)[:, None, :]).transpose(1, 0, 2).reshape(3, -1)
+    by_speed, by_rate = adjoints[:, :, :2] @ twists[:, :2, None], adjoints[:, :, 2:]
+    by_calibration = np.concatenate([by_speed, by_rate], axis=2).transpose(1, 2, 0) @ durations
+    return _integrated(end, scaled @ scaled.T, by_calibration)
 
 
 def _integrated(delta: Array, covariance: Array, calibration_jacobian: Array) -> IntegratedOdometry:
     """With the whitener; a covariance of zero (no time has passed) is lifted to the floor."""
     floored = covariance + np.eye(3) * MIN_SIGMA**2
-    whitener = np.linalg.inv(np.linalg.cholesky(floored))
-    return IntegratedOdometry(delta, covariance, calibration_jacobian, whitener)
+    root, _ = lapack.dpotrf(floored, lower=1)
+    whitener, _ = lapack.dtrtri(root, lower=1)
+    return IntegratedOdometry(delta, covariance, calibration_jacobian, np.ascontiguousarray(whitener))
 
 
 def _midpoints(poses: Array, durations: Array, twists: Array) -> Array:

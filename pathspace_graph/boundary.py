@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.bspline import SpanPolynomials
-from pathspace_graph.factors.footpoint import FootPoints, foot_points, refine_foot_points
+from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_foot_points
 from pathspace_graph.factors.gauge import greville, smoothness_matrix
+from pathspace_graph.factors.spans import SpanPolynomials, Spans, lay_out
 
 from .settings import GaugeSettings, SplineSettings
 from .spline import BSpline
@@ -55,10 +55,10 @@ class Boundary:
         """Parameter up to which sightings hold the curve; beyond it is extrapolated."""
         self.sighted: list[Array] = []
         """Every distinct sighting that the curve was led through, (2,), map frame."""
-        self._set_knots(knots)
+        self._set_tables(SpanPolynomials(knots, self.degree, periodic))
 
-    def _set_knots(self, knots: Array) -> None:
-        self.tables = SpanPolynomials(knots, self.degree, self.periodic)
+    def _set_tables(self, tables: SpanPolynomials) -> None:
+        self.tables, knots = tables, tables.knots
         n = len(knots) - self.degree - 1
         self.size = n - self.degree if self.periodic else n
         """Distinct control points."""
@@ -96,8 +96,8 @@ class Boundary:
             whole=whole,
             columns=np.stack([2 * pairs, 2 * pairs + 1], axis=2).reshape(-1, 4),
             nominal=self.nominal[first],
-            smooth=np.asarray(np.kron(smooth, np.eye(2)), float),
-            hessian=np.asarray(np.kron(smooth + anchor, np.eye(2)), float),
+            smooth=_by_axis(smooth),
+            hessian=_by_axis(smooth + anchor),
         )
 
     @property
@@ -128,9 +128,14 @@ class Boundary:
 
     def find(self, control_points: Array, points: Array, low: Array, high: Array) -> FootPoints:
         """Foot points of points (m, 2) in their stretches, searched for globally."""
-        s = self.settings
-        unwrapped = self.extended(control_points)
-        return foot_points(self.tables, unwrapped, points, low, high, s.search_step, s.search_iterations)
+        s, spans = self.settings, self._spans_from(float(np.min(low, initial=np.inf)))
+        alone, search = np.zeros(len(points), np.intp), (s.search_step, s.search_iterations)
+        return joint_foot_points(spans, control_points, points, alone, low, high, *search)
+
+    def _spans_from(self, u: float) -> Spans:
+        """The curve's spans; of an open one those from u on, since the others are not looked at."""
+        first = 0 if self.periodic else int(self.tables.locate(np.array([u]))[0][0])
+        return lay_out([self.tables.tail(first) if first else self.tables], [first], [self.size])
 
     def refine(self, control_points: Array, points: Array, u: Array) -> FootPoints:
         """Foot points of points (m, 2) near the parameters (m,) they had."""
@@ -139,9 +144,14 @@ class Boundary:
         unwrapped = self.extended(control_points)
         return refine_foot_points(self.tables, unwrapped, points, u, low, high, s.refine_iterations)
 
+    @property
+    def trusted(self) -> float:
+        """Parameter up to which the curve is believed: what an open one only extrapolates isn't."""
+        return np.inf if self.periodic else self.confirmed + self.settings.confirmed_margin
+
     def believed(self, high: Array) -> Array:
         """Upper limits of stretches, (m,), kept off what an open curve only extrapolates."""
-        return high if self.periodic else np.minimum(high, self.confirmed + self.settings.confirmed_margin)
+        return np.minimum(high, self.trusted)
 
     def evaluate(self, control_points: Array, u: Array, derivative: int = 0) -> Array:
         """S(u) or a derivative, (m, 2)."""
@@ -165,7 +175,7 @@ class Boundary:
         missing = int(np.ceil((targets_u[-1] - self.tables.high) / spacing - ROUND_OFF))
         if missing > 0:
             last = self.knots[-1] + spacing * np.arange(1, missing + 1)
-            self._set_knots(np.concatenate([self.knots, last]))
+            self._set_tables(self.tables.extended(np.concatenate([self.knots, last])))
         before = int(np.searchsorted(self.knots[:old], self.confirmed - ROUND_OFF)) - 1
         placed = self._place(control_points, max(before, 0), targets_u, targets)
         self.confirmed = float(targets_u[-1])
@@ -178,15 +188,16 @@ class Boundary:
             start = max(self.confirmed - self.nominal[0], 0.0)
             held_u = np.linspace(start, self.confirmed, self.settings.fit_held)
         held = self._held(control_points, held_u)
-        u = np.concatenate([held_u, targets_u])
-        values, span = self.tables.evaluate(u)
-        design = np.zeros((len(u), self.size))
-        np.put_along_axis(design, self.columns(span), values[0], axis=1)
-        smooth = self.settings.fit_smoothness * smoothness_matrix(self.abscissae, None)
+        values, span = self.tables.evaluate(np.concatenate([held_u, targets_u]))
+        columns = self.columns(span)
+        first = max(min(int(columns.min()), kept - 2), 0)  # no row before it has a column that is free
+        smooth = self.settings.fit_smoothness * smoothness_matrix(self.abscissae[first:], None)
+        design = np.zeros((len(span), self.size - first))
+        np.put_along_axis(design, columns - first, values[0], axis=1)
         matrix = np.concatenate([design, smooth])
         right = np.concatenate([held, targets, np.zeros((len(smooth), 2))])
-        right = right - matrix[:, :kept] @ control_points[:kept]
-        free = np.linalg.lstsq(matrix[:, kept:], right, rcond=None)[0]
+        right = right - matrix[:, : kept - first] @ control_points[first:kept]
+        free = np.linalg.lstsq(matrix[:, kept - first :], right, rcond=None)[0]
         return np.concatenate([control_points[:kept], free])
 
     def _held(self, control_points: Array, u: Array) -> Array:
@@ -196,6 +207,13 @@ class Boundary:
         values, span = self.tables.evaluate(u)
         columns = np.minimum(self.columns(span), len(control_points) - 1)
         return np.asarray(np.einsum("mj,mjd->md", values[0], control_points[columns]))
+
+
+def _by_axis(matrix: Array) -> Array:
+    """(2k, 2k) the same matrix (k, k) on x and on y of k points."""
+    both = np.zeros((len(matrix), 2, len(matrix), 2))
+    both[:, 0, :, 0] = both[:, 1, :, 1] = matrix
+    return both.reshape(2 * len(matrix), -1)
 
 
 def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:

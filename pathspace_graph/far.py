@@ -52,8 +52,8 @@ class Conditional:
 
     parting: Parting
     """Whose it is."""
-    columns: IntArray
-    """As the parting's, kept up to date where x grows."""
+    at: slice
+    """Where the parting's columns are among all, which are kept up to date where x grows (`Far.columns`)."""
     point: Array
     """(f + s,) frontals and separator as they were."""
     lower: Array
@@ -63,12 +63,12 @@ class Conditional:
     right: Array
     """(f,) y."""
 
-    def columns_where(self, begin: Mapping[int, int], otherwise: int) -> IntArray:
+    def order(self, columns: IntArray, begin: Mapping[int, int], otherwise: int) -> IntArray:
         """(f + s,) columns of frontals and separator, where each anchor begins given by its cycle."""
         k, pose = self.parting.frontals, np.arange(POSE)
         left = [] if self.parting.left is None else [begin[self.parting.left] + pose]
         anchor = begin.get(self.parting.anchor, otherwise) + pose
-        return np.concatenate([self.columns[:k], *left, self.columns[k:], anchor])
+        return np.concatenate([columns[:k], *left, columns[k:], anchor])
 
     @property
     def root(self) -> Array:
@@ -89,6 +89,7 @@ class Far:
     def __init__(self) -> None:
         self.parts: list[Conditional] = []
         """The first to leave first."""
+        self._columns: IntArray = np.zeros(0, np.intp)
 
     @property
     def anchor(self) -> int | None:
@@ -97,8 +98,11 @@ class Far:
 
     def shift(self, column: int, count: int) -> None:
         """So many new entries of x at a column."""
-        for part in self.parts:
-            part.columns[part.columns >= column] += count
+        self._columns += count * (self._columns >= column)
+
+    def columns(self, part: Conditional) -> IntArray:
+        """Columns of x of a part's frontal control points, and of its separator but the anchor: a view."""
+        return self._columns[part.at]
 
     def push(self, prior: Prior, parting: Parting) -> Prior:
         """A part leaves; gives the prior on what stays, in its order."""
@@ -108,16 +112,18 @@ class Far:
         lower = np.tril(cholesky(information[:f, :f]))
         half, _ = lapack.dtrtrs(lower, np.column_stack([information[:f, f:], gradient[:f]]), lower=1)
         w, y = np.ascontiguousarray(half[:, :-1]), half[:, -1]
-        self.parts.append(Conditional(parting, parting.columns.copy(), point, lower, w, y))
+        at = slice(len(self._columns), len(self._columns) + len(parting.columns))
+        self._columns = np.concatenate([self._columns, parting.columns])
+        self.parts.append(Conditional(parting, at, point, lower, w, y))
         return Prior(information[f:, f:] - w.T @ w, gradient[f:] - y @ w, point[f:])
 
     def refresh(self, x: Array, anchor: Array) -> dict[int, Array]:
         """Bring the far entries of x up to date, given the last part's anchor (3,); all anchors by cycle."""
         anchors = {self.parts[-1].parting.anchor: anchor} if self.parts else {}
         for part in reversed(self.parts):
-            parting, k = part.parting, part.parting.frontals
-            frontal = part.frontal_mean(np.concatenate([x[part.columns[k:]], anchors[parting.anchor]]))
-            x[part.columns[:k]] = frontal[:k]
+            parting, k, columns = part.parting, part.parting.frontals, self.columns(part)
+            frontal = part.frontal_mean(np.concatenate([x[columns[k:]], anchors[parting.anchor]]))
+            x[columns[:k]] = frontal[:k]
             if parting.left is not None:
                 anchors[parting.left] = frontal[k:]
         return anchors
@@ -139,7 +145,7 @@ class Far:
         information[np.ix_(own, own)] += prior.information
         descent[own] += prior.descent_at(point[own])
         for part in self.parts:
-            columns = part.columns_where(begin, poses)
+            columns = part.order(self.columns(part), begin, poses)
             root, moved = part.root, point[columns] - part.point
             information[np.ix_(columns, columns)] += root.T @ root - part.parting.hessian
             descent[columns] += root.T @ (part.right - root @ moved)

@@ -127,8 +127,8 @@ class FixedLagMapper:
     def _classify(self, detections: Detections) -> None:
         """Which readings update a curve, and which are sightings of what no curve explains yet."""
         new = self.smoother.add_readings(detections)
-        for label in self.boundaries:
-            admit(self.smoother, label, retest=label in self._grown)
+        if self.boundaries:
+            admit(self.smoother, self._grown)
         if not self.closed:
             self.growth.sight(self.smoother, new, detections.t)
 

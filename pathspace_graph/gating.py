@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import TypeVar
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
-from pathspace_graph.factors.projection import ProjectionRows, project, to_map
+from pathspace_graph.factors.projection import ProjectionRows, project, sigma_across, to_map
 
 from .boundary import Boundary
 from .labels import UNKNOWN
+from .readings import Readings
 from .settings import MapperSettings
 from .smoother import Smoother, Step
 from .state import State
@@ -22,83 +20,95 @@ from .window import POSE
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-T = TypeVar("T", FootPoints, ProjectionRows)
 
 SAME_WAY = 0.5
 """Cosine of the angle between a vehicle's heading and the curve beside it, at least."""
 
 
-def admit(smoother: Smoother, label: int, retest: bool) -> None:
-    """Readings that are not in use and lie on the curve: `d^2 < chi^2 (sigma^2 + g' Sigma g)`.
+def admit(smoother: Smoother, retest: frozenset[int]) -> None:
+    """Readings that are not in use and lie on a curve: `d^2 < chi^2 (sigma^2 + g' Sigma g)`.
 
-    Those of the newest pose, whose station is found along with them; all in the window where `retest`, since
-    the curve has grown. A reading of unknown colour is used only where one curve alone would have it.
+    Those of the newest pose, whose stations are found along with them; all in the window of the labels
+    `retest`, whose curves have grown. A reading of unknown colour is used only where one curve alone would
+    have it.
     """
-    readings, gate = smoother.readings, smoother.settings.gate
-    rows = np.concatenate([readings.pending(label), readings.contested(label)])
-    if not retest:
-        rows = rows[readings.slot[rows] == len(smoother.times) - 1]
-    rows, foot, projected = _near_curve(smoother, label, rows)
+    readings, state, gate = smoother.readings, smoother.state, smoother.settings.gate
+    rows, curve = _untested(smoother, retest)
+    poses = state.poses[readings.slot[rows]]
+    points = to_map(readings.point[rows], poses)
+    foot = _find(smoother, rows, curve, points)
     if len(rows) == 0 or smoother.last_step is None:
         return
-    variance, unknown = projected.sigma**2 + gate.sigma_floor**2, readings.label[rows] == UNKNOWN
-    passes = foot.distance**2 < np.where(unknown, gate.chi_unknown, gate.chi) ** 2 * variance
-    far = np.flatnonzero(~passes & ~unknown)
+    covariances, sigma_model = readings.covariance[rows], smoother.settings.spline.sigma_model
+    sigma = sigma_across(foot.normal_unit, covariances, poses, sigma_model)
+    variance, unknown = sigma**2 + gate.sigma_floor**2, readings.label[rows] == UNKNOWN
+    near, square = foot.interior & (np.abs(foot.distance) < gate.rough), foot.distance**2
+    passes = near & (square < np.where(unknown, gate.chi_unknown, gate.chi) ** 2 * variance)
+    far = np.flatnonzero(near & ~passes & ~unknown)
     if len(far):  # what the joint uncertainty adds matters to these only
-        variance[far] += joint_variance(
-            smoother, label, readings.slot[rows[far]], _take(foot, far), _take(projected, far)
-        )
-        passes[far] = foot.distance[far] ** 2 < gate.chi**2 * variance[far]
-    taken = readings.used[rows]
-    doubtful = rows[passes & taken]
-    readings.used[doubtful], readings.boundary[doubtful] = False, UNKNOWN
-    passes &= ~taken
-    chosen = rows[passes]
-    readings.used[chosen], readings.boundary[chosen] = True, label
-    readings.u[chosen] = foot.u[passes]
+        beside = foot.where(far)
+        projected = project(points[far], covariances[far], poses[far], beside, sigma_model)
+        variance[far] += joint_variance(smoother, readings.slot[rows[far]], beside, projected)
+        passes[far] = square[far] < gate.chi**2 * variance[far]
+    _decide(readings, rows[passes], state.curves.labels[curve[passes]], foot.u[passes])
 
 
-def _near_curve(
-    smoother: Smoother, label: int, rows: IntArray
-) -> tuple[IntArray, FootPoints, ProjectionRows]:
-    """Those of some readings that lie roughly on the visible stretch of a curve, projected on it.
+def _untested(smoother: Smoother, retest: frozenset[int]) -> tuple[IntArray, IntArray]:
+    """Readings to be tested, and on which curve (m,) each."""
+    readings, curves = smoother.readings, smoother.state.curves
+    newest = int(readings.slot.searchsorted(len(smoother.times) - 1))
+    rows = [readings.open_to(label, 0 if label in retest else newest) for label in curves.labels.tolist()]
+    return np.concatenate(rows), np.repeat(np.arange(len(rows)), [len(of) for of in rows])
 
-    In the same search the newest pose gets its station.
+
+def _decide(readings: Readings, rows: IntArray, labels: IntArray, u: Array) -> None:
+    """What passes is used on the boundary (m,) that takes it; what two would have, on neither."""
+    doubtful = readings.used[rows] | (np.bincount(rows)[rows] > 1)
+    readings.used[rows], readings.boundary[rows], readings.u[rows] = True, labels, u
+    readings.used[rows[doubtful]], readings.boundary[rows[doubtful]] = False, UNKNOWN
+
+
+def _find(smoother: Smoother, rows: IntArray, curve: IntArray, points: Array) -> FootPoints:
+    """Foot points of readings, at points (m, 2), on the visible stretch of each one's curve.
+
+    In the same search the newest pose gets its station on every curve.
     """
-    readings, state, settings = smoother.readings, smoother.state, smoother.settings
-    boundary, gate, slots = state.boundaries[label], settings.gate, readings.slot[rows]
-    poses = state.poses[slots]
-    points = to_map(readings.point[rows], poses)
-    expected, behind, ahead = _expected_station(state, label, settings)
-    stations = np.append(state.stations[label], expected)[slots]
-    low = np.append(stations - gate.view_behind, expected - behind)
-    high = boundary.believed(np.append(stations + gate.view_ahead, expected + ahead))
-    sought = np.concatenate([points, state.poses[-1:, :2]])
-    foot = boundary.find(state.control_points(label), sought, low, high)
-    station = float(foot.u[-1])
-    if _lost(foot, state.poses[-1, 2], gate.station_lateral):
-        smoother.refresh()
-        station = relocate(boundary, state.control_points(label), state.poses[-1], gate.station_room)
-    _append_station(state, label, station)
-    keep = np.flatnonzero(foot.interior[:-1] & (np.abs(foot.distance[:-1]) < gate.rough))
-    rows, foot = rows[keep], _take(foot, keep)
-    sigma_model = settings.spline.sigma_model
-    return rows, foot, project(points[keep], readings.covariance[rows], poses[keep], foot, sigma_model)
+    state, gate = smoother.state, smoother.settings.gate
+    curves, pose = state.curves, state.poses[-1]
+    known = np.array([state.stations[label] for label in state.boundaries])
+    known = np.append(known, known[:, -1:], axis=1)  # about where the newest pose is
+    behind, ahead = _station_room(state, smoother.settings)
+    seen_from, all_curves = known[curve, smoother.readings.slot[rows]], np.arange(len(known))
+    foot = curves.find(
+        state.map_points,
+        np.concatenate([points, np.broadcast_to(pose[:2], (len(known), 2))]),
+        np.append(curve, all_curves),
+        np.append(seen_from - gate.view_behind, known[:, -1] - behind),
+        np.append(seen_from + gate.view_ahead, known[:, -1] + ahead),
+    )
+    beside = foot.where(slice(len(rows), None))
+    along = beside.tangent_unit @ np.array([np.cos(pose[2]), np.sin(pose[2])])
+    lost = (along < 0.0) | (np.abs(beside.distance) > gate.station_lateral)
+    for label, u, is_lost in zip(state.boundaries, beside.u.tolist(), lost.tolist(), strict=True):
+        _append_station(state, label, _sought_again(smoother, label) if is_lost else u)
+    return foot.where(slice(len(rows)))
 
 
-def _expected_station(state: State, label: int, settings: MapperSettings) -> tuple[float, float, float]:
-    """About where the newest pose's foot point is, and how far behind and ahead it is looked for (m)."""
-    known, gate = float(state.stations[label][-1]), settings.gate
+def _station_room(state: State, settings: MapperSettings) -> tuple[float, float]:
+    """How far behind and ahead (m) of the last station the newest pose's foot point is looked for."""
+    gate = settings.gate
     moved = float(np.hypot(*(state.poses[-1, :2] - state.poses[-2, :2])))
     if moved < gate.station_step:
-        return known, settings.spline.refine_room, settings.spline.refine_room
-    return known, gate.station_behind, gate.station_ahead
+        return settings.spline.refine_room, settings.spline.refine_room
+    return gate.station_behind, gate.station_ahead
 
 
-def _lost(foot: FootPoints, heading: float, lateral: float) -> bool:
-    """Whether the last foot point can't be the vehicle's: the curve runs against it there, or is far off."""
-    along = foot.tangent_unit[-1] @ np.array([np.cos(heading), np.sin(heading)])
-    return bool(along < 0.0 or abs(foot.distance[-1]) > lateral)
+def _sought_again(smoother: Smoother, label: int) -> float:
+    """Station of a vehicle that the curve runs against, or is far off, where it was looked for."""
+    smoother.refresh()
+    state = smoother.state
+    room = smoother.settings.gate.station_room
+    return relocate(state.boundaries[label], state.control_points(label), state.poses[-1], room)
 
 
 def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float) -> float:
@@ -130,14 +140,7 @@ def _append_station(state: State, label: int, u: float) -> None:
     state.stations[label] = np.append(known, u)
 
 
-def _take(rows: T, keep: IntArray) -> T:
-    """Some rows of a dataclass of columns."""
-    return type(rows)(*(getattr(rows, column.name)[keep] for column in fields(rows)))
-
-
-def joint_variance(
-    smoother: Smoother, label: int, slots: IntArray, foot: FootPoints, projected: ProjectionRows
-) -> Array:
+def joint_variance(smoother: Smoother, slots: IntArray, foot: FootPoints, projected: ProjectionRows) -> Array:
     """`g_i' Sigma g_i` (m,) in m^2: variance of each row's residual by what is estimated.
 
     Sigma is that of the last step, which the newest pose wasn't part of: it is reached through its odometry,
@@ -145,7 +148,7 @@ def joint_variance(
     """
     step, state = smoother.last_step, smoother.state
     assert step is not None
-    gradient = _control_gradient(state, label, foot, projected, step)
+    gradient = _control_gradient(foot, projected, step)
     by_pose, extra = projected.by_pose.copy(), np.zeros(len(slots))
     newest = slots == len(smoother.times) - 1
     if newest.any():
@@ -164,17 +167,14 @@ def joint_variance(
     return np.asarray(np.einsum("im,im->m", half, half)) + extra
 
 
-def _control_gradient(
-    state: State, label: int, foot: FootPoints, projected: ProjectionRows, step: Step
-) -> Array:
+def _control_gradient(foot: FootPoints, projected: ProjectionRows, step: Step) -> Array:
     """(n, m) derivative of each residual by the step's system, of which only control points are filled in.
 
     A reading where the map was far has none: it gets no benefit of the doubt, and waits for the next cycle.
     """
     m = len(foot.u)
     gradient = np.zeros((len(step.factor), m), order="F")
-    base = state.offset(label) + 2 * state.boundaries[label].columns(foot.span)
-    place, row = step.position[base], np.broadcast_to(np.arange(m)[:, None], base.shape)
+    place, row = step.position[2 * foot.columns], np.broadcast_to(np.arange(m)[:, None], foot.columns.shape)
     known = place >= 0
     gradient[place[known], row[known]] += projected.by_control[:, :, 0][known]
     gradient[place[known] + 1, row[known]] += projected.by_control[:, :, 1][known]

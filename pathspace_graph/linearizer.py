@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.gauge import spacing_residuals
+from pathspace_graph.factors.gauge import pair_residuals
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, odometry_residuals
 from pathspace_graph.factors.projection import huber_weights, project, project_to_point, to_map
 
@@ -30,23 +30,23 @@ class FootParameters:
     """(m,) readings."""
     u: Array
     """(m,) their parameters."""
+    cut_off: bool
+    """Whether any reading slid to where an open curve is far."""
 
 
-def reading_rows(
-    state: State, readings: Readings, label: int, settings: MapperSettings
-) -> tuple[Rows, FootParameters]:
-    """`w_i n_i . (R z_i + t - S(u_i)) / sigma_i` of every reading in use on a boundary (paper: Update).
+def reading_rows(state: State, readings: Readings, settings: MapperSettings) -> tuple[Rows, FootParameters]:
+    """`w_i n_i . (R z_i + t - S(u_i)) / sigma_i` of every reading in use (paper: Update).
 
     Columns [pose | control points of the span]; w the root of its Huber weight, zero where the foot point is
     not interior. The readings are left as they are. Of the residual `point` two rows each.
     """
-    boundary = state.boundaries[label]
-    rows = readings.used_on(label)
-    slots = readings.slot[rows]
+    rows = np.flatnonzero(readings.used)
+    curves, slots = state.curves, readings.slot[rows]
+    curve = curves.number(readings.boundary[rows])
     poses = state.poses[slots]
     points = to_map(readings.point[rows], poses)
-    foot = boundary.refine(state.control_points(label), points, readings.u[rows])
-    base = state.offset(label) + 2 * boundary.columns(foot.span)
+    foot = curves.refine(state.map_points, points, curve, readings.u[rows])
+    base = 2 * foot.columns
     by_control = np.stack([base, base + 1], axis=2).reshape(len(rows), 2 * base.shape[1])
     columns = np.concatenate([state.pose_columns(slots), by_control], axis=1)
     if settings.spline.residual == "point":
@@ -54,7 +54,7 @@ def reading_rows(
         columns = np.repeat(columns, 2, axis=0)
     else:
         jacobian, residual = _across(points, readings.covariance[rows], poses, foot, settings)
-    return Rows(columns, jacobian, residual), FootParameters(rows, foot.u)
+    return Rows(columns, jacobian, residual), FootParameters(rows, foot.u, curves.cut_off(curve, foot))
 
 
 def _across(
@@ -81,16 +81,15 @@ def _to_point(
     return jacobian * weight[:, None], projected.residual.ravel() * weight
 
 
-def spacing_rows(state: State, label: int, sigma_share: float) -> Rows:
+def spacing_rows(state: State, sigma_share: float) -> Rows:
     """`(|c_{j+1} - c_j| - nominal_j) / (sigma_share nominal_j)`: near control points keep their distance."""
-    near = state.near(label)
-    gauge = state.boundaries[label].gauge_on(near)
-    points = state.control_points(label)[near]
-    residual, direction = spacing_residuals(points, gauge.nominal, gauge.whole)
-    sigma = sigma_share * gauge.nominal
-    columns = state.offset(label) + gauge.columns
+    curves = state.curves
+    pairs, nominal = curves.pairs, curves.nominal
+    first, second = state.map_points[pairs[:, ::2].T // 2]
+    residual, direction = pair_residuals(first, second, nominal)
+    sigma = sigma_share * nominal
     jacobian = np.concatenate([-direction, direction], axis=1) / sigma[:, None]
-    return Rows(columns, jacobian, residual / sigma)
+    return Rows(pairs, jacobian, residual / sigma)
 
 
 def odometry_rows(state: State, odometry: Sequence[IntegratedOdometry]) -> Rows:
@@ -129,7 +128,7 @@ def normal_equations(
 
 def add_smoothness(hessian: Array, descent: Array, state: State, system: Array) -> None:
     """Each boundary's smoothness and anchor between near control points, added to normal equations."""
-    for label, boundary in state.boundaries.items():
-        block, gauge = state.near_block(label), boundary.gauge_on(state.near(label))
-        hessian[block, block] += gauge.hessian
-        descent[block] -= gauge.smooth @ system[block]
+    if state.boundaries:
+        n, curves = state.near_size, state.curves
+        hessian[:n, :n] += curves.hessian
+        descent[:n] -= curves.smooth @ system[:n]

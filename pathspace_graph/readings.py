@@ -71,6 +71,12 @@ class Readings:
         """Rows not in use that may belong to the boundary `label`, those of unknown colour included."""
         return np.flatnonzero(~self.used & ((self.label == label) | (self.label == UNKNOWN)))
 
-    def contested(self, label: int) -> IntArray:
-        """Rows of unknown colour that another boundary than `label` has in use."""
-        return np.flatnonzero(self.used & (self.label == UNKNOWN) & (self.boundary != label))
+    def open_to(self, label: int, since: int) -> IntArray:
+        """Rows, from one on, that the boundary `label` may take: not in use, or doubtful where they are.
+
+        Of unknown colour are those too that another boundary has in use.
+        """
+        said, used = self.label[since:], self.used[since:]
+        unknown = said == UNKNOWN
+        open_to = np.where(used, unknown & (self.boundary[since:] != label), unknown | (said == label))
+        return since + np.flatnonzero(open_to)

@@ -143,21 +143,21 @@ class Smoother:
         """Whitened rows of everything in the window but the prior, on the system's entries."""
         return self._linearize()[0]
 
-    def _linearize(self) -> tuple[list[Rows], list[FootParameters]]:
+    def _linearize(self) -> tuple[list[Rows], FootParameters | None]:
         """The same, and the foot points that it found."""
-        state, groups, feet = self.state, [], []
-        for label in state.boundaries:
-            rows, foot = reading_rows(state, self.readings, label, self.settings)
-            groups += [rows, spacing_rows(state, label, self.settings.gauge.sigma_spacing)]
-            feet.append(foot)
+        state, groups, feet = self.state, [], None
+        if state.boundaries:
+            rows, feet = reading_rows(state, self.readings, self.settings)
+            groups += [rows, spacing_rows(state, self.settings.gauge.sigma_spacing)]
         if self.odometry:
             groups.append(odometry_rows(state, self.odometry))
         if len(self.factors):
             groups += self.factors.rows(state.poses, self.first_cycle, state.pose_column(0))
         if state.whole:
             return groups, feet
-        groups = [rows.at(state.position) for rows in groups]
-        if min(int(rows.columns.min(initial=0)) for rows in groups) < 0:
+        position = state.position
+        groups = [rows.at(position) for rows in groups]
+        if (feet and feet.cut_off) or (groups[0].columns < 0).any():
             self.join()  # a reading has slid to where the map is far: rare, since the near part is generous
             return self._linearize()
         return groups, feet
@@ -165,8 +165,8 @@ class Smoother:
     def step(self, sigma_step: float) -> None:
         """One step, relinearized at the current estimate; a control point moves `sigma_step` (m) freely."""
         groups, feet = self._linearize()
-        for foot in feet:
-            self.readings.u[foot.rows] = foot.u
+        if feet is not None:
+            self.readings.u[feet.rows] = feet.u
         state, system = self.state, self.state.system
         point = state.vector[system]
         hessian, descent = normal_equations(groups, self.prior, state, point)
@@ -223,10 +223,8 @@ class Smoother:
         """(size, size), (size,) normal equations of the weak priors between near control points."""
         state = self.state
         x, position = state.vector[state.system[: state.near_size]], state.position
-        sigma = self.settings.gauge.sigma_spacing
-        hessian, descent = accumulate(
-            [spacing_rows(state, label, sigma).at(position) for label in state.boundaries], size
-        )
+        spacing = spacing_rows(state, self.settings.gauge.sigma_spacing)
+        hessian, descent = accumulate([spacing.at(position)], size)
         add_smoothness(hessian, descent, state, x)
         return hessian, descent
 

@@ -13,7 +13,6 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.bspline import (
     Floats,
     Ints,
-    SpanPolynomials,
     clamped_knots,
     end_change_matrix,
     periodic_knots,
@@ -21,6 +20,7 @@ from pathspace_graph.factors.bspline import (
     uniform_knots,
 )
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
+from pathspace_graph.factors.spans import SpanPolynomials
 
 _PERIODIC_TOLERANCE: Final = 1e-9
 """A periodic spline repeats where |difference| <= tolerance * (1 + largest value)."""

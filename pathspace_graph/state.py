@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 
 from .boundary import Boundary
+from .curves import Curves, side_by_side
 from .window import POSE, without
 
 Array = NDArray[np.float64]
@@ -36,6 +37,7 @@ class State:
         """Poses in x before the window's own."""
         self._known_near: list[IntArray] = []
         self._places = (np.zeros(0, np.intp), np.zeros(0, np.intp))
+        self._curves: Curves | None = None
 
     @property
     def map_size(self) -> int:
@@ -83,6 +85,20 @@ class State:
             places[columns] = np.arange(len(columns))
             self._known_near, self._places = near, (columns, places)
         return self._places
+
+    @property
+    def curves(self) -> Curves:
+        """The boundaries, at least one, side by side; kept for next time."""
+        known = self._curves
+        if known is None or not known.are(self.boundaries, self.near):
+            near = {label: self.near(label) for label in self.boundaries}
+            known = self._curves = side_by_side(self.boundaries, near)
+        return known
+
+    @property
+    def map_points(self) -> Array:
+        """Control points (m, 2) of all boundaries: a view of x."""
+        return self.vector[: self.map_size].reshape(-1, 2)
 
     def near_block(self, label: int) -> slice:
         """Entries of the system that are a boundary's control points."""

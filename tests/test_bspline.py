@@ -10,7 +10,6 @@ from scipy.interpolate import BSpline as ScipyBSpline
 
 from pathspace_graph.factors.bspline import (
     Floats,
-    SpanPolynomials,
     basis,
     basis_matrix,
     clamped_knots,
@@ -22,6 +21,7 @@ from pathspace_graph.factors.bspline import (
     uniform_knots,
     wrap,
 )
+from pathspace_graph.factors.spans import SpanPolynomials
 
 TOLERANCE = 1e-12
 KINDS = ("random", "repeated", "clamped", "uniform")

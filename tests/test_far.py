@@ -97,8 +97,8 @@ def test_the_far_part_follows_to_the_joint_mean() -> None:
 def test_columns_move_where_x_grows() -> None:
     _, _, far = two_partings(np.random.default_rng(2), 0.0)
     far.shift(4, 2)
-    assert far.parts[0].columns.tolist() == [0, 1, 2, 3, 6, 7, 8, 9]
-    assert far.parts[1].columns.tolist() == [2, 3, 6, 7, 8, 9]
+    assert far.columns(far.parts[0]).tolist() == [0, 1, 2, 3, 6, 7, 8, 9]
+    assert far.columns(far.parts[1]).tolist() == [2, 3, 6, 7, 8, 9]
 
 
 # --- in the mapper ---------------------------------------------------------------------------------------

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 from pathspace_graph.factors.bspline import (
     Floats,
-    SpanPolynomials,
     clamped_knots,
     periodic_knots,
     uniform_knots,
 )
 from pathspace_graph.factors.footpoint import FootPoints, foot_points, refine_foot_points
+from pathspace_graph.factors.spans import SpanPolynomials
 
 GRID = 400
 """Coarse grid steps over the domain."""

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.bspline import SpanPolynomials, uniform_knots
+from pathspace_graph.factors.bspline import uniform_knots
 from pathspace_graph.factors.gauge import greville, smoothness_matrix, spacing_residuals
+from pathspace_graph.factors.spans import SpanPolynomials
 from pathspace_graph.settings import MapperSettings
 
 from .jacobians import assert_jacobians

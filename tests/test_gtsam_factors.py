@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.bspline import SpanPolynomials, periodic_knots, uniform_knots
+from pathspace_graph.factors.bspline import periodic_knots, uniform_knots
 from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.gauge import greville, smoothness_matrix, spacing_residuals
 from pathspace_graph.factors.gtsam_factors import (
@@ -29,6 +29,7 @@ from pathspace_graph.factors.odometry import (
     odometry_residuals,
 )
 from pathspace_graph.factors.projection import huber_weights, project, to_map
+from pathspace_graph.factors.spans import SpanPolynomials
 from pathspace_graph.window import POSE, Rows, accumulate, cholesky, solve
 
 from .jacobians import assert_jacobians

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.fixed_lag import FixedLagMapper
-from pathspace_graph.labels import BOUNDARIES, LEFT
+from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.linearizer import reading_rows
 from pathspace_graph.settings import MapperSettings, SplineSettings
 from pathspace_graph.window import POSE, Rows
@@ -31,7 +31,7 @@ def mapper() -> FixedLagMapper:
 
 
 def rows_of(mapper: FixedLagMapper, settings: MapperSettings) -> Rows:
-    return reading_rows(mapper.smoother.state, mapper.smoother.readings, LEFT, settings)[0]
+    return reading_rows(mapper.smoother.state, mapper.smoother.readings, settings)[0]
 
 
 def test_an_offset_is_two_rows_whose_part_across_the_curve_is_the_distance_s(mapper: FixedLagMapper) -> None:
@@ -53,6 +53,16 @@ def test_an_offset_holds_the_vehicle_along_a_straight_curve_and_a_distance_does_
     along[0] = 1.0
     assert np.abs(rows_of(mapper, ACROSS).jacobian[:, :POSE] @ along).max() < 1e-3
     assert np.linalg.norm(rows_of(mapper, POINT).jacobian[:, :POSE] @ along) > 5.0
+
+
+def test_a_reading_that_slides_to_where_an_open_map_is_far_brings_all_of_it_back() -> None:
+    found, _ = map_log(exact_log(ahead(6.0, 9.0), *corridor(80.0)))
+    smoother = found.smoother
+    assert not smoother.state.whole
+    before = [len(rows.residual) for rows in smoother.linearize()]
+    smoother.readings.u[np.flatnonzero(smoother.readings.used)[-1]] = 1.0
+    assert [len(rows.residual) for rows in smoother.linearize()] >= before
+    assert smoother.state.whole
 
 
 def test_a_drive_without_noise_is_mapped_with_either() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.bspline import SpanPolynomials, clamped_knots, periodic_knots, uniform_knots
+from pathspace_graph.factors.bspline import clamped_knots, periodic_knots, uniform_knots
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.projection import (
     huber_weights,
@@ -19,6 +19,7 @@ from pathspace_graph.factors.projection import (
     sigma_across,
     to_map,
 )
+from pathspace_graph.factors.spans import SpanPolynomials
 
 from .jacobians import assert_jacobians
 
