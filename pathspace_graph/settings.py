@@ -90,7 +90,7 @@ class GateSettings(Positive):
     """... it is searched for as far ahead of that (m) as this, ..."""
     station_behind: float = 3.0
     """... and so far behind it (m)."""
-    station_lateral: float = 5.5
+    station_lateral: float = 10.0
     """A curve farther from the vehicle than this (m), or running against it, isn't beside it: the vehicle has
     lost its place, which is looked for all around a closed curve, ..."""
     station_room: float = 40.0
@@ -129,8 +129,8 @@ class GrowthSettings(Positive):
     """A sighting not seen again for so long (s) is dropped."""
     threshold: float = 0.7
     """A sighting closer than this to the end of the curve (m) doesn't extend it."""
-    max_lateral: float = 5.5
-    """Farthest from the driven path (m) that a boundary may start."""
+    max_lateral: float = 10.0
+    """Farthest from the driven path (m) that a boundary may start: circuits are up to 15 m wide."""
     lateral_change: float = 1.5
     """How much farther from the path than the end of the curve the next sighting may be (m)."""
     lateral_rate: float = 0.2
