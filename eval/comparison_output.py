@@ -10,7 +10,8 @@ from typing import Final
 from matplotlib.figure import Figure
 
 from pathspace_graph.files import atomic_folder
-from pathspace_graph.map import PointBoundary, write_result
+from pathspace_graph.map import PointBoundary
+from pathspace_graph.result_folder import write_result
 from pathspace_graph.settings import MapperSettings
 
 from .blind_spot import find_blind_spot

@@ -9,7 +9,8 @@ if TYPE_CHECKING:
     from .errors import InputError, OutputError, PathspaceError, SettingsError
     from .fixed_lag import FixedLagMapper
     from .log import Detections, Log, Odometry, read_log, write_log
-    from .map import Map, PointBoundary, SplineBoundary, read_map, write_result
+    from .map import Map, PointBoundary, SplineBoundary, read_map
+    from .result_folder import write_result
     from .run import CycleRecord, RunResult, run_online
     from .settings import MapperSettings
     from .spline import BSpline
@@ -42,7 +43,8 @@ _HOMES = {
     "errors": ("InputError", "OutputError", "PathspaceError", "SettingsError"),
     "fixed_lag": ("FixedLagMapper",),
     "log": ("Detections", "Log", "Odometry", "read_log", "write_log"),
-    "map": ("Map", "PointBoundary", "SplineBoundary", "read_map", "write_result"),
+    "map": ("Map", "PointBoundary", "SplineBoundary", "read_map"),
+    "result_folder": ("write_result",),
     "run": ("CycleRecord", "RunResult", "run_online"),
     "settings": ("MapperSettings",),
     "spline": ("BSpline",),

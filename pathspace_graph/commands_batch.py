@@ -18,8 +18,9 @@ from .errors import SettingsError
 from .estimators import DEFAULT_BATCH, check_batch, check_settings, make_batch
 from .files import check_target
 from .log import Log, read_log
-from .map import MAP_FILE, write_result
+from .map import MAP_FILE
 from .progress import progress
+from .result_folder import write_result
 from .run import BatchRun
 from .settings import MapperSettings
 

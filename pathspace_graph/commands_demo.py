@@ -21,8 +21,8 @@ from .commands_simulate import describe, generated_track
 from .estimators import DEFAULT
 from .files import atomic_folder, check_target
 from .log import Log, write_log
-from .map import write_result
 from .progress import progress
+from .result_folder import write_result
 from .run import RunResult
 from .settings import MapperSettings
 

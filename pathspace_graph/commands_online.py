@@ -17,8 +17,9 @@ from .estimators import DEFAULT, check_online, check_settings, make_online
 from .files import check_target
 from .labels import NAMES
 from .log import Log, read_log
-from .map import MAP_FILE, write_result
+from .map import MAP_FILE
 from .progress import progress
+from .result_folder import write_result
 from .run import RunResult, run_online
 from .settings import MapperSettings
 

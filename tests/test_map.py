@@ -21,8 +21,8 @@ from pathspace_graph.map import (
     map_from_json,
     map_to_json,
     read_map,
-    write_result,
 )
+from pathspace_graph.result_folder import write_result
 from pathspace_graph.run import CycleRecord, RunResult
 from pathspace_graph.spline import BSpline
 
