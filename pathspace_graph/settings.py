@@ -188,7 +188,7 @@ class ClosingSettings(Positive):
     """The registered position must be this certain (m, one sigma along its worst direction) ..."""
     patience: float = 40.0
     """... or, once so much of the beginning (m) has been driven again, ..."""
-    sigma_patience: float = 0.6
+    sigma_patience: float = 0.85
     """... this certain: a straight says nothing along it, however much of it is driven again."""
     beginning: float = 60.0
     """Stretch of the curves (m) that counts as their beginning, ..."""
