@@ -103,6 +103,11 @@ class Comparison:
         return [outcome for outcome in self.outcomes if outcome.log == log]
 
     @property
+    def paired(self) -> bool:
+        """Whether there are differences to tell: several estimators on several logs."""
+        return len(self.logs) > 1 and len({outcome.estimator for outcome in self.outcomes}) > 1
+
+    @property
     def failures(self) -> list[Outcome]:
         """Those that failed."""
         return [outcome for outcome in self.outcomes if outcome.failure]

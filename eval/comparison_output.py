@@ -33,7 +33,7 @@ _SUFFIXES: Final = (".png", ".pdf")
 def tables(comparison: Comparison) -> dict[str, TextTable]:
     """All that is printed, by the name of its files; differences where there are several to tell apart."""
     found = {"table": paper_table(comparison), "metrics": final_table(comparison)}
-    if len(comparison.logs) > 1 and len({o.estimator for o in comparison.outcomes}) > 1:
+    if comparison.paired:
         found["paired"] = paired_table(comparison, paired_frame(comparison))
     return found
 
@@ -54,7 +54,7 @@ def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings
             "metrics": comparison.frame(),
             "times": comparison.times(),
         }
-        if len(comparison.logs) > 1 and len({o.estimator for o in comparison.outcomes}) > 1:
+        if comparison.paired:
             frames["paired"] = paired_frame(comparison)
         for name, frame in frames.items():
             frame.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
