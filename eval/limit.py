@@ -79,7 +79,7 @@ def fit_rmse(track: Map, truth: Truth) -> float:
 def fit_distances(cones: Array, size: int, like: BSpline) -> Array:
     """(k,) m: from cones (k, 2) in driving order to the spline of `size` control points fitted to them.
 
-    Degree and closedness are those of `like`; knots follow the curvature, as the mapper's own do.
+    Degree and closedness are those of `like`; knots follow the curvature (paper: Simplification).
     """
     fitted = fit_spline(cones, size, like.periodic, FitSettings(degree=like.degree))
     return np.asarray(np.linalg.norm(cones - closest_points(fitted, cones).position, axis=1))

@@ -17,7 +17,7 @@ from .batch_equations import add_odometry, add_priors, calibration_information, 
 from .batch_gating import locate_poses
 from .batch_knots import exact_settings, fit_through
 from .boundary import Boundary
-from .growth import SIDES
+from .candidates import SIDES
 from .labels import BOUNDARIES
 from .path import along_and_across
 from .readings import Readings

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .batch_breaks import chosen_breaks
 from .batch_cones import FEWEST, sighted_cones
 from .boundary import Boundary
+from .cone_knots import chosen_breaks
 from .knots import FitSettings, fit_spline
 from .readings import Readings
 from .settings import MapperSettings, SplineSettings

@@ -54,7 +54,9 @@ class Boundary:
         self.confirmed = 0.0
         """Parameter up to which sightings hold the curve; beyond it is extrapolated."""
         self.sighted: list[Array] = []
-        """Every distinct sighting that the curve was led through, (2,), map frame."""
+        """Every distinct sighting that the curve was led through, (2,), map frame, ..."""
+        self.sighted_u: list[float] = []
+        """... and at which parameter."""
         self._set_tables(SpanPolynomials(knots, self.degree, periodic))
 
     def _set_tables(self, tables: SpanPolynomials) -> None:
@@ -176,10 +178,18 @@ class Boundary:
         if missing > 0:
             last = self.knots[-1] + spacing * np.arange(1, missing + 1)
             self._set_tables(self.tables.extended(np.concatenate([self.knots, last])))
-        before = int(np.searchsorted(self.knots[:old], self.confirmed - ROUND_OFF)) - 1
-        placed = self._place(control_points, max(before, 0), targets_u, targets)
+        placed = self._place(control_points, self.settled(old), targets_u, targets)
         self.confirmed = float(targets_u[-1])
         return placed
+
+    def settled(self, size: int) -> int:
+        """How many of the first `size` control points act before `confirmed`."""
+        return max(int(np.searchsorted(self.knots[:size], self.confirmed - ROUND_OFF)) - 1, 0)
+
+    def take_back(self, kept: int) -> None:
+        """Only the first `kept` sightings hold the curve."""
+        self.confirmed = self.sighted_u[kept - 1]
+        del self.sighted[kept:], self.sighted_u[kept:]
 
     def _place(self, control_points: Array, kept: int, targets_u: Array, targets: Array) -> Array:
         """Least squares of the control points from index `kept` on, through targets and the kept stretch."""

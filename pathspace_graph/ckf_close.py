@@ -111,8 +111,10 @@ def simplify(state: CurveState, sighted: dict[int, list[Array]]) -> None:
     """
     for label in state.curves:
         boundary = state.boundary(label)
-        boundary.sighted = sighted[label]
-        joined = join(boundary, state.control_points(label), state.settings)
+        points, zero = np.array(sighted[label]).reshape(-1, 2), np.zeros(len(sighted[label]))
+        foot = boundary.find(state.control_points(label), points, zero, zero + boundary.confirmed)
+        boundary.sighted_u = np.sort(foot.u).tolist()
+        joined = join(boundary, state.control_points(label), state.settings, state.settings.ckf.knots)
         curve, matrix = periodic_refit(state.spline(label), joined, state.settings)
         state.replace(label, curve, matrix, state.settings.spline.sigma_simplify)
         state.stations[label] = float(joined.overlap.new_parameter(np.array([state.stations[label]]))[0])

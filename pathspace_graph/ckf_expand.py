@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.projection import to_map
 
+from .candidates import SIDES, Candidates, End, chain
 from .ckf_state import CurveState
-from .growth import SIDES, Candidates, End, chain
 from .labels import BOUNDARIES
 from .log import Detections
 from .path import Way

@@ -7,6 +7,9 @@ from typing import Literal
 
 from .positive import Positive
 
+Knots = Literal["cones", "curvature"]
+"""What the knots of a closed boundary follow."""
+
 
 @dataclass(frozen=True)
 class CkfSettings(Positive):
@@ -43,6 +46,8 @@ class CkfSettings(Positive):
     """Second difference of the control points that an extension moves or adds, as a share of their spacing
     (one sigma): the end's bending is known from the readings on it only, and multiplies with each extension
     where nothing holds it. Large: as written."""
+    knots: Knots = "curvature"
+    """Knots of a closed boundary: by curvature as in the paper, or where cones ask for them as in ours."""
     sigma_tie: float = 0.15
     """How far apart the end of a curve and its beginning may be where the loop closes (m, one sigma)."""
     sigma_match: float = 0.6

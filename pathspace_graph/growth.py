@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.projection import to_map
 
-from .boundary import open_boundary
-from .labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
+from .boundary import Boundary, open_boundary
+from .candidates import SIDES, Candidates, End, chain, undisputed
+from .labels import BOUNDARIES
 from .path import Way
 from .settings import GrowthSettings
 from .sightings import Sightings
@@ -18,41 +17,6 @@ from .smoother import Smoother
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-
-SIDES = {LEFT: 1.0, RIGHT: -1.0}
-"""Sign of the signed distance from the path on which each boundary lies."""
-
-
-@dataclass(frozen=True, eq=False)
-class Candidates:
-    """Sightings that a boundary may be led through, in the order of the way."""
-
-    points: Array
-    """(n, 2) map frame, m."""
-    indices: IntArray
-    """(n,) their indices among the sightings."""
-    stations: Array
-    """(n,) path length to each, m."""
-    sides: Array
-    """(n,) distance from the path to the boundary's own side, m."""
-
-    def where(self, chosen: IntArray | NDArray[np.bool_]) -> Candidates:
-        """Some of them."""
-        return Candidates(
-            self.points[chosen], self.indices[chosen], self.stations[chosen], self.sides[chosen]
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class End:
-    """The end of a curve, as far as sightings hold it."""
-
-    position: Array
-    """(2,) map frame, m."""
-    station: float
-    """Path length to it, m."""
-    side: float
-    """Its distance from the path to the boundary's own side, m."""
 
 
 class Growth:
@@ -79,7 +43,7 @@ class Growth:
         for label in BOUNDARIES:
             if label not in smoother.state.boundaries:
                 self._begin(smoother, label, way)
-            elif self._extend(smoother, label, way):
+            elif self._lead_on(smoother, label, way):
                 grown.add(label)
         return frozenset(grown)
 
@@ -118,29 +82,52 @@ class Growth:
         control_points = boundary.grow(np.zeros((0, 2)), u, found.points)
         state.add_boundary(label, boundary)
         smoother.insert_control_points(label, 0, control_points)
-        self._consume(smoother, label, found, 0.0)
-        poses = state.poses[:, :2]
-        low, high = np.zeros(len(poses)), np.full(len(poses), boundary.confirmed)
-        state.stations[label] = boundary.find(state.control_points(label), poses, low, high).u
+        self._consume(smoother, label, found, u)
+        state.stations[label] = np.zeros(len(state.poses))
+        _stand_again(smoother, label, 0.0)
 
-    def _extend(self, smoother: Smoother, label: int, way: Way) -> bool:
-        """Extend by every sighting that comes next, or carry a stranded end on; True where it grew."""
+    def _lead_on(self, smoother: Smoother, label: int, way: Way) -> bool:
+        """Extend a curve, from where its cones are in order; True where it has changed."""
+        boundary, settings = smoother.state.boundaries[label], self.settings
+        kept = in_order(boundary, way, settings)
+        if kept == len(boundary.sighted):
+            return self._extend(smoother, label, way, settings.end_behind)
+        self._take_back(smoother, label, kept)
+        from_u = boundary.confirmed
+        self._extend(smoother, label, way, settings.recall)
+        _stand_again(smoother, label, from_u)
+        return True
+
+    def _extend(self, smoother: Smoother, label: int, way: Way, behind: float) -> bool:
+        """Extend by every sighting that comes next, or carry a stranded end on; True where it grew.
+
+        The end is beside the way since so far (m) behind the vehicle.
+        """
         settings = self.settings
-        end = _end(smoother, label, way)
+        end = _end(smoother, label, way.since(way.driven - behind))
         found = self._candidates(smoother, label, way, end)
         if len(found.points):
-            known = smoother.state.boundaries[label].confirmed
-            lead(smoother, label, end.position, found.points)
-            self._consume(smoother, label, found, known)
+            u = lead(smoother, label, end.position, found.points)
+            self._consume(smoother, label, found, u)
             return True
         if end.station < way.driven - settings.stranded:
             return _carry_on(smoother, label, way, end)
         return False
 
-    def _consume(self, smoother: Smoother, label: int, found: Candidates, from_u: float) -> None:
-        """Sightings that are on the curve from `from_u` on now: their readings update it."""
+    def _take_back(self, smoother: Smoother, label: int, kept: int) -> None:
+        """Only the first `kept` cones hold a curve: the others are sightings that may lead it on again."""
+        boundary, readings = smoother.state.boundaries[label], smoother.readings
+        self.sightings[label].restore(np.array(boundary.sighted[kept:]), smoother.times[-1])
+        boundary.take_back(kept)
+        smoother.forget(label, boundary.settled(boundary.size))
+        rows = readings.used_on(label)
+        readings.used[rows[readings.u[rows] > boundary.trusted]] = False
+
+    def _consume(self, smoother: Smoother, label: int, found: Candidates, u: Array) -> None:
+        """Sightings that are on the curve, at u (k,), now: their readings update it."""
         boundary, state, readings = smoother.state.boundaries[label], smoother.state, smoother.readings
         boundary.sighted.extend(found.points)
+        boundary.sighted_u.extend(u.tolist())
         self.sightings[label].remove(found.indices)
         rows = readings.pending(label)
         rows = rows[readings.label[rows] == label]
@@ -149,51 +136,32 @@ class Growth:
         radius = self.settings.merge_radius
         near = np.hypot(offset[:, :, 0], offset[:, :, 1]).min(axis=1) < radius
         rows, points = rows[near], points[near]
-        low = np.full(len(rows), from_u - radius)
+        low = np.full(len(rows), u[0] - radius)
         high = boundary.believed(np.full(len(rows), np.inf))
         readings.used[rows] = True
         readings.u[rows] = boundary.find(state.control_points(label), points, low, high).u
 
 
-def undisputed(smoother: Smoother, label: int, points: Array, radius: float) -> NDArray[np.bool_]:
-    """Which places (n, 2) have no more readings of the other boundary's label around them than of their own.
+def in_order(boundary: Boundary, way: Way, settings: GrowthSettings) -> int:
+    """How many of the cones that a curve was led through are in the order in which they were passed.
 
-    A sensor that takes a cone for one of the other boundary now and then sees it in its true colour oftener.
-    Readings in the window count, in use or not, within `radius` (m).
+    What comes next is told from an arc ahead; in a hairpin a row of cones may come back nearer than it goes
+    away, and only when the vehicle is past them all it is known which was which. Of the last `recall` metres
+    of the curve; the first cone of them is left where it is.
     """
-    readings = smoother.readings
-    rows = np.flatnonzero(readings.label != UNKNOWN)
-    seen = to_map(readings.point[rows], smoother.state.poses[readings.slot[rows]])
-    offset = points[:, None] - seen
-    near = offset[:, :, 0] ** 2 + offset[:, :, 1] ** 2 < radius**2
-    votes = near @ np.where(readings.label[rows] == label, 1, -1)
-    return np.asarray(votes >= 0)
+    first = int(np.searchsorted(boundary.sighted_u, boundary.confirmed - settings.recall))
+    recent = np.array(boundary.sighted[first:]).reshape(-1, 2)
+    if len(recent) < 3:
+        return len(boundary.sighted)
+    station, _ = way.since(way.driven - settings.recall).locate(recent)
+    passed = np.where(station <= way.driven, station, np.inf)
+    later = np.minimum.accumulate(passed[::-1])[::-1]
+    wrong = np.flatnonzero(passed[1:-1] > later[2:] + settings.station_margin)
+    return first + 1 + int(wrong[0]) if len(wrong) else len(boundary.sighted)
 
 
-def chain(found: Candidates, settings: GrowthSettings, end: End | None) -> IntArray:
-    """Indices of those that follow one another: each not much farther from the path than the last.
-
-    `side_i <= side_last + lateral_change + lateral_rate (s_i - s_last)`, from the end of the curve on where
-    there is one; and of those at about the same station the one nearest to the path: what is behind another
-    row belongs to another stretch of the track.
-    """
-    chosen: list[int] = []
-    last = None if end is None else (end.station, end.side)
-    for i, (station, side) in enumerate(zip(found.stations, found.sides, strict=True)):
-        beside = np.abs(found.stations - station) < settings.beside
-        if (found.sides[beside] < side - settings.lateral_gap).any():
-            continue
-        if last is not None:
-            room = settings.lateral_change + settings.lateral_rate * (station - last[0])
-            if side > last[1] + room:
-                continue
-        chosen.append(i)
-        last = (station, side)
-    return np.array(chosen, dtype=np.intp)
-
-
-def lead(smoother: Smoother, label: int, end: Array, points: Array) -> None:
-    """Lead a curve from its end (2,) through points (k, 2), parametrized by their distances."""
+def lead(smoother: Smoother, label: int, end: Array, points: Array) -> Array:
+    """Lead a curve from its end (2,) through points (k, 2), parametrized by their distances: u (k,)."""
     boundary = smoother.state.boundaries[label]
     u = boundary.confirmed + np.cumsum(_lengths(np.concatenate([end[None], points])))
     known = smoother.state.control_points(label)
@@ -201,6 +169,7 @@ def lead(smoother: Smoother, label: int, end: Array, points: Array) -> None:
     known[:] = control_points[: len(known)]
     if len(control_points) > len(known):
         smoother.insert_control_points(label, len(known), control_points[len(known) :])
+    return np.asarray(u)
 
 
 def _carry_on(smoother: Smoother, label: int, way: Way, end: End) -> bool:
@@ -215,11 +184,21 @@ def _carry_on(smoother: Smoother, label: int, way: Way, end: End) -> bool:
     return True
 
 
+def _stand_again(smoother: Smoother, label: int, from_u: float) -> None:
+    """Stations, on a curve that was led on anew from `from_u` on, of the poses that were past that."""
+    state, boundary = smoother.state, smoother.state.boundaries[label]
+    stations = state.stations[label]
+    late = stations >= from_u
+    poses = state.poses[late, :2]
+    low, high = np.full(len(poses), from_u), np.full(len(poses), boundary.confirmed)
+    stations[late] = boundary.find(state.control_points(label), poses, low, high).u
+
+
 def _end(smoother: Smoother, label: int, way: Way) -> End:
     boundary = smoother.state.boundaries[label]
     u = np.array([boundary.confirmed])
     position = boundary.evaluate(smoother.state.control_points(label), u)
-    station, lateral = way.since(way.driven - smoother.settings.growth.end_behind).locate(position)
+    station, lateral = way.locate(position)
     return End(position[0], float(station[0]), SIDES[label] * float(lateral[0]))
 
 

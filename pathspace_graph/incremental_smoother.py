@@ -73,6 +73,11 @@ class IncrementalSmoother(Smoother):
     def part(self, near: dict[int, IntArray]) -> None:
         """Every control point stays in the system."""
 
+    def forget(self, label: int, first: int) -> None:
+        """GTSAM's smoother can't: a new one starts from the prior that has forgotten."""
+        super().forget(label, first)
+        self._restart()
+
     def step(self, sigma_step: float) -> None:
         """One update of GTSAM's smoother with what is new; the estimate is its own."""
         estimate = self.state.vector.copy()

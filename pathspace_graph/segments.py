@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .window import POSE, Prior, schur_leave
+from .window import POSE, Prior, marginal, schur_leave
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -72,6 +72,18 @@ def relinearize(segment: Segment, values: Array, keyframe: Array) -> tuple[Array
     jacobian[position[:, 1], q + 2] = -c * offset[:, 0] - s * offset[:, 1]
     jacobian[q - 1, q + 2] = -1.0
     return jacobian.T @ segment.information @ jacobian, jacobian.T @ descent_local
+
+
+def forget(segment: Segment, label: int, first: int) -> Segment:
+    """A segment that knows nothing of a boundary's control points from an index on."""
+    gone = (segment.labels == label) & (segment.indices >= first)
+    if not gone.any():
+        return segment
+    columns = np.append(np.repeat(gone, 2), np.zeros(len(segment.local) - 2 * len(gone), bool))
+    leaving, rest = np.flatnonzero(columns), np.flatnonzero(~columns)
+    information, gradient = marginal(segment.information, segment.gradient, leaving, rest)
+    labels, indices = segment.labels[~gone], segment.indices[~gone]
+    return Segment(labels, indices, information, gradient, segment.local[rest])
 
 
 def _frame_rotation(k: int, q: int, theta: float) -> Array:
@@ -141,6 +153,11 @@ class History:
         if self._current is not None:
             self.segments.append(self._finish(labels, indices))
             self._current = None
+
+    def forget(self, label: int, first: int) -> None:
+        """Know nothing of a boundary's control points from an index on; no segment is under way."""
+        assert self._current is None
+        self.segments = [forget(segment, label, first) for segment in self.segments]
 
     def _finish(self, labels: IntArray, indices: IntArray) -> Segment:
         assert self._current is not None

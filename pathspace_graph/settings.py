@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from .batch_settings import BatchSettings
-from .ckf_settings import CkfSettings
+from .ckf_settings import CkfSettings, Knots
 from .landmark_settings import LandmarkSettings
 from .positive import Positive
 
@@ -23,8 +23,11 @@ class SplineSettings(Positive):
     """Control points after closing, as a share of the distinct cones sighted (the paper has 0.44)."""
     min_size: int = 8
     """Fewest control points of a closed boundary."""
+    knots: Knots = "cones"
+    """Knots of a closed boundary: one at each cone but those that are missed least, or at equal quantiles of
+    the curvature (paper: Simplification), from which cones stand off half as much again."""
     linear_baseline: float = 0.5
-    """Share of the knots spread evenly; the rest follows the curvature (paper: Simplification)."""
+    """Of knots by curvature the share that is spread evenly."""
     sigma_model: float = 0.25
     """Added to each reading across the curve (m, one sigma): how far cones stand off it. That error is the
     same every time a cone is seen, which is why it is larger than the offsets themselves, about 0.1 m."""
@@ -144,6 +147,8 @@ class GrowthSettings(Positive):
     end_behind: float = 5.0
     """An end is no farther behind the vehicle than this (m along the path), as a stranded one is carried on;
     that it may be nearer to an older stretch of the path, across the infield, says nothing."""
+    recall: float = 25.0
+    """On the last stretch of a curve, so long (m), it is seen to that cones are in the order of the drive."""
     stranded: float = 2.0
     """An end so far behind the vehicle (m along the path), nothing ahead, is carried along it, ..."""
     stranded_left: float = 0.5

@@ -53,6 +53,13 @@ class Sightings:
         keep[indices] = False
         self._keep(keep)
 
+    def restore(self, points: Array, t: float) -> None:
+        """Points (k, 2) that were sighted often enough, and are to be again, last at a time (s)."""
+        self.points = np.concatenate([self.points, points])
+        self.weights = np.append(self.weights, np.ones(len(points)))
+        self.counts = np.append(self.counts, np.full(len(points), self.settings.sightings))
+        self.last_t = np.append(self.last_t, np.full(len(points), t))
+
     def clear(self) -> None:
         """Drop all."""
         self._keep(np.zeros(len(self.counts), bool))

@@ -1,4 +1,4 @@
-"""Simplification (paper): closed curves on fewer, curvature-weighted knots, `C_old = E C_new`."""
+"""Simplification (paper): closed curves on fewer knots, `C_old = E C_new`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from .boundary import Boundary
-from .knots import BreakSettings, curvature_weighted_breaks, refit
-from .settings import ClosingSettings, MapperSettings, SplineSettings
+from .ckf_settings import Knots
+from .cone_knots import thin
+from .knots import BreakSettings, FitSettings, curvature_weighted_breaks, refit
+from .settings import ClosingSettings, MapperSettings
 from .smoother import Smoother
 from .spline import BSpline
 from .window import Prior, cholesky
@@ -54,42 +56,50 @@ class Join:
 def simplify(smoother: Smoother) -> None:
     """Join every curve, whose end readings already tie to its beginning, and change to the new variables."""
     state, settings = smoother.state, smoother.settings
-    joins = {b: join(boundary, state.control_points(b), settings) for b, boundary in state.boundaries.items()}
+    joins = {
+        label: join(boundary, state.control_points(label), settings, settings.spline.knots)
+        for label, boundary in state.boundaries.items()
+    }
     substitute(smoother, joins)
     for _ in range(settings.closing.iterations):
         smoother.settle()
 
 
-def join(boundary: Boundary, control_points: Array, settings: MapperSettings) -> Join:
+def join(boundary: Boundary, control_points: Array, settings: MapperSettings, knots: Knots) -> Join:
     """The periodic curve nearest to an open one with control points (n, 2)."""
     spline = boundary.spline(control_points)
     overlap = find_overlap(boundary, control_points, settings.closing)
-    size = _size(boundary, control_points, overlap.period, settings)
-    baseline = BreakSettings(settings.spline.linear_baseline)
-    breaks = curvature_weighted_breaks(spline, size, baseline, 0.0, overlap.period)
-    frame = BSpline.periodic_from(breaks, np.zeros((size, 2)), boundary.degree)
+    breaks = _breaks(boundary, control_points, overlap.period, settings, knots)
+    frame = BSpline.periodic_from(breaks, np.zeros((len(breaks) - 1, 2)), boundary.degree)
     change = refit(spline, frame, overlap.new_parameter)
     return Join(overlap, frame.knots, change.new_from_old @ control_points, change.old_from_new)
 
 
-def _size(boundary: Boundary, control_points: Array, period: float, settings: MapperSettings) -> int:
-    """Control points of the closed curve: a share of the distinct cones that it was led through."""
-    spline: SplineSettings = settings.spline
-    sighted = np.array(boundary.sighted).reshape(-1, 2)
-    low = np.zeros(len(sighted))
-    u = boundary.find(control_points, sighted, low, low + boundary.confirmed).u
-    on_lap = np.sort(u[u < period - settings.closing.seam_margin])
-    distinct = _count_apart(on_lap, settings.growth.merge_radius)
-    return max(spline.min_size, int(spline.size_share * distinct))
+def _breaks(
+    boundary: Boundary, control_points: Array, period: float, settings: MapperSettings, knots: Knots
+) -> Array:
+    """(m + 1,) of the closed curve, m a share of the cones that it was led through.
+
+    A cone is where it lies on the curve as that is now.
+    """
+    u = np.array(boundary.sighted_u)
+    u = _apart(u[u < period - settings.closing.seam_margin], settings.growth.merge_radius)
+    size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
+    if knots == "curvature" or size >= len(u):
+        baseline = BreakSettings(settings.spline.linear_baseline)
+        return curvature_weighted_breaks(boundary.spline(control_points), size, baseline, 0.0, period)
+    points = boundary.evaluate(control_points, u)
+    *_, thinned = thin(points, u, period, True, FitSettings(boundary.degree), size)
+    return thinned.breaks
 
 
-def _count_apart(values: Array, distance: float) -> int:
-    """How many of the sorted values (k,) are more than `distance` past the last one counted."""
-    count, last = 0, -np.inf
-    for value in values:
-        if value - last > distance:
-            count, last = count + 1, value
-    return count
+def _apart(values: Array, distance: float) -> Array:
+    """Of the sorted values (k,) those that are more than `distance` past the last one that is."""
+    kept: list[float] = []
+    for value in values.tolist():
+        if not kept or value - kept[-1] > distance:
+            kept.append(value)
+    return np.array(kept)
 
 
 def find_overlap(boundary: Boundary, control_points: Array, settings: ClosingSettings) -> Overlap:

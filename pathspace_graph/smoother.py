@@ -137,6 +137,15 @@ class Smoother:
         if self.history is not None:
             self.history.widen(place, values)
 
+    def forget(self, label: int, first: int) -> None:
+        """Nothing that left the window says anything of a boundary's control points from an index on."""
+        self.join()
+        self._cut_history()
+        block = self.state.block(label)
+        self.prior.forget(np.arange(block.start + 2 * first, block.stop))
+        if self.history is not None:
+            self.history.forget(label, first)
+
     # --- Gauss-Newton ------------------------------------------------------------------------------------
 
     def linearize(self) -> list[Rows]:

@@ -23,6 +23,10 @@ POSE = 3
 """Size of a pose in the state."""
 
 
+NEGLIGIBLE = 1e-6
+"""Information (1/m^2) that is as good as none, and keeps a pivot from being zero."""
+
+
 class SingularSystemError(PathspaceError):
     """The window's normal equations are not positive definite: nothing holds some entry of the state."""
 
@@ -89,6 +93,15 @@ class Prior:
         self.gradient = np.insert(self.gradient, at, np.zeros(count))
         self.point = np.insert(self.point, at, values)
 
+    def forget(self, entries: IntArray) -> None:
+        """Know nothing of some entries (k,) any more, and of the others no less than before."""
+        rest = np.setdiff1d(np.arange(len(self.point)), entries)
+        kept, gradient = marginal(self.information, self.gradient, entries, rest)
+        self.information = np.zeros_like(self.information)
+        self.information[np.ix_(rest, rest)] = kept
+        self.gradient = np.zeros_like(self.gradient)
+        self.gradient[rest] = gradient
+
 
 def accumulate(groups: Sequence[Rows], size: int) -> tuple[Array, Array]:
     """Normal equations `H = sum J'J` (size, size) and `-gradient = -sum J'r` (size,) of all rows."""
@@ -137,6 +150,14 @@ def schur_leave(hessian: Array, descent: Array, low: int, high: int) -> tuple[Ar
     information = without(without(hessian, low, high, 0), low, high, 1)
     information -= w.T @ w
     return information, without(descent, low, high, 0) - g @ w
+
+
+def marginal(information: Array, gradient: Array, gone: IntArray, rest: IntArray) -> tuple[Array, Array]:
+    """What a prior says of the entries `rest`; of the others, `gone`, it may know a part only."""
+    order = np.append(gone, rest)
+    hessian, descent = information[np.ix_(order, order)], gradient[order]
+    hessian[np.arange(len(gone)), np.arange(len(gone))] += NEGLIGIBLE
+    return schur_leave(hessian, descent, 0, len(gone))
 
 
 def without(values: Array, low: int, high: int, axis: int) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.ckf_settings import Knots
 from pathspace_graph.closing import Matches, Registration, _certain, near_start, register
 from pathspace_graph.eval.metrics import cone_distances
 from pathspace_graph.factors.projection import to_map
@@ -162,6 +163,23 @@ def test_a_drifted_window_is_registered_back(
         assert distances.max() < mapper.settings.closing.inlier_distance + 0.1
 
 
+def test_knots_by_the_cones_are_nearer_to_them_than_knots_by_curvature(before: FixedLagMapper) -> None:
+    """Of the same number of control points, and where a cone asks for one."""
+    mapper = deepcopy(before)
+    mapper.smoother.join()
+    state, settings = mapper.smoother.state, mapper.settings
+    kinds: tuple[Knots, Knots] = ("cones", "curvature")
+    for label, boundary in state.boundaries.items():
+        points = state.control_points(label)
+        joins = [join(boundary, points, settings, kind) for kind in kinds]
+        assert len(joins[0].points) == len(joins[1].points)
+        u = np.array(boundary.sighted_u)
+        u = u[u < joins[0].overlap.period - 1.0]
+        cones = boundary.evaluate(points, u)
+        off = [np.hypot(*(boundary.closed(new.knots).evaluate(new.points, u) - cones).T) for new in joins]
+        assert np.sqrt(np.mean(off[0] ** 2)) < 0.8 * np.sqrt(np.mean(off[1] ** 2))
+
+
 def prior_energy(mapper: FixedLagMapper, x: Array) -> float:
     d = x - mapper.prior.point
     return float(0.5 * d @ mapper.prior.information @ d - mapper.prior.gradient @ d)
@@ -174,7 +192,9 @@ def test_an_exact_change_of_variables_keeps_the_priors_energy(before: FixedLagMa
     spline = replace(mapper.settings.spline, sigma_simplify=1e-9)
     mapper.smoother.settings = settings = replace(mapper.settings, spline=spline)
     old, state = deepcopy(mapper), mapper.smoother.state
-    joins = {b: join(curve, state.control_points(b), settings) for b, curve in state.boundaries.items()}
+    joins = {
+        b: join(curve, state.control_points(b), settings, "cones") for b, curve in state.boundaries.items()
+    }
     substitute(mapper.smoother, joins)
     q_old, q_new = len(old.prior.point), len(mapper.prior.point)
     shared = q_old - old.smoother.state.map_size

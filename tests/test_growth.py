@@ -9,12 +9,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from pathspace_graph.candidates import undisputed
 from pathspace_graph.eval.true_curve import mapped_points, true_curve
 from pathspace_graph.fixed_lag import FixedLagMapper
-from pathspace_graph.growth import undisputed
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.log import Detections, Log
 from pathspace_graph.path import Way
+from pathspace_graph.settings import MapperSettings
 
 from .scenes import DT, ahead, corridor, detections, exact_log, map_log, true_poses
 
@@ -106,3 +107,57 @@ def test_an_end_nearer_to_an_older_stretch_of_the_path_does_not_follow_that() ->
     stations = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
     assert mapper.growth.expand(mapper.smoother, Way(points, stations, float(stations[3]))) == frozenset()
     assert (boundary.confirmed, boundary.size) == (confirmed, size)
+
+
+# --- the order of the drive --------------------------------------------------------------------------------
+
+
+def hairpin() -> Log:
+    """Forth, half around and back, 5 m beside; the inner row that leads there lacks its last two cones.
+
+    From afar the row that comes back is what goes on from the one that leads there.
+    """
+    straight, radius, half = 36.0, 2.5, 1.8
+    twists = np.concatenate([ahead(5.0, straight / 5.0), turn(5.0, radius), ahead(5.0, 5.0)])
+    x = np.arange(0.0, straight + 0.1, 4.0)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 5)[1:-1]
+    outer = np.concatenate(
+        [
+            np.column_stack([x, np.full(len(x), -half)]),
+            np.array([straight, radius]) + (radius + half) * np.column_stack([np.cos(angle), np.sin(angle)]),
+            np.column_stack([x[::-1], np.full(len(x), 2.0 * radius + half)]),
+        ]
+    )
+    inner = np.concatenate(
+        [
+            np.column_stack([x[:-2], np.full(len(x) - 2, half)]),
+            np.column_stack([x[::-1], np.full(len(x), 2.0 * radius - half)]),
+        ]
+    )
+    labels = np.repeat([LEFT, RIGHT], [len(inner), len(outer)]).astype(np.intp)
+    return exact_log(twists, np.concatenate([inner, outer]), labels)
+
+
+def turn(speed: float, radius: float) -> Array:
+    """Twists (N, 3) of half a turn to the left."""
+    steps = round(np.pi * radius / speed / DT)
+    return np.tile([speed, 0.0, np.pi / steps / DT], (steps, 1))
+
+
+def backwards(mapper: FixedLagMapper, log: Log) -> float:
+    """How far (m) a curve goes back between two neighbours of a row, at most."""
+    assert log.truth is not None
+    cones = log.truth.cones[log.truth.cone_labels == LEFT]
+    spline = mapper.map().boundaries[LEFT].spline
+    u = np.linspace(*spline.domain, 4000)
+    nearest = u[KDTree(spline.evaluate(u)).query(cones)[1]]
+    return float(np.max(-np.diff(nearest), initial=0.0))
+
+
+def test_an_end_led_on_in_the_wrong_order_is_taken_back() -> None:
+    log = hairpin()
+    mapper, _ = map_log(log)
+    assert backwards(mapper, log) < 0.5
+    settings = MapperSettings()
+    never = replace(settings, growth=replace(settings.growth, recall=0.1))
+    assert backwards(map_log(log, FixedLagMapper(never, log.odometry_sigma))[0], log) > 2.0

@@ -65,3 +65,20 @@ def test_a_straight_drive_is_that_of_the_mapper() -> None:
         estimates.append((result.pose, result.sizes))
     np.testing.assert_allclose(estimates[1][0], estimates[0][0], atol=0.05)
     assert estimates[1][1] == estimates[0][1]
+
+
+def test_a_new_smoother_begins_where_an_end_is_taken_back() -> None:
+    """What it had of the control points that are placed anew, GTSAM's smoother couldn't forget."""
+    log = straight(3.0)
+    mapper = IncrementalFixedLag(odometry_sigma=log.odometry_sigma)
+    cycles = list(split_odometry(log))
+    for odometry, cycle in cycles[:-5]:
+        mapper.update(odometry, cycle)
+    smoother = mapper.smoother
+    assert isinstance(smoother, IncrementalSmoother)
+    old = smoother._gtsam
+    smoother.forget(0, 3)
+    for odometry, cycle in cycles[-5:]:
+        result = mapper.update(odometry, cycle)
+    assert smoother._gtsam is not old
+    np.testing.assert_allclose(result.pose, [6.0 * cycles[-1][1].t, 0.0, 0.0], atol=0.05)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, odometry_residuals
-from pathspace_graph.segments import History, Segment, compress, relinearize, relinearized_prior
+from pathspace_graph.segments import History, Segment, compress, forget, relinearize, relinearized_prior
 from pathspace_graph.window import POSE, Prior, Rows, accumulate, schur_leave
 
 Array = NDArray[np.float64]
@@ -103,6 +103,19 @@ def test_a_segment_leaves_a_rigid_motion_free() -> None:
     hessian, _ = relinearize(random_segment(rng), x[:-POSE], x[-POSE:])
     values = np.linalg.eigvalsh(hessian)
     assert values[2] < 1e-10 * values[-1] < values[3]
+
+
+def test_a_segment_forgets_control_points_and_nothing_else() -> None:
+    """Of boundary 0 from index 5 on: what is left has the same covariance."""
+    rng = np.random.default_rng(3)
+    segment = random_segment(rng)
+    less = forget(segment, 0, 5)
+    assert (less.labels.tolist(), less.indices.tolist()) == ([0, 1], [4, 2])
+    rest = np.delete(np.arange(SIZE), [2, 3])
+    covariance = np.linalg.inv(segment.information)[np.ix_(rest, rest)]
+    np.testing.assert_allclose(np.linalg.inv(less.information), covariance, rtol=1e-3, atol=1e-3)
+    np.testing.assert_array_equal(less.local, segment.local[rest])
+    assert forget(segment, 1, 3) is segment
 
 
 def test_compress_keeps_the_energy_and_what_is_touched() -> None:

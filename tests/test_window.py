@@ -142,6 +142,26 @@ def test_widening_knows_nothing_of_the_new_entries(at: int) -> None:
     np.testing.assert_array_equal(prior.point[at : at + 2], new)
 
 
+@pytest.mark.parametrize("unknown", [False, True])
+def test_forgetting_leaves_the_others_as_sure_as_before(unknown: bool) -> None:
+    """The rest has the same covariance and the same mean; also where a forgotten one was free."""
+    rng = np.random.default_rng(7)
+    prior = random_prior(rng, 6)
+    gone, rest = np.array([1, 4]), np.array([0, 2, 3, 5])
+    covariance = np.linalg.inv(prior.information)
+    mean = prior.point + covariance @ prior.gradient
+    if unknown:
+        prior.widen(6, np.array([3.0]))
+        gone = np.append(gone, 6)
+    prior.forget(gone)
+    assert not prior.information[gone].any()
+    assert not prior.information[:, gone].any()
+    assert not prior.gradient[gone].any()
+    own = np.linalg.inv(prior.information[np.ix_(rest, rest)])
+    np.testing.assert_allclose(own, covariance[np.ix_(rest, rest)], rtol=1e-4)
+    np.testing.assert_allclose(prior.point[rest] + own @ prior.gradient[rest], mean[rest], atol=1e-4)
+
+
 def test_prior_rows_are_the_prior() -> None:
     """Also where the prior knows nothing of some entries."""
     rng = np.random.default_rng(6)

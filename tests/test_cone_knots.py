@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch_breaks import chosen_breaks, thin
+from pathspace_graph.cone_knots import chosen_breaks, thin
 from pathspace_graph.eval.metrics import closest_points
 from pathspace_graph.knots import FitSettings, energy_rows, fit_spline
 from pathspace_graph.spline import BSpline
