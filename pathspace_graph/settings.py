@@ -260,8 +260,8 @@ class MapperSettings(Positive):
     """Time (s) that poses stay in the window."""
     steps: int = 1
     """Gauss-Newton steps a cycle, each relinearized at the current estimate."""
-    steps_grown: int = 2
-    """The same in a cycle in which a curve grew: its new control points are far from their optimum."""
+    steps_grown: int = 1
+    """The same in a cycle in which a curve grew."""
     sigma_step: float = 0.5
     """How far a control point moves freely in a step (m): damps sliding along the curve, not the optimum."""
     spline: SplineSettings = field(default_factory=SplineSettings)
