@@ -1,4 +1,4 @@
-"""Knots of the batch: where the shape asks for them, and how many."""
+"""Knots where cones ask for them: at the shape that needs them, and how many."""
 
 from __future__ import annotations
 
