@@ -19,6 +19,7 @@ from .blind_spot import BlindSpot
 from .comparison import Outcome
 from .comparison_metrics import PAPER
 from .legend import fit_height, grouped_legend
+from .palette import RED
 from .plot import PlotStyle, draw_boundary, draw_start, draw_truth
 from .true_curve import mapped_points
 
@@ -43,7 +44,7 @@ class ComparisonStyle:
     """Height that is more than enough for the legend; what it doesn't take is cut off."""
     gap: float = 0.12
     """Between panels."""
-    missed_color: str = "#CC0000"
+    missed_color: str = RED
     """Of the rings around missed cones."""
     ring_size: float = 8.0
     """Of those rings."""

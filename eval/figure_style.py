@@ -12,6 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from numpy.typing import NDArray
 
+from .palette import BLUE, DARK, GREEN, LIGHT, ORANGE, PURPLE, RED
+
 Array = NDArray[np.float64]
 
 
@@ -23,19 +25,19 @@ class FigureStyle:
     """Of a figure: two columns of a paper."""
     font_size: float = 8.0
     """Of all text."""
-    curve_color: str = "#0067A9"
+    curve_color: str = BLUE
     """Of the state's curve."""
-    fitted_color: str = "#7B3294"
+    fitted_color: str = PURPLE
     """Of what is fitted or updated: the paper's purple."""
-    other_color: str = "#D98200"
+    other_color: str = ORANGE
     """Of what it is held against."""
-    reading_color: str = "#009E73"
+    reading_color: str = GREEN
     """Of readings."""
-    sigma_color: str = "#CC0000"
+    sigma_color: str = RED
     """Of sigma points and of what is marked."""
-    faint_color: str = "#B0B0B0"
+    faint_color: str = LIGHT
     """Of samples."""
-    truth_color: str = "#4D4D4D"
+    truth_color: str = DARK
     """Of what is true."""
     curve_width: float = 1.3
     """Of a curve."""

@@ -21,6 +21,8 @@ from pathspace_graph.log import Log, Truth
 from pathspace_graph.map import Boundary, Map, PointBoundary, SplineBoundary
 from pathspace_graph.spline import BSpline
 
+from .palette import BLUE, DARK, GREEN, ORANGE
+
 Array = NDArray[np.float64]
 
 FORMATS = (".png", ".pdf", ".svg")
@@ -55,16 +57,16 @@ class PlotStyle:
     font_size: float = 8.0
     """Of all text (pt)."""
 
-    left_color: str = "#0067A9"
+    left_color: str = BLUE
     """Blue, as the cones; told from amber by every kind of colour vision, and by lightness in print."""
 
-    right_color: str = "#D98200"
+    right_color: str = ORANGE
     """Amber, for yellow cones on white paper."""
 
-    truth_color: str = "#4D4D4D"
+    truth_color: str = DARK
     """Of everything that is true rather than estimated."""
 
-    trajectory_color: str = "#009E73"
+    trajectory_color: str = GREEN
     """Of the estimated trajectory."""
 
     band_alpha: float = 0.35

@@ -17,6 +17,7 @@ from matplotlib.ticker import (
 )
 
 from .figure_style import FigureStyle, figure_context
+from .palette import BLUE, DARK, GREEN, ORANGE, PURPLE, RED
 from .scaling import Scaling
 from .scaling_points import CONES, LAPS, READINGS, Sweep
 
@@ -27,7 +28,7 @@ class ScalingPlotStyle:
 
     height: float = 3.1
     """Of the figure, in."""
-    colors: tuple[str, ...] = ("#0067A9", "#D98200", "#CC0000", "#7B3294", "#009E73", "#4D4D4D")
+    colors: tuple[str, ...] = (BLUE, ORANGE, RED, PURPLE, GREEN, DARK)
     """Of the estimators, one after the other."""
     markers: str = "os^Dv*"
     """Shapes of their points."""

@@ -12,6 +12,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from .palette import BLUE, DARK, GREY
 from .study import Study
 from .study_metrics import METRICS
 from .study_statistics import Contrast, contrasts
@@ -39,11 +40,11 @@ class StudyPlotStyle:
     """Most metrics side by side in the figure of differences."""
     font_size: float = 8.0
     """Of all text (pt)."""
-    color: str = "#0067A9"
+    color: str = BLUE
     """Of a significant difference."""
-    quiet_color: str = "#8C8C8C"
+    quiet_color: str = GREY
     """Of one that may be chance."""
-    line_color: str = "#4D4D4D"
+    line_color: str = DARK
     """Of the baseline."""
     marker_size: float = 4.5
     """Of means."""
