@@ -54,7 +54,34 @@ MARGIN = 0.1
 def thin(
     points: Array, u: Array, high: float, periodic: bool, fit: FitSettings, least: int
 ) -> Iterator[Thinned]:
-    """From a break at each of the points (k, 2), at u (k,) in [0, high], down to `least` control points.
+    """From a break at each of the points (k, 2), at u (k,) in [0, high], down to `least` control points."""
+    for curve in _removals(points, u, high, periodic, fit, least):
+        yield _judged(curve, points)
+
+
+def thinned_breaks(
+    points: Array, u: Array, high: float, periodic: bool, fit: FitSettings, size: int
+) -> Array:
+    """Breaks (b + 1,) of the last curve of `thin`, of `size` control points."""
+    *_, curve = _removals(points, u, high, periodic, fit, size)
+    return curve.breaks
+
+
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    """A least-squares spline on the knots that are left, in the basis of all of them; until the next one."""
+
+    breaks: Array
+    size: int
+    B: Array
+    inverse: Array
+    control: Array
+
+
+def _removals(
+    points: Array, u: Array, high: float, periodic: bool, fit: FitSettings, least: int
+) -> Iterator[_Curve]:
+    """Without one knot more each time, the one that is missed least.
 
     A knot t is no knot any more where the p-th derivative doesn't jump there: a linear constraint a'c = 0. It
     costs `|a'c|^2 / (a' G^-1 a)`, G the normal equations, so that one inverse tells of all knots which is
@@ -64,15 +91,19 @@ def thin(
     frame = _frame(breaks, periodic, fit.degree)
     B, bending, jumps = frame.basis_matrix(u), energy_rows(frame), _jumps(frame)
     inverse = solve(cholesky(B.T @ B + fit.smoothness * bending.T @ bending), np.eye(B.shape[1]))
-    left = np.arange(len(jumps))
+    spread, control, left = jumps @ inverse, inverse @ (B.T @ points), np.arange(len(jumps))
     for size in range(B.shape[1], max(least, B.shape[1] - len(jumps)) - 1, -1):
-        control, kept = inverse @ (B.T @ points), breaks[np.concatenate([[0], 1 + left, [-1]])]
-        yield _judged(kept, size, points, B, inverse, control)
+        kept = breaks[np.concatenate([[0], 1 + left, [-1]])]
+        yield _Curve(kept, size, B, inverse, control)
         if len(left):
-            spread = jumps[left] @ inverse
-            price = ((jumps[left] @ control) ** 2).sum(axis=1) / (spread * jumps[left]).sum(axis=1)
+            lost = np.einsum("kd,kd->k", jumps @ control, jumps @ control)[left]
+            price = lost / np.einsum("kn,kn->k", spread, jumps)[left]
             k = int((price + EVEN * (kept[2:] - kept[:-2]) ** 2).argmin())
-            inverse -= np.outer(spread[k], spread[k] / (spread[k] @ jumps[left[k]]))
+            a, row = jumps[left[k]], spread[left[k]].copy()
+            gain = row / (row @ a)
+            inverse -= np.outer(row, gain)
+            control = control - np.outer(gain, a @ control)
+            spread -= np.outer(spread @ a, gain)
             left = np.delete(left, k)
 
 
@@ -89,9 +120,9 @@ def _jumps(frame: BSpline) -> Array:
     return np.asarray(np.diff(highest, axis=0))
 
 
-def _judged(breaks: Array, size: int, points: Array, B: Array, inverse: Array, control: Array) -> Thinned:
-    residual = points - B @ control
-    leverage = ((B @ inverse) * B).sum(axis=1)
+def _judged(curve: _Curve, points: Array) -> Thinned:
+    residual = points - curve.B @ curve.control
+    leverage = ((curve.B @ curve.inverse) * curve.B).sum(axis=1)
     rss = float((residual**2).sum())
     crossed = float(((residual / (1.0 - leverage)[:, None]) ** 2).sum())
-    return Thinned(breaks, size, rss, crossed)
+    return Thinned(curve.breaks, curve.size, rss, crossed)

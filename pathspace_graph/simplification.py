@@ -10,7 +10,7 @@ from scipy.linalg import lapack
 
 from .boundary import Boundary
 from .ckf_settings import Knots
-from .cone_knots import thin
+from .cone_knots import thinned_breaks
 from .knots import BreakSettings, FitSettings, curvature_weighted_breaks, refit
 from .settings import ClosingSettings, MapperSettings
 from .smoother import Smoother
@@ -89,8 +89,7 @@ def _breaks(
         baseline = BreakSettings(settings.spline.linear_baseline)
         return curvature_weighted_breaks(boundary.spline(control_points), size, baseline, 0.0, period)
     points = boundary.evaluate(control_points, u)
-    *_, thinned = thin(points, u, period, True, FitSettings(boundary.degree), size)
-    return thinned.breaks
+    return thinned_breaks(points, u, period, True, FitSettings(boundary.degree), size)
 
 
 def _apart(values: Array, distance: float) -> Array:
