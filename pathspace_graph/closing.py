@@ -98,7 +98,8 @@ def register(smoother: Smoother, beginning: Array, settings: ClosingSettings) ->
     prior = np.linalg.inv(smoother.pose_covariance() * settings.prior_scale**2)
     centre = smoother.state.poses[-1, :2].copy()
     vector = np.zeros(3)
-    if np.linalg.eigvalsh(prior[:2, :2])[0] < settings.icp_reach**-2:
+    lost = bool(np.linalg.eigvalsh(prior[:2, :2])[0] < settings.icp_reach**-2)
+    if lost:
         pose = smoother.state.poses[-1]
         starts = [v for v in _motions(pose, beginning, settings) if v @ prior @ v < settings.start_chi2]
         agreement = [
@@ -112,7 +113,7 @@ def register(smoother: Smoother, beginning: Array, settings: ClosingSettings) ->
         vector = vector + np.linalg.solve(matches.hessian + prior, descent)
     posterior = np.linalg.inv(matches.hessian + prior)
     labels = smoother.state.boundaries
-    if not (_agree(matches, list(labels), settings) and _certain(matches, posterior, settings)):
+    if not (_agree(matches, list(labels), settings) and _certain(matches, posterior, settings, lost)):
         return None
     return Registration(Motion(centre, vector), {label: matches.agreeing(label) for label in labels})
 
@@ -181,11 +182,16 @@ def _agree(matches: Matches, labels: list[int], settings: ClosingSettings) -> bo
     return all(len(u) >= settings.min_boundary_readings and np.ptp(u) >= settings.overlap for u in on_each)
 
 
-def _certain(matches: Matches, posterior: Array, settings: ClosingSettings) -> bool:
-    """The motion is certain in every direction: less so where no more will be known of it."""
+def _certain(matches: Matches, posterior: Array, settings: ClosingSettings, lost: bool = False) -> bool:
+    """The motion is certain in every direction: less so where no more will be known of it.
+
+    That is no excuse where the vehicle is `lost`, with several places to choose from: along a straight one
+    agrees as well as the next.
+    """
     sigma = float(np.sqrt(np.linalg.eigvalsh(posterior[:2, :2])[-1]))
     driven_again = float(np.median(matches.u[matches.near]))
-    return sigma <= (settings.sigma_max if driven_again < settings.patience else settings.sigma_patience)
+    patient = driven_again >= settings.patience and not lost
+    return sigma <= (settings.sigma_patience if patient else settings.sigma_max)
 
 
 def tie(smoother: Smoother, registration: Registration) -> None:

@@ -194,7 +194,8 @@ class ClosingSettings(Positive):
     patience: float = 40.0
     """... or, once so much of the beginning (m) has been driven again, ..."""
     sigma_patience: float = 0.85
-    """... this certain: a straight says nothing along it, however much of it is driven again."""
+    """... this certain: a straight says nothing along it, however much of it is driven again. Not where the
+    vehicle is less certain itself than `icp_reach`."""
     beginning: float = 60.0
     """Stretch of the curves (m) that counts as their beginning, ..."""
     beginning_share: float = 0.6

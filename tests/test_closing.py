@@ -296,3 +296,12 @@ def test_a_window_that_has_drifted_far_is_registered_back(before: FixedLagMapper
     assert registration is not None
     moved = registration.motion.apply(mapper.poses[:, :2])
     np.testing.assert_allclose(moved, before.poses[:, :2], atol=0.4)
+
+
+def test_where_there_are_several_places_to_choose_from_patience_is_no_excuse() -> None:
+    rows, near = np.arange(30), np.ones(30, bool)
+    matches = Matches(rows, rows % 2, np.full(30, 50.0), near, np.eye(3), np.zeros(3))
+    posterior = np.diag([0.25, 0.01, 1e-4])
+    assert _certain(matches, posterior, ClosingSettings(), lost=False)
+    assert not _certain(matches, posterior, ClosingSettings(), lost=True)
+    assert _certain(matches, np.diag([0.04, 0.01, 1e-4]), ClosingSettings(), lost=True)
