@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from .knots import Knots
 from .positive import Positive
-
-Knots = Literal["cones", "curvature"]
-"""What the knots of a closed boundary follow."""
 
 
 @dataclass(frozen=True)

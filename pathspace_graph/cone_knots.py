@@ -96,8 +96,8 @@ def _removals(
         kept = breaks[np.concatenate([[0], 1 + left, [-1]])]
         yield _Curve(kept, size, B, inverse, control)
         if len(left):
-            lost = np.einsum("kd,kd->k", jumps @ control, jumps @ control)[left]
-            price = lost / np.einsum("kn,kn->k", spread, jumps)[left]
+            jump = (jumps @ control)[left]
+            price = (jump**2).sum(axis=1) / np.einsum("kn,kn->k", spread, jumps)[left]
             k = int((price + EVEN * (kept[2:] - kept[:-2]) ** 2).argmin())
             a, row = jumps[left[k]], spread[left[k]].copy()
             gain = row / (row @ a)

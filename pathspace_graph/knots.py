@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import scipy.linalg
@@ -14,6 +14,9 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.bspline import Floats
 from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.spline import BSpline
+
+Knots = Literal["cones", "curvature"]
+"""What the knots of a closed boundary follow."""
 
 _SAMPLES_PER_BREAK: Final = 40
 """Curvature samples for each break wanted, equally spaced along the curve."""

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from .batch_settings import BatchSettings
-from .ckf_settings import CkfSettings, Knots
+from .ckf_settings import CkfSettings
+from .knots import Knots
 from .landmark_settings import LandmarkSettings
 from .positive import Positive
 

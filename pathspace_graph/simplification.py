@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from .boundary import Boundary
-from .ckf_settings import Knots
 from .cone_knots import thinned_breaks
-from .knots import BreakSettings, FitSettings, curvature_weighted_breaks, refit
+from .knots import BreakSettings, FitSettings, Knots, curvature_weighted_breaks, refit
 from .settings import ClosingSettings, MapperSettings
 from .smoother import Smoother
 from .spline import BSpline

@@ -21,8 +21,6 @@ IntArray = NDArray[np.intp]
 
 POSE = 3
 """Size of a pose in the state."""
-
-
 NEGLIGIBLE = 1e-6
 """Information (1/m^2) that is as good as none, and keeps a pivot from being zero."""
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.ckf_settings import Knots
 from pathspace_graph.closing import Matches, Registration, _certain, near_start, register
 from pathspace_graph.eval.metrics import cone_distances
 from pathspace_graph.factors.projection import to_map
 from pathspace_graph.fixed_lag import CycleResult, FixedLagMapper
 from pathspace_graph.gating import relocate
+from pathspace_graph.knots import Knots
 from pathspace_graph.labels import LEFT
 from pathspace_graph.log import Log
 from pathspace_graph.map import SplineBoundary
