@@ -69,13 +69,14 @@ def thinned_breaks(
 
 @dataclass(frozen=True, eq=False)
 class _Curve:
-    """A least-squares spline on the knots that are left, in the basis of all of them; until the next one."""
+    """A least-squares spline on the knots that are left."""
 
     breaks: Array
     size: int
-    B: Array
-    inverse: Array
-    control: Array
+    fitted: Array
+    """(k, 2) where it passes the points."""
+    leverage: Array
+    """(k,) by how much each point draws it there, 0 to 1."""
 
 
 def _removals(
@@ -84,27 +85,28 @@ def _removals(
     """Without one knot more each time, the one that is missed least.
 
     A knot t is no knot any more where the p-th derivative doesn't jump there: a linear constraint a'c = 0. It
-    costs `|a'c|^2 / (a' G^-1 a)`, G the normal equations, so that one inverse tells of all knots which is
-    missed least, and `G^-1 - G^-1 a a' G^-1 / (a' G^-1 a)` is that of the curve without it.
+    costs `|a'c|^2 / (a' G^-1 a)`, G the normal equations; and whatever is linear in the control points,
+    `w'c`, is less by `w' G^-1 a / (a' G^-1 a) a'c` then. So of the jumps at all knots and of the curve at the
+    points, W, what changes is `W c` and `W G^-1 A'` only, by a rank of one.
     """
     breaks = np.unique(np.concatenate([[0.0], u, [high]]))
     frame = _frame(breaks, periodic, fit.degree)
     B, bending, jumps = frame.basis_matrix(u), energy_rows(frame), _jumps(frame)
-    inverse = solve(cholesky(B.T @ B + fit.smoothness * bending.T @ bending), np.eye(B.shape[1]))
-    spread, control, left = jumps @ inverse, inverse @ (B.T @ points), np.arange(len(jumps))
-    for size in range(B.shape[1], max(least, B.shape[1] - len(jumps)) - 1, -1):
+    factor = cholesky(B.T @ B + fit.smoothness * bending.T @ bending)
+    watched, n, left = np.concatenate([jumps, B]), len(jumps), np.arange(len(jumps))
+    spread, values = watched @ solve(factor, jumps.T), watched @ solve(factor, B.T @ points)
+    leverage = np.einsum("kn,nk->k", B, solve(factor, B.T))
+    for size in range(B.shape[1], max(least, B.shape[1] - n) - 1, -1):
         kept = breaks[np.concatenate([[0], 1 + left, [-1]])]
-        yield _Curve(kept, size, B, inverse, control)
+        yield _Curve(kept, size, values[n:], leverage)
         if len(left):
-            jump = (jumps @ control)[left]
-            price = (jump**2).sum(axis=1) / np.einsum("kn,kn->k", spread, jumps)[left]
-            k = int((price + EVEN * (kept[2:] - kept[:-2]) ** 2).argmin())
-            a, row = jumps[left[k]], spread[left[k]].copy()
-            gain = row / (row @ a)
-            inverse -= np.outer(row, gain)
-            control = control - np.outer(gain, a @ control)
-            spread -= np.outer(spread @ a, gain)
-            left = np.delete(left, k)
+            price = (values[left] ** 2).sum(axis=1) / spread.diagonal()[left]
+            gone = int((price + EVEN * (kept[2:] - kept[:-2]) ** 2).argmin())
+            k, column = left[gone], spread[:, left[gone]].copy()
+            leverage = leverage - column[n:] ** 2 / column[k]
+            values = values - np.outer(column / column[k], values[k])
+            spread -= np.outer(column / column[k], spread[k])
+            left = np.delete(left, gone)
 
 
 def _frame(breaks: Array, periodic: bool, degree: int) -> BSpline:
@@ -121,8 +123,7 @@ def _jumps(frame: BSpline) -> Array:
 
 
 def _judged(curve: _Curve, points: Array) -> Thinned:
-    residual = points - curve.B @ curve.control
-    leverage = ((curve.B @ curve.inverse) * curve.B).sum(axis=1)
+    residual = points - curve.fitted
     rss = float((residual**2).sum())
-    crossed = float(((residual / (1.0 - leverage)[:, None]) ** 2).sum())
+    crossed = float(((residual / (1.0 - curve.leverage)[:, None]) ** 2).sum())
     return Thinned(curve.breaks, curve.size, rss, crossed)
