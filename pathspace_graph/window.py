@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,12 +107,28 @@ def accumulate(groups: Sequence[Rows], size: int) -> tuple[Array, Array]:
     groups = [g for g in groups if len(g.residual)]
     if not groups:
         return np.zeros((size, size)), np.zeros(size)
-    flat = [(g.columns[:, :, None] * size + g.columns[:, None, :]).ravel() for g in groups]
-    products = [(g.jacobian[:, :, None] * g.jacobian[:, None, :]).ravel() for g in groups]
-    hessian = _sums(np.concatenate(flat), np.concatenate(products), size * size)
-    columns = np.concatenate([g.columns.ravel() for g in groups])
-    descent = np.concatenate([(g.jacobian * -g.residual[:, None]).ravel() for g in groups])
-    return hessian.reshape(size, size), _sums(columns, descent, size)
+    places, products, columns, terms = zip(*(_products(g, size) for g in groups), strict=True)
+    half = _sums(np.concatenate(places), np.concatenate(products), size * size).reshape(size, size)
+    return half + half.T, _sums(np.concatenate(columns), np.concatenate(terms), size)
+
+
+def _products(rows: Rows, size: int) -> tuple[IntArray, Array, IntArray, Array]:
+    """What rows add to half of H, `H/2 + H/2' = H`: flat places and terms; and to the descent, the same."""
+    i, j, share = _pairs(rows.columns.shape[1])
+    columns, jacobian = np.ascontiguousarray(rows.columns.T), np.ascontiguousarray(rows.jacobian.T)
+    places = columns.take(i, axis=0) * size
+    places += columns.take(j, axis=0)
+    products = jacobian.take(i, axis=0)
+    products *= jacobian.take(j, axis=0)
+    products *= share
+    return places.ravel(), products.ravel(), columns.ravel(), (jacobian * -rows.residual).ravel()
+
+
+@cache
+def _pairs(k: int) -> tuple[IntArray, IntArray, Array]:
+    """Every pair (k (k + 1) / 2,) of k columns once, and its share (..., 1): half of one with itself."""
+    i, j = np.triu_indices(k)
+    return i, j, np.where(i == j, 0.5, 1.0)[:, None]
 
 
 def _sums(index: IntArray, terms: Array, size: int) -> Array:
