@@ -23,10 +23,20 @@ class Thinned:
     """(b + 1,) of the parameter."""
     size: int
     """Distinct control points."""
-    rss: float
-    """Sum of squared distances of the points, m^2."""
-    crossed: float
-    """The same of each point from the curve that is fitted without it, m^2: cross-validation."""
+    residual: Array
+    """(k, 2) from where it passes the points to them, m."""
+    leverage: Array
+    """(k,) by how much each point draws it there, 0 to 1."""
+
+    @property
+    def rss(self) -> float:
+        """Sum of squared distances of the points, m^2."""
+        return float((self.residual**2).sum())
+
+    @property
+    def crossed(self) -> float:
+        """The same of each point from the curve that is fitted without it, m^2: cross-validation."""
+        return float(((self.residual / (1.0 - self.leverage)[:, None]) ** 2).sum())
 
 
 def chosen_breaks(points: Array, periodic: bool, fit: FitSettings, least: int, most: int) -> Thinned:
@@ -54,35 +64,9 @@ MARGIN = 0.1
 def thin(
     points: Array, u: Array, high: float, periodic: bool, fit: FitSettings, least: int
 ) -> Iterator[Thinned]:
-    """From a break at each of the points (k, 2), at u (k,) in [0, high], down to `least` control points."""
-    for curve in _removals(points, u, high, periodic, fit, least):
-        yield _judged(curve, points)
+    """From a break at each of the points (k, 2), at u (k,) in [0, high], down to `least` control points.
 
-
-def thinned_breaks(
-    points: Array, u: Array, high: float, periodic: bool, fit: FitSettings, size: int
-) -> Array:
-    """Breaks (b + 1,) of the last curve of `thin`, of `size` control points."""
-    *_, curve = _removals(points, u, high, periodic, fit, size)
-    return curve.breaks
-
-
-@dataclass(frozen=True, eq=False)
-class _Curve:
-    """A least-squares spline on the knots that are left."""
-
-    breaks: Array
-    size: int
-    fitted: Array
-    """(k, 2) where it passes the points."""
-    leverage: Array
-    """(k,) by how much each point draws it there, 0 to 1."""
-
-
-def _removals(
-    points: Array, u: Array, high: float, periodic: bool, fit: FitSettings, least: int
-) -> Iterator[_Curve]:
-    """Without one knot more each time, the one that is missed least.
+    Each curve has one knot less than the last, the one that is missed least.
 
     A knot t is no knot any more where the p-th derivative doesn't jump there: a linear constraint a'c = 0. It
     costs `|a'c|^2 / (a' G^-1 a)`, G the normal equations; and whatever is linear in the control points,
@@ -98,7 +82,7 @@ def _removals(
     leverage = np.einsum("kn,nk->k", B, solve(factor, B.T))
     for size in range(B.shape[1], max(least, B.shape[1] - n) - 1, -1):
         kept = breaks[np.concatenate([[0], 1 + left, [-1]])]
-        yield _Curve(kept, size, values[n:], leverage)
+        yield Thinned(kept, size, points - values[n:], leverage)
         if len(left):
             price = (values[left] ** 2).sum(axis=1) / spread.diagonal()[left]
             gone = int((price + EVEN * (kept[2:] - kept[:-2]) ** 2).argmin())
@@ -120,10 +104,3 @@ def _jumps(frame: BSpline) -> Array:
     breaks = frame.breaks
     highest = frame.basis_matrix(0.5 * (breaks[1:] + breaks[:-1]), frame.degree)
     return np.asarray(np.diff(highest, axis=0))
-
-
-def _judged(curve: _Curve, points: Array) -> Thinned:
-    residual = points - curve.fitted
-    rss = float((residual**2).sum())
-    crossed = float(((residual / (1.0 - curve.leverage)[:, None]) ** 2).sum())
-    return Thinned(curve.breaks, curve.size, rss, crossed)

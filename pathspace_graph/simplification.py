@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from .boundary import Boundary
-from .cone_knots import thinned_breaks
+from .cone_knots import thin
 from .knots import BreakSettings, FitSettings, Knots, curvature_weighted_breaks, refit
 from .settings import ClosingSettings, MapperSettings
 from .smoother import Smoother
@@ -88,7 +88,8 @@ def _breaks(
         baseline = BreakSettings(settings.spline.linear_baseline)
         return curvature_weighted_breaks(boundary.spline(control_points), size, baseline, 0.0, period)
     points = boundary.evaluate(control_points, u)
-    return thinned_breaks(points, u, period, True, FitSettings(boundary.degree), size)
+    *_, thinned = thin(points, u, period, True, FitSettings(boundary.degree), size)
+    return thinned.breaks
 
 
 def _apart(values: Array, distance: float) -> Array:
