@@ -1,16 +1,17 @@
-"""The online mapper's speed, held against GTSAM's own linear algebra on the same windows, in one run.
+"""The online mapper's speed, against GTSAM's own solver and the landmark graph, on the same cycles in one
+run.
 
 `python -m pathspace_graph.eval.benchmark --laps 5 --seed 0 --json FILE`, and with `--compare` what got worse
 than the committed baseline (exit code 1 then), which `--write-baseline` writes. Only ratios are in it, as
 times are the machine's.
 
-What GTSAM is timed on is the mapper's window after a cycle, already linearized, so that neither linearization
-nor the building of a graph counts: `optimize()` and `marginal(control points, calibration, next pose)`, once
-each. It is given its fair best: prior, gauge and damping come as one Hessian factor (as a square root they
-were slower, and so was a gauge of many factors); readings and odometry are cut as each of `CUTS` says;
+What GTSAM is timed on is the mapper's graph after a cycle, with the whole map in it and already linearized,
+so that neither linearization nor the building of a graph counts: `optimize()` and `marginal(map, calibration,
+next pose)`, once each. It is given its fair best: prior, weak priors and damping come as one Hessian factor;
 the window is solved in each of several orderings, finding one beforehand not counted; each call is made once
-untimed before it is timed; what is reported is the cut and ordering that were fastest on average in the run.
-BLAS has one thread. The ratio is of means over all cycles from the first sample on, with the closing one.
+untimed before it is timed; what is reported is the ordering that was fastest on average in the run. BLAS has
+one thread. The ratio is of means over all cycles from the first sample on, with the closing one. The landmark
+graph gets every cycle right after the mapper.
 """
 
 from __future__ import annotations
@@ -22,44 +23,31 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final, Literal, get_args
+from typing import Final
 
 import gtsam
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 from pathspace_graph.errors import PathspaceError
-from pathspace_graph.factors.linear_graph import (
-    LinearRows,
-    WindowKeys,
-    linear_graph,
-    prior_rows,
-    window_keys,
-)
+from pathspace_graph.estimators import make_online
 from pathspace_graph.files import atomic_file, check_file_target
 from pathspace_graph.fixed_lag import FixedLagMapper
-from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.linearizer import add_smoothness
+from pathspace_graph.graph.gaussian import combined, factors_of, graph_of, jacobian_factor
+from pathspace_graph.graph.keys import are_poses
+from pathspace_graph.graph.variables import Layout
 from pathspace_graph.log import Log
 from pathspace_graph.progress import progress
-from pathspace_graph.run import CycleRecord, run_online
+from pathspace_graph.run import CycleRecord, run_online, split_odometry
 from pathspace_graph.settings import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
-from pathspace_graph.window import POSE, accumulate
 
 from .benchmark_baseline import BASELINE, baseline_table, compare, read_baseline, write_baseline
 from .benchmark_metric import Metric
 
-Array = NDArray[np.float64]
-
-Cut = Literal["key set", "pose"]
-"""A factor for each set of keys that rows share, or all rows of a cycle and boundary stacked in one."""
-CUTS: Final[tuple[Cut, ...]] = get_args(Cut)
-"""All of them."""
 SAMPLE_EVERY: Final = 10
 """GTSAM is timed after every so many cycles."""
 WARM_UP: Final = 50
@@ -68,6 +56,8 @@ REFERENCE_LAP: Final = 2
 """The first lap that is driven on a closed map; the last lap is compared with it."""
 MEAN_RATIO: Final = 2.0
 """Mean cycle at most so many times GTSAM's mean."""
+RIVAL: Final = "landmark-fixed-lag"
+"""The estimator that gets the same cycles in turn."""
 P99_MILLISECONDS: Final = 10.0
 """99th percentile of a cycle, where a mean cycle of 3 ms was measured."""
 LAP_RATIO: Final = 1.1
@@ -91,98 +81,66 @@ TAIL_TOLERANCE: Final = 0.5
 
 @dataclass(frozen=True, eq=False)
 class LinearWindow:
-    """`min sum |J dx + r|^2 + dx' L dx - 2 g' dx`: a window, linearized at its estimate."""
+    """A window with the whole map, linearized at its estimate, as GTSAM is best given it."""
 
-    groups: tuple[LinearRows, ...]
-    """Rows of each boundary's readings, and of the odometry."""
-    information: Array
-    """(q, q) L of prior, gauge and damping, on the leading entries of the state."""
-    descent: Array
-    """(q,) g."""
-    keys: WindowKeys
-    """GTSAM's keys of the state."""
+    graph: gtsam.GaussianFactorGraph
+    """A factor a cycle; prior, weak priors and damping in one."""
+    layout: Layout
+    """Its variables."""
 
 
 def linear_window(mapper: FixedLagMapper) -> LinearWindow:
     """The window of a mapper between two cycles, which is left as it is."""
-    whole = mapper.smoother.whole()
-    state = whole.state
-    q, map_size = len(whole.prior.point), state.map_size
-    groups = whole.linearize()
-    gauge = [rows for rows in groups if rows.columns.max(initial=-1) < map_size]
-    information, descent = accumulate(gauge, q)
-    information += whole.prior.information
-    descent += whole.prior.descent_at(state.vector)
-    add_smoothness(information, descent, state, state.vector)
-    information[np.arange(map_size), np.arange(map_size)] += mapper.settings.sigma_step**-2
-    left, right = (mapper.boundaries[b].size if b in mapper.boundaries else 0 for b in (LEFT, RIGHT))
-    keys = window_keys((left, right), len(mapper.calibration), mapper.poses)
-    moving = [rows for rows in groups if rows.columns.max(initial=-1) >= map_size]
-    return LinearWindow(
-        tuple((rows.columns, rows.jacobian, rows.residual) for rows in moving), information, descent, keys
-    )
+    smoother = mapper.smoother
+    smoother.refresh()
+    factors = factors_of(smoother.linear_graph(whole=True))
+    moving = [factor for factor in factors if _is_of_a_cycle(factor)]
+    held = [factor for factor in factors if not _is_of_a_cycle(factor)]
+    together = combined(graph_of(_damping(mapper), *held))
+    return LinearWindow(graph_of(together, *moving), smoother.variables.layout)
 
 
-def gaussian_graph(window: LinearWindow, cut: Cut) -> gtsam.GaussianFactorGraph:
-    """The window as GTSAM has it."""
-    graph = linear_graph(window.groups if cut == "key set" else _stacked(window), window.keys)
-    held = prior_rows(window.information, window.descent)
-    graph.add(gtsam.HessianFactor(linear_graph([held], window.keys)))
-    return graph
+def _is_of_a_cycle(factor: gtsam.GaussianFactor) -> bool:
+    """Whether a factor is of the rows of a cycle: the others are the prior, which is dense, and weak
+    priors."""
+    rows = isinstance(factor, gtsam.JacobianFactor)
+    return rows and bool(are_poses(np.array(list(factor.keys()), np.intp)).any())
 
 
-def _stacked(window: LinearWindow) -> list[LinearRows]:
-    """The rows of each group, cut by their newest pose, all rows of a cut on the same columns."""
-    size = int(window.keys.dims.sum())
-    stacked: list[LinearRows] = []
-    for columns, jacobian, residual in window.groups:
-        newest = (size - 1 - columns.max(axis=1)) // POSE  # poses come last in the state
-        for pose in np.unique(newest):
-            of = newest == pose
-            stacked.append(_widened((columns[of], jacobian[of], residual[of]), size))
-    return stacked
+def _damping(mapper: FixedLagMapper) -> gtsam.GaussianFactor:
+    """What holds the control points in a step, as a factor."""
+    keys, variables = mapper.smoother.map.state.map_keys, mapper.smoother.variables
+    now, sigma = variables.change(variables.layout.entries(keys)), mapper.settings.sigma_step
+    return jacobian_factor(keys, np.eye(len(now)) / sigma, now / sigma)
 
 
-def _widened(rows: LinearRows, size: int) -> LinearRows:
-    """The same rows, all on the same columns."""
-    columns, jacobian, residual = rows
-    dense = np.zeros((len(residual), size))
-    np.add.at(dense, (np.arange(len(residual))[:, None], columns), jacobian)
-    touched = np.unique(columns)
-    return np.tile(touched, (len(residual), 1)), dense[:, touched], residual
-
-
-def orderings(graph: gtsam.GaussianFactorGraph, window: LinearWindow) -> dict[str, gtsam.Ordering | None]:
+def orderings(window: LinearWindow) -> dict[str, gtsam.Ordering | None]:
     """What `optimize` may be given: nothing, COLAMD found beforehand, or poses before what they share."""
-    shared = window.keys.dims != POSE
-    poses_first = gtsam.Ordering()
-    for key in np.array(window.keys.keys, dtype=object)[np.argsort(shared, kind="stable")]:
-        poses_first.push_back(key)
+    keys = window.layout.keys
+    shared = ~are_poses(keys)
     return {
         "no ordering given": None,
-        "COLAMD given": gtsam.Ordering.ColamdGaussianFactorGraph(graph),
-        "poses first": poses_first,
+        "COLAMD given": gtsam.Ordering.ColamdGaussianFactorGraph(window.graph),
+        "poses first": gtsam.Ordering(keys[np.argsort(shared, kind="stable")].tolist()),
     }
 
 
 def marginal_keys(window: LinearWindow) -> list[int]:
     """What stays of the window when its oldest pose leaves, as far as its marginal reaches."""
-    keys = window.keys
-    poses = [key for key, size in zip(keys.keys, keys.dims, strict=True) if size == POSE]
-    return [key for key in keys.keys if key not in poses] + poses[1:2]
+    keys = window.layout.keys
+    poses = are_poses(keys)
+    staying: list[int] = np.append(keys[~poses], keys[poses][1:2]).tolist()
+    return staying
 
 
 def time_gtsam(window: LinearWindow) -> dict[str, tuple[float, float]]:
-    """Seconds of (`optimize`, `marginal`), once each, by cut and ordering."""
-    timings = {}
-    staying = gtsam.KeyVector(marginal_keys(window))
-    for cut in CUTS:
-        graph = gaussian_graph(window, cut)
-        marginal = seconds(partial(graph.marginal, staying))
-        for name, ordering in orderings(graph, window).items():
-            optimize = seconds(partial(graph.optimize, *(() if ordering is None else (ordering,))))
-            timings[f"a factor for each {cut}, {name}"] = (optimize, marginal)
-    return timings
+    """Seconds of (`optimize`, `marginal`), once each, by ordering."""
+    graph, staying = window.graph, gtsam.KeyVector(marginal_keys(window))
+    marginal = seconds(partial(graph.marginal, staying))
+    return {
+        name: (seconds(partial(graph.optimize, *(() if ordering is None else (ordering,)))), marginal)
+        for name, ordering in orderings(window).items()
+    }
 
 
 def seconds(call: Callable[[], object]) -> float:
@@ -201,7 +159,7 @@ class Gtsam:
     """GTSAM at its best."""
 
     candidate: str
-    """Cut and ordering that were fastest on average; empty where nothing was sampled."""
+    """The ordering that was fastest on average; empty where nothing was sampled."""
     optimize: float
     """Mean of `optimize`, s."""
     marginal: float
@@ -222,13 +180,17 @@ class Measurement:
     """The cycle that closed the loop; None where it stayed open."""
     gtsam: Gtsam
     """What it is held against."""
+    rival: tuple[float, ...]
+    """Time (s) of each of the landmark graph's updates."""
 
 
 class _Sampler:
-    """Times GTSAM between cycles, and notes the cycle that closes the loop."""
+    """Times GTSAM and the landmark graph between cycles, and notes the cycle that closes the loop."""
 
-    def __init__(self, mapper: FixedLagMapper, every: int, advance: Callable[[], None]) -> None:
+    def __init__(self, mapper: FixedLagMapper, log: Log, every: int, advance: Callable[[], None]) -> None:
         self._mapper, self._every, self._advance = mapper, every, advance
+        self._cycles, self._rival = split_odometry(log), make_online(RIVAL, mapper.settings, log)
+        self.rival: list[float] = []
         self._timings: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
         self.closing: int | None = None
 
@@ -238,6 +200,10 @@ class _Sampler:
         if record.cycle >= WARM_UP and record.cycle % self._every == 0 and self._mapper.boundaries:
             for name, pair in time_gtsam(linear_window(self._mapper)).items():
                 self._timings[name].append(pair)
+        odometry, detections = next(self._cycles)
+        begin = time.perf_counter()
+        self._rival.update(odometry, detections)
+        self.rival.append(time.perf_counter() - begin)
         self._advance()
 
     def fastest(self) -> Gtsam:
@@ -253,9 +219,10 @@ def measure(log: Log, settings: MapperSettings, every: int = SAMPLE_EVERY) -> Me
     """Map a log online and time GTSAM on the window after every so many cycles."""
     mapper = FixedLagMapper(settings, log.odometry_sigma)
     with progress("benchmark", len(log.cycles)) as advance:
-        sampler = _Sampler(mapper, every, advance)
+        sampler = _Sampler(mapper, log, every, advance)
         result = run_online(log, mapper, on_cycle=sampler)
-    return Measurement(result.cycles, result.laps, sampler.closing, sampler.fastest())
+    fastest = sampler.fastest()
+    return Measurement(result.cycles, result.laps, sampler.closing, fastest, tuple(sampler.rival))
 
 
 def metrics(measurement: Measurement) -> tuple[Metric, ...]:
@@ -263,12 +230,13 @@ def metrics(measurement: Measurement) -> tuple[Metric, ...]:
     cycles, best = measurement.cycles, measurement.gtsam
     times = np.array([record.seconds for record in cycles])
     mean, p99 = _mean(times[WARM_UP:]), float(np.quantile(times, 0.99))
-    reference = best.optimize + best.marginal
+    reference, rival = best.optimize + best.marginal, _mean(measurement.rival[WARM_UP:])
     laps = _lap_means(cycles, measurement.laps)
     slowdown = laps[-1] / laps[REFERENCE_LAP - 1] if len(laps) > REFERENCE_LAP else float("nan")
     closing = times[measurement.closing] if measurement.closing is not None else float("nan")
     return (
         Metric("mean_by_gtsam", mean / reference, "", bound=MEAN_RATIO, tolerance=MEAN_TOLERANCE),
+        Metric("mean_by_landmark", mean / rival, "", tolerance=MEAN_TOLERANCE),
         Metric("p99", 1e3 * p99, "ms", bound=P99_MILLISECONDS),
         Metric("last_lap_by_lap_2", slowdown, "", bound=LAP_RATIO, tolerance=LAP_TOLERANCE),
         Metric("closing", 1e3 * float(closing), "ms", bound=CLOSING_MILLISECONDS),
@@ -277,6 +245,7 @@ def metrics(measurement: Measurement) -> tuple[Metric, ...]:
         Metric("mean", 1e3 * _mean(times), "ms"),
         Metric("median", 1e3 * float(np.median(times)), "ms"),
         Metric("slowest", 1e3 * float(times.max()), "ms"),
+        Metric("landmark", 1e3 * rival, "ms"),
         Metric("gtsam", 1e3 * reference, "ms"),
         Metric("gtsam_optimize", 1e3 * best.optimize, "ms"),
         Metric("gtsam_marginal", 1e3 * best.marginal, "ms"),

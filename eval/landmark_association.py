@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ class Gates:
     """Above it from every landmark, a reading is of none of them; between the two nothing is said."""
 
     @staticmethod
+    @cache
     def of_probabilities(match: float, create: float) -> Gates:
         """The gates that hold a reading of the landmark with these probabilities, as 0.95 and 0.99."""
         return Gates(float(chi2.ppf(match, PLANE)), float(chi2.ppf(create, PLANE)))

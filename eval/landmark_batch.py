@@ -11,14 +11,15 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.batch_data import integrate_log
 from pathspace_graph.fixed_lag import ODOMETRY_SIGMA
+from pathspace_graph.graph.keys import POSE
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.log import Log
 from pathspace_graph.run import BatchRun, settings_dict
 from pathspace_graph.settings import MapperSettings
-from pathspace_graph.window import POSE
 
 from .landmark_fixed_lag import point_map
-from .landmark_reassociation import Reassociation, drop_rare, merge_duplicates
+from .landmark_reassociation import Reassociation, drop_rare
+from .landmark_sightings import duplicates
 from .landmark_start import as_landmark_readings, start_online, start_told
 from .landmark_state import LandmarkState
 from .landmark_system import LandmarkSystem
@@ -65,40 +66,39 @@ class LandmarkBatch:
         else:
             state = start_told(readings, chain, associations)
         system = LandmarkSystem(readings, chain, self.settings)
-        state = system.settle(state)
+        system.settle(state)
         rounds, converged = 0, associations is not None
         while not converged and rounds < settings.max_rounds:
             rounds += 1
             converged = self._refresh(system, state) <= settings.settled * len(readings)
-            state = system.settle(state)
+            system.settle(state)
         return self._result(system, state, rounds, converged)
 
     def _refresh(self, system: LandmarkSystem, state: LandmarkState) -> int:
         """Associate anew, merge, drop; how many readings are of another landmark now."""
-        readings = system.readings
-        before = readings.numbers(state.ids)
-        covariance = system.covariance(state)
-        Reassociation(state, readings, covariance, self.settings, system.chain.stamps).run()
-        merge_duplicates(state, readings, covariance, self.settings)
+        readings, problem = system.readings, system.eliminated(state)
+        before, known = readings.landmark.copy(), len(state)
+        Reassociation(state, readings, problem, self.settings, system.chain.stamps).run()
+        first, second = duplicates(state, known, problem.joint, self.settings)
+        readings.merge(state.numbers[first], state.numbers[second])
         drop_rare(state, readings, self.settings.growth.sightings)
-        return int((before != readings.numbers(state.ids)).sum())
+        return int((before != readings.landmark).sum())
 
     def _result(
         self, system: LandmarkSystem, state: LandmarkState, rounds: int, converged: bool
     ) -> LandmarkResult:
-        laps, covariance = LapCounter(), system.covariance(state)
-        for pose in state.poses:
+        laps, problem, poses = LapCounter(), system.eliminated(state), state.variables.poses.copy()
+        for pose in poses:
             laps.update(pose)
-        joint = covariance.landmarks.reshape(state.map_size, state.map_size)
         return LandmarkResult(
             estimator=NAME,
             settings=settings_dict(self.settings),
-            map=point_map(state, joint, laps.completed > 0),
+            map=point_map(state, problem.joint(state.keys), laps.completed > 0),
             trajectory_t=system.chain.stamps,
-            trajectory=state.poses.copy(),
+            trajectory=poses,
             cycles=(),
             laps=laps.completed,
             rounds=rounds,
             converged=converged,
-            pose_covariances=covariance.poses,
+            pose_covariances=problem.pose_marginals,
         )

@@ -19,13 +19,13 @@ from pathspace_graph.ckf_belief import PLANE, Belief, point_columns, to_vehicle_
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.projection import to_map
 from pathspace_graph.fixed_lag import ODOMETRY_SIGMA, CycleResult
+from pathspace_graph.graph.keys import POSE
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.log import Detections, Odometry
 from pathspace_graph.map import Map, PointBoundary
 from pathspace_graph.settings import MapperSettings
 from pathspace_graph.sightings import Sightings
 from pathspace_graph.stopwatch import Stopwatch
-from pathspace_graph.window import POSE
 
 from .landmark_association import NONE, Association, Gates, associate, compatible, pair_costs
 

@@ -13,12 +13,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.segments import Segment, relinearized_prior
-from pathspace_graph.window import POSE, Prior, schur_leave
 
 from .landmark_association import PLANE, Gates, squared_mahalanobis
-from .landmark_sightings import near_pairs, one_cone
-from .landmark_window import LandmarkSmoother
+from .landmark_map import LandmarkSmoother
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -29,9 +26,9 @@ class Pairs:
     """Landmarks that may be the same."""
 
     first: IntArray
-    """(k,) indices of those seen lately."""
+    """(k,) positions of those seen lately."""
     second: IntArray
-    """(k,) indices of those that each may be, seen long ago."""
+    """(k,) positions of those that each may be, seen long ago."""
     distance: float
     """Squared Mahalanobis distance of all of them together, 2 k degrees of freedom."""
 
@@ -52,11 +49,11 @@ class Belief:
         self, smoother: LandmarkSmoother, recent: IntArray, old: IntArray, scale: float, sigma: float
     ) -> None:
         """`scale` multiplies all sigmas; a pair may be apart by `sigma` (m) anyway."""
-        state = smoother.state
+        state = smoother.map.state
         self.recent, self.old, self.variance = recent, old, sigma**2
         both = np.concatenate([recent, old])
         self.mean = state.landmarks[both].copy()
-        self.covariance = scale**2 * smoother.covariance(both)
+        self.covariance = scale**2 * smoother.last_covariance(state.keys[both])
         self.same_colour = state.labels[recent][:, None] == state.labels[old][None]
 
     def distances(self, mean: Array, covariance: Array) -> Array:
@@ -102,13 +99,13 @@ def recognize(smoother: LandmarkSmoother, recent: IntArray, old: IntArray, reach
 
     Old ones farther than `reach` (m) from all of them aren't looked at.
     """
-    settings, points = smoother.settings.landmark, smoother.state.landmarks
+    settings, points = smoother.map.settings.landmark, smoother.map.state.landmarks
     offset = points[recent][:, None] - points[old][None]
     old = old[(np.hypot(offset[..., 0], offset[..., 1]) < reach).any(axis=0)]
     if len(recent) < settings.min_pairs or len(old) < settings.min_pairs:
         return None
     gate = Gates.of_probabilities(settings.match, settings.create).match
-    belief = Belief(smoother, recent, old, smoother.settings.closing.prior_scale, settings.sigma_merge)
+    belief = Belief(smoother, recent, old, smoother.map.settings.closing.prior_scale, settings.sigma_merge)
     distances = belief.distances(belief.mean, belief.covariance)
     seeds = np.argwhere(distances < gate)
     if len(seeds) == 0:
@@ -122,83 +119,27 @@ def recognize(smoother: LandmarkSmoother, recent: IntArray, old: IntArray, reach
 
 def _believed(smoother: LandmarkSmoother, pairs: Pairs) -> bool:
     """Enough pairs of either colour, compatible as a whole."""
-    settings, labels = smoother.settings.landmark, smoother.state.labels[pairs.first]
+    settings, labels = smoother.map.settings.landmark, smoother.map.state.labels[pairs.first]
     enough = all((labels == label).sum() >= settings.min_pairs // 3 for label in BOUNDARIES)
     joint = chi2.ppf(settings.create, PLANE * len(labels)) if len(labels) else 0.0
     return bool(enough and len(labels) >= settings.min_pairs and pairs.distance < joint)
 
 
 def bend(smoother: LandmarkSmoother, pairs: Pairs) -> None:
-    """Solve the whole loop with the pairs tied, each stretch of the drive relinearized in its own frame.
+    """Solve the whole loop with the pairs tied, each submap relinearized in its own frame.
 
     The pairs are to be merged next.
     """
-    settings, state, history = smoother.settings.closing, smoother.state, smoother.history
-    segments = history.all_segments(*state.control_ids()) if history is not None else []
-    smoother.ties = np.column_stack([pairs.first, pairs.second])
-    if history is not None and segments:
-        state.insert(state.pose_column(0), np.concatenate(history.keyframes))
-        state.keyframes = len(segments)
-        for _ in range(settings.iterations):
-            smoother.prior = _relinearized(smoother, segments)
-            smoother.step()
-        smoother.prior = _without_keyframes(_relinearized(smoother, segments), smoother)
-        smoother.history = None
-
-
-def _relinearized(smoother: LandmarkSmoother, segments: list[Segment]) -> Prior:
-    assert smoother.history is not None
-    state = smoother.state
-    return relinearized_prior(smoother.history, segments, state.vector, {0: 0}, state.map_size)
-
-
-def _without_keyframes(prior: Prior, smoother: LandmarkSmoother) -> Prior:
-    state = smoother.state
-    stop = state.pose_column(0)
-    start = stop - POSE * state.keyframes
-    information, gradient = schur_leave(prior.information, prior.gradient, start, stop)
-    state.vector = np.delete(state.vector, np.s_[start:stop])
-    state.keyframes = 0
-    return Prior(information, gradient, np.delete(prior.point, np.s_[start:stop]))
+    smoother.map.ties = smoother.map.state.numbers[np.column_stack([pairs.first, pairs.second])]
+    smoother.solve_loop(smoother.map.settings.closing.iterations, None)
 
 
 def merge(smoother: LandmarkSmoother, first: IntArray, second: IntArray) -> None:
-    """Landmarks `first` (k,) become `second` (k,): `x_old = E x_new`, `E' L E`; exact, nothing is forgotten.
+    """Landmarks `first` (k,) become `second` (k,), by position; exact, nothing is forgotten.
 
     A step follows, since the last one's columns are gone.
     """
-    state, prior, readings = smoother.state, smoother.prior, smoother.readings
-    target = np.arange(len(state.labels))
-    target[first] = second
-    stays = target == np.arange(len(target))
-    q, size = len(prior.point), state.map_size
-    expand = np.eye(q)
-    doubled = (PLANE * first[:, None] + np.arange(PLANE)).ravel()
-    expand[doubled, doubled] = 0.0
-    expand[doubled, (PLANE * second[:, None] + np.arange(PLANE)).ravel()] = 1.0
-    kept = np.append(np.repeat(stays, PLANE), np.ones(q - size, bool))
-    expand, point = expand[:, kept], state.vector[:q][kept]
-    descent = expand.T @ prior.descent_at(expand @ point)
-    smoother.prior = Prior(expand.T @ prior.information @ expand, descent, point)
-    smoother.merged.update(zip(state.ids[first].tolist(), state.ids[second].tolist(), strict=True))
-    smoother.ties = np.zeros((0, 2), np.intp)
-    np.add.at(state.votes, second, state.votes[first])
-    state.keep(stays)
-    index = np.cumsum(stays) - 1
-    readings.landmark[readings.used] = index[target[readings.landmark[readings.used]]]
+    keys = smoother.map.state.keys
+    smoother.merge(keys[first], keys[second])
+    smoother.map.merge(first, second)
     smoother.step()
-
-
-def duplicates(smoother: LandmarkSmoother) -> Pairs:
-    """Landmarks of one colour, so near that one cone explains both, by their joint covariance."""
-    settings, state = smoother.settings, smoother.state
-    first, second = near_pairs(state.landmarks, state.labels, settings.growth.merge_radius)
-    involved, index = np.unique(np.concatenate([first, second]), return_inverse=True)
-    if len(involved) == 0:
-        return Pairs(first, second, 0.0)
-    k, (i, j) = len(involved), index.reshape(2, -1)
-    blocks = smoother.covariance(involved).reshape(k, PLANE, k, PLANE)
-    spread = blocks[i, :, i] + blocks[j, :, j] - blocks[i, :, j] - blocks[j, :, i]
-    offset = state.landmarks[first] - state.landmarks[second]
-    same = one_cone(first, second, offset, spread, settings.landmark)
-    return Pairs(first[same], second[same], 0.0)

@@ -6,16 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from pathspace_graph.factors.landmark import landmark_residuals
-from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.projection import to_map
-from pathspace_graph.window import POSE
 
 from .landmark_association import NONE, PLANE, Gates, associate, compatible, pair_costs
+from .landmark_map import LandmarkSmoother, two_rows
 from .landmark_state import LEFT_OUT
-from .landmark_window import LandmarkSmoother, rotation
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -27,7 +24,7 @@ class Prediction:
     """What the newest pose should see."""
 
     landmarks: IntArray
-    """(k,) indices."""
+    """(k,) positions."""
     points: Array
     """(k, 2) vehicle frame, m."""
     covariances: Array
@@ -39,57 +36,40 @@ def assign(smoother: LandmarkSmoother, new: slice, eligible: BoolArray) -> None:
 
     eligible (n,): landmarks that they may be of.
     """
-    readings, state, settings = smoother.readings, smoother.state, smoother.settings.landmark
+    readings, state, settings = smoother.map.readings, smoother.map.state, smoother.map.settings.landmark
     rows = np.arange(new.start, new.stop)
     candidates = nearby(smoother, rows, settings.rough)
     seen = predict(smoother, candidates[eligible[candidates]])
-    gates = Gates.of_probabilities(settings.match, settings.create)
+    gates, numbers = Gates.of_probabilities(settings.match, settings.create), state.numbers[seen.landmarks]
     any_colour = pair_costs(readings.point[rows], readings.covariance[rows], seen.points, seen.covariances)
     may_be = compatible(readings.label[rows], state.labels[seen.landmarks])
     found = associate(np.where(may_be, any_colour, np.inf), gates)
     matched = found.landmark != NONE
-    readings.take(rows[matched], seen.landmarks[found.landmark[matched]])
+    readings.take(rows[matched], numbers[found.landmark[matched]])
     explained = (any_colour < gates.match).any(axis=1)  # in the wrong colour, maybe: that makes no new one
     readings.landmark[rows[~matched & (~found.new | explained)]] = LEFT_OUT
     if explained.any():
-        state.vote(readings.label[rows[explained]], seen.landmarks[any_colour[explained].argmin(axis=1)])
+        state.vote(readings.label[rows[explained]], numbers[any_colour[explained].argmin(axis=1)])
 
 
 def nearby(smoother: LandmarkSmoother, rows: IntArray, rough: float) -> IntArray:
     """Landmarks within `rough` (m) of any of these readings."""
-    readings, state = smoother.readings, smoother.state
-    points = to_map(readings.point[rows], state.poses[readings.slot[rows]])
-    offset = points[:, None] - state.landmarks[None]
+    readings = smoother.map.readings
+    points = to_map(readings.point[rows], smoother.variables.poses_at(readings.cycle[rows]))
+    offset = points[:, None] - smoother.map.state.landmarks[None]
     return np.flatnonzero((np.hypot(offset[..., 0], offset[..., 1]) < rough).any(axis=0))
 
 
 def predict(smoother: LandmarkSmoother, landmarks: IntArray) -> Prediction:
-    """`H_j Sigma H_j'` of landmarks (k,) and the newest pose, Sigma their joint covariance.
+    """`H_j Sigma H_j'` of landmarks (k,) and the newest pose, Sigma their joint covariance in the last step.
 
-    Sigma is that of the last step, which the newest pose wasn't part of: it is reached through its odometry,
-    `g_last = g dx_now/dx_last`, `g_calibration = -g R G`, plus the odometry's own noise.
+    Zero before the first step.
     """
-    step, state = smoother.last_step, smoother.state
-    k, pose = len(landmarks), smoother.state.poses[-1]
-    rows = landmark_residuals(np.tile(pose, (k, 1)), state.landmarks[landmarks], np.zeros((k, PLANE)))
-    if step is None or k == 0:
-        return Prediction(landmarks, rows.residual, np.zeros((k, PLANE, PLANE)))
-    odometry, turn = smoother.odometry[-1], rotation(pose[2])
-    local = rows.by_pose @ turn
-    by_last = rows.by_pose.copy()
-    dx, dy = pose[:2] - state.poses[-2, :2]
-    by_last[:, :, 2] += rows.by_pose[:, :, 1] * dx - rows.by_pose[:, :, 0] * dy
-    gradient = np.zeros((len(step.factor), k, PLANE), order="F")
-    j = np.arange(k)
-    for axis in range(PLANE):
-        gradient[PLANE * landmarks + axis, j] = rows.by_landmark[:, :, axis]
-    map_size = state.map_size
-    calibration = slice(map_size, map_size + CALIBRATION_SIZE)
-    gradient[calibration] = np.moveaxis(-local @ odometry.calibration_jacobian, 2, 0)
-    last = len(step.factor) - POSE
-    gradient[last:] = np.moveaxis(by_last, 2, 0)
-    half, _ = lapack.dtrtrs(step.factor, gradient.reshape(len(gradient), -1), lower=1)
-    half = half.reshape(gradient.shape)
-    covariances = np.einsum("nki,nkj->kij", half, half)
-    covariances += local @ odometry.covariance @ np.swapaxes(local, 1, 2)
-    return Prediction(landmarks, rows.residual, covariances)
+    state, k = smoother.map.state, len(landmarks)
+    poses, nowhere = np.tile(smoother.variables.poses[-1], (k, 1)), np.zeros((k, PLANE))
+    seen = landmark_residuals(poses, state.landmarks[landmarks], nowhere)
+    if smoother.last_step is None or k == 0:
+        return Prediction(landmarks, seen.residual, np.zeros((k, PLANE, PLANE)))
+    jacobian = np.concatenate([seen.by_pose, seen.by_landmark], axis=2)
+    rows = two_rows(np.full(k, smoother.next_cycle - 1), state.numbers[landmarks], jacobian, nowhere)
+    return Prediction(landmarks, seen.residual, smoother.predicted(rows, together=PLANE))

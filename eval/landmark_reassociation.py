@@ -11,14 +11,15 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.factors.landmark import landmark_residuals
 from pathspace_graph.factors.projection import to_map
+from pathspace_graph.graph.elimination import Elimination
+from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.settings import MapperSettings
 from pathspace_graph.sightings import Sightings
 
 from .landmark_association import NONE, PLANE, Gates, associate, compatible, kept_costs, squared_mahalanobis
-from .landmark_sightings import near_pairs, one_cone, sighted_by
+from .landmark_sightings import sighted_by
 from .landmark_state import LandmarkReadings, LandmarkState
-from .landmark_system import JointCovariance
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -32,14 +33,14 @@ class Reassociation:
         self,
         state: LandmarkState,
         readings: LandmarkReadings,
-        covariance: JointCovariance,
+        problem: Elimination,
         settings: MapperSettings,
         stamps: Array,
     ) -> None:
-        self.state, self.readings, self.covariance = state, readings, covariance
+        self.state, self.readings, self.problem = state, readings, problem
         self.settings, self.stamps = settings, stamps
         self.gates = Gates.of_probabilities(settings.landmark.match, settings.landmark.create)
-        self.points = to_map(readings.point, state.poses[readings.slot])
+        self.points = to_map(readings.point, state.variables.poses_at(readings.cycle))
 
     def run(self) -> None:
         """Readings are of the landmarks that the assignment says; those of none may make new ones."""
@@ -51,13 +52,12 @@ class Reassociation:
         readings = self.readings
         rows, landmarks, distances = self._near()
         cost = self._costs(rows, landmarks)
-        held = readings.used[rows] & (readings.landmark[rows] == landmarks)
+        held = readings.landmark[rows] == self.state.numbers[landmarks]
         cost = kept_costs(cost, held, self.gates)
         recolour(self.state, readings.label, rows, landmarks, cost, self.gates.match)
-        readings.used[:] = False
         readings.landmark[:] = NONE
         free = np.ones(len(readings), bool)
-        starts = np.searchsorted(readings.slot[rows], np.arange(len(self.stamps) + 1))
+        starts = np.searchsorted(readings.cycle[rows], np.arange(len(self.stamps) + 1))
         for begin, end in pairwise(starts.tolist()):
             self._assign_cycle(rows[begin:end], landmarks[begin:end], cost[begin:end], free)
         # what is on a landmark in the other colour, or would be merged with one, isn't a new one
@@ -74,7 +74,7 @@ class Reassociation:
         table[~compatible(self.readings.label[own], self.state.labels[candidates])] = np.inf
         found = associate(table, self.gates)
         matched = found.landmark != NONE
-        self.readings.take(own[matched], candidates[found.landmark[matched]])
+        self.readings.take(own[matched], self.state.numbers[candidates[found.landmark[matched]]])
         free[own] = found.new
 
     def _near(self) -> tuple[IntArray, IntArray, Array]:
@@ -87,9 +87,10 @@ class Reassociation:
     def _costs(self, rows: IntArray, landmarks: IntArray) -> Array:
         """(k,) squared Mahalanobis distances of pairs."""
         state, readings = self.state, self.readings
-        slot = readings.slot[rows]
-        r = landmark_residuals(state.poses[slot], state.landmarks[landmarks], readings.point[rows])
-        spread = self.covariance.predicted(slot, landmarks, r.by_pose, r.by_landmark)
+        cycles, poses = readings.cycle[rows], state.variables.poses_at(readings.cycle[rows])
+        r = landmark_residuals(poses, state.landmarks[landmarks], readings.point[rows])
+        jacobian = np.concatenate([r.by_pose, r.by_landmark], axis=2)
+        spread = predicted(self.problem, cycles, state.keys[landmarks], jacobian)
         return squared_mahalanobis(r.residual, spread + readings.covariance[rows])
 
     def _create(self, free: IntArray) -> None:
@@ -98,19 +99,18 @@ class Reassociation:
         for label in BOUNDARIES:
             own = free[readings.label[free] == label]
             points = self._confirmed(own)
-            which, sighted = sighted_by(self.points[own], readings.slot[own], points, self.settings.growth)
-            first = len(self.state.labels)
-            self.state.add_landmarks(points, np.full(len(points), label, np.intp))
-            readings.take(own[which], first + sighted)
+            which, sighted = sighted_by(self.points[own], readings.cycle[own], points, self.settings.growth)
+            numbers = self.state.add(points, np.full(len(points), label, np.intp))
+            readings.take(own[which], numbers[sighted])
 
     def _confirmed(self, rows: IntArray) -> Array:
         """(k, 2) what was sighted often enough, m, map frame; in a batch nothing is forgotten."""
         readings, sightings = self.readings, Sightings(replace(self.settings.growth, forget_after=np.inf))
         variances = np.trace(readings.covariance[rows], axis1=1, axis2=2)
         found = [np.zeros((0, PLANE))]
-        for slot in np.unique(readings.slot[rows]):
-            now = readings.slot[rows] == slot
-            sightings.add(self.points[rows[now]], variances[now], float(self.stamps[slot]))
+        for cycle in np.unique(readings.cycle[rows]):
+            now = readings.cycle[rows] == cycle
+            sightings.add(self.points[rows[now]], variances[now], float(self.stamps[cycle]))
             confirmed = sightings.confirmed()
             found.append(sightings.points[confirmed])
             sightings.remove(confirmed)
@@ -123,32 +123,28 @@ def recolour(
     """Each landmark has the colour of most readings that it explains: pairs (k,) of reading and landmark."""
     inside = cost < gate
     state.votes = np.zeros_like(state.votes)
-    state.vote(labels[rows[inside]], landmarks[inside])
+    state.vote(labels[rows[inside]], state.numbers[landmarks[inside]])
 
 
-def merge_duplicates(
-    state: LandmarkState, readings: LandmarkReadings, covariance: JointCovariance, settings: MapperSettings
-) -> None:
-    """Landmarks of one colour that one cone explains become one; those just made have no covariance yet."""
-    known = covariance.landmarks.shape[0]
-    first, second = near_pairs(state.landmarks[:known], state.labels[:known], settings.growth.merge_radius)
-    blocks = covariance.landmarks
-    spread = blocks[first, :, first] + blocks[second, :, second]
-    spread = spread - blocks[first, :, second] - blocks[second, :, first]
-    offset = state.landmarks[first] - state.landmarks[second]
-    same = one_cone(first, second, offset, spread, settings.landmark)
-    target = np.arange(len(state.labels))
-    target[first[same]] = second[same]
-    readings.landmark = np.where(readings.used, target[readings.landmark], readings.landmark)
+def predicted(problem: Elimination, cycles: IntArray, keys: IntArray, jacobian: Array) -> Array:
+    """`J Sigma J'` (m, 2, 2) of what the poses of cycles (m,) see of landmarks (m,), cross terms included.
+
+    J (m, 2, 5) is by [pose | landmark].
+    """
+    own = problem.map.columns(keys)[:, None] + np.arange(POINT)
+    seer = POSE * cycles[:, None] + np.arange(POSE)
+    joint = np.empty((len(cycles), POSE + POINT, POSE + POINT))
+    joint[:, :POSE, :POSE] = problem.pose_marginals[cycles]
+    joint[:, :POSE, POSE:] = problem.cross_covariance[seer[:, :, None], own[:, None, :]]
+    joint[:, POSE:, :POSE] = np.swapaxes(joint[:, :POSE, POSE:], 1, 2)
+    joint[:, POSE:, POSE:] = problem.map_covariance[own[:, :, None], own[:, None, :]]
+    return np.asarray(jacobian @ joint @ np.swapaxes(jacobian, 1, 2))
 
 
 def drop_rare(state: LandmarkState, readings: LandmarkReadings, fewest: int) -> None:
     """Landmarks with fewer readings than `fewest` are taken out, and those readings are of none."""
-    counts = np.bincount(readings.landmark[readings.used], minlength=len(state.labels))
-    stays = counts >= fewest
-    gone = readings.used & ~stays[np.where(readings.used, readings.landmark, 0)]
-    readings.used[gone] = False
-    readings.landmark[gone] = NONE
-    index = np.cumsum(stays) - 1
-    readings.landmark[readings.used] = index[readings.landmark[readings.used]]
-    state.keep(stays)
+    counts = np.bincount(state.positions(readings.landmark[readings.used]), minlength=len(state))
+    gone = counts < fewest
+    readings.landmark[np.isin(readings.landmark, state.numbers[gone])] = NONE
+    state.variables.remove(state.keys[gone])
+    state.keep(~gone)

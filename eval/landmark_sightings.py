@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.landmark_settings import LandmarkSettings
-from pathspace_graph.settings import GrowthSettings
+from pathspace_graph.settings import GrowthSettings, MapperSettings
 
 from .landmark_association import PLANE, Gates, squared_mahalanobis
+from .landmark_state import LandmarkState
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
 def sighted_by(
-    points: Array, slots: IntArray, landmarks: Array, settings: GrowthSettings
+    points: Array, cycles: IntArray, landmarks: Array, settings: GrowthSettings
 ) -> tuple[IntArray, IntArray]:
     """Which of the readings (m, 2), map frame, made new landmarks (k, 2): rows, and the landmark of each.
 
-    Those within the merge radius, each of the nearest landmark, and of each pose's (slots (m,)) the nearest.
+    Those within the merge radius, each of the nearest landmark, and of each cycle's (m,) the nearest.
     """
     if len(points) == 0 or len(landmarks) == 0:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
@@ -29,9 +32,28 @@ def sighted_by(
     distance = distances[np.arange(len(points)), nearest]
     rows = np.argsort(distance, kind="stable")
     rows = rows[distance[rows] < settings.merge_radius]
-    _, first = np.unique(np.column_stack([slots[rows], nearest[rows]]), axis=0, return_index=True)
+    _, first = np.unique(np.column_stack([cycles[rows], nearest[rows]]), axis=0, return_index=True)
     chosen = rows[first]
     return chosen, nearest[chosen]
+
+
+def duplicates(
+    state: LandmarkState, known: int, covariance: Callable[[IntArray], Array], settings: MapperSettings
+) -> tuple[IntArray, IntArray]:
+    """Positions (k,) of landmarks and of older ones of their colour, so near that one cone explains both.
+
+    `covariance` gives the joint one of landmarks by their keys; it knows the oldest `known` landmarks.
+    """
+    first, second = near_pairs(state.landmarks[:known], state.labels[:known], settings.growth.merge_radius)
+    involved, index = np.unique(np.concatenate([first, second]), return_inverse=True)
+    if len(involved) == 0:
+        return first, second
+    k, (i, j) = len(involved), index.reshape(2, -1)
+    blocks = covariance(state.keys[involved]).reshape(k, PLANE, k, PLANE)
+    spread = blocks[i, :, i] + blocks[j, :, j] - blocks[i, :, j] - blocks[j, :, i]
+    offset = state.landmarks[first] - state.landmarks[second]
+    same = one_cone(first, second, offset, spread, settings.landmark)
+    return first[same], second[same]
 
 
 def near_pairs(landmarks: Array, labels: IntArray, radius: float) -> tuple[IntArray, IntArray]:

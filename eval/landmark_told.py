@@ -58,15 +58,13 @@ def solve_landmarks(
     settings = replace(settings, gate=replace(settings.gate, huber=np.inf))
     chain, readings = integrate_log(log, log.odometry_sigma, settings.odometry), as_landmark_readings(log)
     system = LandmarkSystem(readings, chain, settings)
-    state = system.settle(start_told(readings, chain, associations))
-    covariance = None
-    if with_covariance:
-        covariance = system.covariance(state).landmarks.reshape(state.map_size, state.map_size)
+    state = start_told(readings, chain, associations)
+    system.settle(state)
     return LandmarkSolution(
         trajectory_t=chain.stamps,
-        trajectory=state.poses.copy(),
-        landmark_ids=state.ids.astype(np.int64),
+        trajectory=state.variables.poses.copy(),
+        landmark_ids=state.numbers.astype(np.int64),
         landmarks=state.landmarks.copy(),
-        covariance=covariance,
-        error=system.evaluate(state).cost,
+        covariance=system.eliminated(state).joint(state.keys) if with_covariance else None,
+        error=system.cost(state),
     )

@@ -25,25 +25,32 @@ def pair_residuals(first: Array, second: Array, nominal: Array) -> tuple[Array, 
     return length - nominal, offset / np.maximum(length, np.finfo(float).tiny)[:, None]
 
 
-def smoothness_matrix(abscissae: Array, period: float | None, spacing: float | None = None) -> Array:
-    """Second divided differences of control points over their abscissae, times the spacing squared.
+def smoothness_coefficients(abscissae: Array, period: float | None, spacing: float | None = None) -> Array:
+    """Second divided differences over abscissae, times the spacing squared: (m - 2, 3), by three in a row.
 
-    abscissae (m,) (Greville's) -> D (m - 2, m), or (m, m) where `period` closes the curve, so that `D c` (m)
-    are the second differences of evenly spaced points; zero for a straight line, whatever the spacing.
-    `spacing`: the curve's mean one, unless these points' own is meant.
-    Linear: a prior `D c ~ N(0, sigma^2)` is a JacobianFactor.
+    abscissae (m,) (Greville's); `period` closes the curve, (m, 3) then, and row j is of the points j, j + 1
+    and j + 2, counted around. So they are the second differences of evenly spaced points; zero for a straight
+    line, whatever the spacing. `spacing`: the curve's mean one, unless these points' own is meant.
     """
     m = len(abscissae)
     extended = abscissae if period is None else np.concatenate([abscissae, abscissae[:2] + period])
     gaps = np.diff(extended)
     mean = gaps[:m].mean() if spacing is None else spacing  # the gap that the period repeats counts once
-    rows = np.arange(len(extended) - 2)
     before, after = gaps[:-1], gaps[1:]
-    matrix = np.zeros((len(rows), m))
     scale = 2.0 * mean**2 / (before + after)
-    matrix[rows, rows] += scale / before
-    matrix[rows, (rows + 1) % m] -= scale / before + scale / after
-    matrix[rows, (rows + 2) % m] += scale / after
+    return np.column_stack([scale / before, -scale / before - scale / after, scale / after])
+
+
+def smoothness_matrix(abscissae: Array, period: float | None, spacing: float | None = None) -> Array:
+    """The same as a matrix D (m - 2, m), or (m, m) where `period` closes the curve, so that `D c` (m).
+
+    Linear: a prior `D c ~ N(0, sigma^2)` is a JacobianFactor.
+    """
+    coefficients, m = smoothness_coefficients(abscissae, period, spacing), len(abscissae)
+    matrix = np.zeros((len(coefficients), m))
+    rows = np.arange(len(coefficients))
+    for k in range(3):
+        matrix[rows, (rows + k) % m] += coefficients[:, k]
     return matrix
 
 

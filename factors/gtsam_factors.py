@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .footpoint import FootPoints, foot_points
-from .linear_graph import jacobian_factor, rotation
 from .odometry import IntegratedOdometry, odometry_residuals
 from .projection import huber_weights, project, to_map
 from .spans import SpanPolynomials
@@ -57,65 +56,72 @@ def spline_projection_factor(
             f"expected as many readings, covariances and stretches, at least one, found "
             f"{len(points_vehicle)}, {len(covariances)} and {len(low)}, {len(high)}"
         )
-    size = _distinct(tables)
-    if len(control_keys) != size:
-        raise ValueError(f"expected a key for each of {size} control points, found {len(control_keys)}")
-    touched = _touched(tables, low, high)
-    keys = (int(pose_key), *(int(control_keys[j]) for j in touched))
-    function = _Projection(keys, touched, tables, points_vehicle, covariances, low, high, sigma_model, huber)
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(low)), list(keys), function)
+    curve = _Curve.of(control_keys, tables, low, high)
+    function = _Projection(int(pose_key), curve, points_vehicle, covariances, sigma_model, huber)
+    keys = [int(pose_key), *curve.keys]
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(low)), keys, function)
+
+
+def boundary_point_factor(
+    control_keys: Sequence[int],
+    tables: SpanPolynomials,
+    *,
+    points_map: Array,
+    sigma: Array,
+    low: Array,
+    high: Array,
+) -> gtsam.CustomFactor:
+    """`z_i = n_i . (p_i - S(u_i)) / sigma_i`: a boundary passes through surveyed points, such as a wall's
+    corner.
+
+    points_map (m, 2) in the map frame with standard deviations sigma (m,), m; u_i is the foot point of p_i in
+    the stretch [low_i, high_i] (m,) of the curve. Keys and stretches as in `spline_projection_factor`; a row
+    whose foot point is not interior contributes zero.
+    """
+    if not len(points_map) == len(sigma) == len(low) == len(high) > 0:
+        raise ValueError(
+            f"expected as many points, sigmas and stretches, at least one, found "
+            f"{len(points_map)}, {len(sigma)} and {len(low)}, {len(high)}"
+        )
+    curve = _Curve.of(control_keys, tables, low, high)
+    function = _BoundaryPoint(curve, points_map, sigma)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(low)), list(curve.keys), function)
 
 
 @dataclass(frozen=True, eq=False)
-class _Projection:
-    """Error function of a spline-projection factor."""
+class _Curve:
+    """The stretches of a curve that a factor looks at, and the keys of the control points that matter
+    there."""
 
     keys: tuple[int, ...]
-    """The pose's, then those of the control points `touched`."""
+    """Keys of the control points `touched`."""
     touched: IntArray
     """Indices of the control points whose keys are held."""
     tables: SpanPolynomials
     """The basis."""
-    points_vehicle: Array
-    """(m, 2) readings, m."""
-    covariances: Array
-    """(m, 2, 2) their covariances, vehicle frame, m^2."""
     low: Array
     """(m,) beginning of the stretch where each foot point is searched for."""
     high: Array
     """(m,) its end."""
-    sigma_model: float
-    """Standard deviation of cones about a smooth curve, m."""
-    huber: float
-    """Whitened residual beyond which a row's weight falls."""
 
-    def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
-        """Robust whitened rows (m,), and their Jacobians in H where it is given."""
-        pose = values.atPose2(self.keys[0])
-        poses = np.tile(pose_array(pose), (len(self.low), 1))
-        points = to_map(self.points_vehicle, poses)
-        foot = self._find(values, points)
-        rows = project(points, self.covariances, poses, foot, self.sigma_model)
-        usable, slots = self._usable(foot)
-        whitened = rows.residual / rows.sigma
-        if H is None:
-            return np.asarray(huber_roots(whitened, self.huber) * usable)
-        root = np.sqrt(huber_weights(whitened, self.huber)) * usable
-        scale = root / rows.sigma
-        by_pose = rows.by_pose * scale[:, None]
-        by_pose[:, :2] = by_pose[:, :2] @ rotation(pose.theta())
-        _fill(H, [by_pose, *self._by_key(rows.by_control * scale[:, None, None], slots)])
-        return np.asarray(whitened * root)
+    @staticmethod
+    def of(control_keys: Sequence[int], tables: SpanPolynomials, low: Array, high: Array) -> _Curve:
+        """Of the keys of all distinct control points those that matter in the stretches [low, high] (m,)."""
+        size = _distinct(tables)
+        if len(control_keys) != size:
+            raise ValueError(f"expected a key for each of {size} control points, found {len(control_keys)}")
+        touched = _touched(tables, low, high)
+        return _Curve(tuple(int(control_keys[j]) for j in touched), touched, tables, low, high)
 
-    def _find(self, values: gtsam.Values, points: Array) -> FootPoints:
+    def find(self, values: gtsam.Values, points: Array) -> FootPoints:
         """Foot points within the stretch; control points that can't matter there are left at zero."""
         distinct = np.zeros((_distinct(self.tables), 2))
-        distinct[self.touched] = [values.atPoint2(key) for key in self.keys[1:]]
+        distinct[self.touched] = [values.atPoint2(key) for key in self.keys]
         unwrapped = distinct[np.arange(_unwrapped(self.tables)) % len(distinct)]
         step = GRID_SHARE * (self.tables.high - self.tables.low) / len(self.tables.starts)
         return foot_points(self.tables, unwrapped, points, self.low, self.high, step)
 
-    def _usable(self, foot: FootPoints) -> tuple[NDArray[np.bool_], IntArray]:
+    def usable(self, foot: FootPoints) -> tuple[NDArray[np.bool_], IntArray]:
         """Rows (m,) that may contribute, and the key numbers (m, degree + 1) of their control points."""
         size = _distinct(self.tables)
         slot_of = np.full(size, -1, dtype=np.intp)
@@ -123,11 +129,75 @@ class _Projection:
         slots = slot_of[(foot.span[:, None] + np.arange(-self.tables.degree, 1)) % size]
         return foot.interior & (slots >= 0).all(axis=1), slots
 
-    def _by_key(self, by_control: Array, slots: IntArray) -> Array:
+    def by_key(self, by_control: Array, slots: IntArray) -> Array:
         """Derivatives (m, degree + 1, 2) by the control points of each row's span -> (keys, m, 2)."""
         blocks = np.zeros((len(self.touched), len(by_control), 2))
         np.add.at(blocks, (slots, np.arange(len(by_control))[:, None]), by_control)
         return blocks
+
+
+@dataclass(frozen=True, eq=False)
+class _Projection:
+    """Error function of a spline-projection factor."""
+
+    pose_key: int
+    """Of the pose that the readings were made from."""
+    curve: _Curve
+    """What they are held against."""
+    points_vehicle: Array
+    """(m, 2) readings, m."""
+    covariances: Array
+    """(m, 2, 2) their covariances, vehicle frame, m^2."""
+    sigma_model: float
+    """Standard deviation of cones about a smooth curve, m."""
+    huber: float
+    """Whitened residual beyond which a row's weight falls."""
+
+    def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
+        """Robust whitened rows (m,), and their Jacobians in H where it is given."""
+        pose = values.atPose2(self.pose_key)
+        poses = np.tile(pose_array(pose), (len(self.points_vehicle), 1))
+        points = to_map(self.points_vehicle, poses)
+        foot = self.curve.find(values, points)
+        rows = project(points, self.covariances, poses, foot, self.sigma_model)
+        usable, slots = self.curve.usable(foot)
+        whitened = rows.residual / rows.sigma
+        if H is None:
+            return np.asarray(huber_roots(whitened, self.huber) * usable)
+        root = np.sqrt(huber_weights(whitened, self.huber)) * usable
+        scale = root / rows.sigma
+        by_pose = rows.by_pose * scale[:, None]
+        by_pose[:, :2] = by_pose[:, :2] @ rotation(pose.theta())
+        _fill(H, [by_pose, *self.curve.by_key(rows.by_control * scale[:, None, None], slots)])
+        return np.asarray(whitened * root)
+
+
+@dataclass(frozen=True, eq=False)
+class _BoundaryPoint:
+    """Error function of a boundary-point factor."""
+
+    curve: _Curve
+    """What passes through the points."""
+    points: Array
+    """(m, 2) map frame, m."""
+    sigma: Array
+    """(m,) standard deviation across the curve, m."""
+
+    def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
+        """Whitened rows (m,), and their Jacobians in H where it is given."""
+        foot = self.curve.find(values, self.points)
+        usable, slots = self.curve.usable(foot)
+        scale = usable / self.sigma
+        if H is not None:
+            by_control = -foot.basis[:, :, None] * foot.normal_unit[:, None, :] * scale[:, None, None]
+            _fill(H, [*self.curve.by_key(by_control, slots)])
+        return np.asarray(foot.distance * scale)
+
+
+def rotation(theta: float) -> Array:
+    """R(theta) (2, 2): vehicle to map frame."""
+    c, s = np.cos(theta), np.sin(theta)
+    return np.array([[c, -s], [s, c]])
 
 
 def pose_array(pose: gtsam.Pose2) -> Array:
@@ -199,6 +269,21 @@ def smoothness_factors(
     return [_smoothness_factor(control_keys, row, sigma) for row in matrix]
 
 
+def linear_factor(keys: Sequence[int], dims: Sequence[int], A: Array, b: Array) -> gtsam.GaussianConditional:
+    """`1/2 |A x - b|^2` over any number of keys, A (m, sum of dims) whitened, b (m,).
+
+    The binding's own constructors stop at three keys; a Gaussian conditional has no such limit and is a
+    Jacobian factor. Shapes are checked here, since the binding doesn't.
+    """
+    if len(keys) != len(dims) or len(set(keys)) != len(keys):
+        raise ValueError(f"expected one size for each of {len(keys)} different keys, found {len(dims)}")
+    if A.shape != (len(b), sum(dims)):
+        raise ValueError(f"expected a matrix of shape {(len(b), sum(dims))}, found {A.shape}")
+    blocks = np.empty((len(b), A.shape[1] + 1), order="F")
+    blocks[:, :-1], blocks[:, -1] = A, b
+    return gtsam.GaussianConditional(list(keys), 1, gtsam.VerticalBlockMatrix([*dims, 1], blocks, False))
+
+
 def _smoothness_factor(control_keys: Sequence[int], row: Array, sigma: float) -> gtsam.LinearContainerFactor:
     """Linearized about zero: without a point, GTSAM's error of a linear factor is zero everywhere."""
     columns = np.flatnonzero(row)
@@ -207,7 +292,8 @@ def _smoothness_factor(control_keys: Sequence[int], row: Array, sigma: float) ->
     for key in keys:
         zero.insert(key, np.zeros(2))
     A = np.kron(row[columns] / sigma, np.eye(2)).astype(np.float64)
-    return gtsam.LinearContainerFactor(jacobian_factor(keys, [2] * len(keys), A, np.zeros(2)), zero)
+    linear = linear_factor(keys, [2] * len(keys), A, np.zeros(2))
+    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(linear), zero)
 
 
 def odometry_factor(

@@ -114,3 +114,9 @@ def huber_weights(whitened: Array, threshold: float) -> Array:
     An infinite threshold gives least squares: every weight is 1.
     """
     return 1.0 / np.maximum(np.abs(whitened) / threshold, 1.0)
+
+
+def huber_loss(whitened: Array, threshold: float) -> Array:
+    """`rho(z) = z^2 / 2`, beyond the threshold `threshold (|z| - threshold / 2)`, per row."""
+    inner = np.minimum(np.abs(whitened), threshold)
+    return np.asarray(inner * (np.abs(whitened) - 0.5 * inner))

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
@@ -13,13 +16,12 @@ from threadpoolctl import threadpool_limits
 from .batch_cones import cone_counts
 from .batch_data import Chain, collect_readings, integrate_log
 from .batch_dead_reckoning import start_odometry
-from .batch_kernel import Biweight
-from .batch_knots import reknot
+from .batch_graph import nonlinear_graph
+from .batch_knots import map_block, reknot, simplified
 from .batch_optimizer import Convergence, Optimizer, Schedule
 from .batch_scatter import Scatter, scatter_of_cones
-from .batch_simplification import simplified
 from .batch_start import start_online
-from .batch_system import BatchSystem, Evaluation
+from .batch_system import BatchSystem, Biweight, Evaluation
 from .fixed_lag import ODOMETRY_SIGMA
 from .labels import LEFT, RIGHT
 from .laps import LapCounter
@@ -49,14 +51,31 @@ class BatchResult(BatchRun):
     without the cones' scatter."""
     scatter: Scatter
     """How far cones stand off the curves: what no curve of that size follows."""
-    pose_covariances: Array
-    """(n, 3, 3) marginal covariance of each pose (x, y, theta), map frame."""
     calibration: Array
     """(2,) scale error of the speeds, bias of the yaw rate (rad/s)."""
     online: RunResult | None
     """The online run that it began at, where it did."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time of each stage."""
+    system: BatchSystem
+    """The problem that was solved, on curves of nearly a knot for each cone."""
+    optimum: Evaluation
+    """The same where it ended."""
+
+    @cached_property
+    def pose_covariances(self) -> Array:
+        """(n, 3, 3) marginal covariance of each pose (x, y, theta), map frame; found when first asked for."""
+        with threadpool_limits(limits=1):
+            return self.system.eliminated(self.optimum).pose_marginals
+
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """The whole problem at the optimum as GTSAM's own nonlinear factors (see `nonlinear_graph`)."""
+        return nonlinear_graph(self.system, self.optimum)
+
+    def values(self) -> gtsam.Values:
+        """The optimum: control points l_j and r_j, calibration b_0, poses x_k."""
+        variables = self.optimum.state.variables
+        return variables.gtsam_values(variables.keys)
 
 
 class BatchMapper:
@@ -90,9 +109,9 @@ class BatchMapper:
         watch.lap("poses")
         at, convergence = _optimum(optimizer, state, readings, settings, on_round)
         watch.lap("optimum")
-        uncertainty = system.normal_equations(at).reduced()
-        joint, marginals = uncertainty.border_covariance(), uncertainty.pose_marginals()
+        joint = system.eliminated(at).joint(at.state.map_keys)
         watch.lap("covariance")
+        readings = deepcopy(readings)  # those of the problem stay as they were solved for
         state, joint = simplified(at.state, joint, readings, settings)
         scatter = scatter_of_cones(state, readings, settings)
         watch.lap("simplify")
@@ -108,10 +127,11 @@ class BatchMapper:
             converged=convergence.converged,
             convergence=convergence,
             map_covariance=joint,
-            pose_covariances=marginals,
             calibration=at.state.calibration.copy(),
             online=online,
             seconds=watch.laps,
+            system=system,
+            optimum=at,
         )
 
 
@@ -153,7 +173,7 @@ def _map(state: State, joint: Array, scatter: Scatter) -> Map:
     closed = any(boundary.periodic for boundary in state.boundaries.values())
     boundaries = {}
     for label, boundary in state.boundaries.items():
-        block = state.block(label)
+        block = map_block(state, label)
         spline = boundary.spline(state.control_points(label).copy())
         sigma = np.repeat(scatter.sigma(label, boundary.abscissae), 2)
         covariance = joint[block, block] + np.diag(sigma**2)
@@ -164,7 +184,7 @@ def _map(state: State, joint: Array, scatter: Scatter) -> Map:
 def _records(state: State, readings: Readings, chain: Chain, seconds: float) -> tuple[CycleRecord, ...]:
     """A record of each cycle: its share of the time, its readings in use, its lap."""
     left, right = (state.boundaries[b].size if b in state.boundaries else 0 for b in (LEFT, RIGHT))
-    used = np.bincount(readings.slot[readings.used], minlength=len(chain))
+    used = np.bincount(readings.cycle[readings.used], minlength=len(chain))
     counter = LapCounter()
     return tuple(
         CycleRecord(

@@ -20,9 +20,9 @@ BoolArray = NDArray[np.bool_]
 DENSITY_STEP = 0.1
 """Step (m) along a curve of the readings' density."""
 SELDOM = 0.1
-"""What is seen less often than this share of the median cone is none, ..."""
+"""What is seen less often than this share of the median cone is no cone."""
 SELDOM_APART = 0.3
-"""... and than this share where the curve doesn't pass it."""
+"""The same share where the curve doesn't pass it."""
 APART = 0.6
 """Least distance of two cones along a curve as a share of the radius within which sightings are merged: in a
 bend the inner curve is shorter than the way from cone to cone."""
@@ -31,9 +31,9 @@ BLUR = 0.4
 FEWEST = 4
 """Cones that are always kept."""
 BACK = -0.5
-"""A row of cones turns back on itself where the cosine of its turn at a cone is less than this, ..."""
+"""A row of cones turns back on itself where the cosine of its turn at a cone is less than this."""
 FOLD = 1.5
-"""... the nearer neighbour being so near (m)."""
+"""Distance (m) to the nearer neighbour below which such a turn means that one cone was put down twice."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ def sighted_cones(state: State, readings: Readings, label: int, settings: Mapper
     """
     boundary = state.boundaries[label]
     rows = np.flatnonzero(readings.label == label)
-    points = to_map(readings.point[rows], state.poses[readings.slot[rows]])
+    points = to_map(readings.point[rows], state.variables.poses_at(readings.cycle[rows]))
     used = readings.used[rows] & (readings.boundary[rows] == label)
     beside, ending, u = used.copy(), used.copy(), readings.u[rows].copy()
     beside[~used], ending[~used], u[~used] = _beside(state, points[~used], label, settings)

@@ -7,8 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import IntegratedOdometry, compose, integrate_twists
+from pathspace_graph.factors.odometry import (
+    CALIBRATION_SIZE,
+    IntegratedOdometry,
+    compose,
+    integrate_twists,
+    odometry_residuals,
+)
 
+from .graph.elimination import owners
+from .graph.keys import CALIBRATION_KEY, POSE, pose_key, pose_keys
+from .graph.rows import Rows
 from .log import Log
 from .readings import Readings
 from .run import split_odometry
@@ -33,6 +42,8 @@ class Chain:
     """(P - 1, 3, 3) W with `W' W` the inverse of its covariance."""
     by_calibration: Array
     """(P - 1, 3, 2) derivative of its end by the calibration, in the frame of the end."""
+    calibration_sigma: Array
+    """(2,) standard deviation of the calibration (scale error [-], yaw-rate bias [rad/s]) about zero."""
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -46,6 +57,37 @@ class Chain:
         for delta in self.deltas - np.column_stack([error, local[:, 2]]):
             poses.append(compose(poses[-1], delta))
         return np.array(poses)
+
+    def terms(self, poses: Array, calibration: Array) -> tuple[Array, Array]:
+        """Whitened residuals (P - 1, 3) and derivatives (P - 1, 3, 8) by [calibration | pose | next pose]."""
+        residual, by_start, by_end = odometry_residuals(poses[:-1], poses[1:], self.deltas)
+        residual = residual + self.by_calibration @ calibration
+        jacobian = np.concatenate([self.by_calibration, by_start, by_end], axis=2)
+        return np.einsum("pij,pj->pi", self.whiteners, residual), self.whiteners @ jacobian
+
+    def prior_cost(self, first: Array, calibration: Array) -> float:
+        """Half the squares of the priors on the first pose (3,) and on the calibration (2,)."""
+        off, whitened = first - self.first, calibration / self.calibration_sigma
+        return 0.5 * float(off @ self.first_information @ off + whitened @ whitened)
+
+    def rows(self, terms: tuple[Array, Array], first: Array, calibration: Array) -> list[Rows]:
+        """The odometry's `terms`, and the priors at a first pose (3,) and a calibration (2,)."""
+        residual, jacobian = terms
+        start = np.arange(len(residual))
+        shared = np.full(len(start), CALIBRATION_KEY)
+        keys = np.column_stack([shared, pose_keys(start), pose_keys(start + 1)])
+        flat = jacobian.reshape(residual.size, CALIBRATION_SIZE + 2 * POSE)
+        root = np.asarray(np.linalg.cholesky(self.first_information).T, np.float64)
+        return [
+            Rows(np.repeat(keys, POSE, axis=0), flat, residual.ravel(), np.repeat(owners(start), POSE)),
+            _prior(pose_key(0), root, first - self.first),
+            _prior(CALIBRATION_KEY, np.diag(1.0 / self.calibration_sigma), calibration),
+        ]
+
+
+def _prior(key: int, root: Array, off: Array) -> Rows:
+    """`root off` as rows on one variable, in the first factor."""
+    return Rows(np.full((len(off), 1), key), root, root @ off, np.zeros(len(off), np.intp))
 
 
 def integrate_log(log: Log, sigma: Array, settings: OdometrySettings) -> Chain:
@@ -61,6 +103,7 @@ def integrate_log(log: Log, sigma: Array, settings: OdometrySettings) -> Chain:
         deltas=np.array([step.delta for step in steps[1:]]).reshape(-1, 3),
         whiteners=np.array([step.whitener for step in steps[1:]]).reshape(-1, 3, 3),
         by_calibration=np.array([step.calibration_jacobian for step in steps[1:]]).reshape(-1, 3, 2),
+        calibration_sigma=np.array([settings.sigma_scale, settings.sigma_bias]),
     )
 
 
@@ -69,15 +112,16 @@ def _integrate(t: Array, twist: Array, end: float, sigma: Array) -> IntegratedOd
 
 
 def collect_readings(log: Log) -> Readings:
-    """Every reading of a log, none in use; `slot` is the cycle's number."""
+    """Every reading of a log, none in use."""
     cycles = log.cycles
     labels = np.concatenate([np.zeros(0, np.intp), *(cycle.labels for cycle in cycles)]).astype(np.intp)
     return Readings(
-        slot=np.repeat(np.arange(len(cycles)), [len(cycle.labels) for cycle in cycles]).astype(np.intp),
+        cycle=np.repeat(np.arange(len(cycles)), [len(cycle.labels) for cycle in cycles]).astype(np.intp),
         point=np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in cycles)]),
         covariance=np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in cycles)]),
         label=labels,
         boundary=labels.copy(),
         u=np.zeros(len(labels)),
         used=np.zeros(len(labels), bool),
+        changed=np.zeros(len(labels), bool),
     )

@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.projection import to_map
 
-from .arrowhead import Arrowhead, empty_arrowhead
 from .batch_cones import cluster
 from .batch_data import Chain
-from .batch_equations import add_odometry, add_priors, calibration_information, odometry_terms
-from .batch_gating import locate_poses
-from .batch_knots import exact_settings, fit_through
-from .boundary import Boundary
+from .batch_gating import add_drive
+from .batch_knots import fit_through, on_knots_of
 from .candidates import SIDES
+from .graph.elimination import Elimination, linear_graph, owners
+from .graph.keys import CALIBRATION_KEY, POSE, pose_keys
+from .graph.rows import Rows
+from .graph.variables import Variables
 from .labels import BOUNDARIES
 from .path import along_and_across
 from .readings import Readings
 from .settings import ClosingSettings, MapperSettings
 from .state import State
-from .window import POSE
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -41,7 +41,9 @@ REFERENCE_STEP = 8.0
 TIE = np.array([1.5, 1.5, 0.15])
 """Standard deviation (m, m, rad) of a lap's poses about the reference: laps are driven differently."""
 TIE_STEPS = 8
-"""Gauss-Newton steps that tie the laps together."""
+"""Most Gauss-Newton steps that tie the laps together."""
+TIED = 1e-6
+"""Laps are tied where a step moves nothing farther than this (m, rad)."""
 LEAST_CONES = 4
 """Fewest cones that a boundary is begun with."""
 
@@ -65,12 +67,11 @@ def start_odometry(chain: Chain, readings: Readings, settings: MapperSettings) -
     calibration = np.zeros(CALIBRATION_SIZE)
     if np.isfinite(recurrence.lap):
         calibration = _bias(chain, recurrence)
-        poses, calibration = tie_laps(chain, recurrence, calibration, settings)
+        poses, calibration = tie_laps(chain, recurrence, calibration)
     state = State()
     for label in BOUNDARIES:
         _begin_boundary(state, label, poses, recurrence, readings, settings)
-    state.vector = np.concatenate([state.vector[: state.map_size], calibration, poses.ravel()])
-    locate_poses(state)
+    add_drive(state, poses, calibration)
     return state
 
 
@@ -136,51 +137,53 @@ def _bias(chain: Chain, recurrence: Recurrence) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Ties:
-    """Poses that pass a reference pose, each of a lap."""
+    """Poses that pass a reference pose, each of a lap: `(x_k - reference - turns) / TIE`."""
 
     cycles: IntArray
     """(k,) the poses."""
     reference: IntArray
-    """(k,) the reference pose that each passes."""
+    """(k,) the reference pose that each passes, by number."""
     turns: Array
     """(k,) what the heading has gained in whole laps, rad."""
-    count: int
-    """Reference poses."""
 
-    def add_to(self, system: Arrowhead, poses: Array, border: Array) -> None:
-        """`(x_k - reference) / TIE` added to normal equations whose border begins with the references."""
-        residual = poses[self.cycles] - border[: POSE * self.count].reshape(-1, POSE)[self.reference]
-        residual[:, 2] -= self.turns
-        for k, weight in enumerate(TIE**-2.0):
-            rows, columns = POSE * self.cycles + k, POSE * self.reference + k
-            system.diagonal[self.cycles, k, k] += weight
-            np.add.at(system.border, (columns, columns), weight)
-            system.coupling[rows, columns] -= weight
-            system.descent_poses[rows] -= weight * residual[:, k]
-            np.add.at(system.descent_border, columns, weight * residual[:, k])
+    @property
+    def begin(self) -> IntArray:
+        """(c,) the first pose that passes each reference pose."""
+        return np.unique(self.reference, return_index=True)[1]
+
+    def rows(self, poses: Array, references: Array) -> Rows:
+        """Whitened rows at poses (P, 3) and reference poses (c, 3), whose keys come after theirs."""
+        off = poses[self.cycles] - references[self.reference]
+        off[:, 2] -= self.turns
+        keys = pose_keys(np.column_stack([self.cycles, len(poses) + self.reference]))
+        both = np.concatenate([np.diag(1.0 / TIE), np.diag(-1.0 / TIE)], axis=1)
+        return Rows(
+            keys=np.repeat(keys, POSE, axis=0),
+            jacobian=np.tile(both, (len(off), 1)),
+            residual=(off / TIE).ravel(),
+            owner=np.repeat(owners(self.cycles), POSE),
+        )
 
 
-def tie_laps(
-    chain: Chain, recurrence: Recurrence, calibration: Array, settings: MapperSettings
-) -> tuple[Array, Array]:
+def tie_laps(chain: Chain, recurrence: Recurrence, calibration: Array) -> tuple[Array, Array]:
     """Poses (P, 3) and calibration (2,): every lap passes the same reference poses, about.
 
-    The reference poses are unknown themselves; they are the border of the same arrowhead as the map is.
+    The reference poses are unknown themselves: poses of cycles past the last.
     """
-    ties, poses = _ties(recurrence), chain.dead_reckoned(calibration)
-    first = np.array([np.flatnonzero(ties.reference == r)[0] for r in range(ties.count)])
-    references = poses[ties.cycles[first]] - ties.turns[first, None] * [0.0, 0.0, 1.0]
-    border = np.append(references.ravel(), calibration)
-    information = calibration_information(settings.odometry)
+    ties, poses, count = _ties(recurrence), chain.dead_reckoned(calibration), len(chain)
+    references = poses[ties.cycles[ties.begin]] - ties.turns[ties.begin, None] * [0.0, 0.0, 1.0]
+    poses, variables = np.concatenate([poses, references]), Variables()
+    variables.insert(np.array([CALIBRATION_KEY]), calibration)
+    variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
     for _ in range(TIE_STEPS):
-        calibration = border[-CALIBRATION_SIZE:]
-        system = empty_arrowhead(len(chain), len(border))
-        add_odometry(system, *odometry_terms(chain, poses, calibration))
-        add_priors(system, chain, poses[0], calibration, information)
-        ties.add_to(system, poses, border)
-        step_poses, step_border = system.reduced().step(np.zeros_like(system.border))
-        poses, border = poses + step_poses.reshape(-1, POSE), border + step_border
-    return poses, border[-CALIBRATION_SIZE:]
+        poses, calibration = variables.poses[:count], variables.calibration
+        rows = chain.rows(chain.terms(poses, calibration), poses[0], calibration)
+        graph = linear_graph([*rows, ties.rows(poses, variables.poses[count:])], variables)
+        step = Elimination(graph, variables.layout).step(np.zeros(CALIBRATION_SIZE))
+        variables.values = variables.values + step
+        if np.abs(step).max() < TIED:
+            break
+    return variables.poses[:count], variables.calibration
 
 
 def _ties(recurrence: Recurrence) -> Ties:
@@ -190,7 +193,7 @@ def _ties(recurrence: Recurrence) -> Ties:
     cycles = _nearest_cycles(places)
     reference = np.mod(np.round(places[cycles]).astype(np.intp), count)
     whole = 2.0 * np.pi * np.round(recurrence.turn / (2.0 * np.pi))
-    return Ties(cycles, reference, whole * np.round((places[cycles] - reference) / count), count)
+    return Ties(cycles, reference, whole * np.round((places[cycles] - reference) / count))
 
 
 def _nearest_cycles(places: Array) -> IntArray:
@@ -215,26 +218,22 @@ def _begin_boundary(
     """A curve through what was seen of a boundary in the first lap, beside the path of that lap."""
     closed = bool(np.isfinite(recurrence.lap))
     first = recurrence.driven < recurrence.lap
-    rows = np.flatnonzero((readings.label == label) & first[readings.slot])
+    rows = np.flatnonzero((readings.label == label) & first[readings.cycle])
     if len(rows) == 0 or first.sum() < 2:
         return
-    points = to_map(readings.point[rows], poses[readings.slot[rows]])
-    station, kept, length = _beside_path(points, readings.slot[rows], label, poses, recurrence, settings)
+    points = to_map(readings.point[rows], poses[readings.cycle[rows]])
+    station, kept, length = _beside_path(points, readings.cycle[rows], label, poses, recurrence, settings)
     weight = 1.0 / np.trace(readings.covariance[rows[kept]], axis1=1, axis2=2)
     cones = cluster(points[kept], station[kept], weight, length, closed, settings)
     if len(cones.points) < LEAST_CONES:
         return
     spline = fit_through(cones.points, closed, settings, settings.batch.size_share)
-    spline = spline if spline.periodic else spline.unclamp()
-    boundary = Boundary(spline.knots, spline.periodic, exact_settings(settings.spline), settings.gauge)
-    boundary.confirmed = boundary.tables.high
-    state.add_boundary(label, boundary)
-    state.insert(state.offset(label), spline.distinct_control_points.ravel())
+    state.add_boundary(label, *on_knots_of(spline, settings))
 
 
 def _beside_path(
     points: Array,
-    slots: IntArray,
+    cycles: IntArray,
     label: int,
     poses: Array,
     recurrence: Recurrence,
@@ -249,6 +248,6 @@ def _beside_path(
     length = recurrence.lap if closed else float(stations[-1]) + settings.growth.reach
     side, gate = SIDES[label] * lateral, settings.gate
     kept = (side > settings.growth.min_lateral) & (side < settings.growth.max_lateral)
-    ahead = station - recurrence.driven[slots]  # else it is of a stretch that comes later, or again
+    ahead = station - recurrence.driven[cycles]  # else it is of a stretch that comes later, or again
     kept &= (ahead > -gate.view_behind) & (ahead < gate.view_ahead)
     return station, np.asarray(kept & (station >= 0.0) & (station < length)), length

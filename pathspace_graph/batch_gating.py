@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.projection import project, to_map
 
+from .graph.keys import CALIBRATION_KEY, pose_keys
 from .labels import UNKNOWN
 from .readings import Readings
 from .settings import GateSettings, MapperSettings
@@ -22,6 +23,13 @@ OTHER_WAY = 100.0
 """A curve that leads another way counts as so much farther (m): taken only where no other does."""
 STATION_STEP = 1.0
 """Step (m) along a curve at which stations are looked for."""
+
+
+def add_drive(state: State, poses: Array, calibration: Array) -> None:
+    """The poses (P, 3) of all cycles and the calibration (2,) beside curves that are there already."""
+    state.variables.insert(np.array([CALIBRATION_KEY]), calibration)
+    state.variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
+    locate_poses(state)
 
 
 def locate_poses(state: State) -> None:
@@ -66,8 +74,9 @@ def associate(state: State, readings: Readings, settings: MapperSettings, gate: 
             nearer = misfit < best[rows]
             chosen = rows[nearer]
             best[chosen], boundary_of[chosen], u[chosen] = misfit[nearer], label, foot_u[nearer]
-    readings.used, readings.u = boundary_of != UNKNOWN, u
-    readings.boundary = np.where(readings.used, boundary_of, readings.label)
+    readings.release(np.arange(len(readings)))
+    used = np.flatnonzero(boundary_of != UNKNOWN)
+    readings.take(used, boundary_of[used], u[used])
     return int((before != boundary_of).sum())
 
 
@@ -75,25 +84,25 @@ def _misfit(
     state: State, readings: Readings, settings: MapperSettings, label: int, rows: IntArray, whole: bool
 ) -> tuple[Array, Array]:
     """(m,) distance of readings from a curve in sigmas, infinite where it isn't theirs; foot points (m,)."""
-    boundary, poses = state.boundaries[label], state.poses[readings.slot[rows]]
+    boundary, poses = state.boundaries[label], state.variables.poses_at(readings.cycle[rows])
     points = to_map(readings.point[rows], poses)
     if whole:
         low, high = np.full(len(rows), boundary.tables.low), np.full(len(rows), boundary.tables.high)
         foot = boundary.find(state.control_points(label), points, low, high)
     else:
-        begin = _nearest_in_view(state, readings.slot[rows], points, label, settings.gate)
+        begin = _nearest_in_view(state, readings.cycle[rows], points, label, settings.gate)
         foot = boundary.refine(state.control_points(label), points, begin)
     projected = project(points, readings.covariance[rows], poses, foot, settings.spline.sigma_model)
     possible = foot.interior & (np.abs(foot.distance) < settings.gate.rough)
     return np.where(possible, np.abs(foot.distance) / projected.sigma, np.inf), foot.u
 
 
-def _nearest_in_view(state: State, slots: IntArray, points: Array, label: int, gate: GateSettings) -> Array:
+def _nearest_in_view(state: State, cycles: IntArray, points: Array, label: int, gate: GateSettings) -> Array:
     """(m,) the parameter nearest to each point (m, 2) among those that its pose sees, a step apart."""
     boundary = state.boundaries[label]
     ahead = np.arange(-gate.view_behind, gate.view_ahead + STATION_STEP, STATION_STEP)
     u = state.stations[label][:, None] + ahead
     seen = boundary.evaluate(state.control_points(label), u.ravel()).reshape(*u.shape, 2)
-    square = (seen[slots, :, 0] - points[:, :1]) ** 2
-    square += (seen[slots, :, 1] - points[:, 1:]) ** 2
-    return np.asarray(u[slots, square.argmin(axis=1)])
+    square = (seen[cycles, :, 0] - points[:, :1]) ** 2
+    square += (seen[cycles, :, 1] - points[:, 1:]) ** 2
+    return np.asarray(u[cycles, square.argmin(axis=1)])

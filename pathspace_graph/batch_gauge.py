@@ -10,25 +10,16 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.gauge import smoothness_matrix
 
 from .boundary import Boundary
+from .graph.elimination import owners
+from .graph.keys import POINT, indices, pose_keys
+from .graph.rows import Rows
+from .state import State
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-
-@dataclass(frozen=True, eq=False)
-class PoseRows:
-    """Whitened rows, each on one pose and on a few entries of the border."""
-
-    slot: IntArray
-    """(m,) poses."""
-    by_pose: Array
-    """(m, 3) derivatives by (x, y, theta), map frame."""
-    columns: IntArray
-    """(m, k) entries of the border, ..."""
-    by_border: Array
-    """(m, k) ... and the derivatives by them."""
-    residual: Array
-    """(m,)."""
+POINTS_A_FACTOR = 8
+"""Neighbouring control points whose smoothness makes one factor: all in one would join the whole curve."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,43 +31,86 @@ class CurveGauge:
     can't, and the map is as free as before: wherever that pose turns out to have been, they come along.
     """
 
-    slot: IntArray
-    """(m,) the pose that each control point is held beside."""
+    label: int
+    """The boundary."""
+    keys: IntArray
+    """(m,) its control points."""
+    cycle: IntArray
+    """(m,) perception cycle of the pose that each is held beside."""
     ahead: Array
     """(m,) how far ahead of it (m)."""
     sigma: float
     """Its standard deviation, m."""
     smoothness: Array
-    """(2m, 2m) `D' D / sigma'^2`; zero along a straight line."""
-    anchor: float
-    """Information (1/m^2) that holds each control point where it is: no gradient, so not in the cost."""
+    """(r, m) D."""
+    sigma_smoothness: float
+    """sigma', m."""
+    sigma_anchor: float
+    """Standard deviation (m) that holds each control point where it is: no gradient, so not in the cost."""
 
-    def beside(self, control_points: Array, poses: Array, offset: int) -> PoseRows:
-        """Whitened rows; control points (m, 2) are the border's entries from `offset` on, poses (P, 3)."""
-        pose = poses[self.slot]
-        heading = np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])]) / self.sigma
-        arm = control_points - pose[:, :2]
+    def terms(self, control_points: Array, beside: Array) -> tuple[Array, Array, Array]:
+        """Whitened residuals (m,) of control points (m, 2), each beside its pose (m, 3), and derivatives.
+
+        (m, 2) by the control point, (m, 3) by the pose.
+        """
+        heading = np.column_stack([np.cos(beside[:, 2]), np.sin(beside[:, 2])]) / self.sigma
+        arm = control_points - beside[:, :2]
         by_theta = heading[:, 0] * arm[:, 1] - heading[:, 1] * arm[:, 0]
-        columns = offset + 2 * np.arange(len(pose))[:, None] + np.arange(2)
         residual = (heading * arm).sum(axis=1) - self.ahead / self.sigma
-        return PoseRows(self.slot, np.column_stack([-heading, by_theta]), columns, heading, residual)
+        return residual, heading, np.column_stack([-heading, by_theta])
+
+    def beside(self, control_points: Array, poses: Array) -> Rows:
+        """The same as rows on [control point | pose], from all poses (P, 3)."""
+        residual, by_point, by_pose = self.terms(control_points, poses[self.cycle])
+        return Rows(
+            keys=np.column_stack([self.keys, pose_keys(self.cycle)]),
+            jacobian=np.column_stack([by_point, by_pose]),
+            residual=residual,
+            owner=owners(self.cycle, self.label),
+        )
+
+    def smooth(self, control_points: Array) -> Rows:
+        """Whitened second differences, one row for x and one for y: each is of three neighbours."""
+        near = (np.arange(len(self.smoothness))[:, None] + np.arange(3)) % len(self.keys)
+        weights = np.take_along_axis(self.smoothness, near, axis=1) / self.sigma_smoothness
+        keys = np.repeat(self.keys[near], POINT, axis=0)
+        jacobian = (weights[:, None, :, None] * np.eye(POINT)[:, None, :]).reshape(-1, 3 * POINT)
+        residual = (self.smoothness @ control_points).ravel() / self.sigma_smoothness
+        return Rows(keys, jacobian, residual, self._owners(keys[:, 0]))
+
+    def anchor(self) -> Rows:
+        """Rows that hold each control point where it is."""
+        keys = np.repeat(self.keys, POINT)
+        jacobian = np.tile(np.eye(POINT), (len(self.keys), 1)) / self.sigma_anchor
+        return Rows(keys[:, None], jacobian, np.zeros(len(keys)), self._owners(keys))
+
+    def _owners(self, keys: IntArray) -> IntArray:
+        """The factor of rows on control points alone, by the first of each: numbers below those of cycles."""
+        return np.asarray(-1 - self.label - 2 * (indices(keys) // POINTS_A_FACTOR))
 
     def cost(self, control_points: Array, poses: Array) -> float:
         """Half the sum of squares."""
-        residual, flat = self.beside(control_points, poses, 0).residual, control_points.ravel()
-        return 0.5 * float(residual @ residual + flat @ self.smoothness @ flat)
+        beside, _, _ = self.terms(control_points, poses[self.cycle])
+        smooth = self.smoothness @ control_points / self.sigma_smoothness
+        return 0.5 * float(beside @ beside + (smooth**2).sum())
 
 
-def curve_gauge(boundary: Boundary, control_points: Array, poses: Array, sigma: float) -> CurveGauge:
-    """The gauge of a curve that begins with control points (m, 2), beside a drive of poses (P, 3)."""
-    slot = _beside(boundary, control_points, poses)
-    heading = np.column_stack([np.cos(poses[slot, 2]), np.sin(poses[slot, 2])])
-    ahead = (heading * (control_points - poses[slot, :2])).sum(axis=1)
-    abscissae, mean = boundary.abscissae, boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)
-    scaled = smoothness_matrix(abscissae, boundary.length if boundary.periodic else None)
-    scaled = scaled / (boundary.gauge.sigma_smoothness * mean)
-    smoothness = np.asarray(np.kron(scaled.T @ scaled, np.eye(2)), float)
-    return CurveGauge(slot, ahead, sigma, smoothness, boundary.gauge.sigma_anchor**-2.0)
+def curve_gauge(state: State, label: int, sigma: float) -> CurveGauge:
+    """The gauge of a boundary's curve as it is, beside the poses as they are."""
+    boundary, control_points, poses = state.boundaries[label], state.control_points(label), state.poses
+    cycle = _beside(boundary, control_points, poses)
+    heading = np.column_stack([np.cos(poses[cycle, 2]), np.sin(poses[cycle, 2])])
+    mean = boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)
+    return CurveGauge(
+        label=label,
+        keys=state.keys(label),
+        cycle=cycle,
+        ahead=(heading * (control_points - poses[cycle, :2])).sum(axis=1),
+        sigma=sigma,
+        smoothness=smoothness_matrix(boundary.abscissae, boundary.length if boundary.periodic else None),
+        sigma_smoothness=boundary.gauge.sigma_smoothness * mean,
+        sigma_anchor=boundary.gauge.sigma_anchor,
+    )
 
 
 def _beside(boundary: Boundary, control_points: Array, poses: Array) -> IntArray:

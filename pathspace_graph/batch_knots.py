@@ -1,4 +1,4 @@
-"""Knots of the batch's curves: as many, and where, as the cones that were sighted ask for."""
+"""Knots of the batch's curves: nearly one for each cone for the optimum, few for the map."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .batch_cones import FEWEST, sighted_cones
+from .batch_gating import associate, locate_poses
 from .boundary import Boundary
 from .cone_knots import chosen_breaks
-from .knots import FitSettings, fit_spline
+from .graph.keys import CONTROL_LETTERS
+from .graph.variables import Layout
+from .knots import FitSettings, fit_spline, refit
 from .readings import Readings
 from .settings import MapperSettings, SplineSettings
 from .spline import BSpline
@@ -29,20 +32,17 @@ def knot_count(cones: int, share: float, least: int) -> int:
     return max(least, int(share * cones))
 
 
-def replace_curve(state: State, label: int, spline: BSpline, settings: MapperSettings) -> None:
-    """Another curve along nearly the same way takes a boundary's place."""
-    block = state.block(label)
+def on_knots_of(spline: BSpline, settings: MapperSettings) -> tuple[Boundary, Array]:
+    """A boundary that is this curve, all of it confirmed, and its control points (m, 2)."""
     spline = spline if spline.periodic else spline.unclamp()
-    new = Boundary(spline.knots, spline.periodic, exact_settings(settings.spline), settings.gauge)
-    new.confirmed = new.tables.high
-    values = spline.distinct_control_points.ravel()
-    state.vector = np.concatenate([state.vector[: block.start], values, state.vector[block.stop :]])
-    state.boundaries = {**state.boundaries, label: new}
+    boundary = Boundary(spline.knots, spline.periodic, exact_settings(settings.spline), settings.gauge)
+    boundary.confirmed = boundary.tables.high
+    return boundary, spline.distinct_control_points
 
 
 def reknot(state: State, readings: Readings, settings: MapperSettings, dense: bool = False) -> State:
     """Every curve anew, through the cones sighted along it; `dense`: on so many knots that it meets them."""
-    state = replace_state(state)
+    state = state.copy()
     cones = {label: sighted_cones(state, readings, label, settings) for label in state.boundaries}
     share = size_share({label: len(own.points) for label, own in cones.items()}, settings)
     for label, boundary in list(state.boundaries.items()):
@@ -53,7 +53,7 @@ def reknot(state: State, readings: Readings, settings: MapperSettings, dense: bo
             spline = dense_through(points, boundary.periodic, settings)
         else:
             spline = fit_through(points, boundary.periodic, settings, share)
-        replace_curve(state, label, spline, settings)
+        state.replace_boundary(label, *on_knots_of(spline, settings))
     return state
 
 
@@ -61,17 +61,6 @@ def size_share(cones: Mapping[int, int], settings: MapperSettings) -> float:
     """Control points by cones: the settings' own, or what keeps the budget of both boundaries together."""
     size, total = settings.batch.size, sum(cones.values())
     return settings.batch.size_share if size is None or total == 0 else size / total
-
-
-def replace_state(state: State) -> State:
-    """A copy whose boundaries and stations may be replaced."""
-    own = State()
-    own.vector, own.boundaries, own.stations = (
-        state.vector.copy(),
-        dict(state.boundaries),
-        dict(state.stations),
-    )
-    return own
 
 
 def fit_through(points: Array, periodic: bool, settings: MapperSettings, share: float) -> BSpline:
@@ -101,3 +90,39 @@ def _through(points: Array, periodic: bool, settings: MapperSettings, least: int
 def exact_settings(spline: SplineSettings) -> SplineSettings:
     """Foot points are followed as far as it takes: an optimum needs exact ones."""
     return replace(spline, refine_iterations=2, refine_room=8.0, search_iterations=4)
+
+
+def simplified(
+    state: State, covariance: Array, readings: Readings, settings: MapperSettings
+) -> tuple[State, Array]:
+    """The same poses beside curves on the knots that the cones ask for, and their joint covariance (n, n).
+
+    `C_new = F C_old`, so `F Sigma F'` with the given covariance Sigma of the state's control points. Solved
+    for on few knots, a curve would pass its cones by a decimetre on the same side in every lap, which no
+    number of readings averages out: in the first seconds that turns the vehicle, and with it the whole map,
+    by up to a degree, several times what its covariance says.
+    """
+    following = reknot(state, readings, settings)
+    change = np.zeros((following.map_points.size, state.map_points.size))
+    for label, boundary in state.boundaries.items():
+        new, points = following.boundaries[label], following.control_points(label)
+        by_points = new_from_old(boundary, state.control_points(label), new, points)
+        change[map_block(following, label), map_block(state, label)] = np.kron(by_points, np.eye(2))
+    locate_poses(following)
+    associate(following, readings, settings, settings.batch.gate, strict=True)
+    return following, change @ covariance @ change.T
+
+
+def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:
+    """F (m_new, m_old), least squares over points of the old curve and their foot points on the new one."""
+
+    def foot_on_new(u: Array) -> Array:
+        low, high = np.full(len(u), new.tables.low), np.full(len(u), new.tables.high)
+        return new.find(new_points, old.evaluate(old_points, u), low, high).u
+
+    return refit(old.spline(old_points), new.spline(new_points), foot_on_new).new_from_old
+
+
+def map_block(state: State, label: int) -> slice:
+    """Where the control points of a boundary are in a covariance of all of them."""
+    return Layout(state.map_keys).block(CONTROL_LETTERS[label])

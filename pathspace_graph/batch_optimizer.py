@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrowhead import Reduced
 from .batch_gating import associate, locate_poses
-from .batch_kernel import Biweight
 from .batch_settings import BatchSettings
-from .batch_system import BatchSystem, Evaluation, moved
+from .batch_system import BatchSystem, Biweight, Evaluation, moved
+from .errors import SingularSystemError
+from .graph.elimination import Elimination
+from .graph.keys import CALIBRATION_LETTER
+from .graph.rows import Rows
+from .graph.variables import Layout
 from .state import State
-from .window import POSE, SingularSystemError
 
 Array = NDArray[np.float64]
 
@@ -71,8 +73,8 @@ class Optimizer:
         self.steps = 0
         """Steps tried so far."""
         self._damping = settings.damping
-        self._border: Array | None = None
-        """What the step before moved the border by."""
+        self._change: Array | None = None
+        """What the step before moved the map by."""
 
     def run(
         self, state: State, schedule: Schedule, on_round: Callable[[], None] | None = None
@@ -81,7 +83,7 @@ class Optimizer:
         system, gate = self.system, schedule.gate
         system.begin(state)
         locate_poses(state)
-        self._border = None
+        self._change = None
         at: Evaluation | None = None
         cost = np.inf
         for number in range(1, schedule.rounds + 1):
@@ -89,8 +91,7 @@ class Optimizer:
             strict = gate <= self.settings.gate
             system.kernel = Biweight(gate)
             before, cost_before = state, cost
-            self._refresh(state, gate, strict)
-            at = self._step(system.evaluate(state))
+            at = self._step(self._refreshed(state, gate, strict))
             state, cost = at.state, at.cost
             if on_round is not None:
                 on_round()
@@ -101,21 +102,19 @@ class Optimizer:
         assert at is not None
         return at, self._report(at, schedule.rounds, "no round left", False)
 
-    def _refresh(self, state: State, gate: float, strict: bool) -> None:
-        """Stations, readings in use and their sigmas, for a round."""
+    def _refreshed(self, state: State, gate: float, strict: bool) -> Evaluation:
+        """The problem with the stations, the readings in use and their sigmas of a new round."""
         system = self.system
         if not strict:
             locate_poses(state)
         associate(state, system.readings, system.settings, gate, strict)
-        system.hold_sigmas(state)
+        return system.evaluate(state, hold=True)
 
     def hold_map(self, state: State, steps: int, gate: float) -> State:
         """Poses alone, the map and the calibration held."""
         self.system.begin(state)
         for _ in range(steps):
-            self._refresh(state, gate, False)
-            equations = self.system.normal_equations(self.system.evaluate(state))
-            state = moved(state, equations.poses_alone(), np.zeros(len(equations.border)))
+            state = moved(state, self.system.poses_alone(self._refreshed(state, gate, False)))
         return state
 
     def _still(self, movement: Movement, gain: float, cost: float, tolerance: float) -> bool:
@@ -128,11 +127,11 @@ class Optimizer:
         """The next state that is better, damped as much as it takes; the same where none is enough."""
         settings = self.settings
         self._accept(at)
-        equations = self.system.normal_equations(at).reduced()
-        unit = damped(at.state)
+        problem = self.system.eliminated(at)
+        unit = damped(problem.map)
         while self._damping <= settings.damping_most:
             self.steps += 1
-            trial = self._trial(at, equations, self._damping * unit)
+            trial = self._trial(at, problem, self._damping * unit)
             if trial is not None:
                 self._damping = max(settings.damping_down * self._damping, settings.damping_least)
                 self._accept(trial)
@@ -141,19 +140,19 @@ class Optimizer:
         self._damping = settings.damping
         return at
 
-    def _trial(self, at: Evaluation, equations: Reduced, damping: Array) -> Evaluation | None:
+    def _trial(self, at: Evaluation, problem: Elimination, damping: Array) -> Evaluation | None:
         """The state after a step, if it is better."""
         try:
-            poses, border = equations.step(damping)
+            step = problem.step(damping)
         except SingularSystemError:
             return None
-        trial = self.system.evaluate(moved(at.state, poses, border))
+        trial = self.system.evaluate(moved(at.state, step))
         if trial.cost > at.cost:
             return None
-        before, self._border = self._border, border
-        length = 1.0 if before is None else whole_way(border, before, self.settings)
+        before, self._change = self._change, step[: problem.map.size]
+        length = 1.0 if before is None else whole_way(self._change, before, self.settings)
         if length > 1.0:
-            farther = self.system.evaluate(moved(at.state, length * poses, length * border))
+            farther = self.system.evaluate(moved(at.state, length * step))
             trial = min(trial, farther, key=lambda evaluation: evaluation.cost)
         return trial
 
@@ -163,14 +162,8 @@ class Optimizer:
             self.system.readings.u[projected.rows] = projected.foot.u
 
     def _report(self, at: Evaluation, rounds: int, reason: str, converged: bool) -> Convergence:
-        equations = self.system.normal_equations(at)
-        scaled = np.concatenate(
-            [
-                equations.descent_poses / np.sqrt(equations.scale_poses),
-                equations.descent_border / np.sqrt(equations.scale_border),
-            ]
-        )
-        return Convergence(converged, reason, rounds, self.steps, at.cost, float(np.linalg.norm(scaled)))
+        gradient = gradient_norm(self.system.rows(at), at.state.variables.layout)
+        return Convergence(converged, reason, rounds, self.steps, at.cost, gradient)
 
 
 def whole_way(step: Array, before: Array, settings: BatchSettings) -> float:
@@ -185,9 +178,21 @@ def whole_way(step: Array, before: Array, settings: BatchSettings) -> float:
     return 1.0 / (1.0 - share) if settings.share_least < share < settings.share_most else 1.0
 
 
-def damped(state: State) -> Array:
-    """(n, n) ones of the control points, zeros of the calibration: a unit of damping."""
-    return np.diag((np.arange(state.pose_column(0)) < state.map_size).astype(np.float64))
+def damped(layout: Layout) -> Array:
+    """(n,) a unit of damping: ones of the control points, zeros of the calibration."""
+    unit = np.ones(layout.size)
+    unit[layout.block(CALIBRATION_LETTER)] = 0.0
+    return unit
+
+
+def gradient_norm(groups: Sequence[Rows], layout: Layout) -> float:
+    """Norm of `J' r`, each entry in units of its own sigma: divided by the root of that of `diag(J' J)`."""
+    groups = [rows for rows in groups if len(rows)]
+    columns = np.concatenate([rows.columns(layout).ravel() for rows in groups])
+    slopes = np.concatenate([(rows.jacobian * rows.residual[:, None]).ravel() for rows in groups])
+    squares = np.concatenate([rows.jacobian.ravel() ** 2 for rows in groups])
+    gradient, information = (np.bincount(columns, terms, layout.size) for terms in (slopes, squares))
+    return float(np.linalg.norm(gradient / np.sqrt(information)))
 
 
 def _movement(before: State, after: State) -> Movement:
@@ -202,5 +207,5 @@ def _movement(before: State, after: State) -> Movement:
         points = (boundary.evaluate(s.control_points(label), u) for s in (before, after))
         offset = next(points) - next(points)
         curve = max(curve, float(np.abs((offset * normal).sum(axis=1)).max()))
-    pose = float(np.abs(after.poses - before.poses).max()) if POSE * len(after.poses) else 0.0
+    pose = float(np.abs(after.poses - before.poses).max()) if len(after.poses) else 0.0
     return Movement(curve, pose)

@@ -28,9 +28,9 @@ class BatchSettings(Positive):
     pose_steps: int = 3
     """Gauss-Newton steps of the poses alone, beside the map that the start has found."""
     rough_rounds: int = 24
-    """Most rounds of a first optimization, on knots that the start decides, ..."""
+    """Most rounds of a first optimization, on knots that the start decides."""
     rough_tolerance: float = 8.0
-    """... which the tolerances below times this end as well."""
+    """Multiplies the tolerances below in the first optimization."""
     dense_share: float = 1.0
     """Control points by cones of the curves that are solved for: they meet the cones. The map's own, fewer,
     are fitted to them in the end."""
@@ -39,26 +39,26 @@ class BatchSettings(Positive):
     max_rounds: int = 80
     """Steps, each with new foot points, gates and weights; the last of them is told as not converged."""
     loose_gate: float = 8.0
-    """The first round uses readings within so many sigmas of a curve, ..."""
+    """The first round uses readings within so many sigmas of a curve."""
     gate_factor: float = 0.7
-    """... each further one within this share of that, down to `gate`."""
+    """Multiplies the gate from each round to the next, down to `gate`."""
     damping: float = 1e-2
-    """First hold on control points (1/m^2), ..."""
+    """First hold on control points (1/m^2)."""
     damping_up: float = 5.0
-    """... times this after a step that made it worse ..."""
+    """Multiplies the damping after a step that made the cost larger."""
     damping_down: float = 0.1
-    """... and times this after one that made it better, ..."""
+    """Multiplies the damping after a step that made the cost smaller."""
     damping_least: float = 1e-6
-    """... but no less than this (1/m^2)."""
+    """Least damping (1/m^2)."""
     damping_most: float = 1e6
     """Damping (1/m^2) at which no step is left that makes it better."""
     share_least: float = 0.3
-    """A step that goes on from the one before, of more than this share of it, ..."""
+    """Least share of the step before at which a step is tried as far as those that would follow lead."""
     share_most: float = 0.97
-    """... but less than this, is tried as far as all that would follow lead together."""
+    """Largest such share."""
     tolerance_cost: float = 1e-5
-    """Converged where |cost_before - cost_after| <= tolerance * cost_before, ..."""
+    """Converged where |cost_before - cost_after| <= tolerance * cost_before, and both below hold."""
     tolerance_curve: float = 2e-3
-    """... no point of a curve moved farther than this across it (m), ..."""
+    """No point of a curve moved farther than this across it (m)."""
     tolerance_pose: float = 2e-3
-    """... and no pose farther than this (m, and rad)."""
+    """No pose moved farther than this (m, and rad)."""

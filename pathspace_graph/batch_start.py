@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .batch_gating import SAME_WAY, locate_poses
+from .batch_gating import SAME_WAY, add_drive
 from .batch_knots import exact_settings
 from .boundary import Boundary
 from .fixed_lag import CycleResult, FixedLagMapper
@@ -54,7 +54,7 @@ class Recorder:
         """The mapper's update, and a note."""
         result = self.mapper.update(odometry, detections)
         for label, boundary in self.mapper.boundaries.items():
-            u = self.mapper.smoother.state.stations[label][-1:]
+            u = self.mapper.smoother.map.state.stations[label][-1:]
             points = self.mapper.control_points(label)
             position, along = (boundary.evaluate(points, u, order)[0] for order in (0, 1))
             place = Place(self._cycle, float(u[0]), position, float(np.arctan2(along[1], along[0])))
@@ -78,10 +78,7 @@ def start_online(
     for label, boundary in recorder.mapper.boundaries.items():
         _take_over(state, label, boundary, recorder.mapper.control_points(label))
     poses = _in_final_map(recorder, state, unwrap(run.trajectory))
-    state.vector = np.concatenate(
-        [state.vector[: state.map_size], recorder.mapper.calibration, poses.ravel()]
-    )
-    locate_poses(state)
+    add_drive(state, poses, recorder.mapper.calibration)
     return state, run
 
 
@@ -94,8 +91,7 @@ def _take_over(state: State, label: int, boundary: Boundary, control_points: Arr
     """A boundary of the same knots for the batch."""
     own = Boundary(boundary.knots, boundary.periodic, exact_settings(boundary.settings), boundary.gauge)
     own.confirmed = boundary.confirmed
-    state.add_boundary(label, own)
-    state.insert(state.offset(label), control_points.ravel())
+    state.add_boundary(label, own, control_points)
 
 
 def _in_final_map(recorder: Recorder, state: State, poses: Array) -> Array:

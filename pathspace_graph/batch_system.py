@@ -1,8 +1,7 @@
-"""The whole log's least-squares problem: its cost at a state, and its normal equations there."""
+"""The whole log's least-squares problem: its cost at a state, and its linear factors there."""
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass
 
 import gtsam
@@ -10,29 +9,67 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.linear_graph import (
-    LinearRows,
-    WindowKeys,
-    linear_graph,
-    prior_rows,
-    window_keys,
-)
-from pathspace_graph.factors.odometry import CALIBRATION_SIZE
-from pathspace_graph.factors.projection import ProjectionRows, project, to_map
+from pathspace_graph.factors.projection import ProjectionRows, huber_weights, project, to_map
 
-from .arrowhead import Arrowhead, empty_arrowhead
 from .batch_data import Chain
-from .batch_equations import add_odometry, add_priors, add_rows, calibration_information, odometry_terms
-from .batch_gauge import CurveGauge, PoseRows, curve_gauge
-from .batch_kernel import Kernel
-from .labels import BOUNDARIES
+from .batch_gauge import CurveGauge, curve_gauge
+from .graph.elimination import Elimination, linear_graph, map_held, owners
+from .graph.keys import are_poses, pose_keys
+from .graph.rows import Rows
+from .graph.variables import Layout
 from .readings import Readings
 from .settings import MapperSettings
 from .state import State
-from .window import POSE
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """Robust loss of a whitened residual: Huber's, constant beyond a gate."""
+
+    gate: float
+    """Beyond it a reading isn't used, and its loss is that at the gate."""
+    huber: float
+    """Beyond it the loss grows linearly only."""
+
+    def loss(self, whitened: Array) -> Array:
+        """`rho(z)` (m,), Huber's alone: the gate is what decides which rows are used."""
+        inner = np.minimum(np.abs(whitened), self.huber)
+        return np.asarray(inner * (np.abs(whitened) - 0.5 * inner))
+
+    def weights(self, whitened: Array) -> Array:
+        """`rho'(z) / z` (m,)."""
+        return huber_weights(whitened, self.huber)
+
+    @property
+    def ceiling(self) -> float:
+        """Loss of a reading that isn't used."""
+        return float(self.loss(np.array([self.gate]))[0])
+
+
+@dataclass(frozen=True)
+class Biweight(Kernel):
+    """Tukey's `rho(z) = g^2 / 6 (1 - (1 - z^2 / g^2)^3)`, constant beyond the gate g.
+
+    A reading at the gate has no weight, so that one more or less of them moves nothing, as it would with
+    Huber's loss and a hard gate.
+    """
+
+    huber: float = np.inf
+    """Not used."""
+
+    def loss(self, whitened: Array) -> Array:
+        """`rho(z)` (m,)."""
+        return np.asarray(self.gate**2 / 6.0 * (1.0 - self._inner(whitened) ** 3))
+
+    def weights(self, whitened: Array) -> Array:
+        """`(1 - z^2 / g^2)^2` (m,)."""
+        return np.asarray(self._inner(whitened) ** 2)
+
+    def _inner(self, whitened: Array) -> Array:
+        return np.maximum(1.0 - (whitened / self.gate) ** 2, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +82,6 @@ class Projected:
     """Their foot points."""
     projection: ProjectionRows
     """Their residuals and derivatives."""
-
     sigma: Array
     """(m,) held for a round, m."""
 
@@ -64,7 +100,7 @@ class Evaluation:
     projected: dict[int, Projected]
     """Of each boundary."""
     odometry: tuple[Array, Array]
-    """Whitened residuals (P - 1, 3) and derivatives (P - 1, 3, 8) by [calibration | pose | next pose]."""
+    """What `Chain.terms` gives."""
     cost: float
     """Half the sum of squares, robust losses in place of the readings' own."""
 
@@ -77,44 +113,42 @@ class BatchSystem:
         self.chain = chain
         self.settings = settings
         self.kernel = kernel
+        self.gauges: dict[int, CurveGauge] = {}
+        """What holds each curve where readings don't."""
         self._sigma = np.ones(len(readings))
-
-        self._gauges: dict[int, CurveGauge] = {}
 
     def begin(self, state: State) -> None:
         """The curves' own gauges, where control points are now: to be called when knots change."""
         sigma = self.settings.batch.sigma_slide
-        self._gauges = {
-            label: curve_gauge(boundary, state.control_points(label), state.poses, sigma)
-            for label, boundary in state.boundaries.items()
-        }
-
-    def hold_sigmas(self, state: State) -> None:
-        """Each reading's sigma across its curve as it is now: how it turns is in no derivative."""
-        for label in state.boundaries:
-            projected = self._project(state, label)
-            self._sigma[projected.rows] = projected.projection.sigma
+        self.gauges = {label: curve_gauge(state, label, sigma) for label in state.boundaries}
 
     # --- cost --------------------------------------------------------------------------------------------
 
-    def evaluate(self, state: State) -> Evaluation:
-        """Everything at a state; foot points are refined from where the readings have them."""
-        projected = {label: self._project(state, label) for label in state.boundaries}
-        odometry = odometry_terms(self.chain, state.poses, state.calibration)
+    def evaluate(self, state: State, hold: bool = False) -> Evaluation:
+        """Everything at a state; foot points are refined from where the readings have them.
+
+        `hold`: from now on each reading's sigma across its curve is what it is here. How it turns is in no
+        derivative.
+        """
+        projected = {label: self._project(state, label, hold) for label in state.boundaries}
+        odometry = self.chain.terms(state.poses, state.calibration)
         cost = self._readings_cost(projected) + 0.5 * float((odometry[0] ** 2).sum())
         cost += sum(
-            self._gauges[label].cost(state.control_points(label), state.poses) for label in state.boundaries
+            self.gauges[label].cost(state.control_points(label), state.poses) for label in state.boundaries
         )
-        return Evaluation(state, projected, odometry, cost + self._prior_cost(state))
+        cost += self.chain.prior_cost(state.poses[0], state.calibration)
+        return Evaluation(state, projected, odometry, cost)
 
-    def _project(self, state: State, label: int) -> Projected:
+    def _project(self, state: State, label: int, hold: bool) -> Projected:
         readings = self.readings
         rows = readings.used_on(label)
-        poses = state.poses[readings.slot[rows]]
+        poses = state.variables.poses_at(readings.cycle[rows])
         points = to_map(readings.point[rows], poses)
         foot = state.boundaries[label].refine(state.control_points(label), points, readings.u[rows])
         sigma_model = self.settings.spline.sigma_model
         projection = project(points, readings.covariance[rows], poses, foot, sigma_model)
+        if hold:
+            self._sigma[rows] = projection.sigma
         return Projected(rows, foot, projection, self._sigma[rows])
 
     def _readings_cost(self, projected: dict[int, Projected]) -> float:
@@ -122,100 +156,53 @@ class BatchSystem:
         losses = sum(float(self.kernel.loss(p.whitened[p.foot.interior]).sum()) for p in projected.values())
         return losses + self.kernel.ceiling * (len(self.readings) - used)
 
-    def _prior_cost(self, state: State) -> float:
-        first = state.poses[0] - self.chain.first
-        cost = first @ self.chain.first_information @ first
-        cost += state.calibration @ (calibration_information(self.settings.odometry) * state.calibration)
-        return 0.5 * float(cost)
+    # --- linear factors ----------------------------------------------------------------------------------
 
-    # --- normal equations --------------------------------------------------------------------------------
-
-    def normal_equations(self, at: Evaluation) -> Arrowhead:
-        """The Gauss-Newton system: readings weighted as Huber's loss has it, foot points exact."""
+    def rows(self, at: Evaluation) -> list[Rows]:
+        """Every whitened row at a state: Gauss-Newton's, readings weighted as their loss has it."""
         state = at.state
-        n, count = state.map_size + CALIBRATION_SIZE, len(self.chain)
-        system = empty_arrowhead(count, n)
-        for label in state.boundaries:
-            add_rows(system, self.reading_rows(at, label))
-            add_rows(system, self.gauge_rows(state, label))
-            self._add_smoothness(system, state, label)
-        add_odometry(system, *at.odometry)
-        add_priors(
-            system,
-            self.chain,
-            state.poses[0],
-            state.calibration,
-            calibration_information(self.settings.odometry),
-        )
-        return system
+        groups = self.chain.rows(at.odometry, state.poses[0], state.calibration)
+        for label, gauge in self.gauges.items():
+            points = state.control_points(label)
+            groups += [self.reading_rows(at, label), gauge.beside(points, state.poses)]
+            groups += [gauge.smooth(points), gauge.anchor()]
+        return groups
 
-    def reading_rows(self, at: Evaluation, label: int) -> PoseRows:
-        """The readings in use on a boundary, whitened and weighted, on the control points of their span."""
+    def reading_rows(self, at: Evaluation, label: int) -> Rows:
+        """The readings in use on a boundary, on the control points of their span and their pose."""
         p, state = at.projected[label], at.state
-        weight = np.sqrt(self.kernel.weights(p.whitened)) * p.foot.interior / p.sigma
-        base = state.offset(label) + 2 * state.boundaries[label].columns(p.foot.span)
-        shape = len(p.rows), 2 * base.shape[1]
-        return PoseRows(
-            slot=self.readings.slot[p.rows],
-            by_pose=p.projection.by_pose * weight[:, None],
-            columns=np.stack([base, base + 1], axis=2).reshape(shape),
-            by_border=p.projection.by_control.reshape(shape) * weight[:, None],
-            residual=p.projection.residual * weight,
+        cycle, scale = self.readings.cycle[p.rows], self.scale(p)
+        control = state.keys(label)[state.boundaries[label].columns(p.foot.span)]
+        by_control = p.projection.by_control.reshape(len(cycle), 2 * control.shape[1])
+        return Rows(
+            keys=np.column_stack([control, pose_keys(cycle)]),
+            jacobian=np.column_stack([by_control, p.projection.by_pose]) * scale[:, None],
+            residual=p.projection.residual * scale,
+            owner=owners(cycle, label),
         )
 
-    def gauge_rows(self, state: State, label: int) -> PoseRows:
-        """What holds the control points of a boundary beside their poses."""
-        return self._gauges[label].beside(state.control_points(label), state.poses, state.offset(label))
+    def scale(self, projected: Projected) -> Array:
+        """(m,) what a reading's row is multiplied by, 1/m: zero beside the ends of a curve."""
+        weights = self.kernel.weights(projected.whitened)
+        return np.asarray(np.sqrt(weights) * projected.foot.interior / projected.sigma)
 
-    def linear_rows(self, at: Evaluation) -> list[LinearRows]:
-        """Every whitened row on the whole state, whose normal equations these are."""
-        state, groups = at.state, []
-        for label in state.boundaries:
-            for rows in (self.reading_rows(at, label), self.gauge_rows(state, label)):
-                columns = np.concatenate([rows.columns, state.pose_columns(rows.slot)], axis=1)
-                jacobian = np.concatenate([rows.by_border, rows.by_pose], axis=1)
-                groups.append((columns, jacobian, rows.residual))
-            groups += _smooth(self._gauges[label], state.control_points(label), state.offset(label))
-        residual, jacobian = at.odometry
-        pairs = state.pose_columns(np.arange(len(residual)))[:, :1] + np.arange(2 * POSE)
-        shared = np.full((len(residual), 1), state.map_size) + np.arange(CALIBRATION_SIZE)
-        columns = np.repeat(np.concatenate([shared, pairs], axis=1), POSE, axis=0)
-        groups.append((columns, jacobian.reshape(len(columns), -1), residual.ravel()))
-        information = np.zeros((CALIBRATION_SIZE + POSE, CALIBRATION_SIZE + POSE))
-        np.fill_diagonal(
-            information, np.append(calibration_information(self.settings.odometry), [0.0] * POSE)
-        )
-        information[CALIBRATION_SIZE:, CALIBRATION_SIZE:] = self.chain.first_information
-        off = np.append(state.calibration, state.poses[0] - self.chain.first)
-        own, prior, value = prior_rows(information, -information @ off)
-        first = np.append(shared[0], state.pose_columns(np.zeros(1, np.intp)))
-        return [*groups, (first[own], prior, value)]
+    def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
+        """All of it, whose solution is the change from the state."""
+        return linear_graph(self.rows(at), at.state.variables)
 
-    def _add_smoothness(self, system: Arrowhead, state: State, label: int) -> None:
-        block, gauge = state.block(label), self._gauges[label]
-        system.border[block, block] += gauge.smoothness + gauge.anchor * np.eye(len(gauge.smoothness))
-        system.descent_border[block] -= gauge.smoothness @ state.vector[block]
+    def eliminated(self, at: Evaluation) -> Elimination:
+        """The same, with the poses eliminated."""
+        return Elimination(self.linear_graph(at), at.state.variables.layout)
+
+    def poses_alone(self, at: Evaluation) -> Array:
+        """(3 P,) the step of the poses beside a map and a calibration that are held."""
+        keys = at.state.variables.keys
+        graph = linear_graph(map_held(self.rows(at)), at.state.variables)
+        return Elimination(graph, Layout(keys[are_poses(keys)])).beside(np.zeros(0))
 
 
-def _smooth(gauge: CurveGauge, control_points: Array, offset: int) -> list[LinearRows]:
-    """Smoothness and anchor of a curve whose control points begin at an entry of the state."""
-    flat = control_points.ravel()
-    columns = offset + np.arange(len(flat))
-    smooth = prior_rows(gauge.smoothness, -gauge.smoothness @ flat)
-    anchor = prior_rows(gauge.anchor * np.eye(len(flat)), np.zeros(len(flat)))
-    return [(columns[own], jacobian, residual) for own, jacobian, residual in (smooth, anchor)]
-
-
-def moved(state: State, poses: Array, border: Array) -> State:
-    """The state after a step of the poses (3 P,) and of [map | calibration] (n,)."""
-    following = copy(state)
-    following.vector = state.vector + np.concatenate([border, poses])
+def moved(state: State, step: Array) -> State:
+    """The state after a step (n,) of its last variables."""
+    following = state.copy()
+    following.variables.values[len(following.variables.values) - len(step) :] += step
     return following
-
-
-def linear_graph_of(system: BatchSystem, at: Evaluation) -> tuple[gtsam.GaussianFactorGraph, WindowKeys]:
-    """The same step as one GTSAM graph of finished Jacobian blocks: every pose, reading and curve."""
-    state = at.state
-    sizes = [state.boundaries[b].size if b in state.boundaries else 0 for b in BOUNDARIES]
-    keys = window_keys((sizes[0], sizes[1]), CALIBRATION_SIZE, state.poses)
-    return linear_graph(system.linear_rows(at), keys), keys

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_foot_points
-from pathspace_graph.factors.gauge import greville, smoothness_matrix
+from pathspace_graph.factors.gauge import greville, smoothness_coefficients, smoothness_matrix
 from pathspace_graph.factors.spans import SpanPolynomials, Spans, lay_out
 
 from .settings import GaugeSettings, SplineSettings
@@ -23,30 +23,32 @@ ROUND_OFF = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
-    """Weak priors between the control points of a stretch."""
+    """Weak priors between the control points of a stretch, by their indices."""
 
-    near: IntArray
+    points: IntArray
     """(k,) the control points, in driving order."""
-    whole: bool
-    """Whether they are a closed curve's, all of them, so that the last is followed by the first."""
-    columns: IntArray
-    """(r, 4) entries of each and the next, counted from the boundary's first, ..."""
+    pairs: IntArray
+    """(r, 2) each and the next, ..."""
     nominal: Array
     """... and their nominal distance (r,), m."""
-    smooth: Array
-    """(2k, 2k) smoothness in their normal equations; zero along a straight line."""
-    hessian: Array
-    """(2k, 2k) smoothness and anchor; the anchor holds each point where it is, so it has no gradient."""
+    triples: IntArray
+    """(t, 3) three in a row, ..."""
+    bending: Array
+    """... and the coefficients (t, 3) of their second difference in sigmas (1/m)."""
 
 
 class Boundary:
-    """Knots, and what follows from them; the control points are entries of the mapper's state.
+    """Knots, and what follows from them; the control points are variables of the graph.
 
     An open boundary has uniform, floating knots whose interval is the spacing of its control points, so that
     the parameter is roughly a length in metres, from 0 at the first sighting.
     """
 
-    def __init__(self, knots: Array, periodic: bool, settings: SplineSettings, gauge: GaugeSettings) -> None:
+    def __init__(
+        self, knots: Array, periodic: bool, settings: SplineSettings, gauge: GaugeSettings, first: int = 0
+    ) -> None:
+        self.first = first
+        """Number of the first control point's key: new knots make new keys."""
         self.settings = settings
         self.gauge = gauge
         self.degree = settings.degree
@@ -75,32 +77,33 @@ class Boundary:
         """(m,) indices of all control points."""
         self._gauge: Gauge | None = None
 
-    def gauge_on(self, near: IntArray) -> Gauge:
-        """The gauge between the control points `near` (k,), a stretch in driving order; the last is kept."""
-        if self._gauge is None or self._gauge.near is not near:
-            self._gauge = self._new_gauge(near)
+    def gauge_on(self, points: IntArray) -> Gauge:
+        """The gauge between control points (k,), a stretch in driving order; the last one asked for is
+        kept."""
+        if self._gauge is None or self._gauge.points is not points:
+            self._gauge = self._new_gauge(points)
         return self._gauge
 
-    def _new_gauge(self, near: IntArray) -> Gauge:
-        """`D' D / (sigma_smoothness spacing)^2 + I / sigma_anchor^2`, and the neighbours to keep apart."""
-        whole = self.periodic and len(near) == self.size
-        abscissae = self.abscissae[near]
+    def _new_gauge(self, points: IntArray) -> Gauge:
+        """`D / (sigma_smoothness spacing)`, and the neighbours to keep apart."""
+        whole = self.periodic and len(points) == self.size
+        abscissae = self.abscissae[points]
         abscissae = abscissae + self.length * (abscissae < abscissae[:1])  # a stretch past the seam
         spacing = float(np.mean(self.nominal))
-        scaled = smoothness_matrix(abscissae, self.length if whole else None, spacing)
-        scaled = scaled / (self.gauge.sigma_smoothness * spacing)
-        smooth = scaled.T @ scaled
-        anchor = np.eye(len(near)) / self.gauge.sigma_anchor**2
-        first = near if whole else near[:-1]
-        pairs = np.stack([first, (first + 1) % self.size], axis=1)
+        bending = smoothness_coefficients(abscissae, self.length if whole else None, spacing)
+        first = points if whole else points[:-1]
         return Gauge(
-            near=near,
-            whole=whole,
-            columns=np.stack([2 * pairs, 2 * pairs + 1], axis=2).reshape(-1, 4),
+            points=points,
+            pairs=np.stack([first, (first + 1) % self.size], axis=1),
             nominal=self.nominal[first],
-            smooth=_by_axis(smooth),
-            hessian=_by_axis(smooth + anchor),
+            triples=(points[: len(bending), None] + np.arange(3)) % self.size,
+            bending=bending / (self.gauge.sigma_smoothness * spacing),
         )
+
+    @property
+    def numbers(self) -> IntArray:
+        """(m,) numbers of the control points' keys."""
+        return self.first + self.everything
 
     @property
     def knots(self) -> Array:
@@ -161,8 +164,8 @@ class Boundary:
         return np.asarray(np.einsum("mj,mjd->md", values[derivative], control_points[self.columns(span)]))
 
     def closed(self, knots: Array) -> Boundary:
-        """The boundary on periodic knots, all of it confirmed."""
-        boundary = Boundary(knots, True, self.settings, self.gauge)
+        """The boundary on periodic knots, all of it confirmed, with control points of new keys."""
+        boundary = Boundary(knots, True, self.settings, self.gauge, self.first + self.size)
         boundary.confirmed = boundary.tables.high
         return boundary
 
@@ -217,13 +220,6 @@ class Boundary:
         values, span = self.tables.evaluate(u)
         columns = np.minimum(self.columns(span), len(control_points) - 1)
         return np.asarray(np.einsum("mj,mjd->md", values[0], control_points[columns]))
-
-
-def _by_axis(matrix: Array) -> Array:
-    """(2k, 2k) the same matrix (k, k) on x and on y of k points."""
-    both = np.zeros((len(matrix), 2, len(matrix), 2))
-    both[:, 0, :, 0] = both[:, 1, :, 1] = matrix
-    return both.reshape(2 * len(matrix), -1)
 
 
 def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.projection import to_map
 
+from .curve_map import CurveSmoother
 from .labels import LEFT, RIGHT, UNKNOWN
 from .settings import GrowthSettings
-from .smoother import Smoother
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -52,15 +52,15 @@ class End:
     """Its distance from the path to the boundary's own side, m."""
 
 
-def undisputed(smoother: Smoother, label: int, points: Array, radius: float) -> NDArray[np.bool_]:
+def undisputed(smoother: CurveSmoother, label: int, points: Array, radius: float) -> NDArray[np.bool_]:
     """Which places (n, 2) have no more readings of the other boundary's label around them than of their own.
 
     A sensor that takes a cone for one of the other boundary now and then sees it in its true colour oftener.
     Readings in the window count, in use or not, within `radius` (m).
     """
-    readings = smoother.readings
+    readings = smoother.map.readings
     rows = np.flatnonzero(readings.label != UNKNOWN)
-    seen = to_map(readings.point[rows], smoother.state.poses[readings.slot[rows]])
+    seen = to_map(readings.point[rows], smoother.variables.poses_at(readings.cycle[rows]))
     offset = points[:, None] - seen
     near = offset[:, :, 0] ** 2 + offset[:, :, 1] ** 2 < radius**2
     votes = near @ np.where(readings.label[rows] == label, 1, -1)

@@ -12,8 +12,8 @@ from scipy.linalg import block_diag, lapack
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 
 from .cubature import Transformed, square_root, transform
+from .graph.keys import POSE
 from .settings import OdometrySettings
-from .window import POSE
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]

@@ -10,35 +10,16 @@ from scipy.linalg import block_diag
 
 from .ckf_state import CurveState
 from .closing import Motion, register
+from .curve_map import CurveMap
+from .graph.keys import POSE, pose_keys
 from .knots import refit
 from .log import Detections
 from .settings import MapperSettings
 from .simplification import Join, join
-from .smoother import Smoother
 from .spline import BSpline
-from .window import POSE
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-
-
-class _Recent(Smoother):
-    """The newest poses and readings, in the shape that the registration takes."""
-
-    def __init__(self, state: CurveState, cycles: list[tuple[Array, Detections]]) -> None:
-        super().__init__(state.settings)
-        self._pose_covariance = state.belief.covariance[:POSE, :POSE].copy()
-        for label in state.curves:
-            self.state.add_boundary(label, state.boundary(label))
-            self.state.insert(self.state.offset(label), state.control_points(label).ravel())
-        for slot, (pose, detections) in enumerate(cycles):
-            self.state.append_pose(pose)
-            self.times.append(detections.t)
-            self.readings.append(detections, slot)
-
-    def pose_covariance(self) -> Array:
-        """(3, 3) of the newest pose, by the filter."""
-        return self._pose_covariance
 
 
 def associate_early(
@@ -56,8 +37,21 @@ def associate_early(
         patience=ckf.patience,
         sigma_patience=ckf.sigma_patience,
     )
-    found = register(_Recent(state, cycles), beginning, closing)
+    covariance = state.belief.covariance[:POSE, :POSE]
+    times = [detections.t for _, detections in cycles]
+    found = register(_recent(state, cycles), times, covariance, beginning, closing)
     return None if found is None else found.motion
+
+
+def _recent(state: CurveState, cycles: list[tuple[Array, Detections]]) -> CurveMap:
+    """The curves, the newest poses and their readings, as the registration takes them."""
+    track = CurveMap(state.settings)
+    for label in state.curves:
+        track.state.add_boundary(label, state.boundary(label), state.control_points(label))
+    for cycle, (pose, detections) in enumerate(cycles):
+        track.variables.insert(pose_keys(np.array([cycle])), pose)
+        track.readings.append(detections, cycle)
+    return track
 
 
 def tie(state: CurveState, motion: Motion) -> bool:

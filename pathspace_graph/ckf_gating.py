@@ -12,9 +12,9 @@ from pathspace_graph.factors.projection import project, to_map
 
 from .ckf_belief import point_columns
 from .ckf_state import CurveState
+from .graph.keys import POSE
 from .labels import UNKNOWN
 from .log import Detections
-from .window import POSE
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]

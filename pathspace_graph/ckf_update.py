@@ -12,8 +12,8 @@ from .ckf_belief import PLANE, to_vehicle_rows
 from .ckf_fit import SplineReading, fit_readings
 from .ckf_gating import OnCurve
 from .ckf_state import CurveState
+from .graph.keys import POSE
 from .log import Detections
-from .window import POSE
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]

@@ -7,7 +7,7 @@ whole loop. What then makes each curve periodic is `simplification`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,12 +16,9 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.odometry import wrap_angle
 from pathspace_graph.factors.projection import to_map
 
+from .curve_map import CurveMap, CurveSmoother
 from .path import DrivenPath
-from .segments import History, Segment, relinearized_prior
 from .settings import ClosingSettings
-from .smoother import Smoother
-from .state import State
-from .window import POSE, Prior, schur_leave, without
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -86,33 +83,35 @@ def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool
     return bool((same_way & (away < drift)).any())
 
 
-def register(smoother: Smoother, beginning: Array, settings: ClosingSettings) -> Registration | None:
+def register(
+    track: CurveMap, times: Sequence[float], covariance: Array, beginning: Array, settings: ClosingSettings
+) -> Registration | None:
     """The motion that lays the newest readings on the beginning; None where they don't agree with it.
 
     Iterated closest points on the curves, `min sum (n . (M p - S(u)))^2 / sigma^2 + m' P^-1 m`. The vehicle's
-    own uncertainty P is the prior: along a straight or an arc the readings leave the motion free. Where it is
-    larger than what the iteration can bridge, it starts from the best of the `beginning`, poses (k, 3) of the
-    drive's first stretch.
+    own uncertainty P, the `covariance` (3, 3) of its newest pose, is the prior: along a straight or an arc
+    the readings leave the motion free. Where it is larger than what the iteration can bridge, it starts from
+    the best of the `beginning`, poses (k, 3) of the drive's first stretch. `times`: stamps (s) of the poses.
     """
-    recent, points = _recent(smoother, settings.window)
-    prior = np.linalg.inv(smoother.pose_covariance() * settings.prior_scale**2)
-    centre = smoother.state.poses[-1, :2].copy()
+    recent, points = _recent(track, times, settings.window)
+    prior = np.linalg.inv(covariance * settings.prior_scale**2)
+    centre = track.state.poses[-1, :2].copy()
     vector = np.zeros(3)
     lost = bool(np.linalg.eigvalsh(prior[:2, :2])[0] < settings.icp_reach**-2)
     if lost:
-        pose = smoother.state.poses[-1]
+        pose = track.state.poses[-1]
         starts = [v for v in _motions(pose, beginning, settings) if v @ prior @ v < settings.start_chi2]
         agreement = [
-            _match(smoother, settings, recent, points, Motion(centre, v), settings.icp_reach).near.sum()
+            _match(track, settings, recent, points, Motion(centre, v), settings.icp_reach).near.sum()
             for v in [vector, *starts]
         ]
         vector = [vector, *starts][int(np.argmax(agreement))]
     for reach in _reaches(settings):
-        matches = _match(smoother, settings, recent, points, Motion(centre, vector), reach)
+        matches = _match(track, settings, recent, points, Motion(centre, vector), reach)
         descent = matches.descent - prior @ vector
         vector = vector + np.linalg.solve(matches.hessian + prior, descent)
     posterior = np.linalg.inv(matches.hessian + prior)
-    labels = smoother.state.boundaries
+    labels = track.state.boundaries
     if not (_agree(matches, list(labels), settings) and _certain(matches, posterior, settings, lost)):
         return None
     return Registration(Motion(centre, vector), {label: matches.agreeing(label) for label in labels})
@@ -127,13 +126,12 @@ def _motions(pose: Array, beginning: Array, settings: ClosingSettings) -> list[A
     return list(motions)
 
 
-def _recent(smoother: Smoother, seconds: float) -> tuple[IntArray, Array]:
+def _recent(track: CurveMap, times: Sequence[float], seconds: float) -> tuple[IntArray, Array]:
     """Coloured readings of the newest poses, and where they are in the map (m, 2)."""
-    readings = smoother.readings
-    times = np.asarray(smoother.times)
-    rows = np.flatnonzero(times[readings.slot] > times[-1] - seconds)
-    rows = rows[np.isin(readings.label[rows], list(smoother.state.boundaries))]
-    return rows, to_map(readings.point[rows], smoother.state.poses[readings.slot[rows]])
+    readings, variables, stamps = track.readings, track.variables, np.asarray(times)
+    rows = np.flatnonzero(stamps[readings.cycle - variables.first_cycle] > stamps[-1] - seconds)
+    rows = rows[np.isin(readings.label[rows], list(track.state.boundaries))]
+    return rows, to_map(readings.point[rows], variables.poses_at(readings.cycle[rows]))
 
 
 def _reaches(settings: ClosingSettings) -> Iterator[float]:
@@ -143,7 +141,7 @@ def _reaches(settings: ClosingSettings) -> Iterator[float]:
 
 
 def _match(
-    smoother: Smoother,
+    track: CurveMap,
     settings: ClosingSettings,
     recent: IntArray,
     points: Array,
@@ -151,8 +149,8 @@ def _match(
     reach: float,
 ) -> Matches:
     """Readings against the beginning; those within reach (m) pull."""
-    state = smoother.state
-    labels, moved = smoother.readings.label[recent], motion.apply(points)
+    state = track.state
+    labels, moved = track.readings.label[recent], motion.apply(points)
     hessian, descent = np.zeros((3, 3)), np.zeros(3)
     rows, u, near = [recent[:0]], [np.zeros(0)], [np.zeros(0, bool)]
     for label, boundary in state.boundaries.items():
@@ -169,7 +167,7 @@ def _match(
         u.append(foot.u[foot.interior])
         near.append(np.abs(foot.distance[foot.interior]) < settings.inlier_distance)
     matched = np.concatenate(rows)
-    of_rows = smoother.readings.label[matched]
+    of_rows = track.readings.label[matched]
     return Matches(matched, of_rows, np.concatenate(u), np.concatenate(near), hessian, descent)
 
 
@@ -194,48 +192,17 @@ def _certain(matches: Matches, posterior: Array, settings: ClosingSettings, lost
     return sigma <= (settings.sigma_patience if patient else settings.sigma_max)
 
 
-def tie(smoother: Smoother, registration: Registration) -> None:
+def tie(smoother: CurveSmoother, registration: Registration) -> None:
     """Move the window onto the beginning, and hold the agreeing readings against it."""
-    smoother.join()
-    poses, readings = smoother.state.poses, smoother.readings
+    smoother.reactivate(with_prior=smoother.submaps is None)
+    poses = smoother.map.state.poses
     poses[:, :2] = registration.motion.apply(poses[:, :2])
     poses[:, 2] += registration.motion.vector[2]
     for label, (rows, u) in registration.matches.items():
-        readings.used[rows] = True
-        readings.boundary[rows] = label
-        readings.u[rows] = u
+        smoother.map.readings.take(rows, label, u)
 
 
-def bend(smoother: Smoother) -> None:
-    """Solve the whole loop, each stretch of the drive relinearized in its own frame.
-
-    The keyframes are in the state while it is solved, and leave by a Schur complement. Without a history (a
-    user's factors are absolute) the running prior stays linearized where it is.
-    """
-    settings, state, history = smoother.settings.closing, smoother.state, smoother.history
-    segments = history.all_segments(*state.control_ids()) if history is not None else []
-    if history is None or not segments:
-        for _ in range(settings.iterations):
-            smoother.settle()
-        return
-    state.insert(state.pose_column(0), np.concatenate(history.keyframes))
-    state.keyframes = len(segments)
-    for _ in range(settings.iterations):
-        smoother.prior = _relinearized(history, segments, state)
-        smoother.settle()
-    smoother.prior = _without_keyframes(smoother.prior, state)
-    smoother.history = None
-
-
-def _relinearized(history: History, segments: list[Segment], state: State) -> Prior:
-    offsets = {label: state.offset(label) for label in state.boundaries}
-    return relinearized_prior(history, segments, state.vector, offsets, state.map_size)
-
-
-def _without_keyframes(prior: Prior, state: State) -> Prior:
-    """The keyframes leave the state and its prior."""
-    stop = state.pose_column(0)
-    start = stop - POSE * state.keyframes
-    information, gradient = schur_leave(prior.information, prior.gradient, start, stop)
-    state.drop_keyframes()
-    return Prior(information, gradient, without(prior.point, start, stop, 0))
+def bend(smoother: CurveSmoother) -> None:
+    """Solve the whole loop, each submap relinearized in its own frame."""
+    settings = smoother.map.settings.closing
+    smoother.solve_loop(settings.iterations, settings.sigma_step)

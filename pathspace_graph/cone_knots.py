@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
 from .knots import FitSettings, energy_rows
 from .spline import BSpline
-from .window import cholesky, solve
 
 Array = NDArray[np.float64]
 
@@ -76,10 +76,10 @@ def thin(
     breaks = np.unique(np.concatenate([[0.0], u, [high]]))
     frame = _frame(breaks, periodic, fit.degree)
     B, bending, jumps = frame.basis_matrix(u), energy_rows(frame), _jumps(frame)
-    factor = cholesky(B.T @ B + fit.smoothness * bending.T @ bending)
+    factor = cho_factor(B.T @ B + fit.smoothness * bending.T @ bending)
     watched, n, left = np.concatenate([jumps, B]), len(jumps), np.arange(len(jumps))
-    spread, values = watched @ solve(factor, jumps.T), watched @ solve(factor, B.T @ points)
-    leverage = np.einsum("kn,nk->k", B, solve(factor, B.T))
+    spread, values = watched @ cho_solve(factor, jumps.T), watched @ cho_solve(factor, B.T @ points)
+    leverage = np.einsum("kn,nk->k", B, cho_solve(factor, B.T))
     for size in range(B.shape[1], max(least, B.shape[1] - n) - 1, -1):
         kept = breaks[np.concatenate([[0], 1 + left, [-1]])]
         yield Thinned(kept, size, points - values[n:], leverage)

@@ -1,4 +1,4 @@
-"""The map's curves side by side: foot points of readings on both boundaries, and gauge, in one pass."""
+"""The map's curves side by side: foot points of readings on both boundaries in one pass."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, ref
 from pathspace_graph.factors.spans import SpanPolynomials, Spans, lay_out
 
 from .boundary import Boundary
+from .graph.keys import control_keys
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -19,35 +20,31 @@ IntArray = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """The near part of every curve, all control points of the map in one array: curve 0, 1 by label."""
+    """The active part of every curve, all control points of the map in one array: curve 0, 1 by label."""
 
     boundaries: tuple[Boundary, ...]
     """By label."""
     labels: IntArray
     """(k,) theirs."""
-    near: tuple[IntArray, ...]
-    """Control points of each that are in the system."""
+    active: tuple[IntArray, ...]
+    """Control points of each that are active."""
     tables: tuple[SpanPolynomials, ...]
     """Of the whole of each."""
     spans: Spans
-    """Of closed curves all; open ones begin with the first near control point."""
+    """Of closed curves all; open ones begin with the first active control point."""
     cut: Array
-    """(k,) parameter before which the map is far, of open curves; minus infinity where it is near."""
-    pairs: IntArray
-    """(r, 4) columns of each near control point and the next, whose distance is held, ..."""
-    nominal: Array
-    """... and their nominal distance (r,), m."""
-    smooth: Array
-    """(n, n) smoothness of all near control points (`Gauge.smooth`)."""
-    hessian: Array
-    """(n, n) smoothness and anchor (`Gauge.hessian`)."""
+    """(k,) parameter before which an open curve is inactive; minus infinity where nothing of it is."""
+    keys: IntArray
+    """(m,) keys of all control points of the map."""
+    offsets: IntArray
+    """(k,) where each curve's begin among them."""
 
-    def are(self, boundaries: Mapping[int, Boundary], near: Callable[[int], IntArray]) -> bool:
-        """Whether these are the boundaries, as they are now, and their near control points."""
+    def are(self, boundaries: Mapping[int, Boundary], active: Callable[[int], IntArray]) -> bool:
+        """Whether these are the boundaries, as they are now, and their active control points."""
         return len(boundaries) == len(self.tables) and all(
-            boundary.tables is tables and near(label) is indices
+            boundary.tables is tables and active(label) is indices
             for (label, boundary), tables, indices in zip(
-                boundaries.items(), self.tables, self.near, strict=True
+                boundaries.items(), self.tables, self.active, strict=True
             )
         )
 
@@ -77,36 +74,24 @@ class Curves:
         )
 
     def cut_off(self, curve: IntArray, foot: FootPoints) -> bool:
-        """Whether the foot point of any row, on curve (m,), is where an open curve is far."""
+        """Whether the foot point of any row, on curve (m,), is where an open curve is inactive."""
         return not self.spans.periodic and bool((foot.u <= self.cut[curve]).any())
 
 
-def side_by_side(boundaries: Mapping[int, Boundary], near: Mapping[int, IntArray]) -> Curves:
-    """Some boundaries, at least one, with the control points (k,) of each that are near."""
-    all_of, near_of = tuple(boundaries.values()), tuple(near[label] for label in boundaries)
+def side_by_side(boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> Curves:
+    """Some boundaries, at least one, with the control points (k,) of each that are active."""
+    all_of, active_of = tuple(boundaries.values()), tuple(active[label] for label in boundaries)
     sizes = [boundary.size for boundary in all_of]
     offsets = np.cumsum([0, *sizes[:-1]])
-    first = [0 if b.periodic else int(indices[0]) for b, indices in zip(all_of, near_of, strict=True)]
+    first = [0 if b.periodic else int(indices[0]) for b, indices in zip(all_of, active_of, strict=True)]
     tables = [b.tables.tail(start) if start else b.tables for b, start in zip(all_of, first, strict=True)]
-    gauges = [b.gauge_on(indices) for b, indices in zip(all_of, near_of, strict=True)]
     return Curves(
         boundaries=all_of,
         labels=np.array(list(boundaries), np.intp),
-        near=near_of,
+        active=active_of,
         tables=tuple(boundary.tables for boundary in all_of),
         spans=lay_out(tables, [int(o) + f for o, f in zip(offsets, first, strict=True)], sizes),
         cut=np.array([t.low if start else -np.inf for t, start in zip(tables, first, strict=True)]),
-        pairs=np.concatenate([2 * o + gauge.columns for o, gauge in zip(offsets, gauges, strict=True)]),
-        nominal=np.concatenate([gauge.nominal for gauge in gauges]),
-        smooth=_block_diagonal([gauge.smooth for gauge in gauges]),
-        hessian=_block_diagonal([gauge.hessian for gauge in gauges]),
+        keys=np.concatenate([control_keys(label, b.numbers) for label, b in boundaries.items()]),
+        offsets=offsets,
     )
-
-
-def _block_diagonal(blocks: list[Array]) -> Array:
-    """(n, n) the blocks on the diagonal."""
-    matrix, end = np.zeros((sum(map(len, blocks)),) * 2), 0
-    for block in blocks:
-        begin, end = end, end + len(block)
-        matrix[begin:end, begin:end] = block
-    return matrix

@@ -25,3 +25,7 @@ class OutputError(PathspaceError):
 
 class SettingsError(PathspaceError):
     """A setting is out of its range, or names something unknown."""
+
+
+class SingularSystemError(PathspaceError):
+    """The normal equations are not positive definite: nothing holds some variable."""

@@ -41,9 +41,9 @@ def _landmark_ckf(settings: MapperSettings, log: Log) -> OnlineEstimator:
 
 
 def _incremental(settings: MapperSettings, log: Log) -> OnlineEstimator:
-    from .incremental import IncrementalFixedLag  # noqa: PLC0415 - only where it is asked for
+    from .incremental import incremental_fixed_lag  # noqa: PLC0415 - only where it is asked for
 
-    return IncrementalFixedLag(settings, log.odometry_sigma)
+    return incremental_fixed_lag(settings, log.odometry_sigma)
 
 
 ONLINE: Final[Mapping[str, Callable[[MapperSettings, Log], OnlineEstimator]]] = {

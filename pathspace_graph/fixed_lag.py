@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -13,19 +14,20 @@ from pathspace_graph.factors.odometry import IntegratedOdometry, compose, integr
 
 from .boundary import Boundary
 from .closing import bend, near_start, register, tie
+from .curve_map import CurveMap, CurveSmoother
 from .gating import admit
+from .graph.keys import POINT, pose_key, pose_keys
+from .graph.smoother import FixedLagSmoother, SmootherSettings
 from .growth import Growth
 from .labels import LEFT, RIGHT
 from .log import Detections, Odometry
 from .map import Map, SplineBoundary
 from .narrowing import narrow
 from .path import DrivenPath
-from .pose_factors import pose_key
 from .settings import MapperSettings
 from .simplification import simplify
-from .smoother import Smoother
 from .stopwatch import Stopwatch
-from .window import Prior, Rows
+from .window_graph import window_graph
 
 Array = NDArray[np.float64]
 
@@ -51,6 +53,13 @@ class CycleResult:
     """Time (s) that each stage of the update took, by its name."""
 
 
+class Solver(Protocol):
+    """Another way to come from the window's factors to an estimate, as `incremental` has one."""
+
+    def step(self, smoother: CurveSmoother, sigma_step: float) -> None:
+        """Move the smoother's variables to the estimate; its `last_step` is the window's."""
+
+
 class FixedLagMapper:
     """Maps a track's two boundaries cycle by cycle, as splines in one factor graph with the vehicle's poses.
 
@@ -59,11 +68,19 @@ class FixedLagMapper:
     rad/s).
     """
 
-    def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
+    def __init__(
+        self,
+        settings: MapperSettings | None = None,
+        odometry_sigma: Array | None = None,
+        solver: Solver | None = None,
+    ) -> None:
         self.settings = settings or MapperSettings()
         self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
-        self.smoother = Smoother(self.settings)
-        """What is estimated, and from what."""
+        self.smoother = FixedLagSmoother(smoother_settings(self.settings), CurveMap(self.settings))
+        """What is estimated, and from what: variables, factors of the window, and the prior."""
+        self.smoother.exact = True
+        self.solver = solver
+        """What takes the place of the smoother's own step."""
         self.path = DrivenPath(self.settings.path)
         """The way driven."""
         self.growth = Growth(self.settings.growth)
@@ -81,9 +98,10 @@ class FixedLagMapper:
     ) -> CycleResult:
         """One perception cycle: the twists since the last one, and what was detected now.
 
-        `factors`: GTSAM factors of your own on Pose2 keys in the window (`pose_key`, `next_pose_key`). Each
-        is relinearized at every step as long as all of its poses are in the window, and then a part of the
-        prior; SettingsError, and nothing done, where a key isn't in the window.
+        `factors`: GTSAM factors of your own, on poses in the window (`pose_key`, `next_pose_key`: `Pose2`)
+        and on control points (`control_keys`: `Point2`). Each is relinearized at every step as long as all of
+        its poses are in the window and its control points are active, and then a part of the prior.
+        SettingsError, and nothing done, where a key is not a variable of the graph.
         """
         watch = Stopwatch()
         self.smoother.add_factors(factors)
@@ -92,10 +110,11 @@ class FixedLagMapper:
         self._classify(detections)  # projects and gates: what no curve takes may expand one
         watch.lap("classify")
         self._expand()
-        narrow(self.smoother)
+        if self.solver is None:
+            narrow(self.smoother)
         watch.lap("expand")
         for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
-            self.smoother.step(self.settings.sigma_step)
+            self._step()
         watch.lap("update")
         closes = self._close()
         watch.lap("close")
@@ -105,6 +124,13 @@ class FixedLagMapper:
         self.smoother.marginalize()
         watch.lap("marginalize")
         return self._result(detections.t, watch.laps)
+
+    def _step(self) -> None:
+        """One Gauss-Newton step, relinearized at the current estimate, or what the solver does instead."""
+        if self.solver is None:
+            self.smoother.step(self.settings.sigma_step)
+        else:
+            self.solver.step(self.smoother, self.settings.sigma_step)
 
     # --- the stages --------------------------------------------------------------------------------------
 
@@ -121,12 +147,14 @@ class FixedLagMapper:
             start = self.settings.odometry
             sigmas = np.array([start.sigma_start, start.sigma_start, start.sigma_start_heading])
             self.smoother.begin(t, pose, integrated.covariance + np.diag(sigmas) ** 2)
+            if self.solver is not None:
+                self.smoother.submaps = None  # nothing of another solver is relinearized when the loop closes
         self.path.update(pose)
         self.path.steer(odometry.twist)
 
     def _classify(self, detections: Detections) -> None:
         """Which readings update a curve, and which are sightings of what no curve explains yet."""
-        new = self.smoother.add_readings(detections)
+        new = self.smoother.map.readings.append(detections, self.smoother.next_cycle - 1)
         if self.boundaries:
             admit(self.smoother, self._grown)
         if not self.closed:
@@ -148,7 +176,9 @@ class FixedLagMapper:
             return False
         self._closing_tried = length
         self.smoother.refresh()
-        registration = register(self.smoother, self.path.beginning, settings)
+        covariance = self.smoother.covariance(pose_keys(np.array([self.smoother.next_cycle - 1])))
+        beginning = self.path.beginning
+        registration = register(self.smoother.map, self.smoother.times, covariance, beginning, settings)
         if registration is None:
             return False
         tie(self.smoother, registration)
@@ -157,31 +187,51 @@ class FixedLagMapper:
         return True
 
     def _simplify(self) -> None:
-        """Both curves become periodic and have their final size."""
+        """Both curves become periodic and have their final size; from now on hardly anything moves."""
         simplify(self.smoother)
         self.growth.clear()
+        self.smoother.exact = False
 
     def _result(self, t: float, stages: dict[str, float]) -> CycleResult:
-        readings = self.smoother.readings
-        used = int((readings.used & (readings.slot == len(self.smoother.times) - 1)).sum())
+        readings = self.smoother.map.readings
+        used = int(readings.used[readings.cycle.searchsorted(self.smoother.next_cycle - 1) :].sum())
         left, right = (self.boundaries[b].size if b in self.boundaries else 0 for b in (LEFT, RIGHT))
         return CycleResult(t, self.poses[-1].copy(), (left, right), used, self.closed, stages)
 
-    # --- what is known -----------------------------------------------------------------------------------
-
     def map(self) -> Map:
         """The map as it stands, with the joint covariance of each boundary's control points."""
+        boundaries, shape = {}, self.settings.spline.sigma_shape if self.closed else 0.0
+        state = self.smoother.map.state
         if not self.boundaries:
             return Map(self.closed, {})
-        joint, state = self.smoother.map_covariance(), self.smoother.state
-        if self.closed:
-            joint = joint + np.eye(len(joint)) * self.settings.spline.sigma_shape**2
-        boundaries = {}
+        joint, at = self.smoother.covariance(state.map_keys), 0
         for label, boundary in self.boundaries.items():
-            block = state.block(label)
+            block = slice(at, at := at + POINT * boundary.size)
+            covariance = joint[block, block] + shape**2 * np.eye(POINT * boundary.size)
             spline = boundary.spline(self.control_points(label).copy())
-            boundaries[label] = SplineBoundary(spline, joint[block, block])
+            boundaries[label] = SplineBoundary(spline, covariance)
         return Map(self.closed, boundaries)
+
+    # --- the graph ---------------------------------------------------------------------------------------
+
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """The window as GTSAM has it: projection, spacing, smoothness, odometry, your own and prior factors.
+
+        On the keys of `values`: what is active. It shares nothing with the mapper, so optimize it, print its
+        errors, or ask marginals of it with GTSAM's own classes.
+        """
+        return window_graph(self.smoother)
+
+    def values(self) -> gtsam.Values:
+        """The estimate of the window: `Pose2` for poses, points for control points and the calibration."""
+        return self.smoother.variables.gtsam_values(self.smoother.layout.keys)
+
+    def marginal_covariance(self, keys: Sequence[int]) -> Array:
+        """(q, q) joint covariance of any variables (k,) of the map and the window, in the order of the keys.
+
+        Control points (m), poses (x, y, theta) in the map frame (m, m, rad), calibration (-, rad/s).
+        """
+        return self.smoother.covariance(np.array(keys, np.intp))
 
     @staticmethod
     def pose_key(cycle: int) -> int:
@@ -193,39 +243,43 @@ class FixedLagMapper:
         """Key of the pose that the next update adds."""
         return pose_key(self.smoother.next_cycle)
 
+    def control_keys(self, label: int) -> list[int]:
+        """Keys of a boundary's control points. They stay while it grows, and are new ones when it closes."""
+        keys: list[int] = self.smoother.map.state.keys(label).tolist()
+        return keys
+
+    # --- what is known -----------------------------------------------------------------------------------
+
     @property
     def boundaries(self) -> dict[int, Boundary]:
         """The curves by label, without their control points."""
-        return self.smoother.state.boundaries
+        return self.smoother.map.state.boundaries
 
     def control_points(self, label: int) -> Array:
         """Control points (m, 2) of a boundary, map frame, m: a view."""
         self.smoother.refresh()
-        return self.smoother.state.control_points(label)
+        return self.smoother.map.state.control_points(label)
 
     @property
     def poses(self) -> Array:
         """Poses (P, 3) in the window, oldest first, map frame: a view."""
-        return self.smoother.state.poses
+        return self.smoother.variables.poses
 
     @property
     def calibration(self) -> Array:
         """(scale error [-], yaw-rate bias [rad/s]) of the odometry: a view."""
-        return self.smoother.state.calibration
+        return self.smoother.variables.calibration
 
-    @property
-    def state(self) -> Array:
-        """The flat state (n,), see `State`."""
-        return self.smoother.state.vector
 
-    @property
-    def prior(self) -> Prior:
-        """What stands for all that has left the window."""
-        return self.smoother.prior
-
-    def linearize(self) -> list[Rows]:
-        """Whitened rows of all in the window but the prior and the smoothness, at the current estimate."""
-        return self.smoother.linearize()
+def smoother_settings(settings: MapperSettings) -> SmootherSettings:
+    """What the engine is told of the settings."""
+    return SmootherSettings(
+        lag=settings.lag,
+        tolerance_point=settings.relinearize.point,
+        tolerance_heading=settings.relinearize.heading,
+        keyframe_interval=settings.closing.keyframe_interval,
+        sigma_calibration=(settings.odometry.sigma_scale, settings.odometry.sigma_bias),
+    )
 
 
 def _calibration_error(integrated: IntegratedOdometry, calibration: Array) -> Array:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 from pathspace_graph.factors.projection import ProjectionRows, project, sigma_across, to_map
 
 from .boundary import Boundary
+from .curve_map import CurveSmoother
+from .graph.keys import pose_keys
+from .graph.rows import Rows
 from .labels import UNKNOWN
 from .readings import Readings
 from .settings import MapperSettings
-from .smoother import Smoother, Step
 from .state import State
-from .window import POSE
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -25,21 +24,21 @@ SAME_WAY = 0.5
 """Cosine of the angle between a vehicle's heading and the curve beside it, at least."""
 
 
-def admit(smoother: Smoother, retest: frozenset[int]) -> None:
+def admit(smoother: CurveSmoother, retest: frozenset[int]) -> None:
     """Readings that are not in use and lie on a curve: `d^2 < chi^2 (sigma^2 + g' Sigma g)`.
 
     Those of the newest pose, whose stations are found along with them; all in the window of the labels
     `retest`, whose curves have grown. A reading of unknown colour is used only where one curve alone would
     have it.
     """
-    readings, state, gate = smoother.readings, smoother.state, smoother.settings.gate
+    readings, state, gate = smoother.map.readings, smoother.map.state, smoother.map.settings.gate
     rows, curve = _untested(smoother, retest)
-    poses = state.poses[readings.slot[rows]]
+    poses = state.variables.poses_at(readings.cycle[rows])
     points = to_map(readings.point[rows], poses)
     foot = _find(smoother, rows, curve, points)
     if len(rows) == 0 or smoother.last_step is None:
         return
-    covariances, sigma_model = readings.covariance[rows], smoother.settings.spline.sigma_model
+    covariances, sigma_model = readings.covariance[rows], smoother.map.settings.spline.sigma_model
     sigma = sigma_across(foot.normal_unit, covariances, poses, sigma_model)
     variance, unknown = sigma**2 + gate.sigma_floor**2, readings.label[rows] == UNKNOWN
     near, square = foot.interior & (np.abs(foot.distance) < gate.rough), foot.distance**2
@@ -48,15 +47,15 @@ def admit(smoother: Smoother, retest: frozenset[int]) -> None:
     if len(far):  # what the joint uncertainty adds matters to these only
         beside = foot.where(far)
         projected = project(points[far], covariances[far], poses[far], beside, sigma_model)
-        variance[far] += joint_variance(smoother, readings.slot[rows[far]], beside, projected)
+        variance[far] += joint_variance(smoother, readings.cycle[rows[far]], beside, projected)
         passes[far] = square[far] < gate.chi**2 * variance[far]
     _decide(readings, rows[passes], state.curves.labels[curve[passes]], foot.u[passes])
 
 
-def _untested(smoother: Smoother, retest: frozenset[int]) -> tuple[IntArray, IntArray]:
+def _untested(smoother: CurveSmoother, retest: frozenset[int]) -> tuple[IntArray, IntArray]:
     """Readings to be tested, and on which curve (m,) each."""
-    readings, curves = smoother.readings, smoother.state.curves
-    newest = int(readings.slot.searchsorted(len(smoother.times) - 1))
+    readings, curves = smoother.map.readings, smoother.map.state.curves
+    newest = int(readings.cycle.searchsorted(smoother.next_cycle - 1))
     rows = [readings.open_to(label, 0 if label in retest else newest) for label in curves.labels.tolist()]
     return np.concatenate(rows), np.repeat(np.arange(len(rows)), [len(of) for of in rows])
 
@@ -64,21 +63,24 @@ def _untested(smoother: Smoother, retest: frozenset[int]) -> tuple[IntArray, Int
 def _decide(readings: Readings, rows: IntArray, labels: IntArray, u: Array) -> None:
     """What passes is used on the boundary (m,) that takes it; what two would have, on neither."""
     doubtful = readings.used[rows] | (np.bincount(rows)[rows] > 1)
-    readings.used[rows], readings.boundary[rows], readings.u[rows] = True, labels, u
-    readings.used[rows[doubtful]], readings.boundary[rows[doubtful]] = False, UNKNOWN
+    readings.take(rows, labels, u)
+    readings.release(rows[doubtful])
 
 
-def _find(smoother: Smoother, rows: IntArray, curve: IntArray, points: Array) -> FootPoints:
+def _find(smoother: CurveSmoother, rows: IntArray, curve: IntArray, points: Array) -> FootPoints:
     """Foot points of readings, at points (m, 2), on the visible stretch of each one's curve.
 
     In the same search the newest pose gets its station on every curve.
     """
-    state, gate = smoother.state, smoother.settings.gate
+    state, gate = smoother.map.state, smoother.map.settings.gate
     curves, pose = state.curves, state.poses[-1]
     known = np.array([state.stations[label] for label in state.boundaries])
     known = np.append(known, known[:, -1:], axis=1)  # about where the newest pose is
-    behind, ahead = _station_room(state, smoother.settings)
-    seen_from, all_curves = known[curve, smoother.readings.slot[rows]], np.arange(len(known))
+    behind, ahead = _station_room(state, smoother.map.settings)
+    seen_from, all_curves = (
+        known[curve, smoother.map.readings.cycle[rows] - smoother.first_cycle],
+        np.arange(len(known)),
+    )
     foot = curves.find(
         state.map_points,
         np.concatenate([points, np.broadcast_to(pose[:2], (len(known), 2))]),
@@ -103,11 +105,11 @@ def _station_room(state: State, settings: MapperSettings) -> tuple[float, float]
     return gate.station_behind, gate.station_ahead
 
 
-def _sought_again(smoother: Smoother, label: int) -> float:
+def _sought_again(smoother: CurveSmoother, label: int) -> float:
     """Station of a vehicle that the curve runs against, or is far off, where it was looked for."""
     smoother.refresh()
-    state = smoother.state
-    room = smoother.settings.gate.station_room
+    state = smoother.map.state
+    room = smoother.map.settings.gate.station_room
     return relocate(state.boundaries[label], state.control_points(label), state.poses[-1], room)
 
 
@@ -140,48 +142,11 @@ def _append_station(state: State, label: int, u: float) -> None:
     state.stations[label] = np.append(known, u)
 
 
-def joint_variance(smoother: Smoother, slots: IntArray, foot: FootPoints, projected: ProjectionRows) -> Array:
-    """`g_i' Sigma g_i` (m,) in m^2: variance of each row's residual by what is estimated.
-
-    Sigma is that of the last step, which the newest pose wasn't part of: it is reached through its odometry,
-    `g_last = g dx_now/dx_last`, `g_calibration = -g R G`, plus the odometry's own noise.
-    """
-    step, state = smoother.last_step, smoother.state
-    assert step is not None
-    gradient = _control_gradient(foot, projected, step)
-    by_pose, extra = projected.by_pose.copy(), np.zeros(len(slots))
-    newest = slots == len(smoother.times) - 1
-    if newest.any():
-        g = by_pose[newest]
-        local = g @ _rotation(state.poses[-1, 2])
-        odometry: IntegratedOdometry = smoother.odometry[-1]
-        extra[newest] = np.einsum("mi,ij,mj->m", local, odometry.covariance, local)
-        calibration = step.position[state.map_size : state.map_size + CALIBRATION_SIZE]
-        gradient[calibration[:, None], newest] = (-local @ odometry.calibration_jacobian).T
-        dx, dy = state.poses[-1, :2] - state.poses[-2, :2]
-        by_pose[newest, 2] += g[:, 1] * dx - g[:, 0] * dy
-        slots = np.where(newest, slots - 1, slots)
-    columns = step.poses + POSE * (slots + step.dropped)[:, None] + np.arange(POSE)
-    gradient[columns, np.arange(len(slots))[:, None]] += by_pose
-    half, _ = lapack.dtrtrs(step.factor, gradient, lower=1, overwrite_b=1)
-    return np.asarray(np.einsum("im,im->m", half, half)) + extra
-
-
-def _control_gradient(foot: FootPoints, projected: ProjectionRows, step: Step) -> Array:
-    """(n, m) derivative of each residual by the step's system, of which only control points are filled in.
-
-    A reading where the map was far has none: it gets no benefit of the doubt, and waits for the next cycle.
-    """
-    m = len(foot.u)
-    gradient = np.zeros((len(step.factor), m), order="F")
-    place, row = step.position[2 * foot.columns], np.broadcast_to(np.arange(m)[:, None], foot.columns.shape)
-    known = place >= 0
-    gradient[place[known], row[known]] += projected.by_control[:, :, 0][known]
-    gradient[place[known] + 1, row[known]] += projected.by_control[:, :, 1][known]
-    return gradient
-
-
-def _rotation(theta: float) -> Array:
-    """(3, 3) a pose's own tangent to the map frame's (x, y, theta)."""
-    c, s = np.cos(theta), np.sin(theta)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def joint_variance(
+    smoother: CurveSmoother, cycles: IntArray, foot: FootPoints, projected: ProjectionRows
+) -> Array:
+    """`g_i' Sigma g_i` (m,) in m^2: variance of each row's residual by what is estimated, of cycles (m,)."""
+    keys = np.concatenate([pose_keys(cycles)[:, None], smoother.map.state.curves.keys[foot.columns]], axis=1)
+    by_control = projected.by_control.reshape(len(cycles), -1)
+    jacobian = np.concatenate([projected.by_pose, by_control], axis=1)
+    return smoother.predicted(Rows(keys, jacobian, projected.residual, cycles))[:, 0, 0]

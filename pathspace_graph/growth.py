@@ -9,11 +9,11 @@ from pathspace_graph.factors.projection import to_map
 
 from .boundary import Boundary, open_boundary
 from .candidates import SIDES, Candidates, End, chain, undisputed
+from .curve_map import CurveSmoother
 from .labels import BOUNDARIES
 from .path import Way
 from .settings import GrowthSettings
 from .sightings import Sightings
-from .smoother import Smoother
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -26,22 +26,22 @@ class Growth:
         self.settings = settings
         self.sightings = {label: Sightings(settings) for label in BOUNDARIES}
 
-    def sight(self, smoother: Smoother, new: slice, t: float) -> None:
+    def sight(self, smoother: CurveSmoother, new: slice, t: float) -> None:
         """New readings that no curve takes are sightings."""
-        readings = smoother.readings
+        readings = smoother.map.readings
         rows = np.arange(new.start, new.stop)
         rows = rows[~readings.used[rows]]
-        points = to_map(readings.point[rows], smoother.state.poses[readings.slot[rows]])
+        points = to_map(readings.point[rows], smoother.variables.poses_at(readings.cycle[rows]))
         variances = np.trace(readings.covariance[rows], axis1=1, axis2=2)
         for label in BOUNDARIES:
             of = readings.label[rows] == label
             self.sightings[label].add(points[of], variances[of], t)
 
-    def expand(self, smoother: Smoother, way: Way) -> frozenset[int]:
+    def expand(self, smoother: CurveSmoother, way: Way) -> frozenset[int]:
         """Begin each boundary, or lead its end on through what comes next; gives those that were led on."""
         grown = set()
         for label in BOUNDARIES:
-            if label not in smoother.state.boundaries:
+            if label not in smoother.map.state.boundaries:
                 self._begin(smoother, label, way)
             elif self._lead_on(smoother, label, way):
                 grown.add(label)
@@ -52,7 +52,7 @@ class Growth:
         for sightings in self.sightings.values():
             sightings.clear()
 
-    def _candidates(self, smoother: Smoother, label: int, way: Way, end: End | None) -> Candidates:
+    def _candidates(self, smoother: CurveSmoother, label: int, way: Way, end: End | None) -> Candidates:
         """Trusted sightings within reach that follow one another, from an end on where there is one."""
         settings, indices = self.settings, self.sightings[label].confirmed()
         points = self.sightings[label].points[indices]
@@ -71,24 +71,23 @@ class Growth:
         found = found.where(np.argsort(found.stations))
         return found.where(chain(found, settings, end))
 
-    def _begin(self, smoother: Smoother, label: int, way: Way) -> None:
+    def _begin(self, smoother: CurveSmoother, label: int, way: Way) -> None:
         """A new curve through the first sightings."""
         found = self._candidates(smoother, label, way, None)
         if len(found.points) < 2:
             return
-        state, settings = smoother.state, smoother.settings
+        state, settings = smoother.map.state, smoother.map.settings
         u = np.append(0.0, np.cumsum(_lengths(found.points)))
         boundary = open_boundary(settings.spline, settings.gauge)
         control_points = boundary.grow(np.zeros((0, 2)), u, found.points)
-        state.add_boundary(label, boundary)
-        smoother.insert_control_points(label, 0, control_points)
+        state.add_boundary(label, boundary, control_points)
         self._consume(smoother, label, found, u)
         state.stations[label] = np.zeros(len(state.poses))
         _stand_again(smoother, label, 0.0)
 
-    def _lead_on(self, smoother: Smoother, label: int, way: Way) -> bool:
+    def _lead_on(self, smoother: CurveSmoother, label: int, way: Way) -> bool:
         """Extend a curve, from where its cones are in order; True where it has changed."""
-        boundary, settings = smoother.state.boundaries[label], self.settings
+        boundary, settings = smoother.map.state.boundaries[label], self.settings
         kept = in_order(boundary, way, settings)
         if kept == len(boundary.sighted):
             return self._extend(smoother, label, way, settings.end_behind)
@@ -98,7 +97,7 @@ class Growth:
         _stand_again(smoother, label, from_u)
         return True
 
-    def _extend(self, smoother: Smoother, label: int, way: Way, behind: float) -> bool:
+    def _extend(self, smoother: CurveSmoother, label: int, way: Way, behind: float) -> bool:
         """Extend by every sighting that comes next, or carry a stranded end on; True where it grew.
 
         The end is beside the way since so far (m) behind the vehicle.
@@ -114,32 +113,35 @@ class Growth:
             return _carry_on(smoother, label, way, end)
         return False
 
-    def _take_back(self, smoother: Smoother, label: int, kept: int) -> None:
+    def _take_back(self, smoother: CurveSmoother, label: int, kept: int) -> None:
         """Only the first `kept` cones hold a curve: the others are sightings that may lead it on again."""
-        boundary, readings = smoother.state.boundaries[label], smoother.readings
+        boundary, readings = smoother.map.state.boundaries[label], smoother.map.readings
         self.sightings[label].restore(np.array(boundary.sighted[kept:]), smoother.times[-1])
         boundary.take_back(kept)
-        smoother.forget(label, boundary.settled(boundary.size))
+        smoother.forget(smoother.map.state.keys(label)[boundary.settled(boundary.size) :])
         rows = readings.used_on(label)
-        readings.used[rows[readings.u[rows] > boundary.trusted]] = False
+        readings.release(rows[readings.u[rows] > boundary.trusted])
 
-    def _consume(self, smoother: Smoother, label: int, found: Candidates, u: Array) -> None:
+    def _consume(self, smoother: CurveSmoother, label: int, found: Candidates, u: Array) -> None:
         """Sightings that are on the curve, at u (k,), now: their readings update it."""
-        boundary, state, readings = smoother.state.boundaries[label], smoother.state, smoother.readings
+        boundary, state, readings = (
+            smoother.map.state.boundaries[label],
+            smoother.map.state,
+            smoother.map.readings,
+        )
         boundary.sighted.extend(found.points)
         boundary.sighted_u.extend(u.tolist())
         self.sightings[label].remove(found.indices)
         rows = readings.pending(label)
         rows = rows[readings.label[rows] == label]
-        points = to_map(readings.point[rows], state.poses[readings.slot[rows]])
+        points = to_map(readings.point[rows], state.variables.poses_at(readings.cycle[rows]))
         offset = points[:, None, :] - found.points[None]
         radius = self.settings.merge_radius
         near = np.hypot(offset[:, :, 0], offset[:, :, 1]).min(axis=1) < radius
         rows, points = rows[near], points[near]
         low = np.full(len(rows), u[0] - radius)
         high = boundary.believed(np.full(len(rows), np.inf))
-        readings.used[rows] = True
-        readings.u[rows] = boundary.find(state.control_points(label), points, low, high).u
+        readings.take(rows, label, boundary.find(state.control_points(label), points, low, high).u)
 
 
 def in_order(boundary: Boundary, way: Way, settings: GrowthSettings) -> int:
@@ -160,21 +162,21 @@ def in_order(boundary: Boundary, way: Way, settings: GrowthSettings) -> int:
     return first + 1 + int(wrong[0]) if len(wrong) else len(boundary.sighted)
 
 
-def lead(smoother: Smoother, label: int, end: Array, points: Array) -> Array:
+def lead(smoother: CurveSmoother, label: int, end: Array, points: Array) -> Array:
     """Lead a curve from its end (2,) through points (k, 2), parametrized by their distances: u (k,)."""
-    boundary = smoother.state.boundaries[label]
+    boundary = smoother.map.state.boundaries[label]
     u = boundary.confirmed + np.cumsum(_lengths(np.concatenate([end[None], points])))
-    known = smoother.state.control_points(label)
+    known = smoother.map.state.control_points(label)
     control_points = boundary.grow(known.copy(), u, points)
     known[:] = control_points[: len(known)]
     if len(control_points) > len(known):
-        smoother.insert_control_points(label, len(known), control_points[len(known) :])
+        smoother.map.state.extend(label, control_points[len(known) :])
     return np.asarray(u)
 
 
-def _carry_on(smoother: Smoother, label: int, way: Way, end: End) -> bool:
+def _carry_on(smoother: CurveSmoother, label: int, way: Way, end: End) -> bool:
     """The vehicle has passed a stranded end: lead it beside the way nearly as far as the vehicle is."""
-    settings = smoother.settings.growth
+    settings = smoother.map.settings.growth
     side = max(end.side, settings.min_lateral)
     station = way.driven - settings.stranded_left * settings.stranded
     point = way.beside(station, SIDES[label] * side)
@@ -184,9 +186,9 @@ def _carry_on(smoother: Smoother, label: int, way: Way, end: End) -> bool:
     return True
 
 
-def _stand_again(smoother: Smoother, label: int, from_u: float) -> None:
+def _stand_again(smoother: CurveSmoother, label: int, from_u: float) -> None:
     """Stations, on a curve that was led on anew from `from_u` on, of the poses that were past that."""
-    state, boundary = smoother.state, smoother.state.boundaries[label]
+    state, boundary = smoother.map.state, smoother.map.state.boundaries[label]
     stations = state.stations[label]
     late = stations >= from_u
     poses = state.poses[late, :2]
@@ -194,10 +196,10 @@ def _stand_again(smoother: Smoother, label: int, from_u: float) -> None:
     stations[late] = boundary.find(state.control_points(label), poses, low, high).u
 
 
-def _end(smoother: Smoother, label: int, way: Way) -> End:
-    boundary = smoother.state.boundaries[label]
+def _end(smoother: CurveSmoother, label: int, way: Way) -> End:
+    boundary = smoother.map.state.boundaries[label]
     u = np.array([boundary.confirmed])
-    position = boundary.evaluate(smoother.state.control_points(label), u)
+    position = boundary.evaluate(smoother.map.state.control_points(label), u)
     station, lateral = way.locate(position)
     return End(position[0], float(station[0]), SIDES[label] * float(lateral[0]))
 

@@ -19,8 +19,8 @@ BoolArray = NDArray[np.bool_]
 class Readings:
     """Columns of equal length, oldest reading first."""
 
-    slot: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Pose in the window that each was made from, 0 the oldest."""
+    cycle: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
+    """Perception cycle that each was made in."""
     point: Array = field(default_factory=lambda: np.zeros((0, 2)))
     """Reading in the vehicle frame (m)."""
     covariance: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
@@ -33,21 +33,24 @@ class Readings:
     """Its foot point's parameter on that curve, where used."""
     used: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
     """Whether it is a row of the factor graph."""
+    changed: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
+    """Whether it came into use, or went out of it, since its cycle was linearized last."""
 
     def __len__(self) -> int:
-        return len(self.slot)
+        return len(self.cycle)
 
-    def append(self, detections: Detections, slot: int) -> slice:
+    def append(self, detections: Detections, cycle: int) -> slice:
         """Add the readings of one cycle, none used yet; gives their rows."""
         m = len(detections.labels)
         start = len(self)
         new = Readings(
-            np.full(m, slot, np.intp),
+            np.full(m, cycle, np.intp),
             np.asarray(detections.points_vehicle, float),
             np.asarray(detections.covariances, float),
             np.asarray(detections.labels, np.intp),
             np.asarray(detections.labels, np.intp),
             np.zeros(m),
+            np.zeros(m, bool),
             np.zeros(m, bool),
         )
         for column in fields(self):
@@ -56,12 +59,19 @@ class Readings:
             )
         return slice(start, start + m)
 
-    def drop_oldest_pose(self) -> None:
-        """Forget the readings of slot 0; the others move down by one."""
-        keep = self.slot > 0
+    def keep_from(self, cycle: int) -> None:
+        """Forget the readings of earlier cycles."""
+        first = int(self.cycle.searchsorted(cycle))
         for column in fields(self):
-            setattr(self, column.name, getattr(self, column.name)[keep])
-        self.slot = self.slot - 1
+            setattr(self, column.name, getattr(self, column.name)[first:])
+
+    def take(self, rows: IntArray, boundary: IntArray | int, u: Array) -> None:
+        """These readings are in use on a boundary, each with its foot point's parameter."""
+        self.used[rows], self.boundary[rows], self.u[rows], self.changed[rows] = True, boundary, u, True
+
+    def release(self, rows: IntArray) -> None:
+        """These readings are in use no more; the boundary of those without a colour is open again."""
+        self.used[rows], self.boundary[rows], self.changed[rows] = False, self.label[rows], True
 
     def used_on(self, label: int) -> IntArray:
         """Rows in use on the boundary `label`."""

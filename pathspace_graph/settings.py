@@ -243,6 +243,11 @@ class OdometrySettings(Positive):
     sigma_start_heading: float = 1e-5
     """... and its heading (rad): not exactly zero, so that the first pose's information is finite."""
 
+    @property
+    def sigmas_start(self) -> tuple[float, float, float]:
+        """Of the pose at the first odometry stamp: (m, m, rad), one sigma."""
+        return self.sigma_start, self.sigma_start, self.sigma_start_heading
+
 
 @dataclass(frozen=True)
 class FarSettings(Positive):
@@ -252,6 +257,20 @@ class FarSettings(Positive):
     """So much of an open curve behind the vehicle (m) becomes far at once."""
     room: float = 25.0
     """The near part of a closed curve reaches so far beyond what the vehicle sees (m), so that it lasts."""
+
+
+@dataclass(frozen=True)
+class RelinearizeSettings(Positive):
+    """Which factors of the window are linearized anew in a step: those that hold what has moved farther.
+
+    After the loop has closed. Until then all are: an error of linearization is a rotation of the map with a
+    long lever there.
+    """
+
+    point: float = 0.2
+    """A control point, or the position of a pose (m)."""
+    heading: float = 0.02
+    """The heading of a pose (rad)."""
 
 
 @dataclass(frozen=True)
@@ -280,6 +299,8 @@ class MapperSettings(Positive):
     """How the loop closes."""
     far: FarSettings = field(default_factory=FarSettings)
     """What is not solved for in every cycle."""
+    relinearize: RelinearizeSettings = field(default_factory=RelinearizeSettings)
+    """Which factors are linearized anew in a step."""
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     """Calibration of the odometry."""
     batch: BatchSettings = field(default_factory=BatchSettings)

@@ -6,15 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from .boundary import Boundary
 from .cone_knots import thin
+from .curve_map import CurveSmoother
+from .graph.keys import control_keys
 from .knots import BreakSettings, FitSettings, Knots, curvature_weighted_breaks, refit
 from .settings import ClosingSettings, MapperSettings
-from .smoother import Smoother
 from .spline import BSpline
-from .window import Prior, cholesky
 
 Array = NDArray[np.float64]
 
@@ -52,16 +51,16 @@ class Join:
     """(n, m) E."""
 
 
-def simplify(smoother: Smoother) -> None:
+def simplify(smoother: CurveSmoother) -> None:
     """Join every curve, whose end readings already tie to its beginning, and change to the new variables."""
-    state, settings = smoother.state, smoother.settings
+    state, settings = smoother.map.state, smoother.map.settings
     joins = {
         label: join(boundary, state.control_points(label), settings, settings.spline.knots)
         for label, boundary in state.boundaries.items()
     }
     substitute(smoother, joins)
     for _ in range(settings.closing.iterations):
-        smoother.settle()
+        smoother.step(settings.closing.sigma_step)
 
 
 def join(boundary: Boundary, control_points: Array, settings: MapperSettings, knots: Knots) -> Join:
@@ -131,57 +130,16 @@ def _on_beginning(boundary: Boundary, control_points: Array, u: Array, room: flo
     return w
 
 
-def substitute(smoother: Smoother, joins: dict[int, Join]) -> None:
-    """`x_old = M x_new`, so `L <- M' L M` and `g <- M' (g - L (M x_new - x0))`: closed curves for open.
-
-    Less what the old control points being a little off that takes from both.
-    """
-    prior, state = smoother.prior, smoother.state
-    q, n_old = len(prior.point), state.map_size
-    change = _change(smoother, joins)
-    points = np.concatenate([j.points.ravel() for j in joins.values()])
-    point = np.concatenate([points, state.vector[n_old:q]])
-    descent = prior.gradient - prior.information @ (change @ point - prior.point)
-    onto_new = np.column_stack([prior.information @ change, descent])
-    sigma = smoother.settings.spline.sigma_simplify
-    reduced = change.T @ onto_new - _slack(prior.information[:n_old, :n_old], onto_new[:n_old], sigma)
-    smoother.prior = Prior(reduced[:, :-1], reduced[:, -1], point)
-    state.vector = np.concatenate([points, state.vector[n_old:]])
+def substitute(smoother: CurveSmoother, joins: dict[int, Join]) -> None:
+    """Closed curves for open ones, `C_old = E C_new`, in the graph, the readings and the stations."""
+    state, readings = smoother.map.state, smoother.map.readings
     for label, new in joins.items():
-        _replace(smoother, label, new)
-
-
-def _change(smoother: Smoother, joins: dict[int, Join]) -> Array:
-    """M (q, q'): E on each boundary's control points, the identity on the rest of the prior."""
-    state = smoother.state
-    n_old, n_new = state.map_size, 2 * sum(len(j.points) for j in joins.values())
-    rest = len(smoother.prior.point) - n_old
-    change = np.zeros((n_old + rest, n_new + rest))
-    change[n_old:, n_new:] = np.eye(rest)
-    at = 0
-    for label, new in joins.items():
-        size = 2 * len(new.points)
-        change[state.block(label), at : at + size] = np.kron(new.old_from_new, np.eye(2))
-        at += size
-    return change
-
-
-def _slack(information: Array, onto_new: Array, sigma: float) -> Array:
-    """What is known less, since the old control points M may be off `E C_new` by sigma (m).
-
-    `A_M' (I / sigma^2 + L_MM)^-1 A_M` (k, k + 1), L_MM `information` (n, n) and A_M `onto_new` (n, k + 1):
-    their rows of `[L M | -gradient]` (Woodbury).
-    """
-    half = cholesky(information + np.eye(len(information)) / sigma**2)
-    root, _ = lapack.dtrtrs(half, onto_new, lower=1)
-    root = np.ascontiguousarray(root)
-    return np.asarray(root[:, :-1].T @ root)
-
-
-def _replace(smoother: Smoother, label: int, new: Join) -> None:
-    """The closed boundary takes the open one's place, for its readings and stations too."""
-    state, readings = smoother.state, smoother.readings
-    state.boundaries[label] = state.boundaries[label].closed(new.knots)
-    rows = readings.used_on(label)
-    readings.u[rows] = new.overlap.new_parameter(readings.u[rows])
-    state.stations[label] = new.overlap.new_parameter(state.stations[label])
+        old_keys, rows = state.keys(label), readings.used_on(label)
+        boundary = state.boundaries[label].closed(new.knots)
+        new_keys = control_keys(label, boundary.numbers)
+        smoother.substitute(
+            old_keys, new_keys, new.points, new.old_from_new, smoother.map.settings.spline.sigma_simplify
+        )
+        state.boundaries[label] = boundary
+        readings.take(rows, label, new.overlap.new_parameter(readings.u[rows]))
+        state.stations[label] = new.overlap.new_parameter(state.stations[label])

@@ -11,8 +11,7 @@ from pathspace_graph.batch import own_settings
 from pathspace_graph.batch_data import Chain, collect_readings, integrate_log
 from pathspace_graph.batch_dead_reckoning import start_odometry
 from pathspace_graph.batch_gating import associate, locate_poses
-from pathspace_graph.batch_kernel import Biweight
-from pathspace_graph.batch_system import BatchSystem, moved
+from pathspace_graph.batch_system import BatchSystem, Biweight, moved
 from pathspace_graph.settings import MapperSettings
 from pathspace_graph.state import State
 from tests.scenes import ahead, corridor, exact_log
@@ -40,7 +39,7 @@ def straight(seconds: float = 6.0, smoothness: float = SMOOTHNESS) -> tuple[Batc
     system.begin(state)
     locate_poses(state)
     associate(state, readings, settings, settings.batch.gate, True)
-    system.hold_sigmas(state)
+    system.evaluate(state, hold=True)
     return system, settled(system, state)
 
 
@@ -50,8 +49,8 @@ def settled(system: BatchSystem, state: State, steps: int = 4) -> State:
         at = system.evaluate(state)
         for projected in at.projected.values():
             system.readings.u[projected.rows] = projected.foot.u
-        step = system.normal_equations(at).reduced().step(np.zeros((state.pose_column(0),) * 2))
-        state = moved(state, *step)
+        problem = system.eliminated(at)
+        state = moved(state, problem.step(np.zeros(problem.map.size)))
     return state
 
 

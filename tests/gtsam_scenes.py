@@ -18,13 +18,15 @@ from pathspace_graph.factors.gtsam_factors import (
     spacing_factors,
     spline_projection_factor,
 )
-from pathspace_graph.factors.linear_graph import CALIBRATION_KEY
 from pathspace_graph.factors.odometry import IntegratedOdometry, compose, integrate_twists, odometry_residuals
 from pathspace_graph.factors.projection import huber_weights, project, to_map
 from pathspace_graph.factors.spans import SpanPolynomials
-from pathspace_graph.window import POSE, Rows, accumulate, cholesky, solve
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+Rows = tuple[IntArray, Array, Array]
+"""Columns (m, k) of each whitened row, its derivatives (m, k) there, and the residuals (m,)."""
 
 SPACING, DEGREE, SIZE = 3.5, 3, 11
 """Knot interval (m), degree and control points of each boundary."""
@@ -136,7 +138,7 @@ def reading_rows(scene: Scene, label: int, state: Array) -> Rows:
         np.stack([base, base + 1], 2).reshape(len(u), -1),
     ]
     jacobian = np.concatenate([lin.by_pose, by_control], axis=1) * weight[:, None]
-    return Rows(np.concatenate(columns, axis=1), jacobian, lin.residual * weight)
+    return np.concatenate(columns, axis=1), jacobian, lin.residual * weight
 
 
 def gauge_rows(scene: Scene, label: int, state: Array) -> list[Rows]:
@@ -144,14 +146,12 @@ def gauge_rows(scene: Scene, label: int, state: Array) -> list[Rows]:
     control, base = scene.control(label, state), 2 * SIZE * label
     residual, direction = spacing_residuals(control, np.full(SIZE - 1, SPACING), False)
     first = base + 2 * np.arange(SIZE - 1)[:, None] + np.arange(4)
-    spacing = Rows(
-        first, np.concatenate([-direction, direction], 1) / SIGMA_SPACING, residual / SIGMA_SPACING
-    )
+    spacing = first, np.concatenate([-direction, direction], 1) / SIGMA_SPACING, residual / SIGMA_SPACING
     D = np.kron(smooth(), np.eye(2)) / SIGMA_SMOOTHNESS
     columns = np.tile(base + np.arange(2 * SIZE), (len(D), 1))
     offset = (control - scene.control(label, scene.state)).ravel() / SIGMA_ANCHOR
-    anchors = Rows(base + np.arange(2 * SIZE)[:, None], np.full((2 * SIZE, 1), 1.0 / SIGMA_ANCHOR), offset)
-    return [spacing, Rows(columns, D, D @ control.ravel()), anchors]
+    anchors = base + np.arange(2 * SIZE)[:, None], np.full((2 * SIZE, 1), 1.0 / SIGMA_ANCHOR), offset
+    return [spacing, (columns, D, D @ control.ravel()), anchors]
 
 
 def smooth() -> Array:
@@ -171,7 +171,7 @@ def odometry_rows(scene: Scene, state: Array) -> Rows:
     poses_columns = MAP + 2 + POSE * np.arange(m)[:, None] + np.arange(2 * POSE)
     columns = np.concatenate([np.tile([MAP, MAP + 1], (m, 1)), poses_columns], axis=1)
     whitened = np.einsum("mij,mj->mi", whiteners, residual)
-    return Rows(np.repeat(columns, POSE, axis=0), jacobian.reshape(m * POSE, -1), whitened.ravel())
+    return np.repeat(columns, POSE, axis=0), jacobian.reshape(m * POSE, -1), whitened.ravel()
 
 
 def prior_rows_of(scene: Scene, state: Array) -> list[Rows]:
@@ -179,10 +179,8 @@ def prior_rows_of(scene: Scene, state: Array) -> list[Rows]:
     calibration = MAP + np.arange(2)[:, None]
     start = MAP + 2 + np.arange(POSE)[:, None]
     return [
-        Rows(calibration, 1.0 / SIGMA_CALIBRATION[:, None], state[MAP : MAP + 2] / SIGMA_CALIBRATION),
-        Rows(
-            start, np.full((POSE, 1), 1.0 / SIGMA_START), (scene.poses(state)[0] - scene.start) / SIGMA_START
-        ),
+        (calibration, 1.0 / SIGMA_CALIBRATION[:, None], state[MAP : MAP + 2] / SIGMA_CALIBRATION),
+        (start, np.full((POSE, 1), 1.0 / SIGMA_START), (scene.poses(state)[0] - scene.start) / SIGMA_START),
     ]
 
 
@@ -252,13 +250,33 @@ def solve_window(scene: Scene, iterations: int = 25) -> Array:
     """Gauss-Newton on the kernels' rows, relinearized at every step."""
     state = scene.state
     for _ in range(iterations):
-        state = state + solve(*system(scene, state))
+        state = state + np.linalg.solve(*system(scene, state))
     return state
 
 
 def system(scene: Scene, state: Array) -> tuple[Array, Array]:
-    hessian, descent = accumulate(all_rows(scene, state), len(state))
-    return cholesky(hessian), descent
+    """`J' J` and `-J' r` of all rows."""
+    J, r = dense(all_rows(scene, state), len(state))
+    return J.T @ J, -J.T @ r
+
+
+def dense(groups: list[Rows], size: int) -> tuple[Array, Array]:
+    """J (m, size) and r (m,) of all rows."""
+    matrices = []
+    for columns, jacobian, _ in groups:
+        J = np.zeros((len(columns), size))
+        np.put_along_axis(J, columns, jacobian, axis=1)
+        matrices.append(J)
+    return np.concatenate(matrices), np.concatenate([residual for *_, residual in groups])
+
+
+def in_tangents(scene: Scene, state: Array, J: Array) -> Array:
+    """The same with each pose's columns by its own axes, as the tangent of `gtsam.Pose2` has them."""
+    turned = J.copy()
+    for k, pose in enumerate(scene.poses(state)):
+        x, c, s = MAP + 2 + POSE * k, np.cos(pose[2]), np.sin(pose[2])
+        turned[:, x : x + 2] = J[:, x : x + 2] @ np.array([[c, -s], [s, c]])
+    return turned
 
 
 def curves(scene: Scene, state: Array) -> Array:

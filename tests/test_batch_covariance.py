@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.arrowhead import Reduced
-from pathspace_graph.batch_system import BatchSystem
+from pathspace_graph.batch_knots import map_block
+from pathspace_graph.graph.elimination import Elimination
 from pathspace_graph.state import State
 from tests.batch_scenes import drawn, settled, straight
 
@@ -23,21 +23,21 @@ SITES = np.arange(5.0, 33.0, 9.0)
 def errors() -> tuple[Array, Array, Array, Array]:
     """Errors of the curves across themselves (d, 2 k) and of the last pose (d, 3), and what is claimed."""
     system, truth = straight()
-    claimed = system.normal_equations(system.evaluate(truth)).reduced()
+    claimed = system.eliminated(system.evaluate(truth))
     rng = np.random.default_rng(7)
     curves, poses = [], []
     for _ in range(DRAWS):
         noisy, _ = drawn(system, rng)
         noisy.begin(truth)
-        noisy.hold_sigmas(truth)
+        noisy.evaluate(truth, hold=True)
         state = settled(noisy, truth, 2)
         curves.append(across(state, truth))
         poses.append(state.poses[-1] - truth.poses[-1])
     return (
         np.array(curves),
         np.array(poses),
-        curve_covariance(system, truth, claimed),
-        pose_covariance(claimed),
+        curve_covariance(truth, claimed),
+        claimed.pose_marginals[-1],
     )
 
 
@@ -50,20 +50,15 @@ def across(state: State, truth: State) -> Array:
     return np.concatenate([offset[:, 1] for offset in offsets])
 
 
-def curve_covariance(system: BatchSystem, truth: State, claimed: Reduced) -> Array:
-    joint = claimed.border_covariance()
+def curve_covariance(truth: State, claimed: Elimination) -> Array:
+    joint = claimed.joint(truth.map_keys)
     rows = []
     for b, boundary in truth.boundaries.items():
-        basis = boundary.spline(truth.control_points(b)).basis_matrix(SITES)
         design = np.zeros((len(SITES), len(joint)))
-        design[:, truth.offset(b) + 1 : truth.offset(b) + 2 * boundary.size : 2] = basis
+        design[:, map_block(truth, b)][:, 1::2] = boundary.spline(truth.control_points(b)).basis_matrix(SITES)
         rows.append(design)
     B = np.concatenate(rows)
     return np.asarray(B @ joint @ B.T)
-
-
-def pose_covariance(claimed: Reduced) -> Array:
-    return np.asarray(claimed.pose_marginals()[-1])
 
 
 def mean_nees(samples: Array, covariance: Array) -> float:

@@ -17,12 +17,12 @@ Array = NDArray[np.float64]
 @cache
 def scene() -> tuple[State, CurveGauge]:
     _, state = straight()
-    return state, curve_gauge(state.boundaries[0], state.control_points(0), state.poses, 0.2)
+    return state, curve_gauge(state, 0, 0.2)
 
 
 def test_it_begins_at_rest() -> None:
     state, gauge = scene()
-    np.testing.assert_allclose(gauge.beside(state.control_points(0), state.poses, 0).residual, 0.0, atol=1e-9)
+    np.testing.assert_allclose(gauge.beside(state.control_points(0), state.poses).residual, 0.0, atol=1e-9)
 
 
 def test_each_control_point_is_held_beside_the_nearest_pose() -> None:
@@ -32,7 +32,7 @@ def test_each_control_point_is_held_beside_the_nearest_pose() -> None:
     x = boundary.evaluate(state.control_points(0), boundary.abscissae)[:, 0]
     there = (x > poses[0, 0]) & (x < poses[-1, 0])
     assert there.sum() > 3
-    assert np.abs(x[there] - poses[gauge.slot[there], 0]).max() < 0.31
+    assert np.abs(x[there] - poses[gauge.cycle[there], 0]).max() < 0.31
 
 
 def test_its_jacobians_are_its_derivatives() -> None:
@@ -40,19 +40,29 @@ def test_its_jacobians_are_its_derivatives() -> None:
     rng = np.random.default_rng(0)
     points = state.control_points(0) + rng.normal(0.0, 0.5, state.control_points(0).shape)
     poses = state.poses + rng.normal(0.0, 0.3, state.poses.shape)
-    rows, h = gauge.beside(points, poses, 0), 1e-6
+    rows, h = gauge.beside(points, poses), 1e-6
     for k in range(3):
         step = h * np.eye(3)[k]
-        slope = (
-            gauge.beside(points, poses + step, 0).residual - gauge.beside(points, poses - step, 0).residual
-        )
-        np.testing.assert_allclose(rows.by_pose[:, k], slope / (2.0 * h), atol=1e-6)
+        slope = gauge.beside(points, poses + step).residual - gauge.beside(points, poses - step).residual
+        np.testing.assert_allclose(rows.jacobian[:, 2 + k], slope / (2.0 * h), atol=1e-6)
     for k in range(2):
         step = h * np.eye(2)[k]
-        slope = (
-            gauge.beside(points + step, poses, 0).residual - gauge.beside(points - step, poses, 0).residual
-        )
-        np.testing.assert_allclose(rows.by_border[:, k], slope / (2.0 * h), atol=1e-6)
+        slope = gauge.beside(points + step, poses).residual - gauge.beside(points - step, poses).residual
+        np.testing.assert_allclose(rows.jacobian[:, k], slope / (2.0 * h), atol=1e-6)
+
+
+def test_smoothness_is_of_second_differences() -> None:
+    """Its rows make its cost, and are theirs of whom they name."""
+    state, gauge = scene()
+    rng = np.random.default_rng(1)
+    points = state.control_points(0) + rng.normal(0.0, 0.5, state.control_points(0).shape)
+    rows, place = gauge.smooth(points), {key: k for k, key in enumerate(gauge.keys.tolist())}
+    near = np.array([[place[key] for key in row] for row in rows.keys.tolist()])
+    linear = (rows.jacobian * points[near].reshape(len(rows), -1)).sum(axis=1)
+    np.testing.assert_allclose(linear, rows.residual, atol=1e-9)
+    beside = gauge.beside(points, state.poses).residual
+    cost = 0.5 * (beside @ beside + rows.residual @ rows.residual)
+    np.testing.assert_allclose(gauge.cost(points, state.poses), cost)
 
 
 def test_a_map_that_moves_with_its_drive_costs_nothing() -> None:
@@ -62,7 +72,7 @@ def test_a_map_that_moves_with_its_drive_costs_nothing() -> None:
     rotation, shift = np.array([[c, -s], [s, c]]), np.array([3.0, -5.0])
     points = state.control_points(0) @ rotation.T + shift
     poses = np.column_stack([state.poses[:, :2] @ rotation.T + shift, state.poses[:, 2] + 0.7])
-    np.testing.assert_allclose(gauge.beside(points, poses, 0).residual, 0.0, atol=1e-9)
+    np.testing.assert_allclose(gauge.beside(points, poses).residual, 0.0, atol=1e-9)
     np.testing.assert_allclose(
         gauge.cost(points, poses), gauge.cost(state.control_points(0), state.poses), atol=1e-6
     )

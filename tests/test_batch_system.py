@@ -1,25 +1,27 @@
-"""The whole log's problem: gradients against the cost, steps against GTSAM."""
+"""The whole log's problem: its losses, gradients against the cost, steps and covariances against GTSAM's."""
 
 from __future__ import annotations
 
 from functools import cache
 
-import gtsam
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch import own_settings
 from pathspace_graph.batch_data import Chain, collect_readings, integrate_log
 from pathspace_graph.batch_dead_reckoning import start_odometry
 from pathspace_graph.batch_gating import associate, locate_poses
-from pathspace_graph.batch_kernel import Kernel
-from pathspace_graph.batch_system import BatchSystem, Evaluation, linear_graph_of, moved
-from pathspace_graph.factors.linear_graph import window_keys
+from pathspace_graph.batch_optimizer import gradient_norm
+from pathspace_graph.batch_system import BatchSystem, Biweight, Kernel, moved
+from pathspace_graph.graph.keys import pose_key
 from pathspace_graph.settings import MapperSettings
 from pathspace_graph.state import State
 from tests.scenes import bean_track, lap_log, true_poses
 
 Array = NDArray[np.float64]
+
+KERNELS = [Kernel(gate=3.0, huber=1.5), Biweight(4.0)]
 
 
 @cache
@@ -33,22 +35,11 @@ def small_system() -> tuple[BatchSystem, State]:
     state = start_odometry(chain, readings, settings)
     system = BatchSystem(readings, chain, settings, Kernel(settings.gate.chi, settings.gate.huber))
     system.begin(state)
-    state.vector = state.vector + np.random.default_rng(2).normal(0.0, 0.01, len(state.vector))
+    state = moved(state, np.random.default_rng(2).normal(0.0, 0.01, state.variables.layout.size))
     locate_poses(state)
     associate(state, readings, settings, 8.0, False)
-    system.hold_sigmas(state)
+    system.evaluate(state, hold=True)
     return system, state
-
-
-def turn(theta: float) -> Array:
-    """(3, 3) from GTSAM's tangent of a pose to (x, y, theta) in the map frame."""
-    c, s = np.cos(theta), np.sin(theta)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def split(state: State, vector: Array) -> tuple[Array, Array]:
-    n = state.pose_column(0)
-    return vector[n:], vector[:n]
 
 
 def test_dead_reckoning_of_an_exact_log_is_the_truth() -> None:
@@ -59,49 +50,72 @@ def test_dead_reckoning_of_an_exact_log_is_the_truth() -> None:
 
 def test_the_gradient_is_that_of_the_cost() -> None:
     system, state = small_system()
-    equations = system.normal_equations(system.evaluate(state))
-    gradient = -np.concatenate([equations.descent_border, equations.descent_poses])
+    at, layout = system.evaluate(state), state.variables.layout
+    information, descent = system.linear_graph(at).hessian(layout.ordering)
     rng = np.random.default_rng(5)
     for _ in range(5):
-        direction = rng.normal(size=len(gradient))
+        direction = rng.normal(size=layout.size)
         h = 1e-5
-        costs = [system.evaluate(moved(state, *split(state, s * h * direction))).cost for s in (1.0, -1.0)]
+        costs = [system.evaluate(moved(state, s * h * direction)).cost for s in (1.0, -1.0)]
         slope = (costs[0] - costs[1]) / (2.0 * h)
-        np.testing.assert_allclose(gradient @ direction, slope, rtol=1e-4)
+        np.testing.assert_allclose(-descent @ direction, slope, rtol=1e-4)
+    norm = np.linalg.norm(descent / np.sqrt(np.diagonal(information)))
+    np.testing.assert_allclose(gradient_norm(system.rows(at), layout), norm)
 
 
 def test_the_step_is_that_of_gtsam() -> None:
     """A map of 30 to 40 control points and some hundred poses as one Gaussian factor graph."""
     system, state = small_system()
-    at: Evaluation = system.evaluate(state)
-    n = state.pose_column(0)
-    step_poses, step_border = system.normal_equations(at).reduced().step(np.zeros((n, n)))
-    graph, keys = linear_graph_of(system, at)
-    solution = graph.optimize()
-    values = np.concatenate([solution.at(key) for key in keys.keys])
-    poses = values[n:].reshape(-1, 3)
-    turned = np.stack([turn(theta) @ pose for theta, pose in zip(state.poses[:, 2], poses, strict=True)])
-    np.testing.assert_allclose(step_border, values[:n], atol=1e-9)
-    np.testing.assert_allclose(step_poses, turned.ravel(), atol=1e-9)
+    at, keys = system.evaluate(state), state.variables.keys.tolist()
+    problem = system.eliminated(at)
+    solution = system.linear_graph(at).optimize().vector(keys)
+    np.testing.assert_allclose(problem.step(np.zeros(problem.map.size)), solution, atol=1e-9)
+
+
+def test_poses_alone_move_as_beside_a_map_that_is_held() -> None:
+    system, state = small_system()
+    at = system.evaluate(state)
+    problem = system.eliminated(at)
+    held = problem.beside(np.zeros(problem.map.size))
+    np.testing.assert_allclose(system.poses_alone(at), held, atol=1e-9)
 
 
 def test_pose_marginals_are_those_of_gtsam() -> None:
     system, state = small_system()
     at = system.evaluate(state)
-    marginals = system.normal_equations(at).reduced().pose_marginals()
-    graph, keys = linear_graph_of(system, at)
-    n = len(keys.keys) - len(state.poses)
+    marginals = system.eliminated(at).pose_marginals
+    graph = system.linear_graph(at)
     for k in (0, len(state.poses) // 2, len(state.poses) - 1):
-        information = graph.marginal([keys.keys[n + k]]).hessian()[0]
-        rotation = turn(state.poses[k, 2])
-        expected = rotation @ np.linalg.inv(information) @ rotation.T
-        np.testing.assert_allclose(marginals[k], expected, rtol=1e-6, atol=1e-12)
+        information = graph.marginal([pose_key(k)]).hessian()[0]
+        np.testing.assert_allclose(marginals[k], np.linalg.inv(information), rtol=1e-6, atol=1e-12)
 
 
-def test_keys_name_every_entry() -> None:
-    system, state = small_system()
-    _, keys = linear_graph_of(system, system.evaluate(state))
-    sizes = tuple(state.boundaries[b].size for b in (0, 1))
-    assert keys.keys == window_keys((sizes[0], sizes[1]), 2, state.poses).keys
-    assert int(sum(keys.dims)) == len(state.vector)
-    assert isinstance(linear_graph_of(system, system.evaluate(state))[0], gtsam.GaussianFactorGraph)
+def test_a_step_of_the_poses_leaves_the_rest() -> None:
+    _, state = small_system()
+    step = np.ones(state.poses.size)
+    after = moved(state, step)
+    np.testing.assert_array_equal(after.poses, state.poses + 1.0)
+    np.testing.assert_array_equal(after.map_points, state.map_points)
+    np.testing.assert_array_equal(after.calibration, state.calibration)
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=["huber", "biweight"])
+def test_the_weight_is_the_slope_of_the_loss(kernel: Kernel) -> None:
+    z = np.linspace(-6.0, 6.0, 42)
+    h = 1e-5
+    slope = (kernel.loss(z + h) - kernel.loss(z - h)) / (2.0 * h)
+    np.testing.assert_allclose(kernel.weights(z) * z, slope, atol=1e-5)
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=["huber", "biweight"])
+def test_near_zero_the_loss_is_half_the_square(kernel: Kernel) -> None:
+    z = np.array([-0.01, 0.0, 0.01])
+    np.testing.assert_allclose(kernel.loss(z), 0.5 * z**2, rtol=1e-4)
+    np.testing.assert_allclose(kernel.ceiling, kernel.loss(np.array([kernel.gate]))[0])
+
+
+def test_beyond_the_gate_the_biweight_is_flat() -> None:
+    kernel = Biweight(4.0)
+    np.testing.assert_allclose(kernel.loss(np.array([4.0, 5.0, 50.0])), kernel.ceiling)
+    np.testing.assert_array_equal(kernel.weights(np.array([-4.0, 4.0, 50.0])), 0.0)
+    assert kernel.weights(np.array([3.99]))[0] < 1e-4

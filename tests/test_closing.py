@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -14,13 +13,16 @@ from pathspace_graph.eval.metrics import cone_distances
 from pathspace_graph.factors.projection import to_map
 from pathspace_graph.fixed_lag import CycleResult, FixedLagMapper
 from pathspace_graph.gating import relocate
+from pathspace_graph.graph.gaussian import keys_of, normal_equations
+from pathspace_graph.graph.keys import control_keys
+from pathspace_graph.graph.variables import Layout
 from pathspace_graph.knots import Knots
 from pathspace_graph.labels import LEFT
 from pathspace_graph.log import Log
 from pathspace_graph.map import SplineBoundary
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings import ClosingSettings, MapperSettings
-from pathspace_graph.simplification import join, substitute
+from pathspace_graph.simplification import Join, join, substitute
 
 from .scenes import ODOMETRY_SIGMA, ahead, bean_track, corridor, exact_log, lap_log, map_log, true_poses
 
@@ -38,9 +40,9 @@ def run(log: Log) -> tuple[FixedLagMapper, list[CycleResult]]:
     return map_log(log)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def before(log: Log, run: tuple[FixedLagMapper, list[CycleResult]]) -> FixedLagMapper:
-    """The mapper a cycle before it closed; copy it to change it."""
+    """The mapper a cycle before it closed; each test has its own."""
     cycle = next(k for k, result in enumerate(run[1]) if result.closed)
     mapper, results = map_log(replace(log, cycles=log.cycles[:cycle]))
     assert not results[-1].closed
@@ -116,30 +118,44 @@ def test_closing_leaves_the_pose_where_it_is(log: Log, run: tuple[FixedLagMapper
 def test_readings_in_use_lie_on_the_closed_curve(when: str, request: pytest.FixtureRequest) -> None:
     mapper = request.getfixturevalue(when)
     mapper = mapper[0] if isinstance(mapper, tuple) else mapper
-    readings = mapper.smoother.readings
+    readings = mapper.smoother.map.readings
     for label, boundary in mapper.boundaries.items():
         rows = readings.used_on(label)
         assert len(rows) > 20
-        points = to_map(readings.point[rows], mapper.poses[readings.slot[rows]])
+        points = to_map(readings.point[rows], mapper.smoother.variables.poses_at(readings.cycle[rows]))
         on_curve = boundary.evaluate(mapper.control_points(label), readings.u[rows])
         distances = np.hypot(*(points - on_curve).T)
         assert np.median(distances) < 0.15
         assert distances.max() < 0.6
+        foot = boundary.refine(mapper.control_points(label), points, readings.u[rows])
+        assert foot.interior.all()
+        assert np.median(np.abs(foot.distance)) < 0.02
+        assert np.abs(foot.distance).max() < 0.1
 
 
-def registered(before: FixedLagMapper, theta: float, shift: Array) -> tuple[FixedLagMapper, Registration]:
-    """A mapper whose window has drifted by a rigid motion about the vehicle, and how it is found back.
+def covariance_of(mapper: FixedLagMapper) -> Array:
+    """(3, 3) of the newest pose."""
+    return mapper.marginal_covariance([mapper.pose_key(mapper.smoother.next_cycle - 1)])
+
+
+def registered(mapper: FixedLagMapper, theta: float, shift: Array) -> Registration:
+    """The window of a mapper drifts by a rigid motion about the vehicle; how it is found back.
 
     How certain the position along the track is doesn't matter here.
     """
-    mapper = deepcopy(before)
     c, s = np.cos(theta), np.sin(theta)
     centre = mapper.poses[-1, :2].copy()
     mapper.poses[:, :2] = (mapper.poses[:, :2] - centre) @ np.array([[c, s], [-s, c]]) + centre + shift
     mapper.poses[:, 2] += theta
-    registration = register(mapper.smoother, mapper.path.beginning, ClosingSettings(sigma_max=10.0))
+    registration = register(
+        mapper.smoother.map,
+        mapper.smoother.times,
+        covariance_of(mapper),
+        mapper.path.beginning,
+        ClosingSettings(sigma_max=10.0),
+    )
     assert registration is not None
-    return mapper, registration
+    return registration
 
 
 @pytest.mark.parametrize(
@@ -149,14 +165,16 @@ def test_a_drifted_window_is_registered_back(
     before: FixedLagMapper, theta: float, shift: tuple[float, float]
 ) -> None:
     """Across the track by the readings; along it as far as the curve's bends tell."""
-    mapper, registration = registered(before, theta, np.array(shift))
+    mapper, poses_before = before, before.poses.copy()
+    registration = registered(mapper, theta, np.array(shift))
     assert registration.motion.vector[2] == pytest.approx(-theta, abs=0.02)
     moved = registration.motion.apply(mapper.poses[:, :2])
-    np.testing.assert_allclose(moved, before.poses[:, :2], atol=0.3)
-    readings = mapper.smoother.readings
+    np.testing.assert_allclose(moved, poses_before[:, :2], atol=0.3)
+    readings = mapper.smoother.map.readings
     for label, (rows, u) in registration.matches.items():
         assert (readings.label[rows] == label).all()
-        points = registration.motion.apply(to_map(readings.point[rows], mapper.poses[readings.slot[rows]]))
+        poses = mapper.smoother.variables.poses_at(readings.cycle[rows])
+        points = registration.motion.apply(to_map(readings.point[rows], poses))
         on_curve = mapper.boundaries[label].evaluate(mapper.control_points(label), u)
         distances = np.hypot(*(points - on_curve).T)
         assert np.median(distances) < 0.1
@@ -165,9 +183,8 @@ def test_a_drifted_window_is_registered_back(
 
 def test_knots_by_the_cones_are_nearer_to_them_than_knots_by_curvature(before: FixedLagMapper) -> None:
     """Of the same number of control points, and where a cone asks for one."""
-    mapper = deepcopy(before)
-    mapper.smoother.join()
-    state, settings = mapper.smoother.state, mapper.settings
+    before.smoother.reactivate()
+    state, settings = before.smoother.map.state, before.settings
     kinds: tuple[Knots, Knots] = ("cones", "curvature")
     for label, boundary in state.boundaries.items():
         points = state.control_points(label)
@@ -180,39 +197,55 @@ def test_knots_by_the_cones_are_nearer_to_them_than_knots_by_curvature(before: F
         assert np.sqrt(np.mean(off[0] ** 2)) < 0.8 * np.sqrt(np.mean(off[1] ** 2))
 
 
-def prior_energy(mapper: FixedLagMapper, x: Array) -> float:
-    d = x - mapper.prior.point
-    return float(0.5 * d @ mapper.prior.information @ d - mapper.prior.gradient @ d)
+def prior_system(mapper: FixedLagMapper) -> tuple[Layout, Array, Array]:
+    """`1/2 d' L d - g' d` of the prior, d = value - reference."""
+    layout = Layout(keys_of(mapper.smoother.prior))
+    return layout, *normal_equations(mapper.smoother.prior, layout)
 
 
-def test_an_exact_change_of_variables_keeps_the_priors_energy(before: FixedLagMapper) -> None:
-    """`C_old = E C_new`: the same energy at every curve of the new space, to a constant."""
-    mapper = deepcopy(before)
-    mapper.smoother.join()
-    spline = replace(mapper.settings.spline, sigma_simplify=1e-9)
-    mapper.smoother.settings = settings = replace(mapper.settings, spline=spline)
-    old, state = deepcopy(mapper), mapper.smoother.state
-    joins = {
-        b: join(curve, state.control_points(b), settings, "cones") for b, curve in state.boundaries.items()
-    }
-    substitute(mapper.smoother, joins)
-    q_old, q_new = len(old.prior.point), len(mapper.prior.point)
-    shared = q_old - old.smoother.state.map_size
-    assert q_new == state.map_size + shared
-    rng = np.random.default_rng(0)
-    energies = []
-    for _ in range(4):
-        new = mapper.prior.point + 0.1 * rng.normal(size=q_new)
-        points, at = [], 0
-        for label, change in joins.items():
-            size = mapper.boundaries[label].size
-            points.append(change.old_from_new @ new[at : at + 2 * size].reshape(-1, 2))
-            at += 2 * size
-        x = np.concatenate([np.concatenate(points).ravel(), new[at:]])
-        energies.append((prior_energy(old, x), prior_energy(mapper, new)))
-    difference = np.diff(np.array(energies), axis=1).ravel()
-    scale = np.abs(energies).max()
-    np.testing.assert_allclose(difference - difference[0], 0.0, atol=1e-7 * scale)
+def change_of_variables(
+    mapper: FixedLagMapper, joins: dict[int, Join], old: Layout, new: Layout
+) -> tuple[Array, Array]:
+    """`x_old = T x_new`, where what the curves don't hold stays as it is; and which entries are a curve's."""
+    matrix, curves = np.zeros((old.size, new.size)), np.zeros(old.size, bool)
+    others = np.intersect1d(old.keys, new.keys)
+    matrix[old.entries(others), new.entries(others)] = 1.0
+    for label, change in joins.items():
+        last = mapper.boundaries[label].first
+        keys = control_keys(label, np.arange(last - len(change.old_from_new), last))
+        held = old.positions(keys) >= 0
+        by_point = np.kron(change.old_from_new[held], np.eye(2))
+        onto = new.entries(np.array(mapper.control_keys(label)))
+        rows = old.entries(keys[held])
+        matrix[np.ix_(rows, onto)], curves[rows] = by_point, True
+    return matrix, curves
+
+
+@pytest.mark.parametrize("sigma", [1e-5, 0.05])
+def test_the_change_of_variables_is_exact(before: FixedLagMapper, sigma: float) -> None:
+    """`C_old = E C_new + N(0, sigma^2)`: the prior of the old curves, shifted by so much, on the new ones.
+
+    With S the covariance of the shift: `L (1 + S L)^-1` and `(1 + L S)^-1 g`, also where L is singular.
+    """
+    smoother = before.smoother
+    smoother.reactivate()
+    spline = replace(before.settings.spline, sigma_simplify=sigma)
+    smoother.map.settings = settings = replace(before.settings, spline=spline)
+    state = smoother.map.state
+    old, information, gradient = prior_system(before)
+    known = smoother.variables.reference[smoother.variables.layout.entries(old.keys)].copy()
+    joins = {b: join(one, state.control_points(b), settings, "cones") for b, one in state.boundaries.items()}
+    substitute(smoother, joins)
+    new, found, found_gradient = prior_system(before)
+    matrix, curves = change_of_variables(before, joins, old, new)
+    shift = np.diag(sigma**2 * curves)
+    expected = information @ np.linalg.inv(np.eye(old.size) + shift @ information)
+    gradient = np.linalg.solve(np.eye(old.size) + information @ shift, gradient)
+    away = matrix @ smoother.variables.reference[smoother.variables.layout.entries(new.keys)] - known
+    descent = matrix.T @ (gradient - expected @ away)
+    expected = matrix.T @ expected @ matrix
+    np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
+    np.testing.assert_allclose(found_gradient, descent, atol=1e-7 * np.abs(expected).max())
 
 
 # --- where it mustn't ------------------------------------------------------------------------------------
@@ -287,15 +320,14 @@ def test_a_lost_place_is_found_by_position_and_heading(
 
 def test_a_window_that_has_drifted_far_is_registered_back(before: FixedLagMapper) -> None:
     """Farther than the iteration bridges, but within what the vehicle knows of itself."""
-    mapper = deepcopy(before)
+    mapper, poses_before = before, before.poses.copy()
     mapper.poses[:, :2] += [6.0, -5.0]
-    covariance = mapper.smoother.pose_covariance()
-    mapper.smoother.pose_covariance = lambda: covariance + np.diag([25.0, 25.0, 1e-3])  # type: ignore[method-assign]
-    settings = ClosingSettings(sigma_max=10.0)
-    registration = register(mapper.smoother, mapper.path.beginning, settings)
+    unsure = covariance_of(mapper) + np.diag([25.0, 25.0, 1e-3])
+    track, times = mapper.smoother.map, mapper.smoother.times
+    registration = register(track, times, unsure, mapper.path.beginning, ClosingSettings(sigma_max=10.0))
     assert registration is not None
     moved = registration.motion.apply(mapper.poses[:, :2])
-    np.testing.assert_allclose(moved, before.poses[:, :2], atol=0.4)
+    np.testing.assert_allclose(moved, poses_before[:, :2], atol=0.4)
 
 
 def test_where_there_are_several_places_to_choose_from_patience_is_no_excuse() -> None:

@@ -8,7 +8,12 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.bspline import uniform_knots
-from pathspace_graph.factors.gauge import greville, smoothness_matrix, spacing_residuals
+from pathspace_graph.factors.gauge import (
+    greville,
+    smoothness_coefficients,
+    smoothness_matrix,
+    spacing_residuals,
+)
 from pathspace_graph.factors.spans import SpanPolynomials
 from pathspace_graph.settings import MapperSettings
 
@@ -104,6 +109,33 @@ def test_periodic_smoothness_wraps_at_the_seam() -> None:
     np.testing.assert_allclose(turned @ np.roll(values, -2), np.roll(matrix @ values, -2), atol=1e-12)
     even = smoothness_matrix(np.arange(4.0), 4.0)
     np.testing.assert_allclose(even[3], [-2.0, 1.0, 0.0, 1.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("spacing", [None, 2.5])
+@pytest.mark.parametrize("period", [None, 30.0])
+def test_coefficients_are_second_divided_differences(period: float | None, spacing: float | None) -> None:
+    """`2 h^2 f[t_j, t_j+1, t_j+2]`, each by three points in a row: around the curve where it is closed."""
+    rng = np.random.default_rng(6)
+    abscissae = np.cumsum(rng.uniform(0.5, 4.0, 7))
+    values = rng.normal(size=7)
+    coefficients = smoothness_coefficients(abscissae, period, spacing)
+    unrolled = abscissae if period is None else np.append(abscissae, abscissae[:2] + period)
+    repeated = values if period is None else np.append(values, values[:2])
+    mean = np.diff(abscissae).mean() if period is None else period / 7
+    assert coefficients.shape == (len(unrolled) - 2, 3)
+    for j, row in enumerate(coefficients):
+        (a, b, c), (f, g, h) = unrolled[j : j + 3], repeated[j : j + 3]
+        divided = ((h - g) / (c - b) - (g - f) / (b - a)) / (c - a)
+        expected = 2.0 * (mean if spacing is None else spacing) ** 2 * divided
+        assert row @ [f, g, h] == pytest.approx(expected, rel=1e-10)
+    wrapped = np.stack([values, np.roll(values, -1), np.roll(values, -2)], axis=1)[: len(coefficients)]
+    found = smoothness_matrix(abscissae, period, spacing) @ values
+    np.testing.assert_allclose(found, (coefficients * wrapped).sum(axis=1), atol=1e-12)
+
+
+def test_two_points_have_no_second_difference() -> None:
+    assert smoothness_coefficients(np.array([0.0, 2.0]), None).shape == (0, 3)
+    assert smoothness_matrix(np.array([0.0, 2.0]), None).shape == (0, 2)
 
 
 @pytest.mark.parametrize("period", [None, 30.0])

@@ -13,27 +13,31 @@ from pathspace_graph.factors.gauge import greville, smoothness_matrix
 from pathspace_graph.factors.gtsam_factors import (
     calibrated_odometry_factor,
     huber_roots,
+    linear_factor,
     odometry_factor,
     pose_array,
     smoothness_factors,
     spacing_factors,
     spline_projection_factor,
 )
-from pathspace_graph.factors.linear_graph import linear_graph, window_keys
 from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.spans import SpanPolynomials
-from pathspace_graph.window import POSE
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE
 
 from .gtsam_scenes import (
+    CONTROL_KEYS,
     DEGREE,
     HUBER,
     MAP,
+    POSES,
     SIGMA_MODEL,
     SIZE,
     TABLES,
     Scene,
     all_rows,
     curves,
+    dense,
+    in_tangents,
     integrate_noisy,
     make_scene,
     nonlinear_graph,
@@ -53,24 +57,19 @@ def scene(request: pytest.FixtureRequest) -> Scene:
     return make_scene(0, isotropic=request.param)
 
 
-def assert_same_system(first: gtsam.GaussianFactorGraph, second: gtsam.GaussianFactorGraph) -> None:
-    """Hessian and gradient to 1e-9 of their largest entry."""
-    ordering = gtsam.Ordering()
-    for key in sorted(first.keyVector()):
-        ordering.push_back(key)
-    for a, b in zip(first.hessian(ordering), second.hessian(ordering), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(a).max(), rtol=0.0)
-
-
-def test_both_adapters_give_the_same_linear_system(scene: Scene) -> None:
+def test_the_factors_linear_system_is_that_of_the_kernels_rows(scene: Scene) -> None:
     """Far from the optimum, with outliers weighed down, and the poses turned."""
     state = scene.state + np.random.default_rng(1).normal(0.0, 0.05, scene.state.shape)
     state[MAP + 2 : MAP + 2 + POSE] = scene.start  # the prior's tangent is the state's only where it holds
     groups = all_rows(scene, state)
-    assert (np.abs(reading_rows(scene, 0, state).residual) > np.sqrt(HUBER)).any()
-    window = window_keys((SIZE, SIZE), 2, scene.poses(state))
-    vectorized = linear_graph([(g.columns, g.jacobian, g.residual) for g in groups], window)
-    assert_same_system(nonlinear_graph(scene).linearize(to_values(scene, state)), vectorized)
+    assert (np.abs(reading_rows(scene, 0, state)[2]) > np.sqrt(HUBER)).any()
+    J, r = dense(groups, len(state))
+    J = in_tangents(scene, state, J)
+    poses = [gtsam.symbol("x", k) for k in range(POSES)]
+    ordering = gtsam.Ordering([*CONTROL_KEYS[0], *CONTROL_KEYS[1], CALIBRATION_KEY, *poses])
+    hessian, descent = nonlinear_graph(scene).linearize(to_values(scene, state)).hessian(ordering)
+    np.testing.assert_allclose(hessian, J.T @ J, atol=1e-9 * np.abs(hessian).max(), rtol=0.0)
+    np.testing.assert_allclose(descent, -J.T @ r, atol=1e-9 * np.abs(descent).max(), rtol=0.0)
 
 
 @pytest.mark.parametrize(
@@ -290,3 +289,31 @@ def test_smoothness_factors_are_the_matrix_far_from_zero(period: float | None) -
 def test_periodic_spacing_closes_the_ring() -> None:
     factors = spacing_factors([5, 6, 7], np.full(3, 2.0), np.ones(3), True)
     assert [f.keys() for f in factors] == [[5, 6], [6, 7], [7, 5]]
+
+
+def test_a_linear_factor_over_many_keys() -> None:
+    rng = np.random.default_rng(0)
+    keys, dims = [9, 4, 7, 1, 30], [2, 3, 2, 1, 3]
+    A, b, x = rng.normal(size=(4, 11)), rng.normal(size=4), rng.normal(size=11)
+    factor = gtsam.JacobianFactor(linear_factor(keys, dims, A, b))
+    delta = gtsam.VectorValues()
+    for key, part in zip(keys, np.split(x, np.cumsum(dims)[:-1]), strict=True):
+        delta.insert(key, part)
+    np.testing.assert_array_equal(factor.getA(), A)
+    assert factor.error(delta) == pytest.approx(0.5 * np.sum((A @ x - b) ** 2), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("keys", "dims", "shape", "rows"),
+    [
+        ([1, 2], [2], (3, 2), 3),
+        ([1, 1], [2, 2], (3, 4), 3),
+        ([1, 2], [2, 2], (3, 5), 3),
+        ([1], [2], (3, 2), 2),
+    ],
+)
+def test_a_linear_factor_that_does_not_fit_is_refused(
+    keys: list[int], dims: list[int], shape: tuple[int, int], rows: int
+) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        linear_factor(keys, dims, np.zeros(shape), np.zeros(rows))

@@ -11,7 +11,8 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.batch_data import integrate_log
 from pathspace_graph.eval.landmark_batch import LandmarkBatch
-from pathspace_graph.eval.landmark_reassociation import drop_rare, merge_duplicates
+from pathspace_graph.eval.landmark_reassociation import drop_rare, predicted
+from pathspace_graph.eval.landmark_sightings import duplicates
 from pathspace_graph.eval.landmark_start import as_landmark_readings, start_told
 from pathspace_graph.eval.landmark_state import LandmarkState
 from pathspace_graph.eval.landmark_system import LandmarkSystem
@@ -20,6 +21,8 @@ from pathspace_graph.eval.limit import solve_told_landmarks
 from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
 from pathspace_graph.factors.landmark import landmark_residuals
 from pathspace_graph.factors.odometry import integrate_twists
+from pathspace_graph.graph.elimination import linear_graph
+from pathspace_graph.graph.keys import pose_key
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.log import Log
 from pathspace_graph.map import PointBoundary
@@ -107,62 +110,77 @@ def told_system(log: Log, cycles: int) -> tuple[LandmarkSystem, LandmarkState]:
     return LandmarkSystem(readings, chain, settings), state
 
 
-def test_blocks_of_the_joint_covariance_are_those_of_the_whole_inverse(log: Log) -> None:
+def whole_system(system: LandmarkSystem, state: LandmarkState) -> tuple[Array, Array]:
+    """Normal equations of all variables, in the order of their keys."""
+    graph = linear_graph(system.rows(state), state.variables)
+    hessian, vector = graph.hessian(state.variables.layout.ordering)
+    return hessian, vector
+
+
+def test_what_it_predicts_is_of_the_whole_inverse(log: Log) -> None:
     system, state = told_system(log, 25)
-    state = system.settle(state)
-    found = system.covariance(state)
-    matrix, _ = system.normal_equations(system.evaluate(state)).dense()
-    whole = np.linalg.inv(matrix)
-    slot, landmark = np.array([3, 20, 24]), np.array([0, 5, 2])
-    r = landmark_residuals(state.poses[slot], state.landmarks[landmark], np.zeros((3, 2)))
-    predicted = found.predicted(slot, landmark, r.by_pose, r.by_landmark)
-    n = state.map_size + 2
-    for k in range(3):
-        pose, point = n + 3 * slot[k] + np.arange(3), 2 * landmark[k] + np.arange(2)
-        columns = np.concatenate([pose, point])
-        h = np.concatenate([r.by_pose[k], r.by_landmark[k]], axis=1)
-        np.testing.assert_allclose(predicted[k], h @ whole[np.ix_(columns, columns)] @ h.T, rtol=1e-6)
+    system.settle(state)
+    whole = np.linalg.inv(whole_system(system, state)[0])
+    cycles, landmarks = np.array([3, 20, 24]), np.array([0, 5, 2])
+    r = landmark_residuals(state.variables.poses[cycles], state.landmarks[landmarks], np.zeros((3, 2)))
+    jacobian, keys = np.concatenate([r.by_pose, r.by_landmark], axis=2), state.keys[landmarks]
+    found = predicted(system.eliminated(state), cycles, keys, jacobian)
+    for k, h in enumerate(jacobian):
+        entries = state.variables.layout.entries(np.array([pose_key(cycles[k]), keys[k]]))
+        np.testing.assert_allclose(found[k], h @ whole[np.ix_(entries, entries)] @ h.T, rtol=1e-6)
 
 
 def test_the_optimum_has_no_gradient(log: Log) -> None:
     system, state = told_system(log, 60)
-    before = system.evaluate(state).cost
-    state = system.settle(state)
-    at = system.evaluate(state)
-    equations = system.normal_equations(at)
-    scaled = equations.descent_border / np.sqrt(equations.scale_border)
-    assert at.cost < before
-    assert np.abs(scaled).max() < 0.05
+    before = system.cost(state)
+    system.settle(state)
+    hessian, vector = whole_system(system, state)
+    assert system.cost(state) < before
+    assert np.abs(vector / np.sqrt(np.diagonal(hessian))).max() < 0.05
+
+
+def test_the_cost_falls_along_the_gradient_of_the_rows(log: Log) -> None:
+    """`d cost = -g . dx`: the cost and the linear system are of the same problem."""
+    system, state = told_system(log, 25)
+    variables, rng = state.variables, np.random.default_rng(0)
+    hessian, vector = whole_system(system, state)
+    at, step = variables.values, 1e-6 * rng.normal(size=len(vector)) / np.sqrt(np.diagonal(hessian))
+    costs = []
+    for sign in (1.0, -1.0):
+        variables.values = at + sign * step
+        costs.append(system.cost(state))
+    assert costs[0] - costs[1] == pytest.approx(-2.0 * vector @ step, rel=1e-4)
 
 
 def test_two_of_one_cone_are_merged_and_two_cones_are_not(log: Log) -> None:
     system, state = told_system(log, 60)
-    readings, settings = system.readings, system.settings
-    twin = len(state.labels)
-    often = int(np.bincount(readings.landmark[readings.used]).argmax())
-    state.add_landmarks(state.landmarks[often : often + 1] + 0.05, state.labels[often : often + 1])
-    mine = np.flatnonzero(readings.used & (readings.landmark == often))
-    readings.take(mine[::2], np.full(len(mine[::2]), twin))
-    state = system.settle(state)
-    merge_duplicates(state, readings, system.covariance(state), settings)
+    readings, settings, count = system.readings, system.settings, len(state)
+    numbers, sightings = np.unique(readings.landmark[readings.used], return_counts=True)
+    often = numbers[sightings.argmax()]
+    own = state.positions(np.array([often]))
+    twin = state.add(state.landmarks[own] + 0.05, state.labels[own])
+    mine = np.flatnonzero(readings.landmark == often)
+    readings.take(mine[::2], np.repeat(twin, len(mine[::2])))
+    system.settle(state)
+    first, second = duplicates(state, len(state), system.eliminated(state).joint, settings)
+    readings.merge(state.numbers[first], state.numbers[second])
     drop_rare(state, readings, 1)
-    assert len(state.labels) == twin
+    assert len(state) == len(state.landmarks) == count
     assert (readings.landmark[mine] == often).all()
 
 
 def test_rare_ones_are_dropped_and_the_others_keep_their_readings(log: Log) -> None:
     system, state = told_system(log, 60)
     readings = system.readings
-    counts = np.bincount(readings.landmark[readings.used], minlength=len(state.labels))
+    numbers, counts = np.unique(readings.landmark[readings.used], return_counts=True)
     fewest = int(np.sort(counts)[len(counts) // 3]) + 1
-    ids = state.ids.copy()
-    before = readings.numbers(ids)
+    before, points = readings.landmark.copy(), state.landmarks.copy()
     drop_rare(state, readings, fewest)
-    np.testing.assert_array_equal(state.ids, ids[counts >= fewest])
-    after = readings.numbers(state.ids)
-    kept = np.isin(before, state.ids)
-    np.testing.assert_array_equal(after[kept], before[kept])
-    assert (after[~kept] == -1).all()
+    np.testing.assert_array_equal(state.numbers, numbers[counts >= fewest])
+    np.testing.assert_array_equal(state.landmarks, points[counts >= fewest])
+    kept = np.isin(before, state.numbers)
+    np.testing.assert_array_equal(readings.landmark[kept], before[kept])
+    assert (readings.landmark[~kept] == -1).all()
 
 
 def test_a_log_in_which_nothing_is_seen_is_an_empty_map() -> None:

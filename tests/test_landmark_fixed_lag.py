@@ -13,6 +13,7 @@ from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.landmark_closing import recognize
 from pathspace_graph.eval.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.eval.metrics import ate, lap_metrics
+from pathspace_graph.graph.variables import Layout
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from pathspace_graph.log import Detections, Log
 from pathspace_graph.map import Map, PointBoundary
@@ -147,14 +148,13 @@ def recognizing(gap: Array, sigma: float) -> tuple[Array, Array] | None:
     x = np.cumsum(gap)
     old = np.concatenate([np.column_stack([x, np.full(n, y)]) for y in (2.0, -2.0)])
     labels = np.repeat([LEFT, RIGHT], n).astype(np.intp)
-    smoother.state.add_landmarks(
-        np.concatenate([old, old + np.array([0.6 * sigma, 0.0])]), np.tile(labels, 2)
-    )
+    smoother.map.state.add(np.concatenate([old, old + np.array([0.6 * sigma, 0.0])]), np.tile(labels, 2))
     common = np.zeros((8 * n, 2))
     common[4 * n :: 2, 0], common[4 * n + 1 :: 2, 1] = sigma, 0.1  # the new row's shift is all one
     covariance = common @ common.T + 0.01 * np.eye(8 * n)
-    smoother.covariance = lambda landmarks: covariance[  # type: ignore[method-assign]
-        np.ix_(*(2 * [(2 * landmarks[:, None] + np.arange(2)).ravel()]))
+    entries = Layout(smoother.map.state.keys).entries
+    smoother.last_covariance = lambda keys: covariance[  # type: ignore[method-assign]
+        np.ix_(entries(keys), entries(keys))
     ]
     found = recognize(smoother, np.arange(2 * n, 4 * n), np.arange(2 * n), reach=8.0)
     return None if found is None else (found.first, found.second)

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from pathspace_graph.eval.landmark_sightings import near_pairs, one_cone, sighted_by
+from pathspace_graph.eval.landmark_sightings import duplicates, near_pairs, one_cone, sighted_by
+from pathspace_graph.eval.landmark_state import LandmarkState
+from pathspace_graph.graph.variables import Layout
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.landmark_settings import LandmarkSettings
-from pathspace_graph.settings import GrowthSettings
+from pathspace_graph.settings import GrowthSettings, MapperSettings
 
 
 def test_each_pose_gives_a_landmark_one_reading_the_nearest() -> None:
     landmarks = np.array([[0.0, 0.0], [5.0, 0.0]])
     points = np.array([[0.3, 0.0], [0.1, 0.0], [0.2, 0.0], [4.9, 0.0], [2.5, 0.0]])
-    slots = np.array([0, 0, 1, 1, 1])
-    rows, which = sighted_by(points, slots, landmarks, GrowthSettings(merge_radius=1.0))
+    cycles = np.array([0, 0, 1, 1, 1])
+    rows, which = sighted_by(points, cycles, landmarks, GrowthSettings(merge_radius=1.0))
     order = np.argsort(rows)
     np.testing.assert_array_equal(rows[order], [1, 2, 3])
     np.testing.assert_array_equal(which[order], [0, 0, 1])
@@ -45,3 +48,19 @@ def test_a_landmark_is_merged_once_with_the_one_that_fits_best() -> None:
         len(one_cone(first[2:], second[2:], offset[2:], 9.0 * spread[2:] + np.eye(2), LandmarkSettings()))
         == 1
     )
+
+
+@pytest.mark.parametrize(("correlation", "known", "expected"), [(0.0, 3, 1), (0.99, 3, 0), (0.0, 2, 0)])
+def test_what_is_known_of_both_together_says_whether_they_are_one(
+    correlation: float, known: int, expected: int
+) -> None:
+    """0.5 m apart: little where each is known to a metre, much where all of that is common to both."""
+    state = LandmarkState()
+    state.add(np.array([[0.0, 0.0], [9.0, 0.0], [0.5, 0.0]]), np.full(3, LEFT))
+    joint = np.asarray(np.kron(correlation + (1.0 - correlation) * np.eye(3), np.eye(2)), np.float64)
+    entries = Layout(state.keys).entries
+    first, second = duplicates(
+        state, known, lambda keys: joint[np.ix_(entries(keys), entries(keys))], MapperSettings()
+    )
+    np.testing.assert_array_equal(first, [2] * expected)
+    np.testing.assert_array_equal(second, [0] * expected)

@@ -20,13 +20,22 @@ from pathspace_graph.log import Detections, Log, Odometry, write_log
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-FOLDERS = PROJECT["tool"]["setuptools"]["package-dir"]
+PACKAGES, MAPPED = (PROJECT["tool"]["setuptools"][key] for key in ("packages", "package-dir"))
 README = (ROOT / "README.md").read_text()
 
 
+def folder_of(package: str) -> str:
+    """Where setuptools finds a package: where it is told, else in the folder of the package that it is in."""
+    parent, _, name = package.rpartition(".")
+    return MAPPED[package] if package in MAPPED else f"{folder_of(parent)}/{name}"
+
+
+FOLDERS = {package: folder_of(package) for package in PACKAGES}
+
+
 def python_folders() -> set[Path]:
-    """Every folder with Python code below the root, but for tests and what is hidden or built."""
-    skipped = {"tests", "build", "dist"}
+    """Every folder with Python code below the root, but for tests, examples, and what is hidden or built."""
+    skipped = {"tests", "examples", "build", "dist"}
     files = (file.relative_to(ROOT) for file in ROOT.rglob("*.py"))
     return {
         file.parent
@@ -40,7 +49,8 @@ def python_folders() -> set[Path]:
 
 def test_the_packages_listed_are_the_folders_on_disk() -> None:
     assert {Path(folder) for folder in FOLDERS.values()} == python_folders()
-    assert sorted(PROJECT["tool"]["setuptools"]["packages"]) == sorted(FOLDERS)
+    assert set(MAPPED) <= set(PACKAGES)
+    assert len(PACKAGES) == len(FOLDERS)
     assert all((ROOT / folder / "__init__.py").is_file() for folder in FOLDERS.values())
 
 
@@ -57,7 +67,7 @@ def test_types_are_told_to_users() -> None:
 
 def test_mypy_sees_every_folder() -> None:
     checked = {(ROOT / file).resolve() for file in PROJECT["tool"]["mypy"]["files"]}
-    assert checked == {ROOT / folder for folder in FOLDERS.values()}
+    assert checked == {ROOT / folder for folder in MAPPED.values()}
     overlay = ROOT / ".overlay" / "pathspace_graph"
     assert (overlay / "__init__.py").resolve() == ROOT / "pathspace_graph" / "__init__.py"
 

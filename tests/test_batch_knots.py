@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch_knots import reknot
-from pathspace_graph.batch_simplification import new_from_old, simplified
+from pathspace_graph.batch_knots import new_from_old, reknot, simplified
 from pathspace_graph.readings import Readings
 from pathspace_graph.settings import MapperSettings
 from pathspace_graph.state import State
@@ -25,18 +24,17 @@ def dense_scene() -> tuple[State, Readings, MapperSettings]:
 
 def by_shift(state: State, axis: int) -> Array:
     """(n,) derivative of all control points by a shift of the map."""
-    return np.tile(np.eye(2)[axis], state.map_size // 2)
+    return np.tile(np.eye(2)[axis], len(state.map_points))
 
 
 def by_turn(state: State) -> Array:
     """(n,) the same by a turn about the origin."""
-    points = state.vector[: state.map_size].reshape(-1, 2)
-    return np.column_stack([-points[:, 1], points[:, 0]]).ravel()
+    return np.column_stack([-state.map_points[:, 1], state.map_points[:, 0]]).ravel()
 
 
 def test_the_drive_stays_and_the_curves_have_fewer_control_points_on_the_same_lines() -> None:
     state, readings, settings = dense_scene()
-    thin, _ = simplified(state, np.eye(state.pose_column(0)), readings, settings)
+    thin, _ = simplified(state, np.eye(state.map_points.size), readings, settings)
     np.testing.assert_array_equal(thin.poses, state.poses)
     np.testing.assert_array_equal(thin.calibration, state.calibration)
     for label, boundary in thin.boundaries.items():
@@ -53,7 +51,7 @@ def test_a_map_that_is_uncertain_as_a_whole_stays_so() -> None:
         dense = direction(state)
         thin, covariance = simplified(state, np.outer(dense, dense), readings, settings)
         expected = direction(thin)
-        across = np.arange(1, thin.map_size, 2)
+        across = np.arange(1, thin.map_points.size, 2)
         np.testing.assert_allclose(
             covariance[np.ix_(across, across)],
             np.outer(expected, expected)[np.ix_(across, across)],

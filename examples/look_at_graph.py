@@ -1,0 +1,116 @@
+"""Look at the graph: print it, its errors by kind of factor, uncertainties by GTSAM's own classes, and a
+picture.
+
+`mapper.graph()` is the window as a `gtsam.NonlinearFactorGraph`, and `mapper.values()` its estimate: whatever
+GTSAM does with a graph works on it.
+
+    python examples/look_at_graph.py
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+
+import gtsam
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+
+from pathspace_graph import FixedLagMapper
+from pathspace_graph.run import split_odometry
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
+
+POSE, CALIBRATION = ord("x"), ord("b")
+
+
+def build_mapper(cycles: int = 150, seed: int = 0) -> FixedLagMapper:
+    """A mapper after so many cycles on a generated track."""
+    log = simulate(generate_track(np.random.default_rng(seed)), SimulationSettings(laps=1), seed)
+    mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
+    for number, (odometry, detections) in enumerate(split_odometry(log)):
+        if number == cycles:
+            break
+        mapper.update(odometry, detections)
+    return mapper
+
+
+def kind(factor: gtsam.NonlinearFactor) -> str:
+    """What a factor of the mapper says, by its class and keys."""
+    letters = {gtsam.symbolChr(key) for key in list(factor.keys())}
+    if isinstance(factor, gtsam.CustomFactor):
+        return "odometry" if CALIBRATION in letters else "spline projection"
+    if isinstance(factor, gtsam.RangeFactor2):
+        return "spacing"
+    if isinstance(factor, gtsam.LinearContainerFactor):
+        return "prior of the window" if letters & {POSE, CALIBRATION} else "smoothness"
+    return "anchor"
+
+
+def errors_by_kind(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> dict[str, tuple[int, float]]:
+    """Number of factors of each kind, and the sum of their errors (half squared sigmas)."""
+    found: defaultdict[str, tuple[int, float]] = defaultdict(lambda: (0, 0.0))
+    for index in range(graph.size()):
+        factor = graph.at(index)
+        count, error = found[kind(factor)]
+        found[kind(factor)] = count + 1, error + factor.error(values)
+    return dict(found)
+
+
+def draw(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, axes: Axes) -> None:
+    """Poses and control points where they are, and a line from each projection factor's pose to its
+    points."""
+    where = {
+        key: _position(values, key) for key in list(values.keys()) if gtsam.symbolChr(key) != CALIBRATION
+    }
+    for index in range(graph.size()):
+        factor = graph.at(index)
+        if kind(factor) == "spline projection":
+            pose, *points = factor.keys()
+            for point in points:
+                axes.plot(*np.array([where[pose], where[point]]).T, color="0.85", linewidth=0.5, zorder=0)
+    for letter, colour, name in (
+        ("l", "tab:blue", "left"),
+        ("r", "goldenrod", "right"),
+        ("x", "0.2", "poses"),
+    ):
+        own = np.array([place for key, place in where.items() if gtsam.symbolChr(key) == ord(letter)])
+        axes.plot(*own.T, "o-", color=colour, markersize=4, linewidth=0.8, label=name)
+    axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    axes.legend()
+
+
+def _position(values: gtsam.Values, key: int) -> np.ndarray:
+    if gtsam.symbolChr(key) == POSE:
+        pose = values.atPose2(key)
+        return np.array([pose.x(), pose.y()])
+    return np.array(values.atPoint2(key))
+
+
+def main(folder: Path = Path(), cycles: int = 150) -> dict[str, tuple[int, float]]:
+    """Write `graph.dot` and `graph.png` to a folder; gives the errors by kind of factor."""
+    mapper = build_mapper(cycles)
+    graph, values = mapper.graph(), mapper.values()
+    graph.saveGraph(str(folder / "graph.dot"), values)
+    figure, axes = plt.subplots(figsize=(8, 6))
+    draw(graph, values, axes)
+    figure.savefig(folder / "graph.png", dpi=120, bbox_inches="tight")
+    plt.close(figure)
+    return errors_by_kind(graph, values)
+
+
+if __name__ == "__main__":
+    for name, (count, error) in main().items():
+        print(f"{count:4d} {name:20s} {error:9.3f}")
+    mapper = build_mapper()
+    marginals = gtsam.Marginals(mapper.graph(), mapper.values())
+    newest = mapper.next_pose_key - 1
+    print(
+        "newest pose, sigmas by GTSAM (its own frame):",
+        np.sqrt(np.diag(marginals.marginalCovariance(newest))),
+    )
+    print(
+        "the same by the mapper (map frame):          ",
+        np.sqrt(np.diag(mapper.marginal_covariance([newest]))),
+    )

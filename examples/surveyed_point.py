@@ -1,0 +1,95 @@
+"""Your own factors on control points: a boundary that must pass through a surveyed point.
+
+Somebody has measured where one cone of the left boundary stands, to a few centimetres. As soon as the curve
+has grown past it, a factor on the control points there tells the mapper. It stays nonlinear while these are
+active, and is part of the map's prior afterwards.
+
+    python examples/surveyed_point.py
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph import FixedLagMapper, Log
+from pathspace_graph.factors.gtsam_factors import boundary_point_factor
+from pathspace_graph.labels import LEFT
+from pathspace_graph.run import split_odometry
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
+
+Array = NDArray[np.float64]
+
+SIGMA_SURVEY = 0.02
+"""Standard deviation of the surveyed point (m)."""
+REACH = 3.0
+"""Half the stretch of the curve (m along it) in which the point's foot point is looked for."""
+AWAY = 5.0
+"""A curve farther from the point than this (m) has not grown past it yet."""
+
+
+def build_log(laps: int = 1, seed: int = 0) -> Log:
+    """A simulated drive on a generated track."""
+    track = generate_track(np.random.default_rng(seed))
+    return simulate(track, SimulationSettings(laps=laps), seed)
+
+
+def survey(log: Log, share: float = 0.4) -> Array:
+    """(2,) the left cone that stands this share of the way around the track, map frame, m."""
+    assert log.truth is not None
+    cones = log.truth.cones[log.truth.cone_labels == LEFT]
+    pose = log.truth.poses[int(share * len(log.truth.poses)), :2]
+    return np.asarray(cones[np.hypot(*(cones - pose).T).argmin()])
+
+
+def survey_factor(mapper: FixedLagMapper, point: Array) -> gtsam.NonlinearFactor | None:
+    """The factor that holds the left boundary on a point (2,); None where the curve is not beside it yet."""
+    if LEFT not in mapper.boundaries:
+        return None
+    boundary, points = mapper.boundaries[LEFT], mapper.control_points(LEFT)
+    end = np.array([boundary.confirmed])
+    foot = boundary.find(points, point[None], np.zeros(1), end)
+    if not foot.interior[0] or abs(foot.distance[0]) > AWAY:
+        return None
+    return boundary_point_factor(
+        mapper.control_keys(LEFT),
+        boundary.tables,
+        points_map=point[None],
+        sigma=np.array([SIGMA_SURVEY]),
+        low=np.maximum(foot.u - REACH, 0.0),
+        high=np.minimum(foot.u + REACH, end),
+    )
+
+
+def drive(log: Log, point: Array | None) -> FixedLagMapper:
+    """The mapper after a log, told of a surveyed point (2,) or not."""
+    mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
+    told = point is None
+    for odometry, detections in split_odometry(log):
+        factor = None if told or point is None else survey_factor(mapper, point)
+        told = told or factor is not None
+        mapper.update(odometry, detections, [] if factor is None else [factor])
+    return mapper
+
+
+def distance(mapper: FixedLagMapper, point: Array) -> float:
+    """Distance (m) of the left boundary from a point (2,)."""
+    spline = mapper.map().boundaries[LEFT].spline
+    curve = spline.evaluate(np.linspace(*spline.domain, 4000))
+    return float(np.hypot(*(curve - point).T).min())
+
+
+def main(laps: int = 1, seed: int = 0) -> tuple[float, float]:
+    """Distance (m) of the boundary from the surveyed point, without and with the factor."""
+    log = build_log(laps, seed)
+    point = survey(log)
+    return distance(drive(log, None), point), distance(drive(log, point), point)
+
+
+if __name__ == "__main__":
+    without, with_survey = main()
+    print(
+        f"the left boundary passes the surveyed point by {without:.3f} m, {with_survey:.3f} m with the factor"
+    )

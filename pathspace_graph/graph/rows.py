@@ -1,0 +1,155 @@
+"""Finished linear rows on keys, and the GTSAM factors that they make.
+
+The kernels give whitened rows of a whole window at once. The binding's own constructors stop at three keys
+and take one factor at a time from Python, so the rows of all factors are written into one buffer, of which
+each factor is a view that a Gaussian conditional, which is a Jacobian factor, takes over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import accumulate
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from .keys import FIRST_POSE, POINT, POSE, name
+from .variables import UNKNOWN, Layout, Variables
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Whitened linear rows `J_i . dx + r_i`, dx the change from where they were linearized.
+
+    All rows of a group have equally many keys, of the same letters in the same order, none of them twice.
+    """
+
+    keys: IntArray
+    """(m, k) variables of each row."""
+    jacobian: Array
+    """(m, n) whitened derivatives by the entries of these, one key after the other."""
+    residual: Array
+    """(m,) whitened residuals where they were linearized."""
+    owner: IntArray
+    """(m,) number of the factor that each row belongs to; numbers are near each other, as cycles are."""
+
+    def __len__(self) -> int:
+        return len(self.residual)
+
+    def where(self, chosen: NDArray[np.bool_] | IntArray) -> Rows:
+        """Some of the rows."""
+        return Rows(self.keys[chosen], self.jacobian[chosen], self.residual[chosen], self.owner[chosen])
+
+    @property
+    def pattern(self) -> tuple[IntArray, IntArray]:
+        """(n,) which of a row's keys each derivative is by, and by which of its entries."""
+        return _pattern(tuple((self.keys[0] >= FIRST_POSE).tolist()))
+
+    def columns(self, layout: Layout) -> IntArray:
+        """(m, n) column of each derivative; UNKNOWN where a key is not in the layout."""
+        key, entry = self.pattern
+        starts = layout.columns(self.keys)[:, key]
+        return np.where(starts == UNKNOWN, UNKNOWN, starts + entry)
+
+
+@cache
+def _pattern(poses: tuple[bool, ...]) -> tuple[IntArray, IntArray]:
+    widths = [POSE if is_pose else POINT for is_pose in poses]
+    return np.repeat(np.arange(len(widths)), widths), np.concatenate([np.arange(width) for width in widths])
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFactor:
+    """A Jacobian factor, and its keys."""
+
+    keys: frozenset[int]
+    linear: gtsam.GaussianConditional
+
+
+def jacobian_factors(groups: Sequence[Rows], variables: Variables) -> dict[int, LinearFactor]:
+    """A factor `1/2 |A d - b|^2` for each owner, d = value - reference: `A = J`, `b = J d_now - r`.
+
+    The rows were linearized at the variables' values. Gives the factors by their owner.
+    """
+    groups = [rows for rows in groups if len(rows)]
+    if not groups:
+        return {}
+    plan = _Plan(groups, variables.layout)
+    buffer = plan.write(groups, variables)
+    return {owner: plan.factor(f, buffer) for f, owner in enumerate(plan.owners)}
+
+
+class _Plan:
+    """Where each derivative goes in the buffer of all factors, each of which lies there by columns."""
+
+    def __init__(self, groups: Sequence[Rows], layout: Layout) -> None:
+        owner = np.concatenate([rows.owner for rows in groups])
+        lowest = int(owner.min())
+        present = np.bincount(owner - lowest) > 0
+        owners = present.nonzero()[0]
+        self.owners: list[int] = (lowest + owners).tolist()
+        member = (present.cumsum() - 1)[owner - lowest]
+        ends = [*accumulate(len(rows) for rows in groups)]
+        self.slices = [slice(end - len(rows), end) for end, rows in zip(ends, groups, strict=True)]
+        self.member, self.places = member, [_places(rows.keys, layout) for rows in groups]
+        touched = np.zeros((len(owners), len(layout.keys)), bool)
+        for place, own in zip(self.places, self.slices, strict=True):
+            touched[member[own, None], place] = True
+        ending = (touched * layout.widths).cumsum(axis=1)
+        self.begin = ending - layout.widths  # column of each key in the factors that hold it
+        self.width, self.height = ending[:, -1] + 1, np.bincount(member)
+        self.size = self.height * self.width
+        self.offset = self.size.cumsum() - self.size
+        order = member.argsort(kind="stable")
+        first = self.height.cumsum() - self.height
+        self.row = np.empty(len(member), np.intp)
+        self.row[order] = np.arange(len(member)) - first[member[order]]
+        factor, key = touched.nonzero()
+        self._bounds = factor.searchsorted(np.arange(len(owners) + 1)).tolist()
+        self._keys, self._widths = layout.keys[key].tolist(), layout.widths[key].tolist()
+        ends = [*accumulate(self.size.tolist(), initial=0)]
+        self._blocks = list(zip(ends[:-1], ends[1:], self.height.tolist(), strict=True))
+
+    def write(self, groups: Sequence[Rows], variables: Variables) -> Array:
+        """The buffer with all blocks `[A b]`."""
+        buffer = np.zeros(int(self.size.sum()))
+        change, starts = variables.values - variables.reference, variables.layout.starts
+        for rows, place, own in zip(groups, self.places, self.slices, strict=True):
+            (key, entry), member = rows.pattern, self.member[own]
+            height, first = self.height[member], self.offset[member] + self.row[own]
+            columns = self.begin[member[:, None], place][:, key] + entry
+            columns *= height[:, None]
+            columns += first[:, None]
+            buffer[columns] = rows.jacobian
+            moved = change.take(starts.take(place)[:, key] + entry)
+            moved *= rows.jacobian
+            buffer[first + (self.width[member] - 1) * height] = moved.sum(axis=1) - rows.residual
+        return buffer
+
+    def factor(self, f: int, buffer: Array) -> LinearFactor:
+        """The factor of one owner."""
+        own, (begin, end, height) = slice(self._bounds[f], self._bounds[f + 1]), self._blocks[f]
+        keys, block = self._keys[own], buffer[begin:end].reshape((height, -1), order="F")
+        matrix = gtsam.VerticalBlockMatrix([*self._widths[own], 1], block, False)
+        return LinearFactor(frozenset(keys), gtsam.GaussianConditional(keys, 1, matrix))
+
+
+def _places(keys: IntArray, layout: Layout) -> IntArray:
+    """Place of each key in a layout; ValueError where one is not there."""
+    places = layout.keys.searchsorted(keys)
+    known = layout.keys.take(places, mode="clip") == keys
+    if not known.all():
+        raise ValueError(f"expected rows on known variables, found {name(int(keys[~known][0]))}")
+    return places
+
+
+def one_factor(groups: Sequence[Rows], variables: Variables) -> list[gtsam.GaussianConditional]:
+    """All rows as one factor; none where there are no rows."""
+    together = [Rows(r.keys, r.jacobian, r.residual, np.zeros(len(r), np.intp)) for r in groups]
+    return [factor.linear for factor in jacobian_factors(together, variables).values()]

@@ -1,0 +1,178 @@
+"""A linear problem of poses and a map: its solution and covariances against dense algebra."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.graph.elimination import Elimination, linear_graph, map_held, owners
+from pathspace_graph.graph.gaussian import cholesky
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POINT, POSE, landmark_keys, pose_key, pose_keys
+from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.variables import Layout, Variables
+
+Array = NDArray[np.float64]
+
+SIZES = (st.integers(0, 1000), st.integers(1, 40), st.integers(1, 6))
+
+
+def random_variables(rng: np.random.Generator, poses: int, points: int) -> Variables:
+    """Values somewhere, that have moved from where they were first."""
+    variables = Variables()
+    variables.insert(np.array([CALIBRATION_KEY]), rng.normal(size=2))
+    variables.insert(landmark_keys(np.arange(points)), rng.normal(size=POINT * points))
+    variables.insert(pose_keys(np.arange(poses)), rng.normal(size=POSE * poses))
+    variables.values = variables.values + rng.normal(size=variables.layout.size)
+    return variables
+
+
+def random_rows(rng: np.random.Generator, poses: int, points: int) -> list[Rows]:
+    """Odometry with a calibration, readings of two landmarks from each pose, priors of the points."""
+    start = np.repeat(np.arange(poses - 1), POSE)
+    shared = np.full(len(start), CALIBRATION_KEY)
+    between = np.column_stack([shared, pose_keys(start), pose_keys(start + 1)])
+    seer = np.repeat(np.arange(poses), 2 * POINT)
+    seen = landmark_keys(rng.integers(points, size=len(seer)))
+    every = np.append(CALIBRATION_KEY, landmark_keys(np.arange(points))).repeat(POINT)
+    eye = np.tile(np.eye(POINT), (points + 1, 1))
+    return [
+        Rows(between, rng.normal(size=(len(start), 8)), rng.normal(size=len(start)), owners(start)),
+        Rows(
+            np.column_stack([seen, pose_keys(seer)]),
+            rng.normal(size=(len(seer), 5)),
+            rng.normal(size=len(seer)),
+            owners(seer, 1),
+        ),
+        Rows(np.full((3, 1), pose_key(0)), np.eye(3), rng.normal(size=3), np.zeros(3, np.intp)),
+        Rows(every[:, None], eye, rng.normal(size=len(every)), -1 - np.arange(len(every)) // 4),
+    ]
+
+
+def dense(groups: list[Rows], layout: Layout) -> tuple[Array, Array]:
+    """`J' J` and `-J' r`."""
+    size = layout.size
+    matrix, right = np.zeros((size, size)), np.zeros(size)
+    for rows in filter(len, groups):
+        J = np.zeros((len(rows), size))
+        np.put_along_axis(J, rows.columns(layout), rows.jacobian, axis=1)
+        matrix += J.T @ J
+        right -= J.T @ rows.residual
+    return matrix, right
+
+
+def scene(seed: int, poses: int, points: int) -> tuple[Elimination, Array, Array]:
+    """A problem, and the same dense."""
+    rng = np.random.default_rng(seed)
+    variables, groups = random_variables(rng, poses, points), random_rows(rng, poses, points)
+    problem = Elimination(linear_graph(groups, variables), variables.layout)
+    return problem, *dense(groups, variables.layout)
+
+
+@given(*SIZES)
+def test_the_solution_is_that_of_the_dense_system(seed: int, poses: int, points: int) -> None:
+    """A change from the values, wherever they were first."""
+    problem, matrix, right = scene(seed, poses, points)
+    n = problem.map.size
+    np.testing.assert_allclose(problem.step(np.zeros(n)), np.linalg.solve(matrix, right), atol=1e-7)
+
+
+def test_damping_is_added_to_the_map() -> None:
+    problem, matrix, right = scene(3, 20, 4)
+    n = problem.map.size
+    for scale in (0.1, 10.0):
+        damping = scale * np.arange(1.0, n + 1.0)
+        damped = matrix + np.diag(np.append(damping, np.zeros(len(matrix) - n)))
+        np.testing.assert_allclose(problem.step(damping), np.linalg.solve(damped, right), atol=1e-9)
+
+
+def test_poses_beside_a_map_that_is_held() -> None:
+    rng = np.random.default_rng(4)
+    variables, groups = random_variables(rng, 30, 5), random_rows(rng, 30, 5)
+    problem = Elimination(linear_graph(groups, variables), variables.layout)
+    matrix, right = dense(groups, variables.layout)
+    n = problem.map.size
+    alone = Elimination(linear_graph(map_held(groups), variables), problem.poses)
+    expected = np.linalg.solve(matrix[n:, n:], right[n:])
+    np.testing.assert_allclose(problem.beside(np.zeros(n)), expected, atol=1e-9)
+    np.testing.assert_allclose(alone.beside(np.zeros(0)), expected, atol=1e-9)
+    last = np.linalg.inv(matrix[n:, n:])[-POSE:, -POSE:]
+    np.testing.assert_allclose(alone.pose_marginals[-1], last, atol=1e-9)
+
+
+@given(*SIZES)
+def test_covariances_are_blocks_of_the_dense_inverse(seed: int, poses: int, points: int) -> None:
+    problem, matrix, _ = scene(seed, poses, points)
+    inverse, n = np.linalg.inv(matrix), problem.map.size
+    close = {"rtol": 1e-6, "atol": 1e-7}
+    np.testing.assert_allclose(problem.map_covariance, inverse[:n, :n], **close)
+    np.testing.assert_allclose(problem.cross_covariance, inverse[n:, :n], **close)
+    for k, marginal in enumerate(problem.pose_marginals):
+        block = slice(n + POSE * k, n + POSE * (k + 1))
+        np.testing.assert_allclose(marginal, inverse[block, block], **close)
+
+
+def test_the_joint_covariance_has_the_order_that_is_asked_for() -> None:
+    problem, matrix, _ = scene(5, 12, 4)
+    inverse, keys = np.linalg.inv(matrix), landmark_keys(np.array([2, 0]))
+    entries = [6, 7, 2, 3]
+    np.testing.assert_allclose(problem.joint(keys), inverse[np.ix_(entries, entries)], atol=1e-9)
+
+
+def test_poses_that_nothing_holds_are_singular() -> None:
+    rng = np.random.default_rng(6)
+    variables = random_variables(rng, 10, 3)
+    odometry, _, _, points = random_rows(rng, 10, 3)
+    odometry.jacobian[:] = np.tile(np.column_stack([np.zeros((3, 2)), -np.eye(3), np.eye(3)]), (9, 1))
+    with pytest.raises(SingularSystemError, match="poses"):
+        Elimination(linear_graph([odometry, points], variables), variables.layout)
+
+
+def test_a_map_that_nothing_holds_is_singular_but_where_it_is_damped() -> None:
+    rng = np.random.default_rng(7)
+    variables = random_variables(rng, 10, 3)
+    odometry, readings, first, points = random_rows(rng, 10, 3)
+    readings.jacobian[:, :POINT] = 0.0
+    on_calibration = points.where(points.keys[:, 0] == CALIBRATION_KEY)
+    groups = [odometry, readings, first, on_calibration]
+    problem = Elimination(linear_graph(groups, variables), variables.layout)
+    for answer in (lambda: problem.step(np.zeros(8)), lambda: problem.map_covariance):
+        with pytest.raises(SingularSystemError, match="positive definite"):
+            answer()
+    np.testing.assert_allclose(problem.step(np.ones(8))[2:8], 0.0, atol=1e-9)
+
+
+def test_a_variable_that_no_factor_holds_is_named() -> None:
+    """GTSAM's `hessian` would give a smaller matrix and say nothing."""
+    rng = np.random.default_rng(8)
+    variables, groups = random_variables(rng, 10, 3), random_rows(rng, 10, 3)
+    graph = linear_graph(groups, variables)
+    for key, name in ((landmark_keys(np.array([9])), "m9"), (pose_keys(np.array([10])), "x10")):
+        wider = Layout(np.sort(np.append(variables.keys, key)))
+        with pytest.raises(SingularSystemError, match=name):
+            Elimination(graph, wider)
+    smaller, _ = graph.hessian(gtsam.Ordering(variables.keys.tolist()))
+    assert len(smaller) == variables.layout.size
+
+
+def test_covariances_outlive_what_gtsam_made_them_of() -> None:
+    """`R()` and `S()` are views of memory that their factor frees."""
+    problem, matrix, _ = scene(9, 40, 6)
+    cliques = list(problem._cliques())
+    del problem
+    scene(10, 40, 6)
+    for clique in cliques:
+        assert np.isfinite(clique.root).all()
+    log_determinant = -2.0 * sum(np.log(np.abs(np.diagonal(clique.root))).sum() for clique in cliques)
+    poses = matrix[POINT * 7 :, POINT * 7 :]
+    np.testing.assert_allclose(log_determinant, np.linalg.slogdet(poses)[1])
+
+
+def test_cholesky_raises() -> None:
+    np.testing.assert_allclose(np.tril(cholesky(np.diag([4.0, 9.0]))), np.diag([2.0, 3.0]))
+    with pytest.raises(SingularSystemError):
+        cholesky(np.diag([1.0, 0.0]))

@@ -1,0 +1,58 @@
+"""The examples do what they say; each is run as it stands."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import gtsam
+import pytest
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def example(name: str) -> ModuleType:
+    """An example as a module."""
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_example_has_a_test() -> None:
+    tested = {"gnss", "surveyed_point", "look_at_graph"}
+    assert {file.stem for file in EXAMPLES.glob("*.py")} == tested
+
+
+def test_gnss_holds_the_vehicle_where_cones_let_it_drift() -> None:
+    alone, with_gnss = example("gnss").main()
+    assert with_gnss < 0.4
+    assert with_gnss < 0.25 * alone
+
+
+def test_a_boundary_passes_through_the_surveyed_point() -> None:
+    without, with_survey = example("surveyed_point").main()
+    assert with_survey < 0.1
+    assert with_survey < 0.1 * without
+
+
+def test_the_graph_can_be_looked_at(tmp_path: Path) -> None:
+    errors = example("look_at_graph").main(tmp_path, cycles=100)
+    kinds = {"spline projection", "spacing", "smoothness", "anchor", "odometry", "prior of the window"}
+    assert set(errors) == kinds
+    assert all(count > 0 and error >= 0.0 for count, error in errors.values())
+    assert (tmp_path / "graph.png").stat().st_size > 0
+
+
+def test_kinds_are_told_by_class_and_keys() -> None:
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, 1.0)
+    prior = gtsam.PriorFactorPoint2(gtsam.symbol("l", 0), gtsam.Point2(0.0, 0.0), noise)
+    assert example("look_at_graph").kind(prior) == "anchor"
+
+
+@pytest.mark.parametrize("name", ["gnss", "surveyed_point", "look_at_graph"])
+def test_an_example_says_how_to_run_it(name: str) -> None:
+    assert f"python examples/{name}.py" in (EXAMPLES / f"{name}.py").read_text()
