@@ -18,6 +18,9 @@ BoolArray = NDArray[np.bool_]
 
 NONE = -1
 """The landmark of a reading that has none."""
+INSIDE = 1e-9
+"""How far inside the gate (share of it) a pair that is held is put: at its very edge, round-off in the sums
+of an assignment would decide whether it is kept."""
 PLANE = 2
 """Degrees of freedom of a reading."""
 
@@ -84,7 +87,7 @@ def kept_costs(cost: Array, held: BoolArray, gates: Gates) -> Array:
     Held to the strict gate anew in every round, readings would come and go at its edge; and since a reading's
     covariance grows with its range, cutting often at both sides would favour those that are too far.
     """
-    inside = np.nextafter(gates.match, 0.0)
+    inside = (1.0 - INSIDE) * gates.match
     return np.where(held & (cost < gates.create), np.minimum(cost, inside), cost)
 
 

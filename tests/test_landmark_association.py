@@ -91,3 +91,12 @@ def test_distances_are_those_of_the_summed_covariance() -> None:
             expected = r @ np.linalg.solve(covariances[i] + covariances[3 + j], r)
             assert found[i, j] == pytest.approx(expected)
     assert squared_mahalanobis(np.array([3.0, 4.0]), np.eye(2)) == pytest.approx(25.0)
+
+
+def test_a_held_pair_is_kept_however_its_assignment_is_summed() -> None:
+    """At the very edge of the gate, alone or beside a reading of nothing, in any order."""
+    gates = Gates(6.0, 9.0)
+    cost = np.array([[np.inf, np.inf], [7.0, np.inf]])
+    for own, expected in ((cost, [NONE, 0]), (cost[::-1], [0, NONE]), (cost[:, ::-1], [NONE, 1])):
+        held = np.isfinite(own)
+        assert associate(kept_costs(own, held, gates), gates).landmark.tolist() == expected
