@@ -42,7 +42,7 @@ class LandmarkFixedLag:
         self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), LandmarkMap(self.settings))
         """What is estimated, and from what."""
-        self.smoother.exact = True
+        self.smoother.window.exact = True
         self.path = DrivenPath(self.settings.path)
         """The way driven."""
         self.sightings = {label: Sightings(self.settings.growth) for label in BOUNDARIES}
@@ -134,7 +134,7 @@ class LandmarkFixedLag:
             if pairs is not None:
                 bend(self.smoother, pairs)
                 self._merge(pairs.first, pairs.second)
-                self.closed, self.smoother.exact = True, False
+                self.closed, self.smoother.window.exact = True, False
 
     def _merge(self, first: IntArray, second: IntArray) -> None:
         if len(first) == 0:

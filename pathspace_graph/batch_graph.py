@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.gtsam_factors import (
-    calibrated_odometry_factor,
     pose_array,
     rotation,
     smoothness_factors,
     spline_projection_factor,
 )
-from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.projection import to_map
 
 from .batch_data import Chain
@@ -24,6 +22,7 @@ from .batch_gauge import CurveGauge
 from .batch_system import BatchSystem, Evaluation
 from .boundary import Boundary
 from .graph.keys import CALIBRATION_KEY, POSE, pose_key
+from .graph.odometry import odometry_factor
 
 Array = NDArray[np.float64]
 
@@ -58,10 +57,8 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
 
 def _odometry(chain: Chain) -> Iterator[gtsam.NonlinearFactor]:
     """Between every two cycles."""
-    for k, whitener in enumerate(chain.whiteners):
-        covariance = np.linalg.inv(whitener.T @ whitener)
-        odometry = IntegratedOdometry(chain.deltas[k], covariance, chain.by_calibration[k], whitener)
-        yield calibrated_odometry_factor(pose_key(k), pose_key(k + 1), CALIBRATION_KEY, odometry)
+    for k, interval in enumerate(chain.odometry.intervals):
+        yield odometry_factor(k, interval)
 
 
 def _priors(chain: Chain, heading: float) -> Iterator[gtsam.NonlinearFactor]:

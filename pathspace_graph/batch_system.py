@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.projection import ProjectionRows, huber_weights, project, to_map
+from pathspace_graph.factors.projection import ProjectionRows, huber_loss, huber_weights, project, to_map
 
 from .batch_data import Chain
 from .batch_gauge import CurveGauge, curve_gauge
@@ -36,8 +36,7 @@ class Kernel:
 
     def loss(self, whitened: Array) -> Array:
         """`rho(z)` (m,), Huber's alone: the gate is what decides which rows are used."""
-        inner = np.minimum(np.abs(whitened), self.huber)
-        return np.asarray(inner * (np.abs(whitened) - 0.5 * inner))
+        return huber_loss(whitened, self.huber)
 
     def weights(self, whitened: Array) -> Array:
         """`rho'(z) / z` (m,)."""

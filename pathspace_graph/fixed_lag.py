@@ -78,7 +78,7 @@ class FixedLagMapper:
         self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), CurveMap(self.settings))
         """What is estimated, and from what: variables, factors of the window, and the prior."""
-        self.smoother.exact = True
+        self.smoother.window.exact = True
         self.solver = solver
         """What takes the place of the smoother's own step."""
         self.path = DrivenPath(self.settings.path)
@@ -190,7 +190,7 @@ class FixedLagMapper:
         """Both curves become periodic and have their final size; from now on hardly anything moves."""
         simplify(self.smoother)
         self.growth.clear()
-        self.smoother.exact = False
+        self.smoother.window.exact = False
 
     def _result(self, t: float, stages: dict[str, float]) -> CycleResult:
         readings = self.smoother.map.readings
@@ -275,8 +275,7 @@ def smoother_settings(settings: MapperSettings) -> SmootherSettings:
     """What the engine is told of the settings."""
     return SmootherSettings(
         lag=settings.lag,
-        tolerance_point=settings.relinearize.point,
-        tolerance_heading=settings.relinearize.heading,
+        tolerances=(settings.relinearize.point, settings.relinearize.heading),
         keyframe_interval=settings.closing.keyframe_interval,
         sigma_calibration=(settings.odometry.sigma_scale, settings.odometry.sigma_bias),
     )

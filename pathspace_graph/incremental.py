@@ -20,9 +20,10 @@ from .curve_map import CurveSmoother
 from .fixed_lag import FixedLagMapper
 from .graph.gaussian import factors_of, keys_of
 from .graph.keys import POSE, are_poses, control_keys, indices, pose_key
+from .graph.odometry import odometry_factor
 from .graph.user_factors import as_nonlinear
 from .settings import MapperSettings
-from .window_graph import gauge_factors, odometry_factor, reading_factors
+from .window_graph import gauge_factors, reading_factors
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -88,7 +89,7 @@ class IncrementalSolver:
 
     def _add_odometry(self, smoother: CurveSmoother) -> None:
         """The poses that are new, each with the odometry from the one before."""
-        intervals = smoother.odometry.intervals
+        intervals = smoother.window.odometry.intervals
         self._take_up(smoother, pose_key(smoother.first_cycle))
         for cycle in range(self._odometry_until + 1, smoother.next_cycle):
             self._take_up(smoother, pose_key(cycle))

@@ -9,17 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.gtsam_factors import (
-    calibrated_odometry_factor,
     smoothness_factors,
     spacing_factors,
     spline_projection_factor,
 )
-from pathspace_graph.factors.odometry import IntegratedOdometry
 
 from .boundary import Boundary
 from .curve_map import CurveSmoother
 from .graph.gaussian import factors_of
-from .graph.keys import CALIBRATION_KEY, control_keys, pose_key
+from .graph.keys import control_keys, pose_key
+from .graph.odometry import odometry_factor
 from .graph.user_factors import as_nonlinear
 from .readings import Readings
 from .settings import GaugeSettings, MapperSettings
@@ -45,7 +44,7 @@ def window_graph(smoother: CurveSmoother) -> gtsam.NonlinearFactorGraph:
         points = state.control_points(label)[active]
         for key, point in zip(control_keys(label, boundary.first + active).tolist(), points, strict=True):
             graph.add(gtsam.PriorFactorPoint2(key, point, anchor))
-    for slot, interval in enumerate(smoother.odometry.intervals):
+    for slot, interval in enumerate(smoother.window.odometry.intervals):
         graph.add(odometry_factor(smoother.first_cycle + slot, interval))
     _add(graph, smoother.user_factors.factors)
     _add(graph, [as_nonlinear(factor, smoother.variables) for factor in factors_of(smoother.prior)])
@@ -114,8 +113,3 @@ def gauge_factors(
     for triple, bending in zip(gauge.triples.tolist(), gauge.bending, strict=True):
         factors += smoothness_factors([keys[j] for j in triple], bending[None], 1.0)
     return factors
-
-
-def odometry_factor(cycle: int, interval: IntegratedOdometry) -> gtsam.CustomFactor:
-    """The odometry from the pose of a cycle to the next one, with its calibration."""
-    return calibrated_odometry_factor(pose_key(cycle), pose_key(cycle + 1), CALIBRATION_KEY, interval)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -61,8 +62,9 @@ def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, A
     calibration = rng.normal(0.0, [odometry.sigma_scale, odometry.sigma_bias])
     sigma = np.sqrt(readings.covariance[:, 0, 0] + system.settings.spline.sigma_model**2)
     points = readings.point + sigma[:, None] * rng.normal(size=readings.point.shape)
-    noise = np.linalg.solve(chain.whiteners, rng.normal(size=(*chain.deltas.shape, 1)))[..., 0]
-    local = noise + chain.by_calibration @ calibration
+    driven = chain.odometry
+    noise = np.linalg.solve(driven.whiteners, rng.normal(size=(*driven.deltas.shape, 1)))[..., 0]
+    local = noise + driven.by_calibration @ calibration
     first = rng.multivariate_normal(chain.first, np.linalg.inv(chain.first_information))
     noisy = BatchSystem(
         replace(readings, point=points, u=readings.u.copy()),
@@ -75,6 +77,8 @@ def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, A
 
 def _turned(chain: Chain, local: Array) -> Chain:
     """With errors (P - 1, 3) in the frame of each motion's end."""
-    c, s = np.cos(chain.deltas[:, 2]), np.sin(chain.deltas[:, 2])
+    odometry = copy(chain.odometry)
+    c, s = np.cos(odometry.deltas[:, 2]), np.sin(odometry.deltas[:, 2])
     turned = np.column_stack([c * local[:, 0] - s * local[:, 1], s * local[:, 0] + c * local[:, 1]])
-    return replace(chain, deltas=chain.deltas + np.column_stack([turned, local[:, 2]]))
+    odometry.deltas = odometry.deltas + np.column_stack([turned, local[:, 2]])
+    return replace(chain, odometry=odometry)

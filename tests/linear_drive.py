@@ -115,14 +115,13 @@ class LinearDrive:
     def __post_init__(self) -> None:
         settings = SmootherSettings(
             lag=float(self.lag),
-            tolerance_point=self.tolerance,
-            tolerance_heading=self.tolerance,
+            tolerances=(self.tolerance, self.tolerance),
             keyframe_interval=1e9,
             sigma_calibration=(float(SIGMA_CALIBRATION[0]), float(SIGMA_CALIBRATION[1])),
         )
         self.track = LinearTrack(self.seed)
         self.smoother = FixedLagSmoother(settings, self.track)
-        self.smoother.odometry = LinearOdometry()
+        self.smoother.window.odometry = LinearOdometry()
         self.rng = np.random.default_rng(self.seed + 100)
         self.start = self.rng.normal(size=POSE)
 
@@ -155,7 +154,7 @@ class LinearDrive:
     def see(self, numbers: IntArray) -> None:
         """New map points, anywhere."""
         points = self.rng.normal(size=(len(numbers), 2)) * 7.0
-        self.smoother.insert_points(control_keys(0, numbers), points)
+        self.smoother.variables.insert(control_keys(0, numbers), points.ravel())
         self.track.structure = object()
 
     def deactivate(self, before: int) -> None:

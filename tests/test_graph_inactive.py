@@ -175,10 +175,7 @@ class Checked(FixedLagSmoother[CurveMap]):
         if len(self.inactive) == 0:
             return
         assert sigma_step is not None
-        used = (*self._factors.values(), *self._gauge.values())
-        graph = graph_of(
-            self.prior, self.inactive.net, self._linear_gauge, *(factor.linear for factor in used)
-        )
+        graph = graph_of(self.prior, self.inactive.net, *self.window.linear)
         whole = Layout(keys_of(graph))
         hessian, vector = normal_equations(graph, whole)
         own = np.setdiff1d(self.layout.keys, self.inactive.keys)

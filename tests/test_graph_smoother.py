@@ -160,56 +160,56 @@ def test_substituted_points_know_what_the_old_ones_did() -> None:
 def drive_bean(settings: MapperSettings, cycles: int) -> FixedLagMapper:
     """A mapper somewhere on a lap, with the tolerances that hold after it has closed."""
     mapper = FixedLagMapper(settings, ODOMETRY_SIGMA)
-    mapper.smoother.exact = False
+    mapper.smoother.window.exact = False
     for _, (odometry, cycle) in zip(range(cycles), split_odometry(lap_log(bean_track(), 0.0)), strict=False):
         mapper.update(odometry, cycle)
     return mapper
 
 
 def factors_of_cycles(mapper: FixedLagMapper) -> dict[int, LinearFactor]:
-    return dict(mapper.smoother._factors)
+    return dict(mapper.smoother.window.of_cycle)
 
 
 def test_factors_are_kept_as_long_as_nothing_has_moved_by_the_tolerance() -> None:
     mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(1e3, 1e3)), 60)
     mapper.smoother.step(0.5)
-    before, weak = factors_of_cycles(mapper), dict(mapper.smoother._gauge)
+    before, weak = factors_of_cycles(mapper), dict(mapper.smoother.window.gauge)
     mapper.poses[:] += 0.3
     mapper.smoother.step(0.5)
     after = factors_of_cycles(mapper)
     assert len(before) == len(mapper.poses) == len(after)
     assert all(after[cycle] is factor for cycle, factor in before.items())
-    assert all(mapper.smoother._gauge[owner] is factor for owner, factor in weak.items())
+    assert all(mapper.smoother.window.gauge[owner] is factor for owner, factor in weak.items())
 
 
 def test_all_factors_are_new_in_every_step_while_the_loop_is_open() -> None:
     mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(1e3, 1e3)), 60)
-    mapper.smoother.exact = True
+    mapper.smoother.window.exact = True
     mapper.smoother.step(0.5)
     before = factors_of_cycles(mapper)
     mapper.smoother.step(0.5)
     after = factors_of_cycles(mapper)
     assert not any(after[cycle] is factor for cycle, factor in before.items())
-    assert FixedLagMapper().smoother.exact
+    assert FixedLagMapper().smoother.window.exact
 
 
 def test_the_tolerance_holds_once_the_loop_has_closed() -> None:
     mapper = FixedLagMapper(odometry_sigma=ODOMETRY_SIGMA)
     for odometry, cycle in split_odometry(lap_log(bean_track(), 45.0)):
         mapper.update(odometry, cycle)
-        assert mapper.smoother.exact is not mapper.closed
+        assert mapper.smoother.window.exact is not mapper.closed
     assert mapper.closed
 
 
 def test_all_factors_are_new_where_everything_has_moved() -> None:
     mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(1e-12, 1e-12)), 60)
     mapper.smoother.step(0.5)
-    before, weak = factors_of_cycles(mapper), dict(mapper.smoother._gauge)
+    before, weak = factors_of_cycles(mapper), dict(mapper.smoother.window.gauge)
     mapper.smoother.variables.values[:] += 1e-9
     mapper.smoother.factorize(0.5)
     after = factors_of_cycles(mapper)
     assert not any(after[cycle] is factor for cycle, factor in before.items())
-    assert not any(mapper.smoother._gauge[owner] is factor for owner, factor in weak.items())
+    assert not any(mapper.smoother.window.gauge[owner] is factor for owner, factor in weak.items())
 
 
 @pytest.mark.parametrize(("entry", "size"), [(0, 0.02), (1, 0.02), (2, 0.002)])
@@ -222,10 +222,14 @@ def test_a_pose_that_has_moved_makes_the_factors_that_hold_it_anew(entry: int, s
     before, slot = factors_of_cycles(mapper), 7
     mapper.poses[slot, entry] += 0.4 * size
     smoother.factorize(0.5)
-    assert all(smoother._factors[cycle] is factor for cycle, factor in before.items())
+    assert all(smoother.window.of_cycle[cycle] is factor for cycle, factor in before.items())
     mapper.poses[slot, entry] += size
     smoother.factorize(0.5)
-    new = [cycle - smoother.first_cycle for cycle, f in before.items() if smoother._factors[cycle] is not f]
+    new = [
+        cycle - smoother.first_cycle
+        for cycle, f in before.items()
+        if smoother.window.of_cycle[cycle] is not f
+    ]
     assert new == [slot - 1, slot]
 
 
@@ -247,12 +251,12 @@ def test_a_reading_that_goes_in_or_out_of_use_makes_its_cycle_stale(into_use: bo
     else:
         readings.release(row)
     smoother.step(0.5)
-    new = [c for c, factor in before.items() if smoother._factors[c] is not factor]
+    new = [c for c, factor in before.items() if smoother.window.of_cycle[c] is not factor]
     assert new == [cycle]
-    assert height(smoother._factors[cycle]) == rows + (1 if into_use else -1)
-    again = smoother._factors[cycle]
+    assert height(smoother.window.of_cycle[cycle]) == rows + (1 if into_use else -1)
+    again = smoother.window.of_cycle[cycle]
     smoother.step(0.5)
-    assert smoother._factors[cycle] is again
+    assert smoother.window.of_cycle[cycle] is again
     assert not readings.changed.any()
 
 
@@ -277,7 +281,7 @@ def test_the_steps_system_is_that_of_the_graph_at_the_estimate() -> None:
 
 def numeric_end(mapper: FixedLagMapper) -> tuple[Array, Array, Array]:
     """Derivatives of the newest pose by the one before, by the calibration, and by the odometry's noise."""
-    start, odometry = mapper.poses[-2].copy(), mapper.smoother.odometry
+    start, odometry = mapper.poses[-2].copy(), mapper.smoother.window.odometry
     delta, G = odometry.deltas[-1], odometry.by_calibration[-1]
     b = mapper.calibration.copy()
 
@@ -313,7 +317,7 @@ def test_predicted_is_that_of_the_dense_joint_covariance_with_the_newest_pose(to
     reach = np.zeros((POSE, size))
     reach[:, columns_of(pose_keys(np.array([smoother.next_cycle - 2])), step.layout.keys)] = by_last
     reach[:, columns_of(np.array([CALIBRATION_KEY]), step.layout.keys)] = by_calibration
-    whitener = smoother.odometry.whiteners[-1]
+    whitener = smoother.window.odometry.whiteners[-1]
     noise = by_noise @ np.linalg.inv(whitener.T @ whitener) @ by_noise.T
     whole = np.block([[joint, joint @ reach.T], [reach @ joint, reach @ joint @ reach.T + noise]])
     everything = np.append(step.layout.keys, pose_key(smoother.next_cycle - 1))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, odometry_residuals
 
-from .keys import CALIBRATION_KEY, POSE, pose_keys
+from .keys import CALIBRATION_KEY, POSE, pose_key, pose_keys
 from .rows import Rows
 from .variables import Variables
 
@@ -50,26 +52,45 @@ class OdometryChain:
         self.deltas, self.whiteners = self.deltas[1:], self.whiteners[1:]
         self.by_calibration = self.by_calibration[1:]
 
+    def terms(self, slots: IntArray | slice, poses: Array, calibration: Array) -> tuple[Array, Array]:
+        """`W_k (Log(delta_k^-1 x_k^-1 x_{k+1}) + G_k b)` of some intervals k (m,) between poses (P, 3).
+
+        G is `by_calibration`. Gives residuals (m, 3) and derivatives (m, 3, 8) by [calibration | pose |
+        next].
+        """
+        whiteners, by_calibration = self.whiteners[slots], self.by_calibration[slots]
+        start, end = poses[:-1][slots], poses[1:][slots]
+        residual, by_start, by_end = odometry_residuals(start, end, self.deltas[slots])
+        residual = residual + by_calibration @ calibration
+        jacobian = whiteners @ np.concatenate([by_calibration, by_start, by_end], axis=2)
+        return (whiteners @ residual[:, :, None])[:, :, 0], jacobian
+
     def rows(self, variables: Variables, cycles: IntArray) -> list[Rows]:
-        """`W_k (Log(delta_k^-1 x_k^-1 x_{k+1}) + G_k b)` from the poses of some cycles (m,) to the next.
+        """The terms from the poses of some cycles (m,) to the next as rows; each cycle owns its own.
 
         The chain leads from each pose of the window to the next; the newest pose, from which it does not lead
-        on, has no rows. G is `by_calibration`. Each cycle owns its rows.
+        on, has no rows.
         """
         slots = cycles - variables.first_cycle
         slots = slots[slots < len(self)]
         if len(slots) == 0:
             return []
-        poses, whiteners, by_calibration = variables.poses, self.whiteners[slots], self.by_calibration[slots]
-        residual, by_start, by_end = odometry_residuals(poses[slots], poses[slots + 1], self.deltas[slots])
-        residual = residual + by_calibration @ variables.calibration
-        cycles = np.repeat(variables.first_cycle + slots, POSE)
-        keys = np.stack(
-            [np.full(len(cycles), CALIBRATION_KEY), pose_keys(cycles), pose_keys(cycles + 1)], axis=1
-        )
-        jacobian = whiteners @ np.concatenate([by_calibration, by_start, by_end], axis=2)
-        whitened = whiteners @ residual[:, :, None]
-        return [Rows(keys, jacobian.reshape(len(cycles), -1), whitened.ravel(), cycles)]
+        cycles = variables.first_cycle + slots
+        return [odometry_rows(cycles, self.terms(slots, variables.poses, variables.calibration), cycles)]
+
+
+def odometry_rows(cycles: IntArray, terms: tuple[Array, Array], owner: IntArray) -> Rows:
+    """What `OdometryChain.terms` gives of the intervals from some cycles (m,) on, as rows with owners
+    (m,)."""
+    residual, jacobian = terms
+    keys = np.stack([np.full(len(cycles), CALIBRATION_KEY), pose_keys(cycles), pose_keys(cycles + 1)], axis=1)
+    flat = jacobian.reshape(residual.size, CALIBRATION_SIZE + 2 * POSE)
+    return Rows(np.repeat(keys, POSE, axis=0), flat, residual.ravel(), np.repeat(owner, POSE))
+
+
+def odometry_factor(cycle: int, interval: IntegratedOdometry) -> gtsam.CustomFactor:
+    """The odometry from the pose of a cycle to the next one, with its calibration."""
+    return calibrated_odometry_factor(pose_key(cycle), pose_key(cycle + 1), CALIBRATION_KEY, interval)
 
 
 def calibrated_delta(odometry: IntegratedOdometry, calibration: Array) -> Array:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic
 
 import gtsam
 import numpy as np
@@ -20,7 +20,6 @@ from pathspace_graph.factors.odometry import IntegratedOdometry, compose
 
 from .gaussian import (
     cholesky,
-    combined,
     covariance,
     covariance_of,
     eliminate,
@@ -46,11 +45,12 @@ from .keys import (
     pose_key,
     pose_keys,
 )
-from .odometry import OdometryChain, calibrated_delta, through_odometry
-from .rows import LinearFactor, Rows, jacobian_factors, one_factor
+from .odometry import calibrated_delta, through_odometry
+from .rows import Rows
 from .submaps import Submaps
 from .user_factors import UserFactors
-from .variables import Layout, Variables
+from .variables import Layout
+from .window import M_co, WindowFactors
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -59,55 +59,14 @@ TIME_TOLERANCE = 1e-9
 """A pose leaves where it is older than the lag by more than this (s): stamps are sums of decimals."""
 
 
-class MapRows(Protocol):
-    """What the engine has to know about a map: its rows, and what they hang on."""
-
-    variables: Variables
-    """Map points, calibration and poses."""
-    slid: bool
-    """Whether a row that was asked for last should be on an inactive map point, but is not."""
-
-    @property
-    def structure(self) -> object:
-        """Another object where the weak priors are between other variables than before."""
-
-    def changed(self) -> IntArray:
-        """(k,) perception cycles whose readings in use have changed since they were linearized last."""
-
-    def rows(self, cycles: IntArray) -> list[Rows]:
-        """Rows of the readings of some cycles, at the variables' values: the pose first, owned by the
-        cycle."""
-
-    def linearized(self, cycles: IntArray) -> None:
-        """The rows of these cycles are those of the graph from now on."""
-
-    def gauge(self, whole: bool) -> list[Rows]:
-        """Weak priors between the active map points, or between all."""
-
-    def linear_gauge(self, whole: bool) -> list[Rows]:
-        """Those of the weak priors that are linear, so that they are made anew with the structure only."""
-
-    def all_active(self) -> None:
-        """Every map point is active again."""
-
-    def leave(self, cycle: int) -> None:
-        """The pose of a cycle, the window's oldest, has left."""
-
-
-M_co = TypeVar("M_co", bound=MapRows, covariant=True)
-
-
 @dataclass(frozen=True)
 class SmootherSettings:
     """What the window is told."""
 
     lag: float
     """Time (s) that poses stay in the window."""
-    tolerance_point: float
-    """A factor is linearized anew where a map point or a position in it has moved farther than this (m),
-    ..."""
-    tolerance_heading: float
-    """... or a heading (rad)."""
+    tolerances: tuple[float, float]
+    """Of relinearization: of points and positions (m) and of headings (rad)."""
     keyframe_interval: float
     """Path (m) between the keyframes of the submaps."""
     sigma_calibration: tuple[float, float]
@@ -134,8 +93,8 @@ class FixedLagSmoother(Generic[M_co]):
         self.variables = track.variables
         self.times: list[float] = []
         """Stamp (s) of each pose in the window."""
-        self.odometry = OdometryChain()
-        """Between each pose of the window and the next."""
+        self.window = WindowFactors(track, settings.tolerances)
+        """The factors of the poses in the window, and their odometry."""
         self.user_factors = UserFactors()
         """The user's own."""
         self.prior = gtsam.GaussianFactorGraph()
@@ -146,13 +105,7 @@ class FixedLagSmoother(Generic[M_co]):
         """The same prior stretch by stretch, while the loop is open and the user gave no factors."""
         self.last_step: Step | None = None
         """None before the first."""
-        self.exact = False
-        """Whether all that has moved at all is linearized anew, as if the tolerances were zero."""
-        self._factors: dict[int, LinearFactor] = {}
-        self._gauge: dict[int, LinearFactor] = {}
         self._inactive: frozenset[int] = frozenset()
-        self._linear_gauge = gtsam.GaussianFactorGraph()
-        self._structure: object = None
         self._active: tuple[Layout, int] | None = None
         self._layout = Layout(np.zeros(0, np.intp))
         self.epoch = 0
@@ -203,10 +156,10 @@ class FixedLagSmoother(Generic[M_co]):
 
     def follow(self, t: float, pose: Array, odometry: IntegratedOdometry) -> None:
         """The next pose (3,), and how it was reached."""
-        self._factors.pop(self.next_cycle - 1, None)
+        self.window.of_cycle.pop(self.next_cycle - 1, None)
         self.variables.insert(pose_keys(np.array([self.next_cycle])), pose)
         self.times.append(t)
-        self.odometry.append(odometry)
+        self.window.odometry.append(odometry)
 
     def add_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
         """The user's factors, on any variable, and on the pose of the cycle that comes next.
@@ -230,10 +183,6 @@ class FixedLagSmoother(Generic[M_co]):
         if are_poses(np.array(key)):
             return self.first_cycle <= cycle <= self.next_cycle
         return bool(self.variables.layout.positions(np.array(key)) >= 0)
-
-    def insert_points(self, keys: IntArray, points: Array) -> None:
-        """New map points (k, 2), of which the prior knows nothing."""
-        self.variables.insert(keys, points.ravel())
 
     def forget(self, keys: IntArray) -> None:
         """Removes all prior information about map points."""
@@ -268,77 +217,13 @@ class FixedLagSmoother(Generic[M_co]):
         Its unknowns are `value - reference`, poses (x, y, theta) in the map frame. `whole`: of the inactive
         variables too, which are to be up to date.
         """
-        cycles = np.arange(self.first_cycle, self.next_cycle)
-        rows = [*self.map.rows(cycles), *self.odometry.rows(self.variables, cycles)]
-        own = [*jacobian_factors(rows, self.variables).values()]
-        own += jacobian_factors(self.map.gauge(whole), self.variables).values()
-        own += jacobian_factors(self.map.linear_gauge(whole), self.variables).values()
+        own = self.window.fresh(self._cycles, whole)
         prior = self.inactive.joined(self.prior) if whole else self.prior
-        linear = [factor.linear for factor in own]
-        return graph_of(prior, *linear, *self.user_factors.linearized(self.variables, whole))
+        return graph_of(prior, *own, *self.user_factors.linearized(self.variables, whole))
 
-    def _relinearized(self) -> gtsam.GaussianFactorGraph:
-        """The same of the active variables, where only stale factors are made anew."""
-        moved = self._moved()
-        stale = self._stale(moved)
-        rows = [*self.map.rows(stale), *self.odometry.rows(self.variables, stale)]
-        fresh = jacobian_factors(rows, self.variables)
-        if self.map.slid or not all(self._inactive.isdisjoint(factor.keys) for factor in fresh.values()):
-            self.reactivate()  # a reading has slid to where the map is inactive: rare, since there is room
-            return self._relinearized()
-        self._factors |= fresh
-        self.map.linearized(stale)
-        self._relinearize_gauge(moved)
-        entries = self.variables.layout.entries(moved)
-        self.variables.linearized[entries] = self.variables.values[entries]
-        graph = graph_of(self.prior, self._linear_gauge, *self.user_factors.linearized(self.variables))
-        for factor in (*self._factors.values(), *self._gauge.values()):
-            graph.push_back(factor.linear)
-        return graph
-
-    def _moved(self) -> IntArray:
-        """Keys of the variables that have moved by more than the tolerance since they were linearized.
-
-        Not the calibration: every row is linear in it.
-        """
-        layout = self.variables.layout
-        tolerance, poses = np.zeros(layout.size), layout.block(POSE_LETTER)
-        if not self.exact:
-            tolerance += self.settings.tolerance_point
-            tolerance[poses.start + POSE - 1 : poses.stop : POSE] = self.settings.tolerance_heading
-        tolerance[layout.block(CALIBRATION_LETTER)] = np.inf
-        away = np.abs(self.variables.values - self.variables.linearized) > tolerance
-        return layout.keys[np.logical_or.reduceat(away, layout.starts)]
-
-    def _stale(self, moved: IntArray) -> IntArray:
-        """Cycles whose factor is missing, holds a variable that has moved, or other readings than before."""
-        changed, gone = set(self.map.changed().tolist()), frozenset(moved.tolist())
-        return np.array(
-            [
-                cycle
-                for cycle in range(self.first_cycle, self.next_cycle)
-                if cycle in changed
-                or cycle not in self._factors
-                or not gone.isdisjoint(self._factors[cycle].keys)
-            ],
-            np.intp,
-        )
-
-    def _relinearize_gauge(self, moved: IntArray) -> None:
-        """The weak priors, where a map point has moved, or all where they are between others than before."""
-        structure, gone = self.map.structure, frozenset(moved.tolist())
-        if structure is not self._structure:
-            self._gauge, self._structure = {}, structure
-            linear = jacobian_factors(self.map.linear_gauge(False), self.variables)
-            rows = graph_of(*(factor.linear for factor in linear.values()))
-            self._linear_gauge = graph_of(combined(rows)) if linear else rows
-        kept = [owner for owner, factor in self._gauge.items() if gone.isdisjoint(factor.keys)]
-        if len(kept) == len(self._gauge) > 0:
-            return
-        stale = self.map.gauge(False)
-        if kept:
-            stale = [group.where(~np.isin(group.owner, kept)) for group in stale]
-        self._gauge |= jacobian_factors(stale, self.variables)
+    @property
+    def _cycles(self) -> IntArray:
+        return np.arange(self.first_cycle, self.next_cycle)
 
     # --- Gauss-Newton ------------------------------------------------------------------------------------
 
@@ -351,7 +236,11 @@ class FixedLagSmoother(Generic[M_co]):
 
     def factorize(self, sigma_step: float | None = None) -> Array:
         """The step's system and its Cholesky factor; gives the negative gradient (n,). No variable moves."""
-        graph, layout = self._relinearized(), self.layout
+        if not self.window.relinearize(self._cycles, self._inactive):
+            self.reactivate()  # a reading has slid to where the map is inactive: rare, since there is room
+            self.window.relinearize(self._cycles, self._inactive)
+        user, layout = self.user_factors.linearized(self.variables), self.layout
+        graph = graph_of(self.prior, *self.window.linear, *user)
         hessian, vector = normal_equations(graph, layout)
         descent = vector - hessian @ self.variables.change(self.variables.layout.entries(layout.keys))
         if sigma_step is not None:
@@ -367,9 +256,7 @@ class FixedLagSmoother(Generic[M_co]):
         """Map points (k,), active up to now, that nothing in the window touches leave the system."""
         if len(keys) == 0:
             return
-        gauge_rows = [*self.map.gauge(False), *self.map.linear_gauge(False)]
-        leaving = [rows.where(np.asarray(np.isin(rows.keys, keys).any(axis=1))) for rows in gauge_rows]
-        shared = [*one_factor(leaving, self.variables), *self.user_factors.set_aside(keys, self.variables)]
+        shared = [*self.window.weak_on(keys), *self.user_factors.set_aside(keys, self.variables)]
         held = self.user_factors.leave(keys, self.variables)
         keyframes = self.variables.keyframes
         self._cut_submap()
@@ -377,8 +264,7 @@ class FixedLagSmoother(Generic[M_co]):
         self.prior = self.inactive.push(prior, keys, keyframes, shared)
         self.variables.remove(keyframes)
         self._inactive = frozenset(self.inactive.keys.tolist())
-        kept = {c: own for c, own in self._factors.items() if self._inactive.isdisjoint(own.keys)}
-        self._factors = kept  # one that is older than what it holds now may still hold what it held then
+        self.window.drop(self._inactive)  # one that was linearized long ago may hold what it held then
 
     def _cut_submap(self) -> None:
         """The submap under way ends where other map points are active than before: it stays small."""
@@ -425,7 +311,7 @@ class FixedLagSmoother(Generic[M_co]):
         """
         cycle, key = self.first_cycle, pose_key(self.first_cycle)
         held = self.user_factors.leave(np.array([key]), self.variables)
-        own = graph_of(self._factors.pop(cycle).linear, *held)
+        own = graph_of(self.window.of_cycle.pop(cycle).linear, *held)
         if self.submaps is not None:
             self.submaps.leave(key, own, self.variables)
         self.prior = graph_of(self.prior, own)
@@ -434,7 +320,7 @@ class FixedLagSmoother(Generic[M_co]):
             self.prior = marginalize(self.prior, np.array([key]))
             self.variables.remove(np.array([key]))
         self.times.pop(0)
-        self.odometry.drop_first()
+        self.window.odometry.drop_first()
         self.map.leave(cycle)
 
     # --- closing -----------------------------------------------------------------------------------------
@@ -472,7 +358,7 @@ class FixedLagSmoother(Generic[M_co]):
         self.prior = eliminate(graph_of(self.prior, *held, tie), old)[1]
         self.variables.remove(old)
         self.variables.insert(new, points.ravel())
-        self._factors, self._structure = {}, None
+        self.window.clear()
 
     def merge(self, gone: IntArray, kept: IntArray) -> None:
         """Map points `gone` (k,) have become others, `kept` (k,), whose values stay as they are.
@@ -486,7 +372,7 @@ class FixedLagSmoother(Generic[M_co]):
         offset = reference[layout.entries(kept)] - reference[layout.entries(gone)]
         self.prior = merged(graph_of(self.prior, *held), gone, kept, offset)
         self.variables.remove(gone)
-        self._factors, self._structure = {}, None
+        self.window.clear()
 
     # --- uncertainty -------------------------------------------------------------------------------------
 
@@ -522,7 +408,7 @@ class FixedLagSmoother(Generic[M_co]):
         noise, newest = np.zeros((len(rows), POSE)), columns[:, 0] < 0
         if newest.any():
             by_last, by_calibration, noise[newest] = through_odometry(
-                rows.jacobian[newest, :POSE], self.variables.poses[-2:], self.odometry
+                rows.jacobian[newest, :POSE], self.variables.poses[-2:], self.window.odometry
             )
             before = pose_keys(np.array([self.next_cycle - 2]))
             gradient[step.layout.entries(before)[:, None], row[newest]] += by_last.T
