@@ -15,9 +15,11 @@ from pathspace_graph.factors.odometry import IntegratedOdometry, compose, integr
 from .boundary import Boundary
 from .closing import bend, near_start, register, tie
 from .curve_map import CurveMap, CurveSmoother
+from .errors import SettingsError
 from .gating import admit
-from .graph.keys import POINT, pose_key, pose_keys
+from .graph.keys import POINT, name, pose_key, pose_keys
 from .graph.smoother import FixedLagSmoother, SmootherSettings
+from .graph.variables import UNKNOWN as UNKNOWN_PLACE
 from .growth import Growth
 from .labels import LEFT, RIGHT
 from .log import Detections, Odometry
@@ -98,10 +100,11 @@ class FixedLagMapper:
     ) -> CycleResult:
         """One perception cycle: the twists since the last one, and what was detected now.
 
-        `factors`: GTSAM factors of your own, on poses in the window (`pose_key`, `next_pose_key`: `Pose2`)
-        and on control points (`control_keys`: `Point2`). Each is relinearized at every step as long as all of
-        its poses are in the window and its control points are active, and then a part of the prior.
-        SettingsError, and nothing done, where a key is not a variable of the graph.
+        `factors`: GTSAM factors of your own, on poses in the window (`pose_key`, `next_pose_key`: `Pose2`),
+        on control points (`control_keys`: `Point2`) and on the calibration. Each is relinearized at every
+        step until one of its poses leaves the window, and is a part of the prior then; one on control points
+        alone until the loop closes and there are new ones. SettingsError, and nothing done, where a key is
+        not a variable of the graph.
         """
         watch = Stopwatch()
         self.smoother.add_factors(factors)
@@ -230,8 +233,17 @@ class FixedLagMapper:
         """(q, q) joint covariance of any variables (k,) of the map and the window, in the order of the keys.
 
         Control points (m), poses (x, y, theta) in the map frame (m, m, rad), calibration (-, rad/s).
+        SettingsError where a key is no variable: its pose has left the window, or the curve has new knots.
         """
-        return self.smoother.covariance(np.array(keys, np.intp))
+        wanted = np.array(keys, np.intp)
+        unknown = wanted[self.smoother.variables.layout.positions(wanted) == UNKNOWN_PLACE]
+        if len(unknown):
+            first, last = self.smoother.first_cycle, self.smoother.next_cycle - 1
+            raise SettingsError(
+                f"covariance of {name(unknown[0])}: expected keys of poses x{first} to x{last}, "
+                "of control points of the present curves, or of the calibration"
+            )
+        return self.smoother.covariance(wanted)
 
     @staticmethod
     def pose_key(cycle: int) -> int:

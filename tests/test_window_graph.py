@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.fixed_lag import FixedLagMapper
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, normal_equations
 from pathspace_graph.graph.keys import are_poses, control_keys, pose_key
@@ -216,3 +217,12 @@ def test_the_error_of_such_a_factor_is_that_of_its_rows_to_a_constant() -> None:
         differences.append(nonlinear.error(variables.gtsam_values(KEYS)) - own)
     np.testing.assert_allclose(differences, differences[0], rtol=1e-9)
     assert control_keys(0, np.array(0)) in list(nonlinear.keys())
+
+
+def test_the_covariance_of_what_is_no_variable_is_refused(log: Log) -> None:
+    mapper = driven(log, 60, MapperSettings())
+    gone = pose_key(mapper.smoother.first_cycle - 1)
+    beyond = int(control_keys(LEFT, np.array([10_000]))[0])
+    for key, text in ((gone, f"x{mapper.smoother.first_cycle - 1}"), (beyond, "l10000")):
+        with pytest.raises(SettingsError, match=f"covariance of {text}: expected keys of poses"):
+            mapper.marginal_covariance([mapper.next_pose_key - 1, key])
