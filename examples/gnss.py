@@ -43,7 +43,7 @@ def gnss_factor(key: int, fix: Array) -> gtsam.NonlinearFactor:
     """A fix (2,) of a pose, map frame, m; Huber's loss, as a receiver has outliers."""
     gaussian = gtsam.noiseModel.Isotropic.Sigma(2, SIGMA_GNSS)
     robust = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(1.345), gaussian)
-    return gtsam.PoseTranslationPrior2D(key, gtsam.Point2(*fix), robust)
+    return gtsam.PoseTranslationPrior2D(key, fix, robust)
 
 
 def drive(log: Log, fixes: Array | None) -> Array:

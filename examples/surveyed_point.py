@@ -76,8 +76,8 @@ def drive(log: Log, point: Array | None) -> FixedLagMapper:
 
 def distance(mapper: FixedLagMapper, point: Array) -> float:
     """Distance (m) of the left boundary from a point (2,)."""
-    spline = mapper.map().boundaries[LEFT].spline
-    curve = spline.evaluate(np.linspace(*spline.domain, 4000))
+    boundary, points = mapper.boundaries[LEFT], mapper.control_points(LEFT)
+    curve = boundary.evaluate(points, np.linspace(boundary.tables.low, boundary.tables.high, 4000))
     return float(np.hypot(*(curve - point).T).min())
 
 

@@ -175,6 +175,7 @@ def test_the_studies_listed_are_the_files_on_disk_and_are_shipped() -> None:
         "gauge",
         "lag",
         "paper",
+        "relinearize",
         "residual",
         "robust",
     }
