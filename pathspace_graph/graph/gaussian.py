@@ -115,25 +115,6 @@ def jacobian_factor(keys: IntArray, A: Array, b: Array) -> gtsam.GaussianConditi
     return linear_factor(keys.tolist(), sizes(keys).tolist(), A, b)
 
 
-def hessian_factor(layout: Layout, information: Array, vector: Array) -> gtsam.HessianFactor:
-    """`1/2 d' L d - g' d` on any number of keys: L (n, n) may be singular.
-
-    The binding makes one on more than three keys from a graph only, and a singular L has no Cholesky root. So
-    it is the root of L + s I, less s I, which is exact; s is of the size of L's entries.
-    """
-    shift = float(np.abs(np.diagonal(information)).mean()) + 1.0
-    raised = np.asfortranarray(information + shift * np.eye(layout.size))
-    lower = np.tril(cholesky(raised))
-    right, _ = lapack.dtrtrs(lower, vector, lower=1)
-    added = np.sqrt(shift) * np.eye(layout.size)
-    return combined(
-        graph_of(
-            jacobian_factor(layout.keys, lower.T, right),
-            jacobian_factor(layout.keys, added, np.zeros(layout.size)).negate(),
-        )
-    )
-
-
 def rooted(information: Array, vector: Array) -> tuple[Array, Array]:
     """`A` (r, n) and `b` (r,) with `A'A = L` and `A'b = g`: as many rows as L (n, n), which may be singular,
     has rank.
@@ -211,7 +192,8 @@ def merged(
     E[np.arange(old.size), new.entries(becomes)] = 1.0
     e[old.entries(gone[places >= 0])] = offset[np.repeat(places >= 0, sizes(gone))]
     information, vector = normal_equations(graph, old)
-    return graph_of(hessian_factor(new, E.T @ information @ E, E.T @ (vector - information @ e)))
+    root, right = rooted(E.T @ information @ E, E.T @ (vector - information @ e))
+    return graph_of(combined(graph_of(jacobian_factor(new.keys, root, right))))
 
 
 def conditioned(
