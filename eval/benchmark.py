@@ -101,8 +101,7 @@ def linear_window(mapper: FixedLagMapper) -> LinearWindow:
 
 
 def _is_of_a_cycle(factor: gtsam.GaussianFactor) -> bool:
-    """Whether a factor is of the rows of a cycle: the others are the prior, which is dense, and weak
-    priors."""
+    """Whether a factor is of the rows of a cycle; else it is of the prior or of weak priors."""
     rows = isinstance(factor, gtsam.JacobianFactor)
     return rows and bool(are_poses(np.array(list(factor.keys()), np.intp)).any())
 

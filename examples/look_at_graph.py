@@ -59,8 +59,7 @@ def errors_by_kind(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> d
 
 
 def draw(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, axes: Axes) -> None:
-    """Poses and control points where they are, and a line from each projection factor's pose to its
-    points."""
+    """Poses and control points, and a line from the pose of each projection factor to its points."""
     where = {
         key: _position(values, key) for key in list(values.keys()) if gtsam.symbolChr(key) != CALIBRATION
     }

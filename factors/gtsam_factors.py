@@ -90,8 +90,7 @@ def boundary_point_factor(
 
 @dataclass(frozen=True, eq=False)
 class _Curve:
-    """The stretches of a curve that a factor looks at, and the keys of the control points that matter
-    there."""
+    """The stretches of a curve that a factor looks at, and the keys that matter there."""
 
     keys: tuple[int, ...]
     """Keys of the control points `touched`."""

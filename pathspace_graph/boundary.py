@@ -28,13 +28,13 @@ class Gauge:
     points: IntArray
     """(k,) the control points, in driving order."""
     pairs: IntArray
-    """(r, 2) each and the next, ..."""
+    """(r, 2) each and the next."""
     nominal: Array
-    """... and their nominal distance (r,), m."""
+    """(r,) nominal distance of these, m."""
     triples: IntArray
-    """(t, 3) three in a row, ..."""
+    """(t, 3) three in a row."""
     bending: Array
-    """... and the coefficients (t, 3) of their second difference in sigmas (1/m)."""
+    """(t, 3) coefficients of their second difference in sigmas (1/m)."""
 
 
 class Boundary:
@@ -78,8 +78,7 @@ class Boundary:
         self._gauge: Gauge | None = None
 
     def gauge_on(self, points: IntArray) -> Gauge:
-        """The gauge between control points (k,), a stretch in driving order; the last one asked for is
-        kept."""
+        """The gauge between control points (k,), in driving order; the last one asked for is kept."""
         if self._gauge is None or self._gauge.points is not points:
             self._gauge = self._new_gauge(points)
         return self._gauge

@@ -221,8 +221,13 @@ class FixedLagMapper:
         """The window as GTSAM has it: projection, spacing, smoothness, odometry, your own and prior factors.
 
         On the keys of `values`: what is active. It shares nothing with the mapper, so optimize it, print its
-        errors, or ask marginals of it with GTSAM's own classes.
+        errors, or ask marginals of it with GTSAM's own classes. SettingsError where readings are held against
+        their foot points, for which there is no such factor.
         """
+        if self.settings.spline.residual != "across":
+            raise SettingsError(
+                f"graph: expected spline.residual across, found {self.settings.spline.residual}"
+            )
         return window_graph(self.smoother)
 
     def values(self) -> gtsam.Values:

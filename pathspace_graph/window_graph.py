@@ -88,8 +88,7 @@ def reading_factors(
 
 
 def _room(boundary: Boundary, active: IntArray, u: Array, room: float) -> tuple[Array, Array]:
-    """How far before and past parameters (m,) the curve still hangs on active control points, at most
-    `room`."""
+    """How far to both sides of parameters (m,) only active control points matter, at most `room`."""
     if len(active) == boundary.size:
         return np.full(len(u), room), np.full(len(u), room)
     p, begin = boundary.degree, boundary.knots[active[0] + boundary.degree]

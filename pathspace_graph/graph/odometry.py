@@ -80,8 +80,7 @@ class OdometryChain:
 
 
 def odometry_rows(cycles: IntArray, terms: tuple[Array, Array], owner: IntArray) -> Rows:
-    """What `OdometryChain.terms` gives of the intervals from some cycles (m,) on, as rows with owners
-    (m,)."""
+    """What `OdometryChain.terms` gives, as rows of the cycles (m,) it is of, with owners (m,)."""
     residual, jacobian = terms
     keys = np.stack([np.full(len(cycles), CALIBRATION_KEY), pose_keys(cycles), pose_keys(cycles + 1)], axis=1)
     flat = jacobian.reshape(residual.size, CALIBRATION_SIZE + 2 * POSE)

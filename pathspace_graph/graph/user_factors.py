@@ -36,8 +36,7 @@ class _Held:
 
 
 class UserFactors:
-    """The user's factors, each nonlinear until the first of its poses leaves, or its map points are no
-    more."""
+    """The user's factors, each nonlinear until one of its poses leaves, or its map points are replaced."""
 
     def __init__(self) -> None:
         self._held: list[_Held] = []
@@ -78,8 +77,7 @@ class UserFactors:
         return _linear(gone, variables)
 
     def set_aside(self, keys: IntArray, variables: Variables) -> list[gtsam.GaussianFactor]:
-        """Map points (k,) become inactive: the factors that hold one, and no pose, linearized until they
-        return."""
+        """The factors that hold an inactive map point of (k,), and no pose, linearized until it returns."""
         aside, self._held = self._parted(lambda held: held.touches(keys) and not held.on_poses)
         self._aside += aside
         return _linear(aside, variables)

@@ -39,8 +39,7 @@ class MapRows(Protocol):
         """(k,) perception cycles whose readings in use have changed since they were linearized last."""
 
     def rows(self, cycles: IntArray) -> list[Rows]:
-        """Rows of the readings of some cycles, at the variables' values: the pose first, owned by the
-        cycle."""
+        """Rows of the readings of some cycles at the variables' values, the pose first; cycles own them."""
 
     def linearized(self, cycles: IntArray) -> None:
         """The rows of these cycles are those of the graph from now on."""
