@@ -107,10 +107,12 @@ def _station_room(state: State, settings: MapperSettings) -> tuple[float, float]
 
 def _sought_again(smoother: CurveSmoother, label: int) -> float:
     """Station of a vehicle that the curve runs against, or is far off, where it was looked for."""
-    smoother.refresh()
-    state = smoother.map.state
-    room = smoother.map.settings.gate.station_room
-    return relocate(state.boundaries[label], state.control_points(label), state.poses[-1], room)
+    state, room = smoother.map.state, smoother.map.settings.gate.station_room
+    boundary, points = state.boundaries[label], state.control_points(label)
+    low = np.array([boundary.confirmed - room - boundary.settings.refine_room])
+    if boundary.periodic or boundary.tables.locate(low)[0][0] < state.active(label)[0]:
+        smoother.refresh()  # else what is looked at is active, which is up to date
+    return relocate(boundary, points, state.poses[-1], room)
 
 
 def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float) -> float:

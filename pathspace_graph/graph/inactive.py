@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from .gaussian import combined, eliminate, graph_of, keys_of
 from .keys import are_poses
-from .variables import Variables
+from .variables import Variables, spread
 
 IntArray = NDArray[np.intp]
 
@@ -38,6 +38,7 @@ class InactiveMap:
         self.anchors: IntArray = _NO_KEYS
         """(a,) poses that the last conditional hangs on, which have to stay active."""
         self._gone: IntArray = _NO_KEYS  # anchors of earlier conditionals, which left with the next ones
+        self._given: IntArray = _NO_KEYS  # what the conditionals hang on and is neither inactive nor gone
         self._shared: list[gtsam.GaussianFactor] = []
 
     def __len__(self) -> int:
@@ -63,6 +64,7 @@ class InactiveMap:
         self._gone = np.union1d(self._gone, keyframes)
         separator = np.array(list(conditional.keys()), np.intp)[len(frontals) :]
         self.anchors = separator[are_poses(separator)]
+        self._given = np.setdiff1d(np.union1d(self._given, separator), np.append(self.keys, self._gone))
         self._shared += shared
         return remaining
 
@@ -70,10 +72,11 @@ class InactiveMap:
         """Bring the inactive variables up to date: back-substitution, given the active ones."""
         if len(self) == 0:
             return
-        given, wanted = gtsam.VectorValues(), np.array(list(self.net.keyVector()), np.intp)
-        held = wanted[variables.layout.positions(wanted) >= 0]
-        for key in np.setdiff1d(held, self.keys):
-            given.insert(int(key), variables.change(variables.layout.entries(np.array([key]))))
+        given, places = gtsam.VectorValues(), variables.layout.positions(self._given)
+        starts, widths = variables.layout.starts[places], variables.layout.widths[places]
+        change = np.split(variables.change(spread(starts, widths)), np.cumsum(widths)[:-1])
+        for key, values in zip(self._given.tolist(), change, strict=True):
+            given.insert(key, values)
         solution = self.net.optimize(given)
         entries = variables.layout.entries(self.keys)
         variables.values[entries] = variables.reference[entries] + solution.vector(self.keys.tolist())

@@ -97,12 +97,18 @@ class _Plan:
         member = (present.cumsum() - 1)[owner - lowest]
         ends = [*accumulate(len(rows) for rows in groups)]
         self.slices = [slice(end - len(rows), end) for end, rows in zip(ends, groups, strict=True)]
-        self.member, self.places = member, [_places(rows.keys, layout) for rows in groups]
-        touched = np.zeros((len(owners), len(layout.keys)), bool)
+        places = [_places(rows.keys, layout) for rows in groups]
+        held = np.zeros(len(layout.keys), bool)
+        for place in places:
+            held[place] = True
+        number, self.held = held.cumsum() - 1, held.nonzero()[0]  # of few keys where the map is large
+        self.member, self.places = member, [number[place] for place in places]
+        touched = np.zeros((len(owners), len(self.held)), bool)
         for place, own in zip(self.places, self.slices, strict=True):
             touched[member[own, None], place] = True
-        ending = (touched * layout.widths).cumsum(axis=1)
-        self.begin = ending - layout.widths  # column of each key in the factors that hold it
+        widths = layout.widths[self.held]
+        ending = (touched * widths).cumsum(axis=1)
+        self.begin = ending - widths  # column of each key in the factors that hold it
         self.width, self.height = ending[:, -1] + 1, np.bincount(member)
         self.size = self.height * self.width
         self.offset = self.size.cumsum() - self.size
@@ -112,14 +118,14 @@ class _Plan:
         self.row[order] = np.arange(len(member)) - first[member[order]]
         factor, key = touched.nonzero()
         self._bounds = factor.searchsorted(np.arange(len(owners) + 1)).tolist()
-        self._keys, self._widths = layout.keys[key].tolist(), layout.widths[key].tolist()
+        self._keys, self._widths = layout.keys[self.held[key]].tolist(), widths[key].tolist()
         ends = [*accumulate(self.size.tolist(), initial=0)]
         self._blocks = list(zip(ends[:-1], ends[1:], self.height.tolist(), strict=True))
 
     def write(self, groups: Sequence[Rows], variables: Variables) -> Array:
         """The buffer with all blocks `[A b]`."""
         buffer = np.zeros(int(self.size.sum()))
-        change, starts = variables.values - variables.reference, variables.layout.starts
+        change, starts = variables.values - variables.reference, variables.layout.starts[self.held]
         for rows, place, own in zip(groups, self.places, self.slices, strict=True):
             (key, entry), member = rows.pattern, self.member[own]
             height, first = self.height[member], self.offset[member] + self.row[own]
