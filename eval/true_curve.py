@@ -21,6 +21,8 @@ TRUE_STEP: Final = 0.02
 """Distance (m) between the points of a true curve: a distance of 0.1 m to it is 0.5 mm too long at most."""
 MAPPED_STEP: Final = 0.1
 """Distance (m) between the points of a mapped curve that are held against it."""
+ROUND_OFF: Final = 1e-9
+"""A length that is a whole number of steps, but for round-off, has no step more (share of a step)."""
 _OVERLAP: Final = 3
 """Cones past the seam that Akima's tangents of a closed curve look at."""
 _REMEMBERED: Final = 16
@@ -55,5 +57,5 @@ def mapped_points(boundary: Boundary, step: float = MAPPED_STEP) -> Array:
         return boundary.points
     spline = boundary.spline
     length = spline.length()
-    count = max(int(np.ceil(length / step)), 1)
+    count = max(int(np.ceil(length / step - ROUND_OFF)), 1)
     return spline.evaluate(spline.parameters_at((np.arange(count) + 0.5) * length / count))
