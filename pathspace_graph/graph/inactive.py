@@ -35,6 +35,8 @@ class InactiveMap:
         """The conditionals, the first to leave first."""
         self.keys: IntArray = _NO_KEYS
         """(k,) the variables that are inactive, ascending."""
+        self.members: frozenset[int] = frozenset()
+        """The same as a set."""
         self.anchors: IntArray = _NO_KEYS
         """(a,) poses that the last conditional hangs on, which have to stay active."""
         self._gone: IntArray = _NO_KEYS  # anchors of earlier conditionals, which left with the next ones
@@ -61,6 +63,7 @@ class InactiveMap:
         conditional, remaining = eliminate(graph, frontals)
         self.net.push_back(conditional)
         self.keys = np.union1d(self.keys, leaving)
+        self.members = frozenset(self.keys.tolist())
         self._gone = np.union1d(self._gone, keyframes)
         separator = np.array(list(conditional.keys()), np.intp)[len(frontals) :]
         self.anchors = separator[are_poses(separator)]

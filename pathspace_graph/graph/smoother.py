@@ -105,7 +105,6 @@ class FixedLagSmoother(Generic[M_co]):
         """The same prior stretch by stretch, while the loop is open and the user gave no factors."""
         self.last_step: Step | None = None
         """None before the first."""
-        self._inactive: frozenset[int] = frozenset()
         self._active: tuple[Layout, int] | None = None
         self._layout = Layout(np.zeros(0, np.intp))
         self.epoch = 0
@@ -236,9 +235,9 @@ class FixedLagSmoother(Generic[M_co]):
 
     def factorize(self, sigma_step: float | None = None) -> Array:
         """The step's system and its Cholesky factor; gives the negative gradient (n,). No variable moves."""
-        if not self.window.relinearize(self._cycles, self._inactive):
+        if not self.window.relinearize(self._cycles, self.inactive.members):
             self.reactivate()  # a reading has slid to where the map is inactive: rare, since there is room
-            self.window.relinearize(self._cycles, self._inactive)
+            self.window.relinearize(self._cycles, self.inactive.members)
         user, layout = self.user_factors.linearized(self.variables), self.layout
         graph = graph_of(self.prior, *self.window.linear, *user)
         hessian, vector = normal_equations(graph, layout)
@@ -263,8 +262,7 @@ class FixedLagSmoother(Generic[M_co]):
         prior = graph_of(self.prior, *held)
         self.prior = self.inactive.push(prior, keys, keyframes, shared)
         self.variables.remove(keyframes)
-        self._inactive = frozenset(self.inactive.keys.tolist())
-        self.window.drop(self._inactive)  # one that was linearized long ago may hold what it held then
+        self.window.drop(self.inactive.members)  # one that was linearized long ago may hold what it held then
 
     def _cut_submap(self) -> None:
         """The submap under way ends where other map points are active than before: it stays small."""
@@ -286,7 +284,7 @@ class FixedLagSmoother(Generic[M_co]):
         self.refresh()
         if with_prior:
             self.prior = self.inactive.joined(self.prior)
-        self.inactive, self._inactive = InactiveMap(), frozenset()
+        self.inactive = InactiveMap()
         self.user_factors.take_back()
         self._drop_keyframes()
         self.map.all_active()

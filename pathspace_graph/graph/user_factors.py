@@ -13,7 +13,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.gtsam_factors import rotation
 
 from .gaussian import graph_of, jacobian_factor, normal_equations, rooted
-from .keys import POSE, are_poses, name, sizes
+from .keys import POINT, POSE, are_poses, name, sizes
 from .variables import Layout, Variables
 
 Array = NDArray[np.float64]
@@ -108,12 +108,8 @@ def _linearized(held: _Held, variables: Variables) -> gtsam.GaussianFactor | Non
     keys = np.array(list(linear.keys()), np.intp)
     matrix, right = linear.jacobian()
     A, b = np.array(matrix, float), np.array(right, float).ravel()
-    starts = np.cumsum(sizes(keys)) - sizes(keys)
-    entries = variables.layout.entries(keys)
-    for key, start in zip(keys.tolist(), starts.tolist(), strict=True):
-        if are_poses(np.array(key)):
-            A[:, start : start + 2] = A[:, start : start + 2] @ _rotation(variables, key).T
-    return jacobian_factor(keys, A, b + A @ variables.change(entries))
+    A = A @ _turn(keys, variables).T
+    return jacobian_factor(keys, A, b + A @ variables.change(variables.layout.entries(keys)))
 
 
 def as_nonlinear(factor: gtsam.GaussianFactor, variables: Variables) -> gtsam.LinearContainerFactor:
@@ -123,16 +119,19 @@ def as_nonlinear(factor: gtsam.GaussianFactor, variables: Variables) -> gtsam.Li
     """
     layout = Layout(np.sort(np.array(list(factor.keys()), np.intp)))
     information, vector = normal_equations(graph_of(factor), layout)
-    turn = np.eye(layout.size)
-    for key in layout.keys[are_poses(layout.keys)].tolist():
-        start = int(layout.columns(np.array(key)))
-        turn[start : start + 2, start : start + 2] = _rotation(variables, key)
+    turn = _turn(layout.keys, variables)
     descent = vector - information @ variables.change(variables.layout.entries(layout.keys))
     root, right = rooted(turn.T @ information @ turn, turn.T @ descent)
     linear = jacobian_factor(layout.keys, root, right)
     return gtsam.LinearContainerFactor(gtsam.JacobianFactor(linear), variables.gtsam_values(layout.keys))
 
 
-def _rotation(variables: Variables, key: int) -> Array:
-    """R(theta) (2, 2) of a pose: vehicle to map frame."""
-    return rotation(float(variables.of(np.array([key]))[POSE - 1]))
+def _turn(keys: IntArray, variables: Variables) -> Array:
+    """(n, n) block-diagonal over keys (k,): R(theta), vehicle to map frame, of each pose; else the
+    identity."""
+    starts = np.cumsum(sizes(keys)) - sizes(keys)
+    turn = np.eye(int(sizes(keys).sum()))
+    for i in np.flatnonzero(are_poses(keys)):
+        xy = slice(int(starts[i]), int(starts[i]) + POINT)
+        turn[xy, xy] = rotation(float(variables.of(keys[i : i + 1])[POSE - 1]))
+    return turn
