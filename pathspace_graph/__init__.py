@@ -6,14 +6,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pathspace_graph.io.log import Detections, Log, Odometry, read_log, write_log
+    from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, read_map
+    from pathspace_graph.io.results import CycleRecord, RunResult, write_result
+    from pathspace_graph.online.fixed_lag import FixedLagMapper
+    from pathspace_graph.settings.mapper import MapperSettings
+    from pathspace_graph.spline.bspline import BSpline
+
     from .errors import InputError, OutputError, PathspaceError, SettingsError
-    from .fixed_lag import FixedLagMapper
-    from .log import Detections, Log, Odometry, read_log, write_log
-    from .map import Map, PointBoundary, SplineBoundary, read_map
-    from .result_folder import write_result
-    from .run import CycleRecord, RunResult, run_online
-    from .settings import MapperSettings
-    from .spline import BSpline
+    from .run import run_online
 
 __all__ = [
     "BSpline",
@@ -41,13 +42,13 @@ __all__ = [
 # imported when first asked for: the command line's help, and sim, need no estimator
 _HOMES = {
     "errors": ("InputError", "OutputError", "PathspaceError", "SettingsError"),
-    "fixed_lag": ("FixedLagMapper",),
-    "log": ("Detections", "Log", "Odometry", "read_log", "write_log"),
-    "map": ("Map", "PointBoundary", "SplineBoundary", "read_map"),
-    "result_folder": ("write_result",),
-    "run": ("CycleRecord", "RunResult", "run_online"),
-    "settings": ("MapperSettings",),
-    "spline": ("BSpline",),
+    "io.log": ("Detections", "Log", "Odometry", "read_log", "write_log"),
+    "io.map": ("Map", "PointBoundary", "SplineBoundary", "read_map"),
+    "io.results": ("CycleRecord", "RunResult", "write_result"),
+    "online.fixed_lag": ("FixedLagMapper",),
+    "run": ("run_online",),
+    "settings.mapper": ("MapperSettings",),
+    "spline.bspline": ("BSpline",),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
-import re
 import sys
 from collections.abc import Sequence
-from contextlib import redirect_stderr
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
@@ -18,10 +15,6 @@ PROGRAM: Final = "pathspace-graph"
 DONE: Final = 0
 BAD_INPUT: Final = 2
 INTERRUPTED: Final = 130
-
-_ANSI: Final = re.compile(r"\x1b\[[0-9;]*m")
-_FRAME: Final = " │\t"
-_RULE: Final = "─╭╮╰╯"
 
 
 @dataclass(frozen=True)
@@ -37,17 +30,15 @@ class Command:
 
 
 COMMANDS: Final = {
-    "demo": Command("commands_demo", "Demo", "map a generated track online: a table, a map and its picture"),
-    "simulate": Command("commands_simulate", "Simulate", "write the log of a simulated drive, with truth"),
-    "online": Command("commands_online", "Online", "map a log online, cycle by cycle"),
-    "batch": Command("commands_batch", "Batch", "optimize a whole log at once: the ground reference"),
-    "compare": Command(
-        "commands_compare", "Compare", "every estimator on one log or many: the paper's table"
-    ),
-    "ablate": Command("commands_ablate", "Ablate", "run a study: estimators and settings over many drives"),
-    "figures": Command("commands_figures", "Figures", "the paper's isolated tests as figures"),
-    "scale": Command("commands_scale", "Scale", "time per update against map size, readings and laps"),
-    "plot": Command("commands_plot", "Plot", "draw a map with its uncertainty band"),
+    "demo": Command("demo", "Demo", "map a generated track online: a table, a map and its picture"),
+    "simulate": Command("simulate", "Simulate", "write the log of a simulated drive, with truth"),
+    "online": Command("online", "Online", "map a log online, cycle by cycle"),
+    "batch": Command("batch", "Batch", "optimize a whole log at once: the ground reference"),
+    "compare": Command("compare", "Compare", "every estimator on one log or many: the paper's table"),
+    "ablate": Command("ablate", "Ablate", "run a study: estimators and settings over many drives"),
+    "figures": Command("figures", "Figures", "the paper's isolated tests as figures"),
+    "scale": Command("scale", "Scale", "time per update against map size, readings and laps"),
+    "plot": Command("plot", "Plot", "draw a map with its uncertainty band"),
 }
 
 
@@ -90,31 +81,9 @@ def overview() -> str:
 
 def _parse(name: str, arguments: list[str]) -> Any:
     """The command with its options; None where it was asked for help, which is printed by then."""
-    import tyro  # noqa: PLC0415 - so that the list of commands needn't wait for it
-
-    command = COMMANDS[name]
-    options = getattr(import_module(f".{command.module}", __package__), command.name)
-    complaint = io.StringIO()
-    try:
-        with redirect_stderr(complaint):
-            return tyro.cli(options, prog=f"{PROGRAM} {name}", args=arguments)
-    except SystemExit as end:
-        if not end.code:
-            return None
-    raise SettingsError(f"{one_line(complaint.getvalue())} (see {PROGRAM} {name} --help)")
-
-
-def one_line(box: str) -> str:
-    """What the first part of tyro's framed message says, on one line."""
-    words: list[str] = []
-    for line in _ANSI.sub("", box).splitlines():
-        text = line.strip(_FRAME)
-        if not text.strip(_RULE + " ") or text[0] in _RULE:
-            if words:
-                break
-            continue
-        words.extend(text.split())
-    return " ".join(words)
+    options = import_module(".commands.options", __package__)
+    command = import_module(f".commands.{COMMANDS[name].module}", __package__)
+    return options.parse(getattr(command, COMMANDS[name].name), f"{PROGRAM} {name}", arguments)
 
 
 def _refuse(message: str) -> int:

@@ -1,104 +1,106 @@
-"""The estimators by the names that the command line knows them by."""
+"""The estimators by the names that the command line knows them by: ours, and those that others installed.
+
+An installed package adds an estimator by an entry point in the group `pathspace_graph.online` or
+`pathspace_graph.batch`. The entry point tells the estimator's name, and where to find what makes it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.batch.mapper import BatchMapper
+from pathspace_graph.ckf.mapper import CkfMapper
+from pathspace_graph.io.log import Log
+from pathspace_graph.landmark.batch import LandmarkBatch
+from pathspace_graph.landmark.ckf import LandmarkCkf
+from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.online.incremental import incremental_fixed_lag
+from pathspace_graph.settings.mapper import MapperSettings
+
 from .errors import SettingsError
-from .fixed_lag import FixedLagMapper
-from .log import Log
 from .run import BatchEstimator, OnlineEstimator
-from .settings import MapperSettings
+
+Array = NDArray[np.float64]
+MakeOnline = Callable[[MapperSettings, Array], OnlineEstimator]
+MakeBatch = Callable[[MapperSettings, Array], BatchEstimator]
 
 DEFAULT: Final = "fixed-lag"
-"""The online estimator that runs where none is named, ..."""
+"""The online estimator that runs where none is named."""
 DEFAULT_BATCH: Final = "spline"
-"""... and the batch one."""
+"""The batch estimator that runs where none is named."""
+ONLINE_GROUP: Final = "pathspace_graph.online"
+"""The group of entry points that add online estimators."""
+BATCH_GROUP: Final = "pathspace_graph.batch"
+"""The group of entry points that add batch estimators."""
 
 
-def _fixed_lag(settings: MapperSettings, log: Log) -> OnlineEstimator:
-    return FixedLagMapper(settings, log.odometry_sigma)
+def _spline(settings: MapperSettings, odometry_sigma: Array) -> BatchEstimator:
+    return BatchMapper(settings, odometry_sigma, FixedLagMapper)
 
 
-def _landmark_fixed_lag(settings: MapperSettings, log: Log) -> OnlineEstimator:
-    from pathspace_graph.eval.landmark_fixed_lag import LandmarkFixedLag  # noqa: PLC0415 - eval imports us
-
-    return LandmarkFixedLag(settings, log.odometry_sigma)
-
-
-def _ckf(settings: MapperSettings, log: Log) -> OnlineEstimator:
-    from .ckf import CkfMapper  # noqa: PLC0415 - only where it is asked for
-
-    return CkfMapper(settings, log.odometry_sigma)
+def _installed(group: str) -> dict[str, Callable[[MapperSettings, Array], Any]]:
+    """The estimators that other packages add, each imported when it is made."""
+    return {point.name: _loading(point) for point in entry_points(group=group)}
 
 
-def _landmark_ckf(settings: MapperSettings, log: Log) -> OnlineEstimator:
-    from pathspace_graph.eval.landmark_ckf import LandmarkCkf  # noqa: PLC0415 - eval imports us
+def _loading(point: EntryPoint) -> Callable[[MapperSettings, Array], Any]:
+    def make(settings: MapperSettings, odometry_sigma: Array) -> Any:
+        return point.load()(settings, odometry_sigma)
 
-    return LandmarkCkf(settings, log.odometry_sigma)
-
-
-def _incremental(settings: MapperSettings, log: Log) -> OnlineEstimator:
-    from .incremental import incremental_fixed_lag  # noqa: PLC0415 - only where it is asked for
-
-    return incremental_fixed_lag(settings, log.odometry_sigma)
+    return make
 
 
-ONLINE: Final[Mapping[str, Callable[[MapperSettings, Log], OnlineEstimator]]] = {
-    DEFAULT: _fixed_lag,
-    "landmark-fixed-lag": _landmark_fixed_lag,
-    "ckf": _ckf,
-    "landmark-ckf": _landmark_ckf,
-    "incremental-fixed-lag": _incremental,
+ONLINE: Final[dict[str, MakeOnline]] = {
+    **_installed(ONLINE_GROUP),
+    DEFAULT: FixedLagMapper,
+    "landmark-fixed-lag": LandmarkFixedLag,
+    "ckf": CkfMapper,
+    "landmark-ckf": LandmarkCkf,
+    "incremental-fixed-lag": incremental_fixed_lag,
 }
-"""What makes each online estimator for a log, of which it is told the sensors' noise only."""
+"""What makes each online estimator from its settings and the standard deviation (3,) of a twist reading."""
 
-
-def _spline(settings: MapperSettings, log: Log) -> BatchEstimator:
-    from .batch import BatchMapper  # noqa: PLC0415 - only where it is asked for
-
-    return BatchMapper(settings, log.odometry_sigma)
-
-
-def _landmark_batch(settings: MapperSettings, log: Log) -> BatchEstimator:
-    from pathspace_graph.eval.landmark_batch import LandmarkBatch  # noqa: PLC0415 - eval imports us
-
-    return LandmarkBatch(settings, log.odometry_sigma)
-
-
-BATCH: Final[Mapping[str, Callable[[MapperSettings, Log], BatchEstimator]]] = {
+BATCH: Final[dict[str, MakeBatch]] = {
+    **_installed(BATCH_GROUP),
     DEFAULT_BATCH: _spline,
-    "landmark-batch": _landmark_batch,
+    "landmark-batch": LandmarkBatch,
 }
 """The same of the batch estimators."""
 
 
-def check_batch(name: str) -> None:
-    """SettingsError, naming the known ones, where there is no batch estimator of that name."""
-    if name not in BATCH:
-        known = ", ".join(sorted(BATCH))
-        raise SettingsError(f"--estimator: expected a known batch estimator ({known}), found '{name}'")
-
-
-def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:
-    """The batch estimator of that name, for a log."""
-    check_batch(name)
-    return BATCH[name](settings, log)
-
-
 def check_online(name: str) -> None:
     """SettingsError, naming the known ones, where there is no online estimator of that name."""
-    if name not in ONLINE:
-        known = ", ".join(sorted(ONLINE))
-        raise SettingsError(f"--estimator: expected a known online estimator ({known}), found '{name}'")
+    _check(name, ONLINE, "online")
+
+
+def check_batch(name: str) -> None:
+    """SettingsError, naming the known ones, where there is no batch estimator of that name."""
+    _check(name, BATCH, "batch")
+
+
+def _check(name: str, known: dict[str, Any], kind: str) -> None:
+    if name not in known:
+        names = ", ".join(sorted(known))
+        raise SettingsError(f"--estimator: expected a known {kind} estimator ({names}), found '{name}'")
 
 
 def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimator:
-    """The online estimator of that name, ready for the log's first cycle."""
+    """The online estimator of that name for a log, of which it is told the noise of the odometry only."""
     check_online(name)
-    return ONLINE[name](settings, log)
+    return ONLINE[name](settings, log.odometry_sigma)
+
+
+def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:
+    """The batch estimator of that name for a log, of which it is told the noise of the odometry only."""
+    check_batch(name)
+    return BATCH[name](settings, log.odometry_sigma)
 
 
 def check_settings(settings: Any, where: str = "") -> None:

@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.map import Map
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
+
 from .labels import LEFT, RIGHT
 from .laps import LapCounter
-from .log import Detections, Log, Odometry
-from .map import Map
 
 Array = NDArray[np.float64]
 
@@ -62,60 +64,6 @@ class BatchEstimator(Protocol):
 
     def solve(self, log: Log) -> BatchRun:
         """The optimum over a whole log, whose truth isn't read."""
-
-
-@dataclass(frozen=True)
-class CycleRecord:
-    """One row of `cycles.csv` (FORMATS)."""
-
-    cycle: int
-    """Number of the perception cycle, from 0."""
-    t: float
-    """Stamp, s."""
-    seconds: float
-    """Wall time of the whole update, s."""
-    size_left: int
-    """Control points or landmarks of the left boundary."""
-    size_right: int
-    """The same of the right boundary."""
-    readings: int
-    """How many of the cycle's readings were used."""
-    lap: int
-    """The lap being driven, from 1, by the estimated trajectory."""
-    stages: Mapping[str, float] = field(default_factory=dict)
-    """Time (s) that each stage of the update took, by its name."""
-
-
-@dataclass(frozen=True, eq=False)
-class RunResult:
-    """What a run of an estimator over a log gives."""
-
-    estimator: str
-    """Name of the estimator (FORMATS)."""
-    settings: dict[str, Any]
-    """Its settings in full, as plain values."""
-    map: Map
-    """The map at the end of the log."""
-    trajectory_t: Array
-    """Stamps of the perception cycles (n,), s."""
-    trajectory: Array
-    """Poses [x, y, theta] (n, 3), map frame; of an online estimator as they stood at that cycle."""
-    cycles: tuple[CycleRecord, ...]
-    """A record of each perception cycle."""
-    laps: int
-    """Complete laps by the estimated trajectory, one that ends just short of the line included."""
-    lap_maps: tuple[tuple[int, Map], ...] = ()
-    """(lap, map as it stood at its end) of each complete lap by the estimated trajectory."""
-    snapshots: tuple[Map, ...] = ()
-    """The map as it stood at each of the times that were asked for."""
-
-
-@dataclass(frozen=True, eq=False)
-class BatchRun(RunResult):
-    """What a batch estimator gives; its maps of the laps are all the same one, that of the whole log."""
-
-    converged: bool = True
-    """Whether it ended at an optimum."""
 
 
 def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
@@ -217,3 +165,21 @@ class _Run:
 def settings_dict(settings: Any) -> dict[str, Any]:
     """A settings dataclass, nested ones included, as plain dicts."""
     return asdict(settings) if is_dataclass(settings) and not isinstance(settings, type) else {}
+
+
+@dataclass(frozen=True, eq=False)
+class CycleResult:
+    """The estimate after one perception cycle."""
+
+    t: float
+    """Stamp, s."""
+    pose: Array
+    """(3,) x (m), y (m), theta (rad, not wrapped), map frame."""
+    sizes: tuple[int, int]
+    """Control points, or landmarks, of the left and the right boundary."""
+    readings: int
+    """How many of the cycle's readings were used."""
+    closed: bool
+    """Whether the loop has closed."""
+    stages: dict[str, float] = field(default_factory=dict)
+    """Time (s) that each stage of the update took, by its name."""

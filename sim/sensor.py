@@ -10,8 +10,8 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.log import Detections
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int_]

@@ -9,7 +9,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.log import Detections, Log, Odometry, SensorInfo, Truth
+from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth
 
 from .sensor import ConeSensor, OdometryNoise, SensorSettings, measure_twists
 from .track import Track, to_map_frame

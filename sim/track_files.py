@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.table import Table, read_table
+from pathspace_graph.io.csv_table import Table, read_table
 
 from .driving_order import driving_order
 from .geometry import along_polyline, arc_lengths, direction, left_normals, ring, unit

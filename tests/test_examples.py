@@ -9,7 +9,9 @@ from types import ModuleType
 import gtsam
 import pytest
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+from .scenes.paths import ROOT
+
+EXAMPLES = ROOT / "examples"
 
 
 def example(name: str) -> ModuleType:

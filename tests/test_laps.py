@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -11,6 +9,8 @@ from numpy.typing import NDArray
 from pathspace_graph.laps import LapCounter, lap_end_indices
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_files import read_track
+
+from .scenes.paths import TRACKS
 
 RADIUS = 20.0
 """m; a lap is 125.7 m."""
@@ -89,7 +89,6 @@ def test_sparse_poses_that_leap_the_gate_are_counted() -> None:
     assert count(circle(3.1, step=22.0, radius=80.0)).lap == 4
 
 
-TRACKS = Path(__file__).resolve().parents[2] / "shared" / "tracks"
 REAL = ["pacsim/FSG19.yaml", "pacsim/FSG21.yaml", "pacsim/FSG24.yaml", "pacsim/FSE22.yaml", "fssim/FSG.yaml"]
 
 

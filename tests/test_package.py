@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 import pathspace_graph
+from pathspace_graph.io.log import Detections, Log, Odometry, write_log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.log import Detections, Log, Odometry, write_log
 
-ROOT = Path(__file__).resolve().parents[1]
+from .scenes.paths import ROOT
+
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PACKAGES, MAPPED = (PROJECT["tool"]["setuptools"][key] for key in ("packages", "package-dir"))
 README = (ROOT / "README.md").read_text()
@@ -98,7 +99,7 @@ def test_the_command_line_starts_without_the_heavy_libraries() -> None:
 def test_the_simulator_knows_no_estimator() -> None:
     loaded = modules_after("import pathspace_graph.sim.simulate, pathspace_graph.sim.track_generator")
     ours = {name for name in loaded if name.startswith("pathspace_graph.")}
-    allowed = {"errors", "files", "labels", "log", "table"}
+    allowed = {"errors", "factors", "io", "labels", "spline"}
     assert {name.split(".")[1] for name in ours} - {"sim"} <= allowed
     assert "gtsam" not in loaded
 

@@ -12,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from threadpoolctl import threadpool_info
 
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.map import Map, PointBoundary
+from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.labels import LEFT
-from pathspace_graph.log import Detections, Log, Odometry
-from pathspace_graph.map import Map, PointBoundary
-from pathspace_graph.run import CycleRecord, run_online, split_odometry
+from pathspace_graph.run import run_online, split_odometry
 
 
 def detections(t: float) -> Detections:

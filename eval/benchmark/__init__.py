@@ -1,0 +1,1 @@
+"""The online mapper's speed, as ratios within one run."""

@@ -1,0 +1,5 @@
+"""`python -m pathspace_graph.eval.benchmark` measures the online mapper's speed."""
+
+from .benchmark import main
+
+main()

@@ -1,0 +1,199 @@
+"""Every estimator on every log: what each makes of it, measured, whatever any of them fails of."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import pandas as pd
+from threadpoolctl import threadpool_limits
+
+from pathspace_graph import estimators as registry
+from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.eval.metrics.cost import StageTime, stage_times
+from pathspace_graph.eval.metrics.ghosts import GhostSettings
+from pathspace_graph.eval.metrics.summary import lap_times
+from pathspace_graph.eval.study.workers import check_jobs, outcomes, workers
+from pathspace_graph.io.log import LOG_FILE, Log, read_log
+from pathspace_graph.io.results import BatchRun, RunResult
+from pathspace_graph.run import run_online
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .metrics import Row, online_cycles, rows
+
+RUN: Final = ("log", "estimator")
+"""Columns that name a run."""
+
+
+@dataclass(frozen=True, eq=False)
+class NamedLog:
+    """A log, and what it is called."""
+
+    name: str
+    """Its folder's name."""
+    log: Log
+    """What was recorded."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One estimator on one log."""
+
+    log: int
+    """Which of the logs."""
+    estimator: str
+    """Its name."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What came of it."""
+
+    log: str
+    """Name of the log."""
+    estimator: str
+    """Name of the estimator."""
+    result: RunResult | None = None
+    """None where it failed."""
+    failure: str = ""
+    """What it failed of; empty where it finished."""
+    rows: tuple[Row, ...] = ()
+    """Its metrics."""
+    times: tuple[StageTime, ...] = ()
+    """Of its cycles and their stages; empty of a batch."""
+
+    @property
+    def unsettled(self) -> bool:
+        """Whether it is a batch that did not converge."""
+        return isinstance(self.result, BatchRun) and not self.result.converged
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """All outcomes, log by log, in the order of the estimators."""
+
+    logs: tuple[NamedLog, ...]
+    """What was mapped."""
+    estimators: tuple[str, ...]
+    """What mapped it."""
+    reference: str
+    """The estimator that the others are held against."""
+    outcomes: tuple[Outcome, ...] = field(default=())
+    """One of each estimator on each log."""
+
+    def frame(self) -> pd.DataFrame:
+        """A tidy row per run and lap, and one per run of the whole log."""
+        found = [{"log": o.log, "estimator": o.estimator, **row} for o in self.outcomes for row in o.rows]
+        return pd.DataFrame(found, columns=None if found else [*RUN, "scope", "lap"])
+
+    def times(self) -> pd.DataFrame:
+        """A tidy row per run and stage, s."""
+        names = ["stage", "mean", "median", "p99", "share"]
+        found = [
+            [o.log, o.estimator, *(getattr(stage, name) for name in names)]
+            for o in self.outcomes
+            for stage in o.times
+        ]
+        return pd.DataFrame(found, columns=[*RUN, *names])
+
+    def of(self, log: str) -> list[Outcome]:
+        """The outcomes on one log."""
+        return [outcome for outcome in self.outcomes if outcome.log == log]
+
+    @property
+    def paired(self) -> bool:
+        """Whether there are differences to tell: several estimators on several logs."""
+        return len(self.logs) > 1 and len({outcome.estimator for outcome in self.outcomes}) > 1
+
+    @property
+    def failures(self) -> list[Outcome]:
+        """Those that failed."""
+        return [outcome for outcome in self.outcomes if outcome.failure]
+
+
+def read_logs(folder: Path) -> tuple[NamedLog, ...]:
+    """The log of a log folder, or those of a folder of log folders, by name; InputError without any."""
+    if (folder / LOG_FILE).exists() or not folder.is_dir():
+        return (NamedLog(folder.resolve().name, read_log(folder)),)
+    inside = sorted(entry for entry in folder.iterdir() if (entry / LOG_FILE).is_file())
+    if not inside:
+        raise InputError(folder, f"expected a log ({LOG_FILE}) or folders that are logs, found neither")
+    return tuple(NamedLog(entry.name, read_log(entry)) for entry in inside)
+
+
+def choose(names: Sequence[str]) -> tuple[str, ...]:
+    """Estimators by name, all that are known where none is named; SettingsError where one isn't."""
+    known = [*registry.ONLINE, *registry.BATCH]
+    for name in names:
+        if name not in known:
+            raise SettingsError(f"--estimators: expected known ones ({', '.join(known)}), found '{name}'")
+    return tuple(dict.fromkeys(names or known))
+
+
+def choose_reference(name: str | None, estimators: Sequence[str]) -> str:
+    """The one named, else the default estimator where it is compared, else the first."""
+    if name is None:
+        return registry.DEFAULT if registry.DEFAULT in estimators else estimators[0]
+    if name not in estimators:
+        raise SettingsError(
+            f"--reference: expected one that is compared ({', '.join(estimators)}), found '{name}'"
+        )
+    return name
+
+
+def compare(
+    logs: Sequence[NamedLog],
+    estimators: Sequence[str],
+    settings: MapperSettings | None = None,
+    *,
+    reference: str | None = None,
+    ghosts: GhostSettings | None = None,
+    jobs: int = 1,
+    on_run: Callable[[], None] | None = None,
+) -> Comparison:
+    """Run every estimator on every log, `jobs` at a time, each on one BLAS thread; `on_run` after each."""
+    check_jobs(jobs)
+    settings, ghosts = settings or MapperSettings(), ghosts or GhostSettings()
+    tasks = [Task(number, name) for number in range(len(logs)) for name in estimators]
+    done: dict[Task, Outcome] = {}
+    with workers(jobs, None):
+        for task, outcome in outcomes(run_task, tasks, lambda task: (logs[task.log], settings, ghosts)):
+            done[task] = outcome if isinstance(outcome, Outcome) else _failed(task, logs, outcome)
+            if on_run is not None:
+                on_run()
+    chosen = choose_reference(reference, estimators)
+    return Comparison(tuple(logs), tuple(estimators), chosen, tuple(done[task] for task in tasks))
+
+
+def run_task(task: Task, named: NamedLog, settings: MapperSettings, ghosts: GhostSettings) -> Outcome:
+    """Run and measure; a failure is an outcome as well."""
+    try:
+        with threadpool_limits(limits=1):
+            begin = time.perf_counter()
+            result = run_estimator(task.estimator, settings, named.log)
+            seconds = time.perf_counter() - begin
+            measured = tuple(rows(result, named.log, seconds, ghosts))
+        cycles = online_cycles(result)
+        times = tuple(stage_times(cycles)) if cycles else ()
+        return Outcome(named.name, task.estimator, result, rows=measured, times=times)
+    except Exception as error:  # whatever ends a run belongs into the table
+        return Outcome(named.name, task.estimator, failure=_told(error))
+
+
+def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
+    """An online estimator cycle by cycle, with its map at each true lap's end, or a batch one at once."""
+    if name in registry.ONLINE:
+        estimator = registry.make_online(name, settings, log)
+        return run_online(log, estimator, name=name, snapshot_times=lap_times(log))
+    return registry.make_batch(name, settings, log).solve(log)
+
+
+def _failed(task: Task, logs: Sequence[NamedLog], error: BaseException) -> Outcome:
+    return Outcome(logs[task.log].name, task.estimator, failure=_told(error))
+
+
+def _told(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())

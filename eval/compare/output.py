@@ -1,0 +1,117 @@
+"""What a comparison leaves on disk: tables, tidy results, figures, and the maps themselves."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Final
+
+from matplotlib.figure import Figure
+
+from pathspace_graph.eval.figures.map_plot import save_plot
+from pathspace_graph.eval.metrics.blind_spot import find_blind_spot
+from pathspace_graph.eval.metrics.summary import summarize, versions
+from pathspace_graph.eval.tables.text_table import TextTable
+from pathspace_graph.io.files import atomic_folder
+from pathspace_graph.io.map import PointBoundary
+from pathspace_graph.io.results import write_result
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .comparison import Comparison, NamedLog, Outcome
+from .paired import paired_frame, paired_table
+from .plot import plot_blind_spot, plot_maps
+from .table import final_table, paper_frame, paper_table
+
+FORMAT: Final = "pathspace-comparison/1"
+MARKER: Final = "comparison.json"
+"""The file that a comparison's folder is known by."""
+_SUFFIXES: Final = (".png", ".pdf")
+"""Each figure is written as."""
+
+
+def tables(comparison: Comparison) -> dict[str, TextTable]:
+    """All that is printed, by the name of its files; differences where there are several to tell apart."""
+    found = {"table": paper_table(comparison), "metrics": final_table(comparison)}
+    if comparison.paired:
+        found["paired"] = paired_table(comparison, paired_frame(comparison))
+    return found
+
+
+def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings, jobs: int) -> None:
+    """All of it, or nothing; an earlier comparison in `out` is kept as a numbered backup.
+
+    `table.*` is the paper's Table 1, `metrics.*` everything (its CSV a tidy row per run and lap), `times.csv`
+    the stages of the cycles, `paired.*` the differences. Of each log `maps.*`, `blind_spot.*` and a map
+    folder per estimator, in a folder of the log's own where there are several.
+    """
+    with atomic_folder(out, MARKER) as folder:
+        for name, table in tables(comparison).items():
+            (folder / f"{name}.md").write_text(table.markdown(), encoding="utf-8")
+            (folder / f"{name}.tex").write_text(table.latex(), encoding="utf-8")
+        frames = {
+            "table": paper_frame(comparison),
+            "metrics": comparison.frame(),
+            "times": comparison.times(),
+        }
+        if comparison.paired:
+            frames["paired"] = paired_frame(comparison)
+        for name, frame in frames.items():
+            frame.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
+        for named in comparison.logs:
+            own = folder if len(comparison.logs) == 1 else folder / named.name
+            own.mkdir(exist_ok=True)
+            _write_log(own, named, comparison)
+        _write_json(folder / MARKER, comparison, settings, jobs)
+
+
+def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
+    """Maps and figures of one log."""
+    outcomes = comparison.of(named.name)
+    for outcome in outcomes:
+        if outcome.result is not None:
+            write_result(folder / outcome.estimator, outcome.result, summarize(outcome.result, named.log))
+    if any(outcome.result is not None for outcome in outcomes):
+        _save(plot_maps(outcomes, named.log), folder / "maps")
+    figure = blind_spot_figure(outcomes, named, comparison.reference)
+    if figure is not None:
+        _save(figure, folder / "blind_spot")
+
+
+def blind_spot_figure(outcomes: list[Outcome], named: NamedLog, reference: str) -> Figure | None:
+    """The reference beside the first landmark map that misses cones; None without truth or such a map."""
+    maps = {o.estimator: o.result.map for o in outcomes if o.result is not None}
+    truth = named.log.truth
+    points = [
+        name
+        for name, track in maps.items()
+        if any(isinstance(boundary, PointBoundary) for boundary in track.boundaries.values())
+    ]
+    if truth is None or reference not in maps or reference in points:
+        return None
+    for name in points:
+        spot = find_blind_spot(truth, maps[reference], maps[name])
+        if spot is not None:
+            return plot_blind_spot(spot, [(reference, maps[reference]), (name, maps[name])], truth)
+    return None
+
+
+def _save(figure: Figure, file: Path) -> None:
+    for suffix in _SUFFIXES:
+        save_plot(figure, file.with_suffix(suffix))
+
+
+def _write_json(file: Path, comparison: Comparison, settings: MapperSettings, jobs: int) -> None:
+    content = {
+        "format": FORMAT,
+        "logs": [named.name for named in comparison.logs],
+        "estimators": comparison.estimators,
+        "reference": comparison.reference,
+        "failures": [
+            {"log": o.log, "estimator": o.estimator, "error": o.failure} for o in comparison.failures
+        ],
+        "jobs": jobs,
+        "settings": asdict(settings),
+        "versions": versions(),
+    }
+    file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

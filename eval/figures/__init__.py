@@ -1,0 +1,1 @@
+"""Pictures of maps, and the paper's isolated tests as figures."""

@@ -1,0 +1,100 @@
+"""The paper's isolated tests as figures, each with what it shows in a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from pathspace_graph.io.files import atomic_folder
+
+from .expansion import expansion, plot_expansion
+from .fit import fit, plot_fit
+from .map_plot import save_plot
+from .simplification import plot_simplification, simplification
+from .uncertainty import plot_uncertainty, uncertainty
+
+MARKER: Final = "captions.md"
+"""The file that a folder of figures is known by."""
+SUFFIXES: Final = (".png", ".pdf")
+"""Each figure is written as."""
+_SEED: Final = 0
+"""Of the splines that are drawn at random."""
+
+
+@dataclass(frozen=True)
+class IsolatedFigure:
+    """A figure and its caption."""
+
+    name: str
+    """Of its files."""
+    make: Callable[[], tuple[Figure, str]]
+    """Computes and draws it; gives the caption too, with its figures."""
+
+
+def _uncertainty() -> tuple[Figure, str]:
+    data = uncertainty(np.random.default_rng(_SEED))
+    off = np.abs(data.marginals / data.joint - 1.0)
+    return plot_uncertainty(data), (
+        "Uncertainty along a spline. (a) Control points with their uncertainty make a continuous "
+        "distribution of splines, wide where nothing was seen. (b) Its standard deviation across the curve "
+        "by the joint covariance is that of splines drawn at random; the sum of squared basis functions, "
+        f"which leaves the cross terms out, is off by up to {100 * off.max():.0f} %."
+    )
+
+
+def _expansion() -> tuple[Figure, str]:
+    data = expansion()
+    return plot_expansion(data), (
+        "Expansion in its three steps. (a) Readings whose closest point is the end of the curve, beyond a "
+        "threshold from the last two control points, mark an expansion. (b) The curve is led on to the last "
+        "of their proximity chain, exactly as it was up to its old end; the others are readings of it now. "
+        "(c) One update with all of those."
+    )
+
+
+def _fit() -> tuple[Figure, str]:
+    return plot_fit(fit()), (
+        "The fit of S_z. (a) The closest points on the state's curve to the readings. (b) Sigma points of "
+        "the readings, and the curve fitted to each by ridge regression. (c) Mean and covariance of their "
+        "control points: one reading of the curve. (d) The basis functions at the closest points: a control "
+        "point whose function is nothing there (grey) stays where it was."
+    )
+
+
+def _simplification() -> tuple[Figure, str]:
+    data = simplification()
+    weighted, uniform = (100.0 * simplified.rms for simplified in (data.weighted, data.uniform))
+    return plot_simplification(data), (
+        f"Simplification of a closed curve of {data.old.size} control points (a) to "
+        f"{data.weighted.curve.size} (b, the curve before dashed). (c) The distance between the two: "
+        f"{weighted:.1f} cm rms with curvature-weighted knots, {uniform:.1f} cm with uniform ones. "
+        "(d) Curvature, and the knots."
+    )
+
+
+FIGURES: Final = (
+    IsolatedFigure("uncertainty", _uncertainty),
+    IsolatedFigure("expansion", _expansion),
+    IsolatedFigure("fit", _fit),
+    IsolatedFigure("simplification", _simplification),
+)
+"""All of them, in the paper's order."""
+
+
+def write_figures(out: Path, on_figure: Callable[[], None] | None = None) -> None:
+    """Every figure as PNG and PDF, and their captions, or nothing; `on_figure` after each."""
+    captions = []
+    with atomic_folder(out, MARKER) as folder:
+        for isolated in FIGURES:
+            figure, caption = isolated.make()
+            for suffix in SUFFIXES:
+                save_plot(figure, folder / f"{isolated.name}{suffix}")
+            captions.append(f"![{isolated.name}]({isolated.name}.png)\n\n{caption}\n")
+            if on_figure is not None:
+                on_figure()
+        (folder / MARKER).write_text("\n".join(captions), encoding="utf-8")

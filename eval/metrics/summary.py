@@ -1,0 +1,130 @@
+"""What `summary.json` says of a run (FORMATS)."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.io.map import Map
+from pathspace_graph.io.results import BatchRun, RunResult
+from pathspace_graph.labels import BOUNDARIES, NAMES
+
+from .table1 import (
+    LapMetrics,
+    ate,
+    lap_end_times,
+    lap_metrics,
+    laps_metrics,
+    normal_errors,
+    root_mean_square,
+    trajectory_errors,
+)
+
+Array = NDArray[np.float64]
+
+LIBRARIES: Final = ("pathspace-graph", "gtsam", "numpy", "scipy")
+"""Whose versions are told."""
+
+
+def summarize(result: RunResult, log: Log) -> dict[str, Any]:
+    """Estimator, settings, versions, laps, timing, and, where the log has truth, the paper's metrics."""
+    summary: dict[str, Any] = {
+        "estimator": result.estimator,
+        "settings": result.settings,
+        "versions": versions(),
+        "lap_count": result.laps,
+        "closed": result.map.closed,
+        "size": result.map.size,
+        "not_mapped": not_mapped(result.map, log),
+        "seconds": _timing(result),
+    }
+    if log.truth is not None:
+        summary |= _map_errors(result, log, log.truth) | _trajectory_errors(result, log.truth)
+    return summary
+
+
+def versions() -> dict[str, str]:
+    """Of Python and the libraries that a result depends on."""
+    return {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}}
+
+
+def lap_times(log: Log) -> Array:
+    """When each true lap ends (s); empty where there is no true path."""
+    if log.truth is None or len(log.truth.poses) == 0:
+        return np.zeros(0)
+    return lap_end_times(log.truth)
+
+
+def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
+    """The paper's table: at the end of each true lap, or of each estimated one where there is no true path.
+
+    Empty where there are no true cones. `result` has its snapshots at `lap_times`. A batch has one map, that
+    of all laps: one row.
+    """
+    if log.truth is None or not has_cones(log.truth):
+        return []
+    if isinstance(result, BatchRun):
+        return laps_metrics([(result.laps, result.map)], log.truth)
+    by_truth = tuple(enumerate(result.snapshots, start=1))
+    return laps_metrics(by_truth if len(log.truth.poses) else result.lap_maps, log.truth)
+
+
+def not_mapped(track: Map, log: Log) -> list[str]:
+    """A line for each boundary that the map lacks, with the reason."""
+    labels = np.concatenate([np.zeros(0, dtype=int), *(cycle.labels for cycle in log.cycles)])
+    lines = []
+    for label in BOUNDARIES:
+        if label not in track.boundaries:
+            name, count = NAMES[label], int(np.sum(labels == label))
+            reason = f"{count} {name} detections were too few or agreed too little"
+            lines.append(f"{name} boundary: not mapped, " + (reason if count else f"no {name} detections"))
+    return lines
+
+
+def has_cones(truth: Truth) -> bool:
+    """Whether any true cone is of a boundary."""
+    return bool(np.isin(truth.cone_labels, BOUNDARIES).any())
+
+
+def _timing(result: RunResult) -> dict[str, float] | None:
+    if not result.cycles:
+        return None
+    seconds = np.array([record.seconds for record in result.cycles])
+    return {
+        "mean": float(np.mean(seconds)),
+        "p99": float(np.quantile(seconds, 0.99)),
+        "max": float(np.max(seconds)),
+    }
+
+
+def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:
+    """`laps`, and the same of the map at the end of the log, wherever in a lap that is."""
+    if not has_cones(truth):
+        return {}
+    final = asdict(lap_metrics(result.map, truth, result.laps))
+    del final["lap"]
+    return {
+        "laps": [asdict(row) for row in laps_of(result, log)],
+        "final": final,
+        "inside_two_sigma": normal_errors(result.map, truth).share_inside(),
+    }
+
+
+def _trajectory_errors(result: RunResult, truth: Truth) -> dict[str, float]:
+    """`ate`, and the root mean square error along (m), across (m) and in heading (rad)."""
+    if len(truth.poses) == 0 or len(result.trajectory) == 0:
+        return {}
+    errors = trajectory_errors(result.trajectory_t, result.trajectory, truth)
+    along, across, heading = (root_mean_square(column) for column in errors.T)
+    return {
+        "ate": ate(result.trajectory_t, result.trajectory, truth),
+        "rmse_along": along,
+        "rmse_across": across,
+        "rmse_heading": heading,
+    }

@@ -1,0 +1,1 @@
+"""Time per update against the size of the map, the detections of an update, and the laps."""

@@ -1,0 +1,1 @@
+"""Studies: tracks, seeds, estimators and settings, run in parallel and compared in pairs."""

@@ -1,0 +1,98 @@
+"""Studies in TOML files: those that come with the package, and anyone's own."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, Final
+
+from pathspace_graph.errors import InputError, PathspaceError, SettingsError
+
+from .overrides import check_name, flatten
+from .study import ALL, Baseline, Study
+
+SHIPPED: Final = Path(__file__).parents[1] / "studies"
+"""Where the studies are that come with the package."""
+
+_KEYS: Final = tuple("grid" if entry.name == "grids" else entry.name for entry in fields(Study))
+
+
+def shipped_studies() -> list[str]:
+    """The names of the studies that come with the package."""
+    return sorted(file.stem for file in SHIPPED.glob("*.toml"))
+
+
+def find_study(name: Path) -> Path:
+    """The file itself, or the study of that name that comes with the package."""
+    if name.is_file():
+        return name
+    if name.suffix == "" and name.stem in shipped_studies():
+        return SHIPPED / f"{name.stem}.toml"
+    check_name(str(name), shipped_studies(), "expected a study's file, or one that is known by name")
+    raise InputError(name, "expected a study's file")
+
+
+def read_study(file: Path | str) -> Study:
+    """The study of a TOML file, whose relative track files are beside it; InputError names what is wrong."""
+    file = Path(file)
+    try:
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(file, f"expected a readable file: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(file, f"expected TOML: {error}") from error
+    try:
+        return study_from(content, file.parent, file.stem)
+    except PathspaceError as error:
+        raise InputError(file, str(error)) from error
+
+
+def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "study") -> Study:
+    """The study that a TOML file's content tells."""
+    for key in content:
+        check_name(key, _KEYS, "expected a known key")
+    values: dict[str, Any] = {"name": name} | dict(content)
+    if "tracks" not in values:
+        raise SettingsError("tracks: expected track files, or seeds of generated tracks, found none")
+    for key in ("tracks", "seeds", "estimators", "metrics"):
+        if key in values:
+            values[key] = (ALL,) if values[key] == ALL else tuple(_list(key, values[key]))
+    for key in ("name", "question"):
+        _check_text(key, values.get(key, ""))
+    values["tracks"] = tuple(folder / t if isinstance(t, str) else t for t in values["tracks"])
+    for key in ("noise", "variants"):
+        if key in values:
+            values[key] = {k: flatten(_table(f"{key}.{k}", v)) for k, v in _table(key, values[key]).items()}
+    if "grid" in values:
+        grids = values.pop("grid")
+        grids = grids if isinstance(grids, list) else [grids]
+        values["grids"] = tuple(flatten(_table("grid", grid)) for grid in grids)
+    if "baseline" in values:
+        values["baseline"] = _baseline(_table("baseline", values["baseline"]))
+    return Study(**values)
+
+
+def _baseline(table: Mapping[str, Any]) -> Baseline:
+    for key, value in table.items():
+        check_name(key, ("variant", "estimator"), "baseline: expected a known key")
+        _check_text(f"baseline.{key}", value)
+    return Baseline(**table)
+
+
+def _list(key: str, value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise SettingsError(f"{key}: expected a list, found {value!r}")
+    return value
+
+
+def _table(key: str, value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise SettingsError(f"{key}: expected a table, found {value!r}")
+    return value
+
+
+def _check_text(key: str, value: Any) -> None:
+    if not isinstance(value, str):
+        raise SettingsError(f"{key}: expected text, found {value!r}")

@@ -1,0 +1,63 @@
+"""A study's results as a data frame: a row per run and lap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import pandas as pd
+
+from pathspace_graph.eval.metrics.summary import versions
+
+from .cells import Cell, Record
+from .metrics import METRICS, TIMES
+from .overrides import leaves
+from .study import Study
+
+COMBINATION: Final = ("noise", "estimator", "variant")
+"""What is compared."""
+RUN: Final = ("track", "seed")
+"""What is paired: the same drive, the same noise."""
+SIMULATION: Final = "simulation."
+"""Prefix of the columns that tell the simulation's settings."""
+
+
+def frame_of(study: Study, cells: Sequence[tuple[Cell, Record | None]]) -> pd.DataFrame:
+    """A row per run and lap, one without figures for a run that failed; every varied setting is a column."""
+    rows = []
+    for cell, record in cells:
+        assert record is not None, "every cell has been run by now"
+        shared = {"study": study.name} | cell.names | _settings_row(study, cell)
+        about = {"failure": record["failure"], **record["versions"]}
+        rows += [shared | lap | about for lap in record["laps"]] or [shared | {"lap": None} | about]
+    settings = _settings_row(study, cells[0][0])
+    order = ["study", *RUN, *COMBINATION, *settings, "lap", *METRICS, "failure", *versions()]
+    known = dict.fromkeys([*order, *(name for row in rows for name in row)])
+    frame = pd.DataFrame(rows, columns=[name for name in known if any(name in row for row in rows)])
+    return frame.astype({"lap": "Int64"})
+
+
+def _settings_row(study: Study, cell: Cell) -> dict[str, Any]:
+    settings, simulation = leaves(cell.settings), leaves(cell.drive.simulation)
+    row = {f"{SIMULATION}{name}": _cell(simulation[name]) for name in study.varied_noise}
+    return row | {name: _cell(settings[name]) for name in study.varied}
+
+
+def _cell(value: Any) -> Any:
+    return " ".join(str(part) for part in value) if isinstance(value, tuple) else value
+
+
+def without_times(frame: pd.DataFrame) -> pd.DataFrame:
+    """What comes out the same whenever and wherever the study is run."""
+    return frame.drop(columns=[name for name in TIMES if name in frame])
+
+
+def times_of(frame: pd.DataFrame) -> pd.DataFrame:
+    """Wall times, by the same rows."""
+    return frame[["study", *RUN, *COMBINATION, "lap", *(name for name in TIMES if name in frame)]]
+
+
+def last_laps(frame: pd.DataFrame) -> pd.DataFrame:
+    """The last row of each run that finished."""
+    finished = frame[frame["failure"] == ""]
+    return finished.groupby([*RUN, *COMBINATION], sort=False).tail(1)

@@ -1,0 +1,40 @@
+"""What a finished study leaves in its folder: tables to load, to read and to print, and figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import pandas as pd
+
+from .frame import times_of, without_times
+from .plot import figures
+from .store import replacing, write_text
+from .study import Study
+from .table import as_latex, as_markdown, as_text, caption, summary_tables
+
+RESULTS: Final = "results.csv"
+TIMES: Final = "times.csv"
+FIGURE_SUFFIXES: Final = (".png", ".pdf")
+
+
+def write_tables(study: Study, frame: pd.DataFrame, out: Path) -> str:
+    """Write `results.csv`, `times.csv` and the summary in three forms; gives its text."""
+    for name, table in ((RESULTS, without_times(frame)), (TIMES, times_of(frame))):
+        with replacing(out / name) as temporary:
+            table.to_csv(temporary, index=False, lineterminator="\n")
+    tables, told = summary_tables(study, frame), caption(study, frame)
+    text = as_text(tables, told)
+    write_text(out / "summary.txt", text)
+    write_text(out / "summary.md", as_markdown(tables, told))
+    write_text(out / "summary.tex", as_latex(tables, told))
+    return text
+
+
+def write_figures(study: Study, frame: pd.DataFrame, out: Path) -> None:
+    """Write the figures, as a picture to look at and as vectors to print."""
+    for name, figure in figures(study, frame).items():
+        for suffix in FIGURE_SUFFIXES:
+            with replacing(out / "figures" / f"{name}{suffix}") as temporary:
+                metadata = {"Software": None} if suffix == ".png" else {"CreationDate": None}
+                figure.savefig(temporary, dpi=200, format=suffix[1:], metadata=metadata)

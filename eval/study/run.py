@@ -1,0 +1,192 @@
+"""Runs a study: in parallel, every finished cell kept at once, so that a killed one goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from pathspace_graph.errors import OutputError
+from pathspace_graph.io.files import check_target
+from pathspace_graph.io.log import Log
+
+from .cells import Cell, Drive, NamedTrack, Record, failed, load_tracks, run_cell, try_drive
+from .frame import frame_of
+from .overrides import flatten
+from .store import Store, plain, write_text
+from .study import Study
+from .workers import check_jobs, outcomes, workers
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FORMAT: Final = "pathspace-study/1"
+STUDY_FILE: Final = "study.json"
+_PRESENTATION: Final = ("question", "metrics")
+"""What a study may change without becoming another one: no cell depends on it."""
+
+Told = Callable[[int, int], None]
+"""Called with how many cells are done, of how many, as they are."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A study with its tracks, and every cell of it."""
+
+    study: Study
+    """The study."""
+    tracks: tuple[NamedTrack, ...]
+    """Its tracks."""
+    cells: tuple[Cell, ...]
+    """Every run, in the order of the results."""
+
+    def resolved(self) -> dict[str, Any]:
+        """The content of `study.json`: the study with nothing left to a default."""
+        study = self.study
+        return {
+            "format": FORMAT,
+            "name": study.name,
+            "question": study.question,
+            "tracks": [{"name": track.name, "digest": track.digest} for track in self.tracks],
+            "seeds": study.seeds,
+            "laps": study.laps,
+            "noise": {name: asdict(study.simulation(name)) for name in study.noise},
+            "estimators": study.estimators,
+            "varied": study.varied,
+            "variants": {name: asdict(settings) for name, settings in study.points.items()},
+            "baseline": {"variant": study.baseline_variant, "estimator": study.baseline.estimator},
+            "metrics": study.metrics,
+        }
+
+
+def make_plan(study: Study) -> Plan:
+    """The cells of a study, grouped by the log they share; reads and generates the tracks."""
+    tracks, points = tuple(load_tracks(study.tracks)), study.points
+    drives = [
+        Drive(track, seed, noise, study.simulation(noise))
+        for noise in study.noise
+        for track in tracks
+        for seed in study.seeds
+    ]
+    cells = [
+        Cell(drive, estimator, variant, settings)
+        for drive in drives
+        for estimator in study.estimators
+        for variant, settings in points.items()
+    ]
+    return Plan(study, tracks, tuple(cells))
+
+
+def run_study(
+    study: Study,
+    out: Path | str | None = None,
+    *,
+    jobs: int = 1,
+    cluster: str | None = None,
+    retry_failed: bool = False,
+    on_cell: Told | None = None,
+) -> pd.DataFrame:
+    """Run what is left of a study, and give all of its results: a row per run and lap.
+
+    `out`: folder in which finished cells are kept (none: nothing is); `jobs`: processes, -1 for every core;
+    `cluster`: address of a Dask scheduler whose workers run it instead. OutputError where the folder belongs
+    to another study.
+    """
+    check_jobs(jobs)
+    plan = make_plan(study)
+    if out is None:
+        with tempfile.TemporaryDirectory() as folder:
+            return run_plan(plan, Path(folder), jobs, cluster, retry_failed, on_cell)
+    return run_plan(plan, Path(out), jobs, cluster, retry_failed, on_cell)
+
+
+def run_plan(
+    plan: Plan, out: Path, jobs: int, cluster: str | None, retry_failed: bool, on_cell: Told | None = None
+) -> pd.DataFrame:
+    """The same of a plan."""
+    check_folder(out, plan)
+    store = Store(out)
+    left = [cell for cell in plan.cells if _is_left(store.read(cell), retry_failed)]
+    with workers(jobs, cluster) if left else nullcontext():
+        write_text(out / STUDY_FILE, json.dumps(plain(plan.resolved()), indent=1) + "\n")
+        if left:
+            _run_cells(left, store, on_cell or (lambda done, total: None))
+    store.drop_logs()
+    return frame_of(plan.study, [(cell, store.read(cell)) for cell in plan.cells])
+
+
+def check_folder(out: Path, plan: Plan) -> None:
+    """OutputError where the folder can't be this study's: another's, or anything else."""
+    check_target(out, STUDY_FILE)
+    file = out / STUDY_FILE
+    if not file.is_file():
+        return
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{file}: expected a study: {error}") from error
+    if not isinstance(found, dict):
+        raise OutputError(f"{file}: expected a study, found {type(found).__name__}")
+    expected, other = (
+        flatten({key: value for key, value in content.items() if key not in _PRESENTATION})
+        for content in (plain(plan.resolved()), found)
+    )
+    for name in expected | other:
+        if expected.get(name) != other.get(name):
+            raise OutputError(
+                f"{file}: expected the study that is to be run, with {name} = {expected.get(name)}, "
+                f"found another, with {other.get(name)}"
+            )
+
+
+def _is_left(record: Record | None, retry_failed: bool) -> bool:
+    return record is None or (retry_failed and bool(record["failure"]))
+
+
+# --- work ------------------------------------------------------------------------------------------------
+
+
+def _run_cells(cells: Sequence[Cell], store: Store, told: Told) -> None:
+    """Simulate the logs they need, each once, then run the cells; whatever is done is kept at once."""
+    broken = _simulate(cells, store)
+    done = 0
+    for cell in cells:
+        if cell.drive.id in broken:
+            store.write(cell, failed(cell, broken[cell.drive.id]))
+            done += 1
+    told(done, len(cells))
+    runnable = [cell for cell in cells if cell.drive.id not in broken]
+    for cell, record in outcomes(run_cell, runnable, _Logs(store).load):
+        store.write(cell, failed(cell, record) if isinstance(record, Exception) else record)
+        done += 1
+        told(done, len(cells))
+
+
+def _simulate(cells: Sequence[Cell], store: Store) -> dict[str, Exception]:
+    """Simulate and keep the logs that aren't there; gives the errors of those that can't be."""
+    drives = {cell.drive.id: cell.drive for cell in cells}
+    wanted = [drive for drive in drives.values() if not store.has_log(drive)]
+    broken: dict[str, Exception] = {}
+    for drive, log in outcomes(try_drive, wanted, lambda _: ()):
+        if isinstance(log, Exception):
+            broken[drive.id] = log
+        else:
+            store.write_log(drive, log)
+    return broken
+
+
+class _Logs:
+    """Logs from disk, one in memory at a time: cells are in the order of their logs."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._kept: tuple[Drive, Log] | None = None
+
+    def load(self, cell: Cell) -> tuple[Log]:
+        if self._kept is None or self._kept[0] is not cell.drive:
+            self._kept = (cell.drive, self._store.read_log(cell.drive))
+        return (self._kept[1],)

@@ -1,0 +1,173 @@
+"""A study: which tracks, seeds, noise, estimators and settings are compared, and with what."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from pathlib import Path
+from typing import Any, Final
+
+from pathspace_graph import estimators as registry
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings
+
+from .metrics import METRICS
+from .overrides import Overrides, check_name, override
+
+DEFAULT: Final = "default"
+"""The variant without any override, which is part of every study."""
+ALL: Final = "all"
+"""In place of estimators: every one that there is."""
+
+
+def known_estimators() -> list[str]:
+    """Every estimator's name, online ones first."""
+    return [*registry.ONLINE, *registry.BATCH]
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """What every other combination is compared with, on the same track, seed and noise."""
+
+    variant: str = DEFAULT
+    """Its settings."""
+    estimator: str | None = None
+    """Its estimator; where not given, each one's own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """A grid of tracks x seeds x noise x estimators x settings; checked where it is made."""
+
+    tracks: tuple[Path | int, ...]
+    """Track files, and seeds of generated tracks."""
+    seeds: tuple[int, ...] = (0,)
+    """Of each drive and its noise."""
+    laps: int = 5
+    """Laps driven."""
+    name: str = "study"
+    """What it is called."""
+    question: str = ""
+    """What it is to answer."""
+    estimators: tuple[str, ...] = (registry.DEFAULT,)
+    """Names of online and batch estimators, or `all` alone."""
+    noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
+    """Named changes of the simulation's dotted fields."""
+    variants: Mapping[str, Overrides] = field(default_factory=dict)
+    """Named changes of the settings' dotted fields, beside `default`, which changes none."""
+    grids: tuple[Mapping[str, Sequence[Any]], ...] = ()
+    """Values by dotted field: every combination of them is a variant, called as `lag=1, steps=2`."""
+    baseline: Baseline = field(default_factory=Baseline)
+    """What the others are compared with."""
+    metrics: tuple[str, ...] = ("rmse", "missed", "size", "ms_mean")
+    """Columns of the results that the summary tells of."""
+
+    def __post_init__(self) -> None:
+        """SettingsError where anything is unknown, empty, named twice or out of its range."""
+        self._normalize()
+        for name in ("tracks", "seeds", "estimators", "noise", "metrics"):
+            _check_list(name, getattr(self, name))
+        _check_integers("seeds", self.seeds)
+        _check_integers("tracks", [track for track in self.tracks if not isinstance(track, Path)])
+        for name in self.estimators:
+            check_name(name, known_estimators(), "estimators: expected a known estimator")
+        for name in self.metrics:
+            check_name(name, METRICS, "metrics: expected a known metric")
+        self._check_settings()
+        self._check_baseline()
+
+    def _normalize(self) -> None:
+        """Lists are tuples, and texts among the tracks are files."""
+        for name in ("tracks", "seeds", "estimators", "metrics", "grids"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
+        tracks = tuple(Path(track) if isinstance(track, str) else track for track in self.tracks)
+        object.__setattr__(self, "tracks", tracks)
+        if self.estimators == (ALL,):
+            object.__setattr__(self, "estimators", tuple(known_estimators()))
+
+    def _check_settings(self) -> None:
+        if isinstance(self.laps, bool) or not isinstance(self.laps, int):
+            raise SettingsError(f"laps: expected a whole number, found {self.laps!r}")
+        if DEFAULT in self.variants:
+            raise SettingsError(f"variants.{DEFAULT}: that name is kept for the settings as they are")
+        for name in self.noise:
+            self.simulation(name)
+        points = self._named()
+        if len(points) != 1 + len(self.variants) + sum(len(_grid(grid)) for grid in self.grids):
+            raise SettingsError("variants: expected every name once, found one of a grid among them")
+
+    def _check_baseline(self) -> None:
+        check_name(self.baseline.variant, self._named(), "baseline.variant: expected a variant")
+        if self.baseline.estimator is not None:
+            expected = "baseline.estimator: expected one of the study's estimators"
+            check_name(self.baseline.estimator, self.estimators, expected)
+
+    def simulation(self, noise: str) -> SimulationSettings:
+        """The settings of the drives under a named noise."""
+        if "laps" in self.noise[noise]:
+            raise SettingsError(f"noise.{noise}.laps: expected laps as a key of the study itself")
+        return replace(override(SimulationSettings(), self.noise[noise], f"noise.{noise}"), laps=self.laps)
+
+    @property
+    def points(self) -> dict[str, MapperSettings]:
+        """The settings to run, by name: of variants that come to the same, the first."""
+        distinct: dict[str, MapperSettings] = {}
+        for name, settings in self._named().items():
+            if settings not in distinct.values():
+                distinct[name] = settings
+        return distinct
+
+    @property
+    def baseline_variant(self) -> str:
+        """The baseline's name among `points`."""
+        wanted = self._named()[self.baseline.variant]
+        return next(name for name, settings in self.points.items() if settings == wanted)
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """The dotted settings that any variant changes."""
+        names = [name for overrides in self.variants.values() for name in overrides]
+        return tuple(dict.fromkeys([*names, *(name for grid in self.grids for name in grid)]))
+
+    @property
+    def varied_noise(self) -> tuple[str, ...]:
+        """The dotted simulation settings that any noise changes."""
+        return tuple(dict.fromkeys(name for overrides in self.noise.values() for name in overrides))
+
+    def _named(self) -> dict[str, MapperSettings]:
+        points = {DEFAULT: MapperSettings()}
+        for name, overrides in self.variants.items():
+            points[name] = override(MapperSettings(), overrides, f"variants.{name}")
+        for grid in self.grids:
+            for name, overrides in _grid(grid).items():
+                points[name] = override(MapperSettings(), overrides, "grid")
+        return points
+
+
+def _grid(grid: Mapping[str, Sequence[Any]]) -> dict[str, Overrides]:
+    """Every combination of the values, by a name that tells them."""
+    for name, values in grid.items():
+        if not isinstance(values, list | tuple) or not values:
+            raise SettingsError(f"grid.{name}: expected a list of values, found {values!r}")
+    points = [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
+    return {", ".join(f"{name}={_short(value)}" for name, value in point.items()): point for point in points}
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, int | float) and float(f"{value:g}") == value and not isinstance(value, bool):
+        return f"{value:g}"
+    return str(value)
+
+
+def _check_list(name: str, values: Any) -> None:
+    if len(values) == 0 or len({repr(value) for value in values}) != len(values):
+        raise SettingsError(f"{name}: expected at least one, and none twice, found {list(values)}")
+
+
+def _check_integers(name: str, values: Sequence[Any]) -> None:
+    for value in values:
+        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+            raise SettingsError(f"{name}: expected whole numbers from 0 on, found {value!r}")

@@ -1,0 +1,1 @@
+"""The spline graph over a whole log: the ground reference."""

@@ -1,0 +1,80 @@
+"""`batch`: a whole log optimized at once, the ground reference."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from pathspace_graph.batch.mapper import BatchMapper, BatchResult, Start
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.estimators import DEFAULT_BATCH, check_batch, check_settings, make_batch
+from pathspace_graph.eval.metrics.gap import gap
+from pathspace_graph.eval.metrics.summary import summarize
+from pathspace_graph.io.files import check_target
+from pathspace_graph.io.log import Log, read_log
+from pathspace_graph.io.map import MAP_FILE
+from pathspace_graph.io.results import BatchRun, write_result
+from pathspace_graph.progress import progress
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .online import report
+
+NOT_CONVERGED: Final = 3
+"""Exit code of a run whose result is written, but isn't the optimum."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """Optimize a whole log at once, and write the map, the trajectory, the cycles and a summary."""
+
+    log: Positional[Path]
+    """Log folder to read."""
+    out: Path
+    """Map folder to write; an earlier map there is kept as a numbered backup."""
+    estimator: str = DEFAULT_BATCH
+    """Name of the batch estimator."""
+    start: Start = "online"
+    """Begin at an online run's map, or at odometry alone."""
+    settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
+    """The mapper."""
+
+    def run(self) -> None:
+        """Read, optimize, write, and say what came out; exit code 3 where it did not converge."""
+        check_batch(self.estimator)
+        if self.start != "online" and self.estimator != DEFAULT_BATCH:
+            raise SettingsError(f"--start: expected online for {self.estimator}, found {self.start}")
+        check_settings(self.settings)
+        check_target(self.out, MAP_FILE)
+        log = read_log(self.log)
+        with progress("optimizing") as advance:
+            estimator = make_batch(self.estimator, self.settings, log)
+            if isinstance(estimator, BatchMapper):
+                result: BatchRun = estimator.solve(log, self.start, advance)
+            else:
+                result = estimator.solve(log)
+        write_result(self.out, result, summarize_batch(result, log, self.start))
+        report(result, log)
+        Console().print(f"written to {self.out}", highlight=False, soft_wrap=True, markup=False)
+        if not result.converged:
+            reason = (
+                result.convergence.reason if isinstance(result, BatchResult) else "associations still change"
+            )
+            line = f"not converged: {reason}"
+            Console(stderr=True).print(line, highlight=False, soft_wrap=True, markup=False)
+            raise SystemExit(NOT_CONVERGED)
+
+
+def summarize_batch(result: BatchRun, log: Log, start: Start) -> dict[str, Any]:
+    """What `summarize` says, how the optimization ended, and its gap from the online run it began at."""
+    summary = summarize(result, log) | {"start": start, "converged": result.converged}
+    if not isinstance(result, BatchResult):
+        return summary
+    summary["convergence"] = asdict(result.convergence)
+    summary["calibration"] = {"scale": result.calibration[0], "bias": result.calibration[1]}
+    summary["stages"] = result.seconds
+    summary["gap"] = None if result.online is None else asdict(gap(result.online, result))
+    return summary

@@ -1,0 +1,81 @@
+"""`demo`: the main job with no argument, on a simulated Formula Student track."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from joblib import Parallel, delayed, parallel_config
+from rich.console import Console
+
+from pathspace_graph.estimators import DEFAULT
+from pathspace_graph.eval.compare.comparison import run_estimator
+from pathspace_graph.eval.compare.table import side_by_side
+from pathspace_graph.eval.figures.map_plot import PlotStyle, plot_map, save_plot
+from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
+from pathspace_graph.io.files import atomic_folder, check_target
+from pathspace_graph.io.log import Log, write_log
+from pathspace_graph.io.results import RunResult, write_result
+from pathspace_graph.progress import progress
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+
+from .online import map_online, outline
+from .simulate import describe, generated_track
+
+RIVAL: Final = "landmark-fixed-lag"
+"""The estimator whose table stands beside ours."""
+PICTURE: Final = "track.png"
+PICTURE_STYLE: Final = PlotStyle(dpi=150.0)
+"""Of a size that suits a web page."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    """Simulate a track, map it online: the paper's table beside the landmark graph's, and a picture."""
+
+    out: Path = field(default_factory=lambda: Path("pathspace-demo"))
+    """Folder for the log, the map and the picture; an earlier demo there is kept as a numbered backup."""
+    seed: int = 0
+    """Seed of the track and of all noise."""
+    laps: int = 5
+    """Laps driven."""
+
+    def run(self) -> None:
+        """Simulate, map, draw, and say where it is."""
+        check_target(self.out, PICTURE)
+        with progress("driving"):
+            log = simulate(generated_track(self.seed), SimulationSettings(laps=self.laps), self.seed)
+        say = partial(Console().print, highlight=False, soft_wrap=True, markup=False)
+        say(f"a generated track, {self.laps} times around: {describe(log)}")
+        result, rival = map_with_both(log)
+        write_demo(self.out, log, result)
+        table = side_by_side({run.estimator: laps_of(run, log) for run in (result, rival)})
+        if table.rows:
+            Console().print(table.rich())
+        say(outline(result))
+        for line in not_mapped(result.map, log):
+            say(line)
+        say(f"log, map and {PICTURE} are in {self.out}")
+
+
+def map_with_both(log: Log) -> tuple[RunResult, RunResult]:
+    """The log mapped by us, with progress, and meanwhile, in a process of its own, by the landmark graph."""
+    settings = MapperSettings()
+    with parallel_config(backend="loky", inner_max_num_threads=1):
+        # with one job it would be run here, and first
+        rival = Parallel(n_jobs=2, return_as="generator")([delayed(run_estimator)(RIVAL, settings, log)])
+        result = map_online(log, settings, DEFAULT)
+        with progress(RIVAL):
+            return result, next(rival)
+
+
+def write_demo(out: Path, log: Log, result: RunResult) -> None:
+    """The log, the map and its picture, all of them or none."""
+    with progress("writing"), atomic_folder(out, PICTURE) as folder:
+        write_log(log, folder / "log")
+        write_result(folder / "map", result, summarize(result, log))
+        picture = plot_map(result.map, log=log, trajectory=result.trajectory, style=PICTURE_STYLE)
+        save_plot(picture, folder / PICTURE, style=PICTURE_STYLE)

@@ -1,0 +1,90 @@
+"""`online`: a log mapped cycle by cycle, never reading ahead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from rich.table import Table
+from tyro.conf import Positional, arg
+
+from pathspace_graph.estimators import DEFAULT, check_online, check_settings, make_online
+from pathspace_graph.eval.metrics.summary import lap_times, laps_of, not_mapped, summarize
+from pathspace_graph.eval.metrics.table1 import LapMetrics
+from pathspace_graph.io.files import check_target
+from pathspace_graph.io.log import Log, read_log
+from pathspace_graph.io.map import MAP_FILE
+from pathspace_graph.io.results import RunResult, write_result
+from pathspace_graph.labels import NAMES
+from pathspace_graph.progress import progress
+from pathspace_graph.run import run_online
+from pathspace_graph.settings.mapper import MapperSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Online:
+    """Map a log online, cycle by cycle, and write the map, the trajectory, the cycles and a summary."""
+
+    log: Positional[Path]
+    """Log folder to read."""
+    out: Path
+    """Map folder to write; an earlier map there is kept as a numbered backup."""
+    estimator: str = DEFAULT
+    """Name of the online estimator."""
+    settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
+    """The mapper."""
+
+    def run(self) -> None:
+        """Read, map, write, and say what came out."""
+        check_online(self.estimator)
+        check_settings(self.settings)
+        check_target(self.out, MAP_FILE)
+        log = read_log(self.log)
+        result = map_online(log, self.settings, self.estimator)
+        write_result(self.out, result, summarize(result, log))
+        report(result, log)
+        Console().print(f"written to {self.out}", highlight=False, soft_wrap=True, markup=False)
+
+
+def map_online(log: Log, settings: MapperSettings, estimator: str = DEFAULT) -> RunResult:
+    """Map a log with progress; maps are kept from the end of each true lap where there is truth."""
+    with progress("mapping", len(log.cycles)) as advance:
+        return run_online(
+            log,
+            make_online(estimator, settings, log),
+            name=estimator,
+            snapshot_times=lap_times(log),
+            on_cycle=lambda _: advance(),
+        )
+
+
+def report(result: RunResult, log: Log) -> None:
+    """The paper's table where there is truth, the run in a line; on standard error what was not mapped."""
+    console = Console()
+    laps = laps_of(result, log)
+    if laps:
+        console.print(laps_table(laps))
+    console.print(outline(result), highlight=False)
+    missing = not_mapped(result.map, log)
+    if missing:
+        Console(stderr=True).print("; ".join(missing), highlight=False, soft_wrap=True, markup=False)
+
+
+def outline(result: RunResult) -> str:
+    """The run in one line."""
+    laps = f"{result.laps} lap{'' if result.laps == 1 else 's'}"
+    loop = "loop closed" if result.map.closed else "loop not closed"
+    sizes = [f"{NAMES[label]} {boundary.size}" for label, boundary in sorted(result.map.boundaries.items())]
+    return ", ".join([laps, loop, f"control points: {' + '.join(sizes) or 'none'}"])
+
+
+def laps_table(laps: list[LapMetrics]) -> Table:
+    """The paper's Table 1, a row per lap."""
+    table = Table("lap", "rmse [m]", "missed [%]", "size")
+    for column in table.columns:
+        column.justify = "right"
+    for row in laps:
+        table.add_row(str(row.lap), f"{row.rmse:.3f}", f"{100 * row.missed:.1f}", str(row.size))
+    return table

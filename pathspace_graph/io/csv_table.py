@@ -1,0 +1,124 @@
+"""CSV tables with a header: columns by name, and errors that name the row."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import InputError
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Table:
+    """The rows below a CSV header, as text, column by column."""
+
+    file: Path
+    """Where it was read from."""
+    columns: dict[str, list[str]]
+    """Text of each column by its name, as it stands in the file."""
+    lines: list[int]
+    """Line of the file that each row stands on (the header is line 1)."""
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def fail(self, index: int, message: str) -> NoReturn:
+        """Raise the InputError of the row with this index."""
+        raise InputError(self.file, message, self.lines[index])
+
+    def require(self, good: NDArray[np.bool_], message: str) -> None:
+        """Raise an InputError for the first row that isn't good; `good` is (rows,)."""
+        if not good.all():
+            self.fail(int(np.argmin(good)), message)
+
+    def numbers(self, name: str) -> FloatArray:
+        """The column as finite numbers (rows,); a word, NaN or infinity is an InputError."""
+        texts = self.columns[name]
+        try:
+            values = np.array(list(map(float, texts)), dtype=float)
+        except ValueError:
+            index = next(i for i, text in enumerate(texts) if not _is_number(text))
+            self.fail(index, f"expected a number in column '{name}', found '{texts[index].strip()}'")
+        bad = ~np.isfinite(values)
+        if bad.any():
+            index = int(np.argmax(bad))
+            self.fail(index, f"expected a finite number in column '{name}', found '{texts[index].strip()}'")
+        return values
+
+    def stack(self, names: Sequence[str]) -> FloatArray:
+        """The named columns side by side (rows, names)."""
+        return np.column_stack([self.numbers(name) for name in names])
+
+
+def read_table(file: Path, required: Sequence[str], comment: str = "") -> Table:
+    """A CSV file with a header that holds at least the required columns, in any order.
+
+    Quotes, blanks around fields, empty lines, Windows line ends and a byte-order mark are tolerated;
+    `comment` is stripped from the front of the header. A file that is missing or empty, a missing column, or
+    a row with too few or too many fields is an InputError.
+    """
+    rows, lines = _read_rows(file)
+    if not rows:
+        raise InputError(file, f"expected a header {','.join(required)}, found an empty file", 1)
+    header = [name.strip() for name in rows[0]]
+    if header:
+        header[0] = header[0].removeprefix(comment).strip()
+    _check_header(file, header, required, lines[0])
+    body = [
+        row if len(row) == len(header) else _fit(file, row, len(header), line)
+        for row, line in zip(rows[1:], lines[1:], strict=True)
+    ]
+    columns = [list(column) for column in zip(*body, strict=True)] or [[] for _ in header]
+    return Table(file, dict(zip(header, columns, strict=True)), lines[1:])
+
+
+def _read_rows(file: Path) -> tuple[list[list[str]], list[int]]:
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    try:
+        with file.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.reader(stream, skipinitialspace=True)
+            for row in reader:
+                if "".join(row).strip():
+                    rows.append(row)
+                    lines.append(reader.line_num)
+    except FileNotFoundError:
+        raise InputError(file, "expected a file, found none") from None
+    except OSError as error:
+        raise InputError(file, f"expected a readable file: {error.strerror}") from error
+    except UnicodeDecodeError:
+        raise InputError(file, "expected text in UTF-8") from None
+    except csv.Error as error:
+        raise InputError(file, f"expected comma-separated values: {error}", reader.line_num) from error
+    return rows, lines
+
+
+def _check_header(file: Path, header: list[str], required: Sequence[str], line: int) -> None:
+    for name in required:
+        if header.count(name) != 1:
+            found = "none" if name not in header else "more than one"
+            raise InputError(file, f"expected a column '{name}', found {found} in '{','.join(header)}'", line)
+
+
+def _fit(file: Path, row: list[str], width: int, line: int) -> list[str]:
+    while len(row) > width and not row[-1].strip():
+        row = row[:-1]
+    if len(row) != width:
+        raise InputError(file, f"expected {width} fields, found {len(row)}", line)
+    return row
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,319 @@
+"""A log: odometry, perception cycles and, where known, the truth; read from and written to a folder."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import InputError
+from pathspace_graph.labels import NAMES, label_from_name
+
+from .csv_table import FloatArray, Table, read_table
+from .files import atomic_folder
+
+IntArray = NDArray[np.int_]
+
+FORMAT: Final = "pathspace-log/1"
+LOG_FILE: Final = "log.toml"
+ODOMETRY_FILE: Final = "odometry.csv"
+DETECTIONS_FILE: Final = "detections.csv"
+TRUTH_POSES_FILE: Final = "truth_poses.csv"
+TRUTH_CONES_FILE: Final = "truth_cones.csv"
+TRUTH_ASSOCIATIONS_FILE: Final = "truth_associations.csv"
+
+MAX_HOLD: Final = 1.0
+"""The last twist may be held for so long (s): a perception cycle later than that has no odometry."""
+MIN_RELATIVE_DETERMINANT: Final = 1e-12
+"""A covariance with det <= this * xx * yy is singular to double precision, so not positive definite."""
+
+
+@dataclass(frozen=True, eq=False)
+class Odometry:
+    """Readings of the body twist, each held until the next."""
+
+    t: FloatArray
+    """Stamps (N,), s, strictly increasing."""
+    twist: FloatArray
+    """[vx, vy, wz] (N, 3), m/s, m/s, rad/s, vehicle frame."""
+
+    def between(self, start: float, end: float) -> Odometry:
+        """The twists in force from `start` to `end` (s): the first from `start`, the last held until `end`.
+
+        Before the first row nothing moves; where no time passes there are no rows.
+        """
+        start = max(start, float(self.t[0]))
+        first = int(np.searchsorted(self.t, start, side="right")) - 1
+        stop = max(first, int(np.searchsorted(self.t, end, side="left"))) if end > start else first
+        return Odometry(np.maximum(self.t[first:stop], start), self.twist[first:stop])
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """The boundary points detected in one perception cycle."""
+
+    t: float
+    """Stamp, s."""
+    points_vehicle: FloatArray
+    """Detected points (m, 2), m, vehicle frame."""
+    covariances: FloatArray
+    """Covariance of each point (m, 2, 2), m^2, vehicle frame."""
+    labels: IntArray
+    """LEFT, RIGHT or UNKNOWN of each point (m,)."""
+
+
+@dataclass(frozen=True)
+class SensorInfo:
+    """What is known of the sensor; None where the log doesn't say."""
+
+    range_max: float | None = None
+    """Greatest range, m."""
+    fov: float | None = None
+    """Field of view, the whole angle, rad."""
+    rate: float | None = None
+    """Perception cycles per second, Hz."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a simulator or a survey knows, for evaluation only; what isn't known has no rows."""
+
+    pose_t: FloatArray
+    """Stamps of the true poses (N,), s."""
+    poses: FloatArray
+    """True poses [x, y, theta] (N, 3), m, m, rad, map frame."""
+    cones: FloatArray
+    """True cones (M, 2), m, map frame."""
+    cone_labels: IntArray
+    """LEFT, RIGHT or UNKNOWN of each true cone (M,)."""
+    associations: IntArray | None = None
+    """True cone of each detection in file order (R,), -1 for a false positive; None where not known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """All that a vehicle recorded on one drive."""
+
+    odometry: Odometry
+    """Readings of the body twist."""
+    cycles: tuple[Detections, ...]
+    """Perception cycles in order of time."""
+    odometry_sigma: FloatArray
+    """Standard deviation of one twist reading (3,), m/s, m/s, rad/s, white from sample to sample."""
+    sensor: SensorInfo = SensorInfo()
+    """What is known of the sensor."""
+    source: Mapping[str, str] = field(default_factory=dict)
+    """Free text on where the log comes from."""
+    truth: Truth | None = None
+    """The truth where there is any."""
+
+
+def read_log(folder: Path | str) -> Log:
+    """Read and check a log folder (FORMATS: A log).
+
+    What is wrong is an InputError that names the file, the row and what was expected.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(folder, "expected a log folder, found " + ("a file" if folder.exists() else "none"))
+    header = _read_toml(folder / LOG_FILE)
+    odometry = _read_odometry(folder / ODOMETRY_FILE)
+    table = read_table(folder / DETECTIONS_FILE, ("t", "x", "y", "label", "xx", "xy", "yy"))
+    cycles = _cycles(table, float(odometry.t[0]), float(odometry.t[-1]))
+    return Log(
+        odometry=odometry,
+        cycles=cycles,
+        odometry_sigma=_odometry_sigma(folder / LOG_FILE, header),
+        sensor=_sensor_info(folder / LOG_FILE, header),
+        source={key: str(value) for key, value in _section(folder / LOG_FILE, header, "source").items()},
+        truth=_read_truth(folder, len(table)),
+    )
+
+
+def write_log(log: Log, folder: Path | str) -> None:
+    """Write a log folder that `read_log` gives back exactly.
+
+    A cycle without detections has no row in the file, so is left out. The folder appears as a whole or not at
+    all; an earlier log there is kept as a numbered backup.
+    """
+    with atomic_folder(folder, LOG_FILE) as target:
+        (target / LOG_FILE).write_text(_toml(log), encoding="utf-8", newline="\n")
+        odometry = np.column_stack([log.odometry.t, log.odometry.twist]).tolist()
+        _write_csv(target / ODOMETRY_FILE, "t,vx,vy,wz", odometry)
+        _write_csv(target / DETECTIONS_FILE, "t,x,y,label,xx,xy,yy", _detection_rows(log.cycles))
+        if log.truth is not None:
+            _write_truth(log.truth, target)
+
+
+def _read_toml(file: Path) -> dict[str, Any]:
+    try:
+        header = tomllib.loads(file.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise InputError(file, "expected a file, found none") from None
+    except OSError as error:
+        raise InputError(file, f"expected a readable file: {error.strerror}") from error
+    except UnicodeDecodeError:
+        raise InputError(file, "expected text in UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        line = re.search(r"at line (\d+)", str(error))
+        raise InputError(file, f"expected TOML: {error}", int(line[1]) if line else None) from error
+    if header.get("format") != FORMAT:
+        raise InputError(file, f'expected format = "{FORMAT}", found {header.get("format")!r}')
+    return header
+
+
+def _section(file: Path, header: dict[str, Any], name: str) -> dict[str, Any]:
+    section = header.get(name, {})
+    if not isinstance(section, dict):
+        raise InputError(file, f"expected a section [{name}], found {section!r}")
+    return section
+
+
+def _odometry_sigma(file: Path, header: dict[str, Any]) -> FloatArray:
+    sigma = _section(file, header, "odometry").get("sigma")
+    good = isinstance(sigma, list) and len(sigma) == 3 and all(_is_positive(value) for value in sigma)
+    if not good:
+        raise InputError(file, f"expected three positive numbers as [odometry] sigma, found {sigma!r}")
+    return np.array(sigma, dtype=float)
+
+
+def _sensor_info(file: Path, header: dict[str, Any]) -> SensorInfo:
+    section = _section(file, header, "sensor")
+    values: dict[str, float | None] = {}
+    for name in ("range_max", "fov", "rate"):
+        value = section.get(name)
+        if value is not None and not _is_positive(value):
+            raise InputError(file, f"expected a positive number as [sensor] {name}, found {value!r}")
+        values[name] = None if value is None else float(value)
+    return SensorInfo(**values)
+
+
+def _is_positive(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
+
+
+def _read_odometry(file: Path) -> Odometry:
+    table = read_table(file, ("t", "vx", "vy", "wz"))
+    if not len(table):
+        raise InputError(file, "expected at least one reading, found a header only", 2)
+    return Odometry(_increasing_times(table), table.stack(("vx", "vy", "wz")))
+
+
+def _increasing_times(table: Table) -> FloatArray:
+    t = table.numbers("t")
+    good = np.append(True, np.diff(t) > 0) if len(t) else np.ones(0, dtype=bool)
+    table.require(good, "expected a time later than the row before")
+    return t
+
+
+def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ...]:
+    if not len(table):
+        return ()
+    t = table.numbers("t")
+    table.require(np.append(True, np.diff(t) >= 0), "expected a time not earlier than the row before")
+    table.require(t >= t_first, f"expected a time not before the first odometry reading ({t_first:g} s)")
+    late = f"expected a time at most {MAX_HOLD:g} s after the last odometry reading ({t_last:g} s)"
+    table.require(t <= t_last + MAX_HOLD, late)
+    points = table.stack(("x", "y"))
+    covariances = _covariances(table)
+    labels = _labels(table)
+    starts = np.flatnonzero(np.diff(t, prepend=-np.inf))
+    stops = np.append(starts[1:], len(t))
+    spans = [slice(a, b) for a, b in zip(starts, stops, strict=True)]
+    return tuple(Detections(float(t[s.start]), points[s], covariances[s], labels[s]) for s in spans)
+
+
+def _covariances(table: Table) -> FloatArray:
+    xx, xy, yy = (table.numbers(name) for name in ("xx", "xy", "yy"))
+    with np.errstate(over="ignore", invalid="ignore"):
+        good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
+    table.require(good, "expected a positive definite covariance (xx > 0, xx yy > xy^2)")
+    return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
+
+
+def _labels(table: Table) -> IntArray:
+    return np.array([label_from_name(name) for name in table.columns["label"]], dtype=int)
+
+
+def _read_truth(folder: Path, detection_count: int) -> Truth | None:
+    files = (folder / TRUTH_POSES_FILE, folder / TRUTH_CONES_FILE, folder / TRUTH_ASSOCIATIONS_FILE)
+    if not any(file.exists() for file in files):
+        return None
+    pose_t, poses = _read_truth_poses(files[0])
+    cones, cone_labels = _read_truth_cones(files[1])
+    associations = _read_associations(files[2], detection_count, len(cones))
+    return Truth(pose_t, poses, cones, cone_labels, associations)
+
+
+def _read_truth_poses(file: Path) -> tuple[FloatArray, FloatArray]:
+    if not file.exists():
+        return np.zeros(0), np.zeros((0, 3))
+    table = read_table(file, ("t", "x", "y", "theta"))
+    return _increasing_times(table), table.stack(("x", "y", "theta"))
+
+
+def _read_truth_cones(file: Path) -> tuple[FloatArray, IntArray]:
+    if not file.exists():
+        return np.zeros((0, 2)), np.zeros(0, dtype=int)
+    table = read_table(file, ("x", "y", "label"))
+    return table.stack(("x", "y")), _labels(table)
+
+
+def _read_associations(file: Path, detection_count: int, cone_count: int) -> IntArray | None:
+    if not file.exists():
+        return None
+    table = read_table(file, ("cone",))
+    if len(table) != detection_count:
+        raise InputError(file, f"expected a row for each of {detection_count} detections, found {len(table)}")
+    cones = table.numbers("cone")
+    good = (cones == np.floor(cones)) & (cones >= -1) & (cones < cone_count)
+    table.require(good, f"expected -1 or the index of one of {cone_count} true cones")
+    return cones.astype(int)
+
+
+def _toml(log: Log) -> str:
+    sigma = ", ".join(repr(float(value)) for value in log.odometry_sigma)
+    sensor = {"range_max": log.sensor.range_max, "fov": log.sensor.fov, "rate": log.sensor.rate}
+    lines = [f'format = "{FORMAT}"', "", "[odometry]", f"sigma = [{sigma}]", "", "[sensor]"]
+    lines += [f"{name} = {float(value)!r}" for name, value in sensor.items() if value is not None]
+    lines += ["", "[source]"]
+    lines += [f"{_toml_text(key)} = {_toml_text(value)}" for key, value in log.source.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _toml_text(text: str) -> str:
+    # a JSON string is a TOML string, but for the delete character
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _detection_rows(cycles: Iterable[Detections]) -> Iterable[list[object]]:
+    for cycle in cycles:
+        points, covariances = cycle.points_vehicle.tolist(), cycle.covariances.tolist()
+        for (x, y), label, ((xx, xy), (_, yy)) in zip(
+            points, cycle.labels.tolist(), covariances, strict=True
+        ):
+            yield [float(cycle.t), x, y, NAMES[label], xx, xy, yy]
+
+
+def _write_truth(truth: Truth, target: Path) -> None:
+    poses = np.column_stack([truth.pose_t, truth.poses]).tolist()
+    _write_csv(target / TRUTH_POSES_FILE, "t,x,y,theta", poses)
+    labels = [NAMES[label] for label in truth.cone_labels]
+    cones = ([x, y, label] for (x, y), label in zip(truth.cones.tolist(), labels, strict=True))
+    _write_csv(target / TRUTH_CONES_FILE, "x,y,label", cones)
+    if truth.associations is not None:
+        _write_csv(target / TRUTH_ASSOCIATIONS_FILE, "cone", ([cone] for cone in truth.associations.tolist()))
+
+
+def _write_csv(file: Path, header: str, rows: Iterable[list[Any]]) -> None:
+    # str of a Python float is the shortest text that reads back as the same number
+    text = "".join(",".join(map(str, row)) + "\n" for row in rows)
+    file.write_text(f"{header}\n{text}", encoding="utf-8", newline="\n")

@@ -1,0 +1,222 @@
+"""A map: the track's boundaries with their joint covariance, and its JSON (FORMATS)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.labels import BOUNDARIES, NAMES
+from pathspace_graph.spline.bspline import BSpline
+
+Array = NDArray[np.float64]
+
+FORMAT = "pathspace-map/1"
+MAP_FILE = "map.json"
+
+_SYMMETRY_TOLERANCE = 1e-9
+"""|P - P^T| <= tolerance * max|P|: what rounding leaves of a covariance's symmetry."""
+_NEGATIVE_TOLERANCE = 1e-9
+"""smallest eigenvalue >= -tolerance * largest: what rounding leaves of its positive semidefiniteness."""
+
+
+@dataclass(frozen=True, eq=False)
+class SplineBoundary:
+    """A boundary as a B-spline."""
+
+    spline: BSpline
+    """The curve, map frame, in the direction of travel."""
+
+    covariance: Array
+    """(2m, 2m) m^2, joint covariance of the m distinct control points over x0, y0, x1, y1 ..."""
+
+    @property
+    def size(self) -> int:
+        """The number m of distinct control points."""
+        return self.spline.size
+
+
+@dataclass(frozen=True, eq=False)
+class PointBoundary:
+    """A boundary as points: the landmarks of an estimator that doesn't know they form a curve."""
+
+    points: Array
+    """(m, 2) m, map frame, in no particular order."""
+
+    covariance: Array
+    """(2m, 2m) m^2, joint covariance over x0, y0, x1, y1 ..."""
+
+    @property
+    def size(self) -> int:
+        """The number m of points."""
+        return len(self.points)
+
+
+Boundary = SplineBoundary | PointBoundary
+
+
+@dataclass(frozen=True, eq=False)
+class Map:
+    """What was mapped of a track."""
+
+    closed: bool
+    """Whether the track was found to be a loop."""
+
+    boundaries: Mapping[int, Boundary]
+    """By label, LEFT and RIGHT; a boundary that could not be mapped is absent."""
+
+    @property
+    def size(self) -> int:
+        """The number of control points or landmarks on both boundaries together."""
+        return sum(boundary.size for boundary in self.boundaries.values())
+
+
+# --- JSON ------------------------------------------------------------------------------------------------
+
+
+def map_to_json(track: Map) -> dict[str, Any]:
+    """The content of `map.json`, of plain Python types; every number to full precision."""
+    boundaries = {
+        NAMES[label]: _boundary_to_json(track.boundaries[label]) for label in sorted(track.boundaries)
+    }
+    return {"format": FORMAT, "closed": bool(track.closed), "boundaries": boundaries}
+
+
+def _boundary_to_json(boundary: Boundary) -> dict[str, Any]:
+    shared = {"covariance": boundary.covariance.tolist(), "size": boundary.size}
+    if isinstance(boundary, PointBoundary):
+        return {"points": boundary.points.tolist(), **shared}
+    spline = boundary.spline
+    return {
+        "degree": int(spline.degree),
+        "periodic": bool(spline.periodic),
+        "knots": spline.knots.tolist(),
+        "control_points": spline.control_points.tolist(),
+        **shared,
+    }
+
+
+def map_from_json(content: Any, file: Path | str = MAP_FILE) -> Map:
+    """The map of a `map.json`'s content; InputError, naming `file`, where it is not what FORMATS says."""
+    reader = _Reader(Path(file))
+    top = reader.object(content, "the file")
+    if top.get("format") != FORMAT:
+        raise reader.error(f'expected format = "{FORMAT}", found {top.get("format")!r}')
+    boundaries = reader.object(reader.get(top, "boundaries", ""), "boundaries")
+    unknown = sorted(set(boundaries) - {NAMES[label] for label in BOUNDARIES})
+    if unknown:
+        raise reader.error(f"boundaries: expected left and right, found {unknown[0]!r}")
+    return Map(
+        closed=reader.boolean(reader.get(top, "closed", ""), "closed"),
+        boundaries={
+            label: reader.boundary(boundaries[NAMES[label]], f"boundaries.{NAMES[label]}")
+            for label in BOUNDARIES
+            if NAMES[label] in boundaries
+        },
+    )
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Takes values out of parsed JSON, checked; `where` is the dotted path that an error names."""
+
+    file: Path
+
+    def error(self, message: str) -> InputError:
+        return InputError(self.file, message)
+
+    def object(self, value: Any, where: str) -> dict[str, Any]:
+        if not isinstance(value, dict):
+            raise self.error(f"{where}: expected an object, found {type(value).__name__}")
+        return value
+
+    def get(self, parent: dict[str, Any], key: str, where: str) -> Any:
+        if key not in parent:
+            raise self.error(f"{where + '.' if where else ''}{key}: expected, but missing")
+        return parent[key]
+
+    def boolean(self, value: Any, where: str) -> bool:
+        if not isinstance(value, bool):
+            raise self.error(f"{where}: expected true or false, found {value!r}")
+        return value
+
+    def integer(self, value: Any, where: str, least: int) -> int:
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise self.error(f"{where}: expected a whole number of at least {least}, found {value!r}")
+        return value
+
+    def array(self, value: Any, where: str, columns: int | None = None) -> Array:
+        """Finite numbers: a list (columns None), or rows of `columns` values."""
+        expected = "a list of finite numbers" if columns is None else f"rows of {columns} finite numbers"
+        try:
+            array = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            raise self.error(f"{where}: expected {expected}") from None
+        if columns is not None and array.size == 0:
+            array = array.reshape(0, columns)
+        shaped = array.ndim == 1 if columns is None else array.ndim == 2 and array.shape[1] == columns
+        if not isinstance(value, list) or not shaped or not np.isfinite(array).all():
+            raise self.error(f"{where}: expected {expected}")
+        return array
+
+    def boundary(self, value: Any, where: str) -> Boundary:
+        fields = self.object(value, where)
+        if "points" in fields:
+            points = self.array(fields["points"], f"{where}.points", columns=2)
+            return PointBoundary(points, self.covariance(fields, len(points), where))
+        spline = self.spline(fields, where)
+        return SplineBoundary(spline, self.covariance(fields, spline.size, where))
+
+    def spline(self, fields: dict[str, Any], where: str) -> BSpline:
+        degree = self.integer(self.get(fields, "degree", where), f"{where}.degree", least=1)
+        periodic = self.boolean(self.get(fields, "periodic", where), f"{where}.periodic")
+        knots = self.array(self.get(fields, "knots", where), f"{where}.knots")
+        points = self.array(self.get(fields, "control_points", where), f"{where}.control_points", columns=2)
+        try:
+            return BSpline(knots, points, degree, periodic)
+        except SettingsError as error:
+            raise self.error(f"{where}: {error}") from None
+
+    def covariance(self, fields: dict[str, Any], size: int, where: str) -> Array:
+        stated = self.integer(self.get(fields, "size", where), f"{where}.size", least=0)
+        if stated != size:
+            raise self.error(f"{where}.size: expected {size} (what is listed), found {stated}")
+        listed = self.get(fields, "covariance", where)
+        covariance = self.array(listed, f"{where}.covariance", columns=2 * size)
+        if len(covariance) != 2 * size:
+            raise self.error(f"{where}.covariance: expected {2 * size} rows, found {len(covariance)}")
+        if not _is_covariance(covariance):
+            raise self.error(f"{where}.covariance: expected a symmetric, positive semidefinite matrix")
+        return covariance
+
+
+def _is_covariance(P: Array) -> bool:
+    if P.size == 0:
+        return True
+    if np.abs(P - P.T).max() > _SYMMETRY_TOLERANCE * np.abs(P).max():
+        return False
+    eigenvalues = np.linalg.eigvalsh(P)
+    return bool(eigenvalues[0] >= -_NEGATIVE_TOLERANCE * max(eigenvalues[-1], 0.0))
+
+
+# --- folders ---------------------------------------------------------------------------------------------
+
+
+def read_map(folder: Path | str) -> Map:
+    """The map of a folder that follows FORMATS, as `write_result`'s do; InputError where it doesn't."""
+    file = Path(folder) / MAP_FILE
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(file, f"expected a map, can't be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise InputError(file, "expected text in UTF-8") from None
+    except json.JSONDecodeError as error:
+        raise InputError(file, f"expected JSON ({error.msg})", row=error.lineno) from None
+    return map_from_json(content, file)

@@ -1,0 +1,1 @@
+"""The Hungarian landmark estimators that the curves are compared with: online, batch and filter."""

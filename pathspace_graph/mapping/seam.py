@@ -1,0 +1,118 @@
+"""The seam of a curve that closes: where its end lies on its beginning, and its periodic knots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.settings.knots import BreakSettings, FitSettings, Knots
+from pathspace_graph.settings.mapper import ClosingSettings, MapperSettings
+from pathspace_graph.spline.boundary import Boundary
+from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.cone_knots import thin
+from pathspace_graph.spline.knots import curvature_weighted_breaks, refit
+
+Array = NDArray[np.float64]
+
+
+EXTRAPOLATED = 2
+"""Knot intervals past the last sighting whose parameters are given a place on the closed curve."""
+
+
+@dataclass(frozen=True, eq=False)
+class Overlap:
+    """Where a curve's end lies on its beginning."""
+
+    period: float
+    """Length of the closed curve in the open one's parameter, m."""
+    u: Array
+    """(k,) parameters of the open curve from there on, increasing, ..."""
+    w: Array
+    """... and theirs (k,) on the beginning, from 0 on."""
+
+    def new_parameter(self, u: Array) -> Array:
+        """Parameter on the closed curve (not wrapped) of the open curve's."""
+        return np.where(u < self.u[0], u, self.period + np.interp(u, self.u, self.w))
+
+
+@dataclass(frozen=True, eq=False)
+class Join:
+    """How an open curve becomes periodic."""
+
+    overlap: Overlap
+    """Of its end and its beginning."""
+    knots: Array
+    """(m + 2 p + 1,) periodic knots."""
+    points: Array
+    """(m, 2) control points of the closed curve, map frame, m."""
+    old_from_new: Array
+    """(n, m) E."""
+
+
+def join(boundary: Boundary, control_points: Array, settings: MapperSettings, knots: Knots) -> Join:
+    """The periodic curve nearest to an open one with control points (n, 2)."""
+    spline = boundary.spline(control_points)
+    overlap = find_overlap(boundary, control_points, settings.closing)
+    breaks = _breaks(boundary, control_points, overlap.period, settings, knots)
+    frame = BSpline.periodic_from(breaks, np.zeros((len(breaks) - 1, 2)), boundary.degree)
+    change = refit(spline, frame, overlap.new_parameter)
+    return Join(overlap, frame.knots, change.new_from_old @ control_points, change.old_from_new)
+
+
+def _breaks(
+    boundary: Boundary, control_points: Array, period: float, settings: MapperSettings, knots: Knots
+) -> Array:
+    """(m + 1,) of the closed curve, m a share of the cones that it was led through.
+
+    A cone is where it lies on the curve as that is now.
+    """
+    u = np.array(boundary.sighted_u)
+    u = _apart(u[u < period - settings.closing.seam_margin], settings.growth.merge_radius)
+    size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
+    if knots == "curvature" or size >= len(u):
+        baseline = BreakSettings(settings.spline.linear_baseline)
+        return curvature_weighted_breaks(boundary.spline(control_points), size, baseline, 0.0, period)
+    points = boundary.evaluate(control_points, u)
+    *_, thinned = thin(points, u, period, True, FitSettings(boundary.degree), size)
+    return thinned.breaks
+
+
+def _apart(values: Array, distance: float) -> Array:
+    """Of the sorted values (k,) those that are more than `distance` past the last one that is."""
+    kept: list[float] = []
+    for value in values.tolist():
+        if not kept or value - kept[-1] > distance:
+            kept.append(value)
+    return np.array(kept)
+
+
+def find_overlap(boundary: Boundary, control_points: Array, settings: ClosingSettings) -> Overlap:
+    """The seam is the foot point of the beginning on the end; from there on the end repeats the beginning.
+
+    Where the end doesn't reach the beginning, the gap is closed straight.
+    """
+    confirmed = boundary.confirmed
+    late = confirmed - settings.beginning - settings.join_margin
+    late = max(late, settings.join_share * confirmed)
+    ends = boundary.evaluate(control_points, np.array([0.0, confirmed]))
+    foot = boundary.find(control_points, ends[:1], np.array([late]), np.array([confirmed]))
+    if not foot.interior[0]:
+        period = confirmed + float(np.hypot(*(ends[0] - ends[1])))
+        return Overlap(period, np.array([period, period + 1.0]), np.array([0.0, 1.0]))
+    seam = float(foot.u[0])
+    u = np.linspace(seam, confirmed, max(int((confirmed - seam) / settings.overlap_step), 1) + 1)
+    w = _on_beginning(boundary, control_points, u, settings.overlap_room)
+    beyond = EXTRAPOLATED * boundary.nominal[0]
+    return Overlap(seam, np.append(u, u[-1] + beyond), np.append(w, w[-1] + beyond))
+
+
+def _on_beginning(boundary: Boundary, control_points: Array, u: Array, room: float) -> Array:
+    """Parameters (k,) on the beginning of the end's points at u (k,), from 0 on and never falling."""
+    guess = u - u[0]
+    points = boundary.evaluate(control_points, u)
+    w = boundary.find(control_points, points, np.maximum(guess - room, 0.0), guess + room).u
+    w = np.maximum.accumulate(w)
+    w[0] = 0.0
+    return w

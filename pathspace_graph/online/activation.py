@@ -1,0 +1,68 @@
+"""Which part of the map is active: what the window can touch, and some room for what comes next."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.mapping.curve_map import CurveSmoother
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+def narrow(smoother: CurveSmoother) -> None:
+    """Keep what is solved for to the active part of the map; exact, see `graph.inactive`.
+
+    An open curve's inactive part grows as the vehicle drives on; a closed one's is chosen anew when the
+    active part no longer holds what the window needs.
+    """
+    state, room = smoother.map.state, smoother.map.settings.far.room
+    needed = {label: _needed(smoother, label) for label in state.boundaries}
+    if not all(
+        _holds(state.active(label), indices, state.boundaries[label].size)
+        for label, indices in needed.items()
+    ):
+        smoother.reactivate()
+    elif not _worthwhile(smoother, needed):
+        return
+    active = {label: _needed(smoother, label, room) for label in state.boundaries}
+    leaving = [np.setdiff1d(state.active(label), indices) for label, indices in active.items()]
+    if not any(map(len, leaving)):
+        return
+    keys = [state.keys(label)[gone] for label, gone in zip(active, leaving, strict=True)]
+    smoother.deactivate(np.concatenate(keys))
+    state.narrowed = active
+
+
+def _holds(active: IntArray, needed: IntArray, size: int) -> bool:
+    """Whether one stretch of control points holds another; on a closed curve of that size they wrap."""
+    return int(needed[0] - active[0]) % size + len(needed) <= len(active)
+
+
+def _worthwhile(smoother: CurveSmoother, needed: dict[int, IntArray]) -> bool:
+    """A closed curve that is active all around, or enough behind the vehicle on an open one."""
+    state, settings = smoother.map.state, smoother.map.settings
+    behind = [0]
+    for label, indices in needed.items():
+        if state.boundaries[label].periodic:
+            return state.whole
+        behind.append(int(indices[0] - state.active(label)[0]))
+    return max(behind) * settings.spline.spacing >= settings.far.stretch
+
+
+def _needed(smoother: CurveSmoother, label: int, room: float = 0.0) -> IntArray:
+    """Control points (k,) of what the window's poses see in this cycle and the next, and `room` (m) ahead."""
+    boundary, stations = smoother.map.state.boundaries[label], smoother.map.state.stations[label]
+    gate, slide = smoother.map.settings.gate, smoother.map.settings.spline.refine_room
+    low = float(stations.min()) - gate.view_behind - slide
+    high = float(stations.max()) + gate.view_ahead + gate.station_ahead + slide + room
+    if boundary.periodic and high - low >= boundary.length:
+        return boundary.everything
+    first, last = boundary.tables.locate(np.array([low, high]))[0]
+    if not boundary.periodic:
+        return np.arange(first, boundary.size)
+    last += boundary.degree + (boundary.size if last < first else 0)
+    if last - first >= boundary.size - 1:
+        return boundary.everything
+    return np.arange(first, last + 1) % boundary.size

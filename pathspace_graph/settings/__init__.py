@@ -1,0 +1,1 @@
+"""Settings: frozen dataclasses with a sentence for each field, and no number anywhere else."""

@@ -1,0 +1,1 @@
+"""Plane B-splines: curves, their knots, and the boundary that a mapper grows."""

@@ -1,0 +1,207 @@
+"""Where knots go: curvature-weighted breaks, refits onto other knots as matrices, fits to ordered points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.bspline import Floats
+from pathspace_graph.factors.footpoint import foot_points
+from pathspace_graph.settings.knots import BreakSettings, FitSettings
+
+from .bspline import BSpline
+
+_SAMPLES_PER_BREAK: Final = 40
+"""Curvature samples for each break wanted, equally spaced along the curve."""
+_SAMPLES_PER_SPAN: Final = 8
+"""Least-squares samples on each span of a refit: enough for any degree up to 7."""
+_BRIDGE: Final = 1e-3
+"""Weight of the refit's second differences beside its samples, where a span has too few of them."""
+_BENDING_PER_SPAN: Final = 3
+"""Second differences taken on each span."""
+
+
+def quantile_breaks(u: Floats, curvature: Floats, count: int, settings: BreakSettings) -> Floats:
+    """Breaks (count + 1,) at equal quantiles of (1 - b) |kappa| / sum |kappa| + b / N over N equal lengths.
+
+    u (N + 1,): the samples' increasing parameters, curvature (N,) between them, 1/m; b the linear baseline.
+    """
+    if count < 1:
+        raise SettingsError(f"at least one knot interval is needed, not {count}")
+    bent = np.minimum(np.abs(curvature), settings.curvature_max)
+    total = float(bent.sum())
+    equal = np.full(len(bent), 1.0 / len(bent))
+    share = (1.0 - settings.baseline) * bent / total + settings.baseline * equal if total > 0.0 else equal
+    cumulative = np.concatenate([[0.0], np.cumsum(share)])
+    breaks = np.interp(np.linspace(0.0, 1.0, count + 1), cumulative / cumulative[-1], u)
+    breaks[0], breaks[-1] = u[0], u[-1]
+    return breaks
+
+
+def curvature_weighted_breaks(
+    spline: BSpline, count: int, settings: BreakSettings, low: float | None = None, high: float | None = None
+) -> Floats:
+    """Breaks (count + 1,) in the spline's own parameter between low and high (by default its domain).
+
+    The paper's Simplification: sample equally along the curve, take curvature as a probability density, mix
+    in the linear baseline, put knots at equal quantiles. Beyond an open curve's ends counts as straight.
+    """
+    first, last = spline.domain
+    low, high = first if low is None else low, last if high is None else high
+    if not low < high:
+        raise SettingsError(f"knots need a stretch that is not empty, not [{low}, {high}]")
+    u = _equal_lengths(spline, low, high, count * _SAMPLES_PER_BREAK)
+    middle = 0.5 * (u[1:] + u[:-1])
+    curvature = spline.curvature(middle)
+    if not spline.periodic:
+        curvature[(middle < first) | (middle > last)] = 0.0
+    return quantile_breaks(u, curvature, count, settings)
+
+
+def _equal_lengths(spline: BSpline, low: float, high: float, count: int) -> Floats:
+    """Parameters (count + 1,) from low to high, equal chords apart; beyond an end at the mean speed."""
+    first, last = spline.domain
+    grid = np.linspace(low, high, 4 * count + 1)
+    chords = np.linalg.norm(np.diff(spline.evaluate(grid), axis=0), axis=1)
+    if not spline.periodic:
+        beyond = (grid[:-1] < first) | (grid[1:] > last)
+        chords[beyond] = spline.length() / (last - first) * (grid[1] - grid[0])
+    shortest = 1e-9 * max(float(chords.sum()), 1.0) / len(chords)
+    along = np.concatenate([[0.0], np.cumsum(np.maximum(chords, shortest))])
+    return np.interp(np.linspace(0.0, along[-1], count + 1), along, grid)
+
+
+@dataclass(frozen=True, eq=False)
+class Refit:
+    """A change of basis between an old and a new spline, on each coordinate alike."""
+
+    new_from_old: Floats
+    """F (m_new, m_old): C_new = F C_old, least squares over samples of the old curve."""
+    old_from_new: Floats
+    """E (m_old, m_new): C_old ~ E C_new, least squares of the new curve's samples in the old basis."""
+
+
+def refit(old: BSpline, new: BSpline, u_map: Callable[[Floats], Floats] | None = None) -> Refit:
+    """Least squares between the bases of two splines: only the knots of `new` matter, not its control points.
+
+    `u_map` takes increasing parameters of the old spline to those of the new (by default the same); of a
+    periodic new spline they are wrapped, so that the beginning of an open curve and an end that overlaps it,
+    once around, land on the same stretch. Where the new domain has no sample of the old, F bridges smoothly.
+    """
+    u = _refit_samples(old, new)
+    w = u if u_map is None else u_map(u)
+    B_old, B_new = old.basis_matrix(u), new.basis_matrix(w)
+    bridge = _BRIDGE * _bending_rows(new)[np.repeat(_sparse_spans(new, w), _BENDING_PER_SPAN)]
+    stacked = np.concatenate([B_new, bridge])
+    target = np.concatenate([B_old, np.zeros((len(bridge), old.size))])
+    return Refit(new_from_old=_least_squares(stacked, target), old_from_new=_least_squares(B_old, B_new))
+
+
+def _least_squares(matrix: Floats, right: Floats) -> Floats:
+    """argmin |M X - R| by normal equations: for a B-spline basis sampled all along, of a small condition."""
+    factor = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
+    return np.asarray(scipy.linalg.cho_solve(factor, matrix.T @ right, check_finite=False))
+
+
+def _refit_samples(old: BSpline, new: BSpline) -> Floats:
+    """Parameters over the old domain, middles of equal parts of every span, dense enough for the new."""
+    widths = np.diff(old.breaks)
+    finer = int(np.ceil(widths.max() / np.diff(new.breaks).min()))
+    parts = _SAMPLES_PER_SPAN * min(max(1, finer), _SAMPLES_PER_SPAN)
+    offsets = (np.arange(parts) + 0.5) / parts
+    return (old.breaks[:-1, None] + widths[:, None] * offsets).ravel()
+
+
+def _sparse_spans(spline: BSpline, u: Floats) -> NDArray[np.bool_]:
+    """(spans,) where a spline's own span has fewer samples than it has control points."""
+    low, high = spline.domain
+    inside = low + np.mod(u - low, high - low) if spline.periodic else u
+    return np.histogram(inside, spline.breaks)[0] <= spline.degree
+
+
+def _bending_rows(spline: BSpline) -> Floats:
+    """h^2 S''(u) onto the distinct control points, at the middle of equal parts of every span of width h."""
+    breaks = spline.breaks
+    width = np.diff(breaks)
+    offsets = (np.arange(_BENDING_PER_SPAN) + 0.5) / _BENDING_PER_SPAN
+    u = (breaks[:-1, None] + width[:, None] * offsets).ravel()
+    order = min(2, spline.degree)
+    scale = np.repeat(width, _BENDING_PER_SPAN) ** order
+    return np.asarray(spline.basis_matrix(u, order) * scale[:, None])
+
+
+def fit_spline(
+    points: Floats,
+    size: int,
+    periodic: bool,
+    settings: FitSettings | None = None,
+    breaks: Floats | None = None,
+) -> BSpline:
+    """The least-squares spline of `size` distinct control points through ordered points (k, 2), metres.
+
+    Parameters begin as chord lengths and are moved to the foot points; knots follow the curvature, unless
+    `breaks` are given (in chord lengths from the first point). The best of all fits by rmse is returned. A
+    weak bending energy decides where points are few, so two points (three where periodic) give a curve.
+    """
+    settings = FitSettings() if settings is None else settings
+    u, high = _chord_lengths(points, periodic)
+    count = size if periodic else size - settings.degree
+    if count < 1 or (periodic and count <= settings.degree):
+        raise SettingsError(f"{size} control points are too few for a spline of degree {settings.degree}")
+    knots = np.linspace(0.0, high, count + 1) if breaks is None else breaks
+    best, best_rmse = None, np.inf
+    for _ in range(settings.rounds + 1 if breaks is None else 1):
+        spline, u, rmse = _fit_on(points, u, knots, periodic, settings)
+        if rmse < best_rmse or best is None:
+            best, best_rmse = spline, rmse
+        knots = curvature_weighted_breaks(spline, count, settings.breaks)
+    assert best is not None
+    return best
+
+
+def _chord_lengths(points: Floats, periodic: bool) -> tuple[Floats, float]:
+    """Chord length (k,) from the first point to each, and the whole curve's."""
+    following = np.roll(points, -1, axis=0) if periodic else points[1:]
+    chords = np.linalg.norm(following - points[: len(following)], axis=1)
+    along = np.concatenate([[0.0], np.cumsum(chords)])
+    if len(points) < (3 if periodic else 2) or not along[-1] > 0.0:
+        raise SettingsError("a spline is fitted to at least two distinct points, a closed one to three")
+    return along[: len(points)], float(along[-1])
+
+
+def _fit_on(
+    points: Floats, u: Floats, breaks: Floats, periodic: bool, settings: FitSettings
+) -> tuple[BSpline, Floats, float]:
+    """The fit on given breaks after refreshing foot points: spline, parameters (k,), rmse in metres."""
+    p = settings.degree
+    count = len(breaks) - 1
+    build = BSpline.periodic_from if periodic else BSpline.clamped_from
+    frame = build(breaks, np.zeros((count if periodic else count + p, 2)), p)
+    bending = np.sqrt(settings.smoothness) * energy_rows(frame)
+    zeros = np.zeros((len(bending), 2))
+    reach = (breaks[-1] - breaks[0]) / max(count, len(points))
+    rmse = np.inf
+    for _ in range(settings.refits):
+        stacked = np.concatenate([frame.basis_matrix(u), bending])
+        solution = np.linalg.lstsq(stacked, np.concatenate([points, zeros]), rcond=None)[0]
+        frame = frame.with_points(solution)
+        feet = foot_points(frame.tables, frame.control_points, points, u - reach, u + reach, 0.1 * reach)
+        rmse = float(np.sqrt(np.mean(np.sum((feet.position - points) ** 2, axis=1))))
+        u = feet.u
+    return frame, u, rmse
+
+
+def energy_rows(spline: BSpline) -> Floats:
+    """Rows R with |R c|^2 = integral of |S''|^2 (exact up to degree 4), of |S'|^2 for degree 1."""
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    breaks = spline.breaks
+    half = 0.5 * np.diff(breaks)
+    u = ((breaks[:-1] + half)[:, None] + half[:, None] * nodes).ravel()
+    root = np.sqrt((half[:, None] * weights).ravel())
+    return np.asarray(spline.basis_matrix(u, min(2, spline.degree)) * root[:, None])

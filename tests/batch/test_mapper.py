@@ -1,0 +1,176 @@
+"""The batch from end to end: both starts, open tracks, broken-off logs, logs that hold nothing."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.batch.mapper import BatchMapper, BatchResult
+from pathspace_graph.cli import main
+from pathspace_graph.commands.batch import NOT_CONVERGED
+from pathspace_graph.eval.metrics.gap import gap
+from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.io.log import Log, write_log
+from pathspace_graph.io.map import SplineBoundary, read_map
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.settings.mapper import MapperSettings
+
+from ..scenes.drives import ahead, bean_track, corridor, exact_log, lap_log, true_poses
+
+Array = NDArray[np.float64]
+
+
+def noisy(log: Log, seed: int, sigma: float = 0.1) -> Log:
+    """The log with noise on its readings."""
+    rng = np.random.default_rng(seed)
+    cycles = tuple(
+        replace(c, points_vehicle=c.points_vehicle + rng.normal(0.0, sigma, c.points_vehicle.shape))
+        for c in log.cycles
+    )
+    return replace(log, cycles=cycles)
+
+
+@cache
+def bean() -> Log:
+    """A lap and a half of a small closed track."""
+    return noisy(lap_log(bean_track(), overrun=50.0), seed=1)
+
+
+@cache
+def solved(start: str) -> BatchResult:
+    assert start in ("online", "odometry")
+    return BatchMapper(None, bean().odometry_sigma, FixedLagMapper).solve(
+        bean(), "online" if start == "online" else "odometry"
+    )
+
+
+def broken_off(log: Log, share: float) -> Log:
+    """Only the first cycles of a log."""
+    cycles = log.cycles[: int(share * len(log.cycles))]
+    return replace(log, cycles=cycles)
+
+
+@pytest.mark.parametrize("start", ["online", "odometry"])
+def test_a_closed_track_is_mapped_within_the_noise(start: str) -> None:
+    result, truth = solved(start), bean().truth
+    assert truth is not None
+    assert result.convergence.converged
+    assert result.map.closed
+    metrics = lap_metrics(result.map, truth, 1)
+    assert metrics.missed == 0.0
+    assert metrics.rmse < 0.1
+    errors = result.trajectory - true_poses(bean())
+    assert np.abs(errors[:, :2]).max() < 0.25
+
+
+def test_both_starts_come_to_one_optimum() -> None:
+    first, second = solved("online"), solved("odometry")
+    assert first.map.size == second.map.size
+    np.testing.assert_allclose(first.convergence.cost, second.convergence.cost, rtol=1e-3)
+    between = gap(first, second)
+    assert max(between.curves.values()) < 0.02
+    assert max(between.along, between.across) < 0.05
+
+
+def test_the_size_keeps_to_its_budget() -> None:
+    result, truth = solved("odometry"), bean().truth
+    assert truth is not None
+    assert result.map.size <= 0.44 * len(truth.cones)
+
+
+def test_a_fixed_budget_is_kept() -> None:
+    settings = replace(MapperSettings(), batch=replace(MapperSettings().batch, size=24))
+    result = BatchMapper(settings, bean().odometry_sigma).solve(bean(), "odometry")
+    assert result.convergence.converged
+    assert 22 <= result.map.size <= 24
+
+
+def test_an_open_track_has_open_curves() -> None:
+    cones, labels = corridor(80.0)
+    log = noisy(exact_log(ahead(6.0, 10.0), cones, labels), seed=2)
+    for start in ("online", "odometry"):
+        result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log, start)  # type: ignore[arg-type]
+        assert result.convergence.converged
+        assert not result.map.closed
+        for boundary in result.map.boundaries.values():
+            assert isinstance(boundary, SplineBoundary)
+            assert not boundary.spline.periodic
+            assert 50.0 < boundary.spline.length() < 80.0
+        assert np.abs(result.trajectory[:, 1]).max() < 0.2
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5])
+def test_a_log_that_stops_in_the_middle_of_a_lap(share: float) -> None:
+    log = broken_off(bean(), share)
+    result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log, "odometry")
+    assert result.convergence.converged
+    assert not result.map.closed
+    assert len(result.map.boundaries) == 2
+    errors = result.trajectory - true_poses(log)
+    assert np.abs(errors[:, :2]).max() < 0.3
+
+
+def test_several_laps_that_stop_in_the_middle_of_one() -> None:
+    """Two and a half: the map is closed, and every lap's poses stand beside the same curves."""
+    log = noisy(lap_log(bean_track(), overrun=160.0), seed=4)
+    result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log, "odometry")
+    assert result.convergence.converged
+    assert result.map.closed
+    assert result.laps == 2
+    assert log.truth is not None
+    assert result.map.size <= 0.44 * len(log.truth.cones)
+    errors = result.trajectory - true_poses(log)
+    assert np.abs(errors[:, :2]).max() < 0.25
+
+
+def test_a_log_without_readings_is_its_odometry() -> None:
+    log = bean()
+    empty = replace(
+        log,
+        cycles=tuple(
+            replace(
+                c, points_vehicle=np.zeros((0, 2)), covariances=np.zeros((0, 2, 2)), labels=np.zeros(0, int)
+            )
+            for c in log.cycles
+        ),
+    )
+    result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(empty, "odometry")
+    assert result.convergence.converged
+    assert not result.map.boundaries
+    np.testing.assert_allclose(result.trajectory, true_poses(log), atol=1e-3)
+
+
+def test_the_covariances_are_of_the_right_shape_and_positive() -> None:
+    result = solved("odometry")
+    assert result.map_covariance.shape == (2 * result.map.size, 2 * result.map.size)
+    assert result.pose_covariances.shape == (len(bean().cycles), 3, 3)
+    assert np.linalg.eigvalsh(result.pose_covariances).min() > 0.0
+    assert np.linalg.eigvalsh(result.map_covariance).min() > 0.0
+
+
+def test_the_command_writes_its_result(tmp_path: Path) -> None:
+    write_log(bean(), tmp_path / "log")
+    arguments = ["batch", str(tmp_path / "log"), "--out", str(tmp_path / "map"), "--start", "online"]
+    assert main(arguments) == 0
+    summary = json.loads((tmp_path / "map" / "summary.json").read_text())
+    assert summary["convergence"]["converged"]
+    assert set(summary["gap"]["curves"]) == {"left", "right"}
+    assert read_map(tmp_path / "map").closed
+
+
+def test_what_did_not_converge_is_written_and_told(tmp_path: Path) -> None:
+    write_log(bean(), tmp_path / "log")
+    arguments = ["batch", str(tmp_path / "log"), "--out", str(tmp_path / "map"), "--start", "odometry"]
+    with pytest.raises(SystemExit) as end:
+        main([*arguments, "--batch.max-rounds", "1"])
+    assert end.value.code == NOT_CONVERGED
+    summary = json.loads((tmp_path / "map" / "summary.json").read_text())
+    assert not summary["convergence"]["converged"]
+    assert summary["convergence"]["reason"] == "no round left"
+    assert read_map(tmp_path / "map").size > 0

@@ -1,0 +1,122 @@
+"""The whole log's problem: its losses, gradients against the cost, steps and covariances against GTSAM's."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.batch.association import associate, locate_poses
+from pathspace_graph.batch.dead_reckoning import start_odometry
+from pathspace_graph.batch.mapper import own_settings
+from pathspace_graph.batch.optimizer import gradient_norm
+from pathspace_graph.batch.system import BatchSystem, Biweight, Kernel, moved
+from pathspace_graph.graph.keys import pose_key
+from pathspace_graph.mapping.measurements import Chain, collect_readings, integrate_log
+from pathspace_graph.mapping.state import State
+from pathspace_graph.settings.mapper import MapperSettings
+
+from ..scenes.drives import bean_track, lap_log, true_poses
+
+Array = NDArray[np.float64]
+
+KERNELS = [Kernel(gate=3.0, huber=1.5), Biweight(4.0)]
+
+
+@cache
+def small_system() -> tuple[BatchSystem, State]:
+    """An exact lap with some noise on its readings, linearized beside the optimum."""
+    log = lap_log(bean_track())
+    settings = own_settings(MapperSettings())
+    chain = integrate_log(log, log.odometry_sigma, settings.odometry)
+    readings = collect_readings(log)
+    readings.point = readings.point + np.random.default_rng(1).normal(0.0, 0.1, readings.point.shape)
+    state = start_odometry(chain, readings, settings)
+    system = BatchSystem(readings, chain, settings, Kernel(settings.gate.chi, settings.gate.huber))
+    system.begin(state)
+    state = moved(state, np.random.default_rng(2).normal(0.0, 0.01, state.variables.layout.size))
+    locate_poses(state)
+    associate(state, readings, settings, 8.0, False)
+    system.evaluate(state, hold=True)
+    return system, state
+
+
+def test_dead_reckoning_of_an_exact_log_is_the_truth() -> None:
+    log = lap_log(bean_track())
+    chain: Chain = integrate_log(log, log.odometry_sigma, MapperSettings().odometry)
+    np.testing.assert_allclose(chain.dead_reckoned(np.zeros(2))[:, :2], true_poses(log)[:, :2], atol=1e-6)
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    system, state = small_system()
+    at, layout = system.evaluate(state), state.variables.layout
+    information, descent = system.linear_graph(at).hessian(layout.ordering)
+    rng = np.random.default_rng(5)
+    for _ in range(5):
+        direction = rng.normal(size=layout.size)
+        h = 1e-5
+        costs = [system.evaluate(moved(state, s * h * direction)).cost for s in (1.0, -1.0)]
+        slope = (costs[0] - costs[1]) / (2.0 * h)
+        np.testing.assert_allclose(-descent @ direction, slope, rtol=1e-4)
+    norm = np.linalg.norm(descent / np.sqrt(np.diagonal(information)))
+    np.testing.assert_allclose(gradient_norm(system.rows(at), layout), norm)
+
+
+def test_the_step_is_that_of_gtsam() -> None:
+    """A map of 30 to 40 control points and some hundred poses as one Gaussian factor graph."""
+    system, state = small_system()
+    at, keys = system.evaluate(state), state.variables.keys.tolist()
+    problem = system.eliminated(at)
+    solution = system.linear_graph(at).optimize().vector(keys)
+    np.testing.assert_allclose(problem.step(np.zeros(problem.map.size)), solution, atol=1e-9)
+
+
+def test_poses_alone_move_as_beside_a_map_that_is_held() -> None:
+    system, state = small_system()
+    at = system.evaluate(state)
+    problem = system.eliminated(at)
+    held = problem.beside(np.zeros(problem.map.size))
+    np.testing.assert_allclose(system.poses_alone(at), held, atol=1e-9)
+
+
+def test_pose_marginals_are_those_of_gtsam() -> None:
+    system, state = small_system()
+    at = system.evaluate(state)
+    marginals = system.eliminated(at).pose_marginals
+    graph = system.linear_graph(at)
+    for k in (0, len(state.poses) // 2, len(state.poses) - 1):
+        information = graph.marginal([pose_key(k)]).hessian()[0]
+        np.testing.assert_allclose(marginals[k], np.linalg.inv(information), rtol=1e-6, atol=1e-12)
+
+
+def test_a_step_of_the_poses_leaves_the_rest() -> None:
+    _, state = small_system()
+    step = np.ones(state.poses.size)
+    after = moved(state, step)
+    np.testing.assert_array_equal(after.poses, state.poses + 1.0)
+    np.testing.assert_array_equal(after.map_points, state.map_points)
+    np.testing.assert_array_equal(after.calibration, state.calibration)
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=["huber", "biweight"])
+def test_the_weight_is_the_slope_of_the_loss(kernel: Kernel) -> None:
+    z = np.linspace(-6.0, 6.0, 42)
+    h = 1e-5
+    slope = (kernel.loss(z + h) - kernel.loss(z - h)) / (2.0 * h)
+    np.testing.assert_allclose(kernel.weights(z) * z, slope, atol=1e-5)
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=["huber", "biweight"])
+def test_near_zero_the_loss_is_half_the_square(kernel: Kernel) -> None:
+    z = np.array([-0.01, 0.0, 0.01])
+    np.testing.assert_allclose(kernel.loss(z), 0.5 * z**2, rtol=1e-4)
+    np.testing.assert_allclose(kernel.ceiling, kernel.loss(np.array([kernel.gate]))[0])
+
+
+def test_beyond_the_gate_the_biweight_is_flat() -> None:
+    kernel = Biweight(4.0)
+    np.testing.assert_allclose(kernel.loss(np.array([4.0, 5.0, 50.0])), kernel.ceiling)
+    np.testing.assert_array_equal(kernel.weights(np.array([-4.0, 4.0, 50.0])), 0.0)
+    assert kernel.weights(np.array([3.99]))[0] < 1e-4

@@ -1,0 +1,116 @@
+"""`ablate` as a user types it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from pathspace_graph.cli import main
+from pathspace_graph.eval.study.progress import time_left
+
+from ..scenes.pretenders import Fragile, contents, register, write_round_track
+
+
+@pytest.fixture(scope="module")
+def track(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_round_track(tmp_path_factory.mktemp("tracks"))
+
+
+@pytest.fixture(autouse=True)
+def pretenders(monkeypatch: pytest.MonkeyPatch) -> None:
+    register(monkeypatch)
+
+
+TEXT = """
+tracks = ["{track}"]
+seeds = [0, 1]
+laps = 1
+estimators = ["pretender", "fragile"]
+grid.lag = [1.0]
+"""
+
+
+@pytest.fixture
+def file(track: Path, tmp_path: Path) -> Path:
+    (tmp_path / "small.toml").write_text(TEXT.format(track=track))
+    return tmp_path / "small.toml"
+
+
+def test_the_command_leaves_tables_and_figures(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit) as end:
+        main(["ablate", str(file), "--out", str(out), "--jobs", "1"])
+    assert end.value.code == 3
+    printed = capsys.readouterr()
+    assert "8 runs (2 failed)" in printed.out
+    assert "ValueError: lost" in printed.err
+    assert "2 of 8 cells failed" in printed.err
+    assert "left" in printed.err
+    files = set(contents(out)) - {f"cells/{name.name}" for name in (out / "cells").iterdir()}
+    assert files == {
+        *("study.json", "results.csv", "times.csv", "summary.txt", "summary.md", "summary.tex"),
+        *(
+            f"figures/{name}.{suffix}"
+            for name in ("differences", "accuracy_size", "accuracy_time")
+            for suffix in ("png", "pdf")
+        ),
+    }
+    before = contents(out)
+    with pytest.raises(SystemExit):
+        main(["ablate", str(file), "--out", str(out), "--jobs", "1"])
+    assert contents(out) == before
+
+
+def test_the_command_takes_other_tracks_seeds_and_laps(
+    file: Path, tmp_path: Path, track: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Fragile, "broken", False)
+    options = ["--tracks", "0", str(track), "--seeds", "5", "--laps", "2", "--jobs", "1"]
+    assert main(["ablate", str(file), "--out", str(tmp_path / "out"), *options]) == 0
+    frame = pd.read_csv(tmp_path / "out" / "results.csv")
+    assert set(frame["track"]) == {"generated 0", "round"}
+    assert set(frame["seed"]) == {5}
+    assert frame["lap"].max() == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["STUDY", "--jobs", "0"], "jobs: expected"),
+        (["STUDY", "--laps", "0"], "laps: expected"),
+        (["STUDY", "--tracks", "none.yaml"], "none.yaml"),
+        (["lagg"], "the nearest is 'lag'"),
+        (["none.toml"], "none.toml"),
+    ],
+)
+def test_bad_usage_is_one_line_and_leaves_nothing(
+    options: list[str], says: str, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = [option.replace("STUDY", str(file)) for option in options]
+    assert main(["ablate", *options, "--out", str(tmp_path / "out")]) == 2
+    printed = capsys.readouterr()
+    assert printed.err.count("\n") == 1
+    assert says in printed.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_refuses_the_folder_of_another_study(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Fragile, "broken", False)
+    arguments = ["ablate", str(file), "--out", str(tmp_path / "out"), "--jobs", "1"]
+    assert main(arguments) == 0
+    before = contents(tmp_path / "out")
+    assert main([*arguments, "--laps", "2"]) == 2
+    assert "found another, with 1" in capsys.readouterr().err
+    assert contents(tmp_path / "out") == before
+
+
+def test_the_time_left_is_that_of_the_mean_cell() -> None:
+    assert time_left(30.0, 0, 4) == "time left unknown"
+    assert time_left(30.0, 1, 4) == "0:01:30 left"
+    assert time_left(30.0, 4, 4) == "0:00:00 left"

@@ -1,0 +1,300 @@
+"""The command line end to end on a short drive: what it writes, says, refuses, and never leaves behind."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.interpolate import BSpline as ScipyBSpline
+
+from pathspace_graph.cli import COMMANDS, main, one_line
+from pathspace_graph.commands import online as commands_online
+from pathspace_graph.io.log import Detections, Log, read_log, write_log
+from pathspace_graph.io.map import read_map
+from pathspace_graph.labels import LEFT, NAMES, RIGHT
+
+from ..scenes.paths import TRACKS
+
+SHORT_TRACK = [
+    *("--generator.lap-length", "100", "160"),
+    *("--generator.corners", "3", "4"),
+    *("--generator.hairpins", "0", "0"),
+    *("--generator.cones", "90"),
+]
+
+
+def simulate(out: Path, *options: str) -> int:
+    return main(["simulate", "--generate", "4", "--laps", "1", "--out", str(out), *SHORT_TRACK, *options])
+
+
+@pytest.fixture(scope="module")
+def log_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("drive") / "log"
+    assert simulate(folder) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def map_folder(log_folder: Path) -> Path:
+    folder = log_folder.parent / "map"
+    assert main(["online", str(log_folder), "--out", str(folder)]) == 0
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in sorted(folder.iterdir())}
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def with_labels(log: Log, keep: set[int]) -> Log:
+    """The log of a detector that sees these labels only; it knows no truth."""
+    cycles = []
+    for cycle in log.cycles:
+        kept = np.isin(cycle.labels, list(keep))
+        if kept.any():
+            points, covariances = cycle.points_vehicle[kept], cycle.covariances[kept]
+            cycles.append(Detections(cycle.t, points, covariances, cycle.labels[kept]))
+    return replace(log, cycles=tuple(cycles), truth=None)
+
+
+# --- simulate --------------------------------------------------------------------------------------------
+
+
+def test_a_seed_gives_the_same_log_to_the_byte(log_folder: Path, tmp_path: Path) -> None:
+    assert simulate(tmp_path / "again") == 0
+    assert simulate(tmp_path / "other", "--seed", "1") == 0
+    assert contents(tmp_path / "again") == contents(log_folder)
+    assert contents(tmp_path / "other")["detections.csv"] != contents(log_folder)["detections.csv"]
+
+
+def test_a_log_keeps_the_formats_contract(log_folder: Path) -> None:
+    expected = {
+        "odometry.csv": "t,vx,vy,wz",
+        "detections.csv": "t,x,y,label,xx,xy,yy",
+        "truth_poses.csv": "t,x,y,theta",
+        "truth_cones.csv": "x,y,label",
+    }
+    for name, header in expected.items():
+        assert (log_folder / name).read_text().splitlines()[0] == header
+    assert (log_folder / "log.toml").read_text().startswith('format = "pathspace-log/1"')
+    first = (log_folder / "truth_poses.csv").read_text().splitlines()[1]
+    assert [float(value) for value in first.split(",")[1:]] == [0.0, 0.0, 0.0]
+
+
+def test_settings_of_the_simulator_are_options(tmp_path: Path) -> None:
+    assert simulate(tmp_path / "log", "--sensor.range-max", "9", "--odometry.white", "0.1", "0.2", "0.3") == 0
+    log = read_log(tmp_path / "log")
+    assert log.sensor.range_max == 9.0
+    assert log.odometry_sigma.tolist() == [0.1, 0.2, 0.3]
+    assert max(np.linalg.norm(cycle.points_vehicle, axis=1).max() for cycle in log.cycles) < 10.5
+
+
+def test_a_track_file_wins_over_a_generated_one(tmp_path: Path) -> None:
+    track = TRACKS / "fssim" / "FSG.yaml"
+    if not track.exists():
+        pytest.skip(f"the real tracks are not at {track.parents[1]}")
+    options = ["--track", str(track), "--generate", "1", "--laps", "1", "--out", str(tmp_path / "log")]
+    assert main(["simulate", *options]) == 0
+    assert read_log(tmp_path / "log").source["track"] == "FSG"
+
+
+# --- online ----------------------------------------------------------------------------------------------
+
+
+def test_a_map_keeps_the_formats_contract(log_folder: Path, map_folder: Path) -> None:
+    assert names(map_folder) == {"map.json", "trajectory.tum", "cycles.csv", "summary.json"}
+    content = json.loads((map_folder / "map.json").read_text())
+    assert content["format"] == "pathspace-map/1"
+    cones = read_log(log_folder).truth
+    assert cones is not None
+    for label in (LEFT, RIGHT):
+        boundary = content["boundaries"][NAMES[label]]
+        spline = ScipyBSpline(boundary["knots"], boundary["control_points"], boundary["degree"])
+        low, high = boundary["knots"][boundary["degree"]], boundary["knots"][-boundary["degree"] - 1]
+        curve = spline(np.linspace(low, high, 2000))
+        own = cones.cones[cones.cone_labels == label]
+        away = np.linalg.norm(own[:, None] - curve[None], axis=2).min(axis=1)
+        assert np.median(away) < 1.0
+        assert np.shape(boundary["covariance"]) == (2 * boundary["size"], 2 * boundary["size"])
+
+
+def test_a_row_for_every_cycle(log_folder: Path, map_folder: Path) -> None:
+    log = read_log(log_folder)
+    rows = (map_folder / "cycles.csv").read_text().splitlines()
+    assert rows[0] == "cycle,t,seconds,size_left,size_right,readings,lap"
+    assert len(rows) == len(log.cycles) + 1
+    trajectory = np.loadtxt(map_folder / "trajectory.tum")
+    assert trajectory.shape == (len(log.cycles), 8)
+    np.testing.assert_array_equal(trajectory[:, 0], [cycle.t for cycle in log.cycles])
+
+
+def test_the_summary_says_how_and_how_well(map_folder: Path) -> None:
+    summary = json.loads((map_folder / "summary.json").read_text())
+    assert summary["estimator"] == "fixed-lag"
+    assert summary["settings"]["lag"] == 3.0
+    assert {"python", "gtsam", "numpy", "scipy", "pathspace-graph"} <= set(summary["versions"])
+    assert summary["lap_count"] == 1
+    assert [row["lap"] for row in summary["laps"]] == [1]
+    assert {"lap", "rmse", "missed", "size"} <= set(summary["laps"][0])
+    assert summary["final"]["size"] == read_map(map_folder).size
+    assert 0.0 < summary["ate"] < 5.0
+    assert summary["ate"] ** 2 == pytest.approx(summary["rmse_along"] ** 2 + summary["rmse_across"] ** 2)
+
+
+def test_settings_of_the_mapper_are_options(log_folder: Path, tmp_path: Path) -> None:
+    options = ["--lag", "1.5", "--growth.reach", "6.5"]
+    assert main(["online", str(log_folder), "--out", str(tmp_path / "map"), *options]) == 0
+    settings = json.loads((tmp_path / "map" / "summary.json").read_text())["settings"]
+    assert (settings["lag"], settings["growth"]["reach"]) == (1.5, 6.5)
+
+
+def test_a_second_run_keeps_the_earlier_result(tmp_path: Path) -> None:
+    assert simulate(tmp_path / "log") == 0
+    first = contents(tmp_path / "log")
+    assert simulate(tmp_path / "log", "--seed", "1") == 0
+    assert names(tmp_path) == {"log", "log.~1~"}
+    assert contents(tmp_path / "log.~1~") == first
+
+
+def test_a_log_without_detections_says_what_it_could_not_map(
+    log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_log(with_labels(read_log(log_folder), set()), tmp_path / "log")
+    assert main(["online", str(tmp_path / "log"), "--out", str(tmp_path / "map")]) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert said == [
+        "left boundary: not mapped, no left detections; right boundary: not mapped, no right detections"
+    ]
+    assert read_map(tmp_path / "map").boundaries == {}
+    assert (tmp_path / "map" / "trajectory.tum").read_text() == ""
+    assert main(["plot", str(tmp_path / "map"), "--out", str(tmp_path / "map.svg")]) == 0
+
+
+@pytest.mark.parametrize("label", [LEFT, RIGHT])
+def test_a_log_of_one_boundary_maps_that_one(
+    label: int, log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_log(with_labels(read_log(log_folder), {label}), tmp_path / "log")
+    assert main(["online", str(tmp_path / "log"), "--out", str(tmp_path / "map")]) == 0
+    other = NAMES[LEFT + RIGHT - label]
+    assert capsys.readouterr().err == f"{other} boundary: not mapped, no {other} detections\n"
+    assert set(read_map(tmp_path / "map").boundaries) == {label}
+    summary = json.loads((tmp_path / "map" / "summary.json").read_text())
+    assert "laps" not in summary
+    assert len(summary["not_mapped"]) == 1
+
+
+# --- plot and demo ---------------------------------------------------------------------------------------
+
+
+def test_plot_draws_a_map_with_its_log(log_folder: Path, map_folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "map.png"
+    assert main(["plot", str(map_folder), "--log", str(log_folder), "--out", str(out)]) == 0
+    assert out.read_bytes().startswith(b"\x89PNG")
+    assert names(tmp_path) == {"map.png"}
+
+
+def test_demo_shows_the_table_and_leaves_log_map_and_picture(
+    log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pathspace_graph.commands.demo.simulate", lambda *_: read_log(log_folder))
+    monkeypatch.chdir(tmp_path)
+    assert main(["demo"]) == 0
+    assert names(tmp_path / "pathspace-demo") == {"log", "map", "track.png"}
+    assert read_map(tmp_path / "pathspace-demo" / "map").boundaries
+    printed = capsys.readouterr().out
+    assert "rmse" in printed
+    assert "pathspace-demo" in printed
+
+
+# --- usage -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ([], f"expected a command ({', '.join(COMMANDS)})"),
+        (["fly"], "'fly'"),
+        (["online"], "Missing"),
+        (["online", "LOG", "--out", "MAP", "--lag", "long"], "--lag"),
+        (["online", "LOG", "--out", "MAP", "--no-such-option", "1"], "--no-such-option"),
+        (["online", "LOG", "--out", "MAP", "--estimator", "magic"], "fixed-lag"),
+        (["online", "LOG", "--out", "MAP"], "LOG: expected a log folder"),
+        (["online", "LOG", "--out", "MAP", "--lag", "nan"], "lag: expected"),
+        (["online", "LOG", "--out", "MAP", "--lag", "-1"], "lag: expected"),
+        (["online", "LOG", "--out", "MAP", "--spline.degree", "0"], "spline.degree: expected"),
+        (["online", "LOG", "--out", "MAP", "--gauge.sigma-spacing", "inf"], "gauge.sigma_spacing: expected"),
+        (["simulate", "--out", "LOG"], "--track FILE or --generate SEED"),
+        (["simulate", "--generate", "1", "--laps", "0", "--out", "LOG"], "laps"),
+        (["simulate", "--generate", "-1", "--out", "LOG"], "seed"),
+        (["simulate", "--generate", "1", "--out", "LOG", "--sensor.fov", "nan"], "sensor.fov"),
+        (["simulate", "--track", "none.yaml", "--out", "LOG"], "none.yaml"),
+        (["plot", "MAP", "--out", "map.doc"], ".png"),
+        (["plot", "MAP", "--out", "map.png"], "map.json"),
+        (["plot", "MAP", "--out", "map.png", "--band-scale", "0"], "--band-scale"),
+    ],
+)
+def test_bad_usage_is_one_line_and_exit_code_2(
+    arguments: list[str],
+    says: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1
+    assert printed.err.startswith("pathspace-graph: ")
+    assert says in printed.err
+    assert names(tmp_path) == set()
+
+
+def test_the_output_is_checked_before_the_work(
+    log_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(commands_online, "read_log", lambda _: pytest.fail("read before the check"))
+    (tmp_path / "thesis.tex").write_text("mine")
+    assert main(["online", str(log_folder), "--out", str(tmp_path)]) == 2
+    assert main(["online", str(log_folder), "--out", str(tmp_path / "thesis.tex" / "map")]) == 2
+    assert capsys.readouterr().err.count("\n") == 2
+    assert names(tmp_path) == {"thesis.tex"}
+
+
+def test_an_interrupt_leaves_nothing_half_written(
+    log_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pathspace_graph.io.results._write_cycles", interrupt)
+    assert main(["online", str(log_folder), "--out", str(tmp_path / "deep" / "map")]) == 130
+    assert capsys.readouterr().err == "pathspace-graph: interrupted\n"
+    assert names(tmp_path) == set()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_explains_the_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    assert "--out" in capsys.readouterr().out
+
+
+def test_a_box_becomes_its_first_part_on_one_line() -> None:
+    box = "╭─ Value error ──╮\n│ \x1b[1mError\x1b[0m parsing │\n│ --lag │\n│ ────── │\n│ help │\n╰──╯\n"
+    assert one_line(box) == "Error parsing --lag"
+
+
+def test_it_runs_as_a_program_and_lists_its_commands() -> None:
+    command = [sys.executable, "-m", "pathspace_graph", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert all(name in done.stdout for name in COMMANDS)
+    assert done.stderr == ""

@@ -1,0 +1,145 @@
+"""`compare` end to end with estimators whose maps are known: what it writes, says and refuses."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from pathspace_graph.cli import main
+from pathspace_graph.io.log import read_log, write_log
+from pathspace_graph.io.map import read_map
+
+from ..scenes.rings import register, write_logs
+
+NAMES = ("rings", "gaps", "rings-batch")
+
+
+@pytest.fixture(autouse=True)
+def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    register(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_logs(tmp_path_factory.mktemp("drives") / "round")
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures as PNG only."""
+    monkeypatch.setattr("pathspace_graph.eval.compare.output._SUFFIXES", (".png",))
+
+
+def without_truth(folder: Path, out: Path) -> Path:
+    write_log(replace(read_log(folder), truth=None), out)
+    return out
+
+
+def rows(file: Path) -> list[dict[str, str]]:
+    with file.open(encoding="utf-8", newline="") as lines:
+        return list(csv.DictReader(lines))
+
+
+def test_the_command_writes_tables_figures_and_maps(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    command = ["compare", str(folder / "a"), "--out", str(out), "--estimators", *NAMES]
+    assert main(command) == 0
+    printed = capsys.readouterr()
+    assert "rmse [m]" in printed.out and "ghost curve [m]" in printed.out
+    assert printed.err == "rings-batch on a: not converged\n"
+    files = {f"{name}.{suffix}" for name in ("table", "metrics") for suffix in ("csv", "md", "tex")}
+    figures = {f"{name}.{suffix}" for name in ("maps", "blind_spot") for suffix in ("png", "pdf")}
+    assert {path.name for path in out.iterdir()} == files | figures | {
+        "times.csv",
+        "comparison.json",
+        *NAMES,
+    }
+    assert read_map(out / "gaps").size == 36
+    assert json.loads((out / "rings" / "summary.json").read_text())["laps"][1]["size"] == 32
+    table = rows(out / "table.csv")
+    assert [row["lap"] for row in table] == ["1", "2", "1", "2", "2"]
+    assert {"log", "estimator", "scope", "lap", "rmse", "two_way"} <= set(rows(out / "metrics.csv")[0])
+    assert json.loads((out / "comparison.json").read_text())["failures"] == []
+
+
+def test_a_second_comparison_keeps_the_first_and_a_failure_ends_in_3(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], quick: None
+) -> None:
+    out = tmp_path / "out"
+    command = ["compare", str(folder / "a"), "--out", str(out), "--estimators", "broken", "rings"]
+    with pytest.raises(SystemExit) as ended:
+        main(command)
+    assert ended.value.code == 3
+    assert "broken on a: failed, ValueError: lost the way" in capsys.readouterr().err
+    assert (out / "rings" / "map.json").exists() and not (out / "broken").exists()
+    with pytest.raises(SystemExit):
+        main(command)
+    assert (tmp_path / "out.~1~" / "comparison.json").exists()
+
+
+def test_where_all_fail_the_tables_say_so(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit) as ended:
+        main(["compare", str(folder), "--out", str(out), "--estimators", "broken"])
+    assert ended.value.code == 3
+    printed = capsys.readouterr()
+    assert "failed" in printed.out and "no true cones" not in printed.out
+    assert printed.err.count("lost the way") == 2
+    assert (out / "table.tex").exists() and not list(out.rglob("*.png"))
+
+
+def test_several_logs_have_folders_of_their_own_and_intervals(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], quick: None
+) -> None:
+    out = tmp_path / "out"
+    assert main(["compare", str(folder), "--out", str(out), "--estimators", "rings", "gaps"]) == 0
+    assert "Difference from rings" in capsys.readouterr().out
+    assert {path.name for path in out.iterdir() if path.is_dir()} == {"a", "b"}
+    assert {path.name for path in (out / "b").iterdir()} >= {"rings", "gaps", "maps.png", "blind_spot.png"}
+    paired = pd.read_csv(out / "paired.csv")
+    assert set(paired["estimator"]) == {"gaps"} and (paired["pairs"] <= 2).all()
+    assert (out / "paired.tex").exists()
+
+
+def test_without_truth_the_command_says_so_and_draws_the_maps(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], quick: None
+) -> None:
+    log, out = without_truth(folder / "a", tmp_path / "bare"), tmp_path / "out"
+    assert main(["compare", str(log), "--out", str(out), "--estimators", "rings", "gaps"]) == 0
+    assert "no true cones" in capsys.readouterr().out
+    assert (out / "maps.png").exists() and not (out / "blind_spot.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--estimators", "nothing"], "'nothing'"),
+        (["--estimators", "rings", "--reference", "gaps"], "--reference"),
+        (["--jobs", "0"], "jobs"),
+        (["--ghosts.distance", "-1"], "distance"),
+        (["--lag", "nan"], "lag"),
+    ],
+)
+def test_bad_usage_is_one_line_and_leaves_nothing(
+    options: list[str], expected: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["compare", str(folder / "a"), "--out", str(tmp_path / "out"), *options]) == 2
+    error = capsys.readouterr().err
+    assert expected in error and error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty").mkdir()
+    assert main(["compare", str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 2
+    assert "found neither" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"empty"}

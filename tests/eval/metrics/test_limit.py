@@ -1,0 +1,215 @@
+"""The landmark batch that is told the truth, on answers known by hand, and the limit made of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.eval.metrics.limit import (
+    Limit,
+    driving_order,
+    fit_rmse,
+    landmark_rmse,
+    limit,
+    solve_told_landmarks,
+)
+from pathspace_graph.eval.metrics.table1 import ate, root_mean_square
+from pathspace_graph.io.log import Detections, Log, Odometry, Truth
+from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
+from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.landmark.oracle import solve_landmarks
+from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
+from pathspace_graph.spline.bspline import BSpline
+
+Array = NDArray[np.float64]
+
+RADIUS = 12.0
+"""m, of the circle driven anticlockwise around (0, RADIUS)."""
+SPEED = 6.0
+"""m/s."""
+SIGMA = np.array([0.1, 0.05, 0.02])
+"""Of the odometry's readings."""
+RANGE_MAX = 12.0
+"""m."""
+RATE, CYCLE_RATE = 50.0, 5.0
+"""Hz."""
+
+
+def circle_poses(t: Array) -> Array:
+    angle = SPEED * t / RADIUS
+    heading = np.pi - np.remainder(np.pi - angle, 2 * np.pi)
+    return np.stack([RADIUS * np.sin(angle), RADIUS * (1.0 - np.cos(angle)), heading], axis=1)
+
+
+def ring(radius: float, count: int) -> Array:
+    angle = 2 * np.pi * np.arange(count) / count
+    return np.stack([radius * np.sin(angle), RADIUS - radius * np.cos(angle)], axis=1)
+
+
+def circle_log(noise: float, seed: int = 0, laps: float = 2.0) -> Log:
+    """Two rings of cones seen all around up to RANGE_MAX; `noise` scales the sigmas that the log states."""
+    rng = np.random.default_rng(seed)
+    duration = laps * 2 * np.pi * RADIUS / SPEED
+    t = np.arange(0.0, duration, 1.0 / RATE)
+    twists = np.tile([SPEED, 0.0, SPEED / RADIUS], (len(t), 1)) + noise * rng.normal(0.0, SIGMA, (len(t), 3))
+    cones = np.concatenate([ring(RADIUS - 1.5, 16), ring(RADIUS + 1.5, 20)])
+    labels = np.repeat([LEFT, RIGHT], [16, 20])
+    stamps = t[:: int(RATE / CYCLE_RATE)]
+    seen = [
+        _detect(stamp, pose, cones, labels, noise=noise, rng=rng)
+        for stamp, pose in zip(stamps, circle_poses(stamps), strict=True)
+    ]
+    truth = Truth(t, circle_poses(t), cones, labels, np.concatenate([ids for _, ids in seen]))
+    return Log(Odometry(t, twists), tuple(cycle for cycle, _ in seen), SIGMA, truth=truth)
+
+
+def _detect(
+    t: float, pose: Array, cones: Array, labels: Array, *, noise: float, rng: np.random.Generator
+) -> tuple[Detections, NDArray[np.int_]]:
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    points = (cones - pose[:2]) @ np.array([[c, -s], [s, c]])
+    ids = np.flatnonzero(np.linalg.norm(points, axis=1) < RANGE_MAX)
+    root = np.array([[0.04, 0.0], [0.02, 0.01]])
+    errors = noise * rng.normal(0.0, 1.0, (len(ids), 2)) @ root.T
+    covariances = np.tile(root @ root.T, (len(ids), 1, 1))
+    return Detections(float(t), points[ids] + errors, covariances, labels[ids]), ids
+
+
+def test_without_noise_the_batch_is_exact() -> None:
+    log = circle_log(noise=0.0)
+    assert log.truth is not None
+    solution = solve_told_landmarks(log)
+    assert len(solution.landmarks) == 36
+    assert landmark_rmse(solution, log.truth) < 1e-6
+    assert ate(solution.trajectory_t, solution.trajectory, log.truth) < 1e-6
+    assert solution.error < 1e-6
+
+
+def test_with_noise_the_errors_are_as_large_as_the_covariance_says() -> None:
+    """Mean normalized squared error of 72 coordinates over 6 seeds: 432 degrees of freedom, sigma 0.068."""
+    ratios = []
+    for seed in range(6):
+        log = circle_log(noise=1.0, seed=seed)
+        assert log.truth is not None
+        solution = solve_told_landmarks(log, with_covariance=True)
+        errors = (solution.landmarks - log.truth.cones[solution.landmark_ids]).ravel()
+        assert solution.covariance is not None
+        ratios.append(errors @ np.linalg.solve(solution.covariance, errors) / len(errors))
+        # l of one run has the joint covariance's size: errors are correlated, so only roughly
+        expected = np.sqrt(2.0 * np.mean(np.diag(solution.covariance)))
+        assert landmark_rmse(solution, log.truth) < 3.0 * expected
+    assert np.mean(ratios) == pytest.approx(1.0, abs=4 * np.sqrt(2 / (6 * 72)))
+
+
+CERTAIN = MapperSettings(
+    odometry=OdometrySettings(sigma_scale=1e-9, sigma_bias=1e-9, sigma_start=1e-6, sigma_start_heading=1e-6)
+)
+"""A vehicle that stands turns by its yaw rate's bias, unless that is known."""
+
+
+def standing_log(readings: Array, covariances: Array) -> Log:
+    """A vehicle that stands and knows it, and sees one point once a cycle."""
+    n = len(readings)
+    cycles = tuple(
+        Detections(0.1 * k, readings[k : k + 1], covariances[k : k + 1], np.array([UNKNOWN]))
+        for k in range(n)
+    )
+    odometry = Odometry(np.array([0.0, 0.1 * n]), np.zeros((2, 3)))
+    return Log(odometry, cycles, np.full(3, 1e-9))
+
+
+def test_a_landmark_seen_standing_is_the_information_weighted_mean() -> None:
+    rng = np.random.default_rng(0)
+    roots = rng.normal(0.0, 2e-3, (8, 2, 2)) + 1e-3 * np.eye(2)
+    covariances = roots @ np.swapaxes(roots, 1, 2)
+    readings = np.array([3.0, -4.0]) + np.einsum("kij,kj->ki", roots, rng.normal(0.0, 1.0, (8, 2)))
+    solution = solve_landmarks(
+        standing_log(readings, covariances), np.zeros(8, dtype=int), with_covariance=True, settings=CERTAIN
+    )
+    weights = np.linalg.inv(covariances)
+    covariance = np.linalg.inv(weights.sum(axis=0))
+    mean = covariance @ np.einsum("kij,kj->i", weights, readings)
+    np.testing.assert_allclose(solution.landmarks, [mean], atol=2e-5)
+    assert solution.covariance is not None
+    np.testing.assert_allclose(solution.covariance, covariance, atol=0.05 * covariance.max())
+
+
+def test_false_positives_are_left_out_and_colours_not_looked_at() -> None:
+    readings = np.array([[5.0, 1.0], [50.0, 50.0], [5.0, 1.2]])
+    covariances = np.tile(1e-4 * np.eye(2), (3, 1, 1))
+    solution = solve_landmarks(standing_log(readings, covariances), np.array([7, -1, 7]), settings=CERTAIN)
+    np.testing.assert_array_equal(solution.landmark_ids, [7])
+    np.testing.assert_allclose(solution.landmarks, [[5.0, 1.1]], atol=1e-3)
+    assert solution.trajectory.shape == (3, 3)
+
+
+def test_a_log_in_which_nothing_is_seen_gives_the_odometry() -> None:
+    log = circle_log(noise=0.0)
+    readings = sum(len(cycle.labels) for cycle in log.cycles)
+    solution = solve_landmarks(log, np.full(readings, -1), with_covariance=True)
+    assert solution.landmarks.shape == (0, 2)
+    assert solution.covariance is not None and solution.covariance.shape == (0, 0)
+    np.testing.assert_allclose(
+        solution.trajectory[:, :2], circle_poses(solution.trajectory_t)[:, :2], atol=1e-6
+    )
+
+
+def exact_ring_map(size: int) -> Map:
+    """What was mapped matters to the limit by size, degree and closedness only."""
+    nowhere = BSpline.periodic_from(np.arange(size + 1.0), np.zeros((size, 2)))
+    return Map(True, {LEFT: SplineBoundary(nowhere, np.zeros((2 * size, 2 * size)))})
+
+
+def test_the_fit_to_a_ring_gets_better_with_size_and_is_exact_with_a_control_point_for_each() -> None:
+    log = circle_log(noise=0.0)
+    assert log.truth is not None
+    errors = [fit_rmse(exact_ring_map(size), log.truth) for size in (4, 6, 8)]
+    assert 1.0 > errors[0] > errors[1] > errors[2] > 0.0
+    assert errors[2] < 0.05
+    assert fit_rmse(exact_ring_map(16), log.truth) == 0.0
+    landmarks = Map(True, {LEFT: PointBoundary(np.zeros((3, 2)), np.eye(6))})
+    assert fit_rmse(landmarks, log.truth) == 0.0
+    assert np.isnan(fit_rmse(Map(False, {}), log.truth))
+
+
+def test_the_limit_is_both_together() -> None:
+    log = circle_log(noise=1.0)
+    assert log.truth is not None
+    found = limit(log, exact_ring_map(6))
+    assert found.l == landmark_rmse(solve_told_landmarks(log), log.truth) > 0.0
+    assert found.f == fit_rmse(exact_ring_map(6), log.truth)
+    assert Limit(l=0.3, f=0.4).total == pytest.approx(0.5)
+
+
+def test_unknown_cones_are_not_counted() -> None:
+    log = circle_log(noise=1.0)
+    assert log.truth is not None
+    solution = solve_told_landmarks(log)
+    some = log.truth.cone_labels.copy()
+    some[16:] = UNKNOWN
+    told = Truth(log.truth.pose_t, log.truth.poses, log.truth.cones, some)
+    errors = np.linalg.norm(solution.landmarks - log.truth.cones, axis=1)[:16]
+    assert landmark_rmse(solution, told) == pytest.approx(root_mean_square(errors))
+
+
+@pytest.mark.parametrize("with_path", [True, False])
+def test_cones_are_put_in_driving_order(with_path: bool) -> None:
+    t = np.linspace(0.0, 2 * np.pi * RADIUS / SPEED, 40)
+    in_order = np.roll(ring(RADIUS - 1.5, 16), -3, axis=0)
+    shuffled = np.random.default_rng(0).permutation(in_order) if with_path else in_order
+    poses = circle_poses(t) if with_path else np.zeros((0, 3))
+    truth = Truth(t if with_path else np.zeros(0), poses, shuffled, np.zeros(16, dtype=int))
+    found = driving_order(truth, LEFT)
+    start = int(np.argmin(np.linalg.norm(found - in_order[0], axis=1)))
+    np.testing.assert_array_equal(np.roll(found, -start, axis=0), in_order)
+
+
+def test_a_log_without_truth_has_no_limit() -> None:
+    log = circle_log(noise=0.0, laps=0.2)
+    with pytest.raises(ValueError, match="truth"):
+        limit(Log(log.odometry, log.cycles, log.odometry_sigma), exact_ring_map(6))
+    assert log.truth is not None
+    told = Truth(log.truth.pose_t, log.truth.poses, log.truth.cones, log.truth.cone_labels)
+    with pytest.raises(ValueError, match="associations"):
+        solve_told_landmarks(Log(log.odometry, log.cycles, log.odometry_sigma, truth=told))

@@ -1,0 +1,154 @@
+"""Metrics, on maps and trajectories whose errors can be told by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pathspace_graph.eval.metrics.table1 import (
+    ate,
+    boundary_distances,
+    cone_distances,
+    interpolate_poses,
+    lap_end_times,
+    lap_metrics,
+    laps_metrics,
+    normal_errors,
+    trajectory_errors,
+    two_way_distance,
+)
+from pathspace_graph.io.log import Truth
+from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
+from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.spline.bspline import BSpline
+
+Array = NDArray[np.float64]
+
+
+def truth(cones: list[tuple[float, float, int]], poses: Array | None = None, t: Array | None = None) -> Truth:
+    rows = np.array([(x, y) for x, y, _ in cones], dtype=float).reshape(-1, 2)
+    return Truth(
+        pose_t=np.zeros(0) if t is None else t,
+        poses=np.zeros((0, 3)) if poses is None else poses,
+        cones=rows,
+        cone_labels=np.array([label for _, _, label in cones], dtype=int),
+    )
+
+
+def straight(y: float, covariance: Array | None = None) -> SplineBoundary:
+    """The line from (0, y) to (10, y) with control points every 10/3 m."""
+    points = np.column_stack([np.linspace(0.0, 10.0, 4), np.full(4, y)])
+    spline = BSpline.clamped_from(np.array([0.0, 10.0]), points)
+    return SplineBoundary(spline, np.zeros((8, 8)) if covariance is None else covariance)
+
+
+def landmarks(*points: tuple[float, float]) -> PointBoundary:
+    return PointBoundary(np.array(points, dtype=float).reshape(-1, 2), np.eye(2 * len(points)))
+
+
+def test_table_of_a_spline_map() -> None:
+    """Errors 0.3 and 0.4 to their own lines, one at 3.0 (found), one beyond the end at 5 (missed)."""
+    true = truth([(5, 2.3, LEFT), (1, -2.4, RIGHT), (5, 5.0, LEFT), (13, 6.0, LEFT), (5, 0.0, UNKNOWN)])
+    row = lap_metrics(Map(False, {LEFT: straight(2.0), RIGHT: straight(-2.0)}), true, lap=4)
+    assert row.lap == 4
+    assert row.size == 8
+    assert row.missed == 0.25
+    assert row.rmse == pytest.approx(np.sqrt((0.3**2 + 0.4**2 + 3.0**2) / 3), abs=1e-12)
+
+
+def test_a_cone_counts_to_its_own_boundary_only() -> None:
+    true = truth([(5, 2.0, RIGHT)])
+    row = lap_metrics(Map(False, {LEFT: straight(2.0), RIGHT: straight(0.5)}), true, 1)
+    assert row.rmse == pytest.approx(1.5)
+
+
+def test_an_absent_boundary_is_missed_as_a_whole() -> None:
+    true = truth([(5, 2, LEFT), (6, 2, LEFT), (7, 2, LEFT), (5, -2, RIGHT)])
+    row = lap_metrics(Map(False, {RIGHT: straight(-2.0)}), true, 1)
+    assert (row.missed, row.rmse, row.size) == (0.75, pytest.approx(0.0, abs=1e-12), 4)
+    nothing = lap_metrics(Map(False, {}), true, 1)
+    assert nothing.missed == 1.0 and np.isnan(nothing.rmse) and nothing.size == 0
+    assert np.isnan(lap_metrics(Map(False, {}), truth([]), 1).missed)
+
+
+def test_landmarks_are_measured_to_the_nearest() -> None:
+    true = truth([(0, 0, LEFT), (10, 0, LEFT), (0, 5, RIGHT)])
+    track = Map(False, {LEFT: landmarks((0.0, 1.0), (0.0, 2.0), (10.0, 0.0)), RIGHT: landmarks()})
+    np.testing.assert_array_equal(cone_distances(track, true), [1.0, 0.0, np.inf])
+    row = lap_metrics(track, true, 1)
+    assert (row.size, row.missed) == (3, pytest.approx(1 / 3))
+    assert row.rmse == pytest.approx(np.sqrt(0.5))
+
+
+def test_laps_are_rows_of_the_map_as_it_stood() -> None:
+    true = truth([(5, 2, LEFT)])
+    rows = laps_metrics([(1, Map(False, {LEFT: straight(3.0)})), (2, Map(True, {LEFT: straight(2.5)}))], true)
+    assert [(row.lap, row.rmse) for row in rows] == [(1, pytest.approx(1.0)), (2, pytest.approx(0.5))]
+
+
+@given(seed=st.integers(0, 10_000))
+def test_the_closest_point_is_no_farther_than_any_sample(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    angle = np.arange(12) * 2 * np.pi / 12
+    ring = 20.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1) + rng.normal(0.0, 2.0, (12, 2))
+    spline = BSpline.periodic_from(np.arange(13.0), ring)
+    points = rng.uniform(-30.0, 30.0, (40, 2))
+    distances = boundary_distances(SplineBoundary(spline, np.zeros((24, 24))), points)
+    samples = spline.evaluate(np.linspace(0.0, 12.0, 6001))
+    sampled = np.linalg.norm(points[:, None] - samples[None], axis=2).min(axis=1)
+    assert (distances <= sampled + 1e-3).all()
+    np.testing.assert_allclose(distances, sampled, atol=0.02)
+
+
+def test_normal_errors_carry_sign_and_the_joint_covariance() -> None:
+    """All control points move together: sigma is 0.2 everywhere, which marginals alone wouldn't give."""
+    across = np.tile([0.0, 1.0], 4)
+    track = Map(False, {LEFT: straight(2.0, 0.2**2 * np.outer(across, across))})
+    true = truth([(2, 2.3, LEFT), (5, 1.5, LEFT), (8, 2.39, LEFT), (5, 0.0, RIGHT), (5, 2.0, UNKNOWN)])
+    found = normal_errors(track, true)
+    np.testing.assert_allclose(found.errors, [0.3, -0.5, 0.39], atol=1e-12)
+    np.testing.assert_allclose(found.sigmas, 0.2, atol=1e-12)
+    assert found.share_inside() == pytest.approx(2 / 3)
+    assert found.share_inside(3.0) == 1.0
+    assert np.isnan(normal_errors(Map(False, {LEFT: landmarks((0, 0))}), true).share_inside())
+
+
+def test_trajectory_errors_are_along_and_across_the_true_heading() -> None:
+    """Due north at 1 m/s: 0.3 m too far north is along, 0.4 m too far west is across (left positive)."""
+    t = np.array([0.0, 10.0])
+    true = truth([], np.array([[0.0, 0.0, np.pi / 2], [0.0, 10.0, np.pi / 2]]), t)
+    stamps = np.array([-1.0, 2.0, 5.0, 10.0, 11.0])
+    poses = np.array(
+        [[9, 9, 0], [0, 2.3, 1.6], [-0.4, 5, np.pi / 2], [0, 10, np.pi / 2], [9, 9, 0]], dtype=float
+    )
+    errors = trajectory_errors(stamps, poses, true)
+    expected = [[0.3, 0, 1.6 - np.pi / 2], [0, 0.4, 0], [0, 0, 0]]
+    np.testing.assert_allclose(errors, expected, atol=1e-12)
+    assert ate(stamps, poses, true) == pytest.approx(np.sqrt((0.3**2 + 0.4**2) / 3))
+
+
+def test_headings_are_interpolated_the_short_way_and_wrap() -> None:
+    poses = np.array([[0.0, 0.0, np.pi - 0.1], [2.0, 0.0, -np.pi + 0.1]])
+    between = interpolate_poses(np.array([0.0, 2.0]), poses, np.array([0.5, 1.0, 1.5]))
+    np.testing.assert_allclose(between[:, 0], [0.5, 1.0, 1.5])
+    np.testing.assert_allclose(np.abs(between[:, 2]), [np.pi - 0.05, np.pi, np.pi - 0.05])
+    assert between[2, 2] < 0.0 < between[0, 2]
+
+
+def test_lap_ends_of_the_true_path_are_times() -> None:
+    angle = np.arange(0.0, 2.5 * 2 * np.pi, 0.02)
+    wrapped = np.arctan2(np.sin(angle), np.cos(angle))
+    poses = np.stack([25.0 * np.sin(angle), 25.0 * (1 - np.cos(angle)), wrapped], axis=1)
+    times = lap_end_times(truth([], poses, 3.0 * angle))
+    np.testing.assert_allclose(times, 3.0 * 2 * np.pi * np.array([1.0, 2.0]), atol=0.06)
+
+
+def test_two_way_distance_of_parallels_and_of_a_part() -> None:
+    x = np.linspace(0.0, 10.0, 1001)
+    line = np.column_stack([x, np.zeros_like(x)])
+    assert two_way_distance(line, line + np.array([0.0, 0.7])) == pytest.approx(0.7)
+    # half of it: 0 from the half to the whole, and back 0 on one half and 2.5 m on average on the other
+    assert two_way_distance(line[:501], line) == pytest.approx(0.5 * 1.25, abs=0.01)

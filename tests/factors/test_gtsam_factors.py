@@ -1,0 +1,319 @@
+"""The GTSAM factors against the vectorized kernels: the same linear system, the same optimum."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.bspline import periodic_knots
+from pathspace_graph.factors.footpoint import foot_points
+from pathspace_graph.factors.gauge import greville, smoothness_matrix
+from pathspace_graph.factors.gtsam_factors import (
+    calibrated_odometry_factor,
+    huber_roots,
+    linear_factor,
+    odometry_factor,
+    pose_array,
+    smoothness_factors,
+    spacing_factors,
+    spline_projection_factor,
+)
+from pathspace_graph.factors.odometry import IntegratedOdometry
+from pathspace_graph.factors.spans import SpanPolynomials
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE
+
+from ..scenes.gtsam import (
+    CONTROL_KEYS,
+    DEGREE,
+    HUBER,
+    MAP,
+    POSES,
+    SIGMA_MODEL,
+    SIZE,
+    TABLES,
+    Scene,
+    all_rows,
+    curves,
+    dense,
+    in_tangents,
+    integrate_noisy,
+    make_scene,
+    nonlinear_graph,
+    projection_factor,
+    reading_rows,
+    solve_window,
+    to_state,
+    to_values,
+)
+from ..scenes.jacobians import assert_jacobians
+
+Array = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["isotropic", "anisotropic"])
+def scene(request: pytest.FixtureRequest) -> Scene:
+    return make_scene(0, isotropic=request.param)
+
+
+def test_the_factors_linear_system_is_that_of_the_kernels_rows(scene: Scene) -> None:
+    """Far from the optimum, with outliers weighed down, and the poses turned."""
+    state = scene.state + np.random.default_rng(1).normal(0.0, 0.05, scene.state.shape)
+    state[MAP + 2 : MAP + 2 + POSE] = scene.start  # the prior's tangent is the state's only where it holds
+    groups = all_rows(scene, state)
+    assert (np.abs(reading_rows(scene, 0, state)[2]) > np.sqrt(HUBER)).any()
+    J, r = dense(groups, len(state))
+    J = in_tangents(scene, state, J)
+    poses = [gtsam.symbol("x", k) for k in range(POSES)]
+    ordering = gtsam.Ordering([*CONTROL_KEYS[0], *CONTROL_KEYS[1], CALIBRATION_KEY, *poses])
+    hessian, descent = nonlinear_graph(scene).linearize(to_values(scene, state)).hessian(ordering)
+    np.testing.assert_allclose(hessian, J.T @ J, atol=1e-9 * np.abs(hessian).max(), rtol=0.0)
+    np.testing.assert_allclose(descent, -J.T @ r, atol=1e-9 * np.abs(descent).max(), rtol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("seed", "isotropic", "allowed"), [(0, True, 1e-6), (1, True, 1e-6), (2, False, 5e-3)]
+)
+def test_levenberg_marquardt_reaches_the_windows_optimum(seed: int, isotropic: bool, allowed: float) -> None:
+    """Curves and poses to 1e-6 m where sigma doesn't turn with the normal.
+
+    Where it does, Levenberg-Marquardt looks at an error whose derivative isn't quite the gradient that it was
+    given, and stops when no step lowers it: millimetres at most, here.
+    """
+    scene = make_scene(seed, isotropic)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(0.0)
+    parameters.setAbsoluteErrorTol(1e-13)
+    values = to_values(scene, scene.state)
+    found = to_state(gtsam.LevenbergMarquardtOptimizer(nonlinear_graph(scene), values, parameters).optimize())
+    expected = solve_window(scene)
+    np.testing.assert_allclose(curves(scene, found), curves(scene, expected), atol=allowed)
+    np.testing.assert_allclose(scene.poses(found), scene.poses(expected), atol=allowed)
+    assert np.abs(curves(scene, found) - curves(scene, scene.state)).max() > 0.05
+
+
+def test_gauss_newton_reaches_the_windows_optimum(scene: Scene) -> None:
+    """GTSAM's own Gauss-Newton stands still where the window does, whatever the covariances."""
+    optimizer = gtsam.GaussNewtonOptimizer(nonlinear_graph(scene), to_values(scene, scene.state))
+    for _ in range(25):
+        optimizer.iterate()
+    found, expected = to_state(optimizer.values()), solve_window(scene)
+    np.testing.assert_allclose(curves(scene, found), curves(scene, expected), atol=1e-6)
+    np.testing.assert_allclose(scene.poses(found), scene.poses(expected), atol=1e-6)
+
+
+def test_error_is_hubers_loss_and_its_derivative_is_the_linearizations_gradient() -> None:
+    """So that an optimizer that judges its steps by the error judges the rows that it was given."""
+    scene = make_scene(2)
+    factor = projection_factor(scene, 0, 3)
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(factor)
+    values = to_values(scene, scene.state)
+    assert np.abs(factor.unwhitenedError(values)).max() > HUBER
+    gradient = graph.linearize(values).gradientAtZero()
+    for key in list(factor.keys()):
+        expected = gradient.at(key)
+        numeric = [error_slope(graph, values, key, e) for e in np.eye(len(expected))]
+        np.testing.assert_allclose(numeric, expected, atol=1e-5 * (1.0 + np.abs(expected).max()))
+
+
+def error_slope(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, key: int, along: Array) -> float:
+    """Central difference of the error along a tangent of one key."""
+    errors = []
+    for step in (1e-5, -1e-5):
+        delta = values.zeroVectors()
+        delta.update(single(key, step * along))
+        errors.append(graph.error(values.retract(delta)))
+    return float((errors[0] - errors[1]) / 2e-5)
+
+
+def single(key: int, vector: Array) -> gtsam.VectorValues:
+    values = gtsam.VectorValues()
+    values.insert(key, vector)
+    return values
+
+
+@pytest.mark.parametrize("threshold", [1.5, np.inf])
+def test_huber_roots(threshold: float) -> None:
+    z = np.array([-4.0, -1.0, 0.0, 1.5, 100.0])
+    loss = np.where(np.abs(z) <= threshold, 0.5 * z**2, np.minimum(threshold, 1e9) * (np.abs(z) - 0.75))
+    roots = huber_roots(z, threshold)
+    np.testing.assert_allclose(0.5 * roots**2, loss, rtol=1e-14)
+    np.testing.assert_array_equal(np.sign(roots), np.sign(z))
+
+
+def pose_plus(pose: Array, delta: Array) -> Array:
+    return pose_array(gtsam.Pose2(*pose).retract(delta))
+
+
+def test_calibrated_odometry_jacobians_in_pose2s_tangent() -> None:
+    """Residuals of metres; the noise model is left out, as the factor's function leaves it out."""
+    odometry = integrate_noisy(np.random.default_rng(3))
+    unit = IntegratedOdometry(odometry.delta, np.eye(3), odometry.calibration_jacobian, np.eye(3))
+    factor = calibrated_odometry_factor(0, 1, 2, unit)
+
+    def function(start: Array, end: Array, calibration: Array) -> tuple[Array, ...]:
+        values = gtsam.Values()
+        values.insert(0, gtsam.Pose2(*start))
+        values.insert(1, gtsam.Pose2(*end))
+        values.insert(2, calibration)
+        linear = gtsam.JacobianFactor(factor.linearize(values))
+        assert linear.keys() == [0, 1, 2]
+        A = linear.getA()
+        return -linear.getb(), A[:, :3].copy(), A[:, 3:6].copy(), A[:, 6:].copy()
+
+    inputs = [np.array([1.0, -2.0, 2.5]), np.array([4.0, 1.0, -2.9]), np.array([0.01, -0.02])]
+    assert_jacobians(function, inputs, [pose_plus, pose_plus, lambda x, d: x + d])
+
+
+def test_without_calibration_both_odometry_factors_agree() -> None:
+    odometry = integrate_noisy(np.random.default_rng(4))
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose2(1.0, 2.0, 3.0))
+    values.insert(1, gtsam.Pose2(2.0, 2.5, -3.0))
+    values.insert(2, np.zeros(2))
+    native = gtsam.JacobianFactor(odometry_factor(0, 1, odometry).linearize(values))
+    own = gtsam.JacobianFactor(calibrated_odometry_factor(0, 1, 2, odometry).linearize(values))
+    scale = np.abs(native.getA()).max()
+    np.testing.assert_allclose(own.getA()[:, :6], native.getA(), atol=1e-9 * scale)
+    np.testing.assert_allclose(own.getb(), native.getb(), atol=1e-9 * np.abs(native.getb()).max())
+
+
+def test_periodic_stretch_across_the_seam_holds_only_its_own_keys() -> None:
+    """Readings at the seam of a closed curve: keys of both of its ends, and the Jacobians are right."""
+    size = 12
+    angle = 2.0 * np.pi * np.arange(size) / size
+    points = 6.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    tables = SpanPolynomials(periodic_knots(3.0 * np.arange(size + 1.0), DEGREE), DEGREE, True)
+    u = whole_period_search(tables, points, np.array([[7.0, 1.0], [7.2, 1.3]]))
+    factor = spline_projection_factor(
+        99,
+        list(range(size)),
+        tables,
+        points_vehicle=np.array([[2.0, 0.0], [2.2, 0.3]]),
+        covariances=np.tile(0.01 * np.eye(2), (2, 1, 1)),
+        low=u - 1.0,
+        high=u + 1.0,
+        sigma_model=SIGMA_MODEL,
+        huber=np.inf,
+    )
+    keys = factor.keys()[1:]
+    assert {0, size - 1} < set(keys)
+    assert len(keys) < size
+
+    def function(pose: Array, control: Array) -> tuple[Array, ...]:
+        values = gtsam.Values()
+        values.insert(99, gtsam.Pose2(*pose))
+        for key, point in zip(keys, control.reshape(-1, 2), strict=True):
+            values.insert(key, point)
+        linear = gtsam.JacobianFactor(factor.linearize(values))
+        return -linear.getb(), linear.getA()[:, :3].copy(), linear.getA()[:, 3:].copy()
+
+    inputs = [np.array([5.0, 1.0, 0.0]), points[keys].ravel()]
+    residual = function(*inputs)[0]
+    assert np.abs(residual).min() > 1.0
+    assert_jacobians(function, inputs, [pose_plus, lambda x, d: x + d])
+
+
+def whole_period_search(tables: SpanPolynomials, distinct: Array, points: Array) -> Array:
+    unwrapped = np.concatenate([distinct, distinct[:DEGREE]])
+    ends = np.full(len(points), tables.low), np.full(len(points), tables.high)
+    return foot_points(tables, unwrapped, points, *ends, 0.5).u
+
+
+def straight_factor(u: Array, points: Array) -> tuple[gtsam.CustomFactor, gtsam.Values]:
+    """Readings beside a straight boundary along the x axis, from a pose at the origin."""
+    factor = spline_projection_factor(
+        99,
+        list(range(SIZE)),
+        TABLES,
+        points_vehicle=points,
+        covariances=np.tile(0.01 * np.eye(2), (len(u), 1, 1)),
+        low=u - 1.0,
+        high=u + 1.0,
+        sigma_model=SIGMA_MODEL,
+        huber=np.inf,
+    )
+    values = gtsam.Values()
+    values.insert(99, gtsam.Pose2())
+    for j, x in enumerate(greville(TABLES.knots, DEGREE)):
+        values.insert(j, np.array([x, 0.0]))
+    return factor, values
+
+
+def test_a_row_whose_foot_point_leaves_its_stretch_contributes_zero() -> None:
+    """Until the factor is created anew; so does one beyond the end of the curve."""
+    end = TABLES.high
+    points = np.array([[10.5, 0.4], [13.0, 0.4], [end + 0.5, 0.4]])
+    factor, values = straight_factor(np.array([10.0, 10.0, end]), points)
+    linear = gtsam.JacobianFactor(factor.linearize(values))
+    sigma = np.hypot(0.1, SIGMA_MODEL)
+    np.testing.assert_allclose(linear.getb(), [-0.4 / sigma, 0.0, 0.0], atol=1e-9)
+    assert np.abs(linear.getA()[0]).max() > 1.0
+    np.testing.assert_array_equal(linear.getA()[1:], 0.0)
+    assert factor.error(values) == pytest.approx(0.5 * (0.4 / sigma) ** 2, rel=1e-9)
+
+
+def test_a_factor_holds_only_the_keys_of_its_stretch() -> None:
+    """Foot points between 9 and 11: spans 2 and 3 (7 to 14), so control points 2 to 6."""
+    factor, _ = straight_factor(np.array([10.0]), np.array([[10.0, 0.4]]))
+    assert factor.keys() == [99, 2, 3, 4, 5, 6]
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        straight_factor(np.zeros(0), np.zeros((0, 2)))
+    with pytest.raises(ValueError, match="expected as many"):
+        straight_factor(np.zeros(2), np.zeros((1, 2)))
+    with pytest.raises(ValueError, match="expected 2 distances"):
+        spacing_factors([1, 2, 3], np.ones(3), np.ones(3), False)
+    with pytest.raises(ValueError, match="expected a key for each of 4 columns"):
+        smoothness_factors([1, 2, 3], smoothness_matrix(np.arange(4.0), None), 1.0)
+
+
+@pytest.mark.parametrize("period", [None, 9.0])
+def test_smoothness_factors_are_the_matrix_far_from_zero(period: float | None) -> None:
+    """Their error is 1/2 |D c / sigma|^2 at any control points, not only where they were created."""
+    matrix = smoothness_matrix(np.array([0.0, 1.0, 3.0, 4.0, 7.0]), period)
+    points = np.random.default_rng(5).normal(size=(5, 2)) * 10.0
+    values = gtsam.Values()
+    for j, point in enumerate(points):
+        values.insert(j, point)
+    factors = smoothness_factors(list(range(5)), matrix, 0.5)
+    assert all(len(f.keys()) <= 3 for f in factors)
+    expected = 0.5 * np.sum((matrix @ points / 0.5) ** 2)
+    assert sum(f.error(values) for f in factors) == pytest.approx(expected, rel=1e-12)
+
+
+def test_periodic_spacing_closes_the_ring() -> None:
+    factors = spacing_factors([5, 6, 7], np.full(3, 2.0), np.ones(3), True)
+    assert [f.keys() for f in factors] == [[5, 6], [6, 7], [7, 5]]
+
+
+def test_a_linear_factor_over_many_keys() -> None:
+    rng = np.random.default_rng(0)
+    keys, dims = [9, 4, 7, 1, 30], [2, 3, 2, 1, 3]
+    A, b, x = rng.normal(size=(4, 11)), rng.normal(size=4), rng.normal(size=11)
+    factor = gtsam.JacobianFactor(linear_factor(keys, dims, A, b))
+    delta = gtsam.VectorValues()
+    for key, part in zip(keys, np.split(x, np.cumsum(dims)[:-1]), strict=True):
+        delta.insert(key, part)
+    np.testing.assert_array_equal(factor.getA(), A)
+    assert factor.error(delta) == pytest.approx(0.5 * np.sum((A @ x - b) ** 2), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("keys", "dims", "shape", "rows"),
+    [
+        ([1, 2], [2], (3, 2), 3),
+        ([1, 1], [2, 2], (3, 4), 3),
+        ([1, 2], [2, 2], (3, 5), 3),
+        ([1], [2], (3, 2), 2),
+    ],
+)
+def test_a_linear_factor_that_does_not_fit_is_refused(
+    keys: list[int], dims: list[int], shape: tuple[int, int], rows: int
+) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        linear_factor(keys, dims, np.zeros(shape), np.zeros(rows))

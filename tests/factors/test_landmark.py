@@ -1,0 +1,50 @@
+"""The landmark factor's Jacobians, and that it is what GTSAM's own factor says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.landmark import landmark_residuals, whiteners
+
+from ..scenes.jacobians import assert_jacobians
+
+Array = NDArray[np.float64]
+
+
+def one_reading(pose: Array, landmark: Array, reading: Array) -> Sequence[Array]:
+    rows = landmark_residuals(pose[None], landmark[None], reading[None])
+    return rows.residual[0], rows.by_pose[0], rows.by_landmark[0], -np.eye(2)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_jacobians_far_from_zero(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pose, landmark, reading = rng.normal(0.0, 10.0, 3), rng.normal(0.0, 20.0, 2), rng.normal(0.0, 10.0, 2)
+    assert_jacobians(one_reading, [pose, landmark, reading])
+
+
+def test_a_landmark_to_the_left_is_seen_to_the_left() -> None:
+    rows = landmark_residuals(np.array([[1.0, 2.0, np.pi / 2]]), np.array([[-1.0, 5.0]]), np.zeros((1, 2)))
+    np.testing.assert_allclose(rows.residual, [[3.0, 2.0]], atol=1e-12)
+
+
+def test_it_agrees_with_gtsam() -> None:
+    rng = np.random.default_rng(1)
+    poses, landmarks = rng.normal(0.0, 3.0, (20, 3)), rng.normal(0.0, 9.0, (20, 2))
+    rows = landmark_residuals(poses, landmarks, np.zeros((20, 2)))
+    for pose, landmark, seen in zip(poses, landmarks, rows.residual, strict=True):
+        np.testing.assert_allclose(gtsam.Pose2(*pose).transformTo(landmark), seen, atol=1e-12)
+
+
+def test_whitened_rows_are_independent_and_of_unit_variance() -> None:
+    rng = np.random.default_rng(2)
+    roots = rng.normal(0.0, 1.0, (50, 2, 2)) + np.eye(2)
+    covariances = roots @ np.swapaxes(roots, 1, 2)
+    w = whiteners(covariances)
+    whitened = w @ covariances @ np.swapaxes(w, 1, 2)
+    np.testing.assert_allclose(whitened, np.tile(np.eye(2), (50, 1, 1)), atol=1e-8)

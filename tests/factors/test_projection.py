@@ -1,0 +1,271 @@
+"""The spline-projection kernel: Jacobians with re-found foot points metres off the curve, noise, weights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.bspline import clamped_knots, periodic_knots, uniform_knots
+from pathspace_graph.factors.footpoint import FootPoints, foot_points
+from pathspace_graph.factors.projection import huber_weights, project, project_to_point, sigma_across, to_map
+from pathspace_graph.factors.spans import SpanPolynomials
+
+from ..scenes.jacobians import assert_jacobians
+
+Array = NDArray[np.float64]
+
+SPACING = 3.0
+"""Knot interval of the test curves (m)."""
+ROOM = 2.0
+"""Stretch on either side of the parameter where a foot point is searched for (m)."""
+SIGMA_MODEL = 0.08
+MAX_BEND = 0.8
+"""Largest curvature times distance: at 1 the reading is the centre of curvature."""
+
+
+def control_columns(tables: SpanPolynomials, span: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Distinct control points (m, degree + 1) of each span."""
+    count = len(tables.knots) - tables.degree - 1 - (tables.degree if tables.periodic else 0)
+    return (span[:, None] + np.arange(-tables.degree, 1)) % count
+
+
+def unwrapped(tables: SpanPolynomials, distinct: Array) -> Array:
+    """Control points as the kernels take them."""
+    return distinct[np.arange(len(tables.knots) - tables.degree - 1) % len(distinct)]
+
+
+def random_curve(
+    rng: np.random.Generator, degree: int, kind: str, size: int = 10
+) -> tuple[SpanPolynomials, Array]:
+    """A winding curve about `SPACING` a knot; open, clamped with a repeated knot, or periodic."""
+    if kind == "periodic":
+        angle = 2.0 * np.pi * np.arange(size) / size
+        points = SPACING * size / (2.0 * np.pi) * np.column_stack([np.cos(angle), np.sin(angle)])
+        knots = periodic_knots(SPACING * np.arange(size + 1, dtype=float), degree)
+    else:
+        heading = np.cumsum(rng.normal(0.0, 0.3, size))
+        points = SPACING * np.cumsum(np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+        breaks = SPACING * np.arange(size - degree + 1, dtype=float)
+        if kind == "repeated" and degree > 2:
+            breaks[2] = breaks[3]
+        knots = uniform_knots(size, degree, SPACING) if kind == "open" else clamped_knots(breaks, degree)
+    return SpanPolynomials(knots, degree, kind == "periodic"), points + rng.normal(0.0, 0.2, points.shape)
+
+
+def find(tables: SpanPolynomials, distinct: Array, points: Array, u: Array) -> FootPoints:
+    return foot_points(tables, unwrapped(tables, distinct), points, u - ROOM, u + ROOM, 0.25)
+
+
+def well_posed(tables: SpanPolynomials, distinct: Array, points: Array, u: Array) -> NDArray[np.bool_]:
+    """Interior foot points away from kinks and centres of curvature, where the nearest point jumps."""
+    foot = find(tables, distinct, points, u)
+    values, _ = tables.evaluate(foot.u, 2)
+    columns = control_columns(tables, foot.span)
+    _, first, second = np.einsum("rmj,mjd->rmd", values, distinct[columns])
+    bend = np.sum(second * foot.normal_unit, axis=1) * foot.distance / np.sum(first**2, axis=1)
+    low, high = tables.inside(foot.u - 1e-3), tables.inside(foot.u + 1e-3)
+    same_side = tables.locate(low)[0] == tables.locate(high)[0]  # third derivatives jump at a knot
+    near = np.abs(foot.u - tables.inside(u)) < 0.8 * ROOM
+    at_kink = np.linalg.norm(points - foot.position, axis=1) - np.abs(foot.distance) > 1e-6
+    return np.asarray(foot.interior & (bend < MAX_BEND) & same_side & near & ~at_kink)
+
+
+def projection_function(tables: SpanPolynomials, points_vehicle: Array, u: Array):
+    """(pose, control points) -> residuals, Jacobians; every call finds the foot points anew."""
+    covariances = np.tile(0.01 * np.eye(2), (len(u), 1, 1))
+
+    def function(pose: Array, control: Array) -> tuple[Array, Array, Array]:
+        distinct, poses = control.reshape(-1, 2), np.tile(pose, (len(u), 1))
+        points = to_map(points_vehicle, poses)
+        foot = find(tables, distinct, points, u)
+        rows = project(points, covariances, poses, foot, SIGMA_MODEL)
+        by_control = np.zeros((len(u), len(distinct), 2))
+        columns = control_columns(tables, foot.span)
+        np.add.at(by_control, (np.arange(len(u))[:, None], columns), rows.by_control)
+        return rows.residual, rows.by_pose, by_control.reshape(len(u), -1)
+
+    return function
+
+
+def to_vehicle(points: Array, pose: Array) -> Array:
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return (points - pose[:2]) @ np.array([[c, -s], [s, c]])
+
+
+def readings_beside(
+    rng: np.random.Generator, tables: SpanPolynomials, distinct: Array, distance: Array
+) -> tuple[Array, Array]:
+    """Points (m, 2) at given signed distances from the curve and their parameters, the well posed ones."""
+    margin = 0.0 if tables.periodic else 0.2
+    u = rng.uniform(tables.low + margin, tables.high - margin, len(distance))
+    values, span = tables.evaluate(u, 1)
+    position, tangent = np.einsum("rmj,mjd->rmd", values, distinct[control_columns(tables, span)])
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]]) / np.linalg.norm(tangent, axis=1)[:, None]
+    points = position + distance[:, None] * normal
+    keep = well_posed(tables, distinct, points, u)
+    return points[keep], u[keep]
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    degree=st.integers(1, 4),
+    kind=st.sampled_from(["open", "clamped", "repeated", "periodic"]),
+)
+def test_jacobians_are_exact_metres_away_from_the_curve(seed: int, degree: int, kind: str) -> None:
+    """Every term through the foot point vanishes, though it moves with pose and control points."""
+    rng = np.random.default_rng(seed)
+    tables, distinct = random_curve(rng, degree, kind)
+    points, u = readings_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 25))
+    pose = np.append(rng.uniform(-20.0, 20.0, 2), rng.uniform(-np.pi, np.pi))
+    function = projection_function(tables, to_vehicle(points, pose), u)
+    assert_jacobians(function, [pose, distinct.ravel()])
+
+
+def test_the_samples_are_far_from_zero_and_their_foot_points_move() -> None:
+    """What the test above rests on: residuals of metres, and parameters that depend on the pose."""
+    rng = np.random.default_rng(1)
+    tables, distinct = random_curve(rng, 3, "open")
+    points, u = readings_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 200))
+    foot = find(tables, distinct, points, u)
+    assert np.abs(foot.distance).max() > 4.0
+    assert (np.abs(foot.distance) > 1.0).sum() > 50
+    moved = find(tables, distinct, points + np.array([0.01, 0.0]), u)
+    assert np.abs(moved.u - foot.u).max() > 0.005
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        [0.0, 0.0, 0.0],
+        [1e-9, -1e-9, 1e-9],
+        [3.0, 1.0, np.pi],
+        [3.0, 1.0, -np.pi + 1e-7],
+        [500.0, -300.0, 40.0],
+    ],
+)
+@pytest.mark.parametrize("distance", [0.0, 1e-9, 0.3])
+def test_jacobians_at_degenerate_states(pose: list[float], distance: float) -> None:
+    """Near identity, at the seam of the angle, many turns on; on the curve itself."""
+    rng = np.random.default_rng(3)
+    tables, distinct = random_curve(rng, 3, "open")
+    distinct = distinct + np.array(pose[:2])
+    points, u = readings_beside(rng, tables, distinct, np.full(10, distance))
+    assert len(u) > 3
+    function = projection_function(tables, to_vehicle(points, np.array(pose)), u)
+    assert_jacobians(function, [np.array(pose), distinct.ravel()])
+
+
+def test_a_reading_at_the_vehicle_itself_does_not_turn() -> None:
+    rng = np.random.default_rng(4)
+    tables, distinct = random_curve(rng, 3, "periodic")
+    points, u = readings_beside(rng, tables, distinct, np.array([1.0, 1.0]))
+    pose = np.append(points[0], 0.7)
+    function = projection_function(tables, np.zeros((1, 2)), u[:1])
+    assert_jacobians(function, [pose, distinct.ravel()])
+    assert function(pose, distinct.ravel())[1][0, 2] == 0.0
+
+
+def test_coinciding_control_points_keep_the_jacobians() -> None:
+    rng = np.random.default_rng(5)
+    tables, distinct = random_curve(rng, 3, "open")
+    distinct[5] = distinct[4]
+    points, u = readings_beside(rng, tables, distinct, rng.uniform(-0.5, 0.5, 20))
+    assert_jacobians(projection_function(tables, points, u), [np.zeros(3), distinct.ravel()])
+
+
+def test_at_the_end_of_the_curve_the_row_is_marked() -> None:
+    """Beyond the end the residual is not the distance, the Jacobians not exact: `interior` is False."""
+    tables = SpanPolynomials(uniform_knots(6, 3, SPACING), 3)
+    distinct = SPACING * np.column_stack([np.arange(6.0), np.zeros(6)])
+    end = SPACING * 4.0
+    foot = find(tables, distinct, np.array([[end + 1.0, 0.5], [end - 1.0, 0.5]]), np.array([tables.high] * 2))
+    assert foot.interior.tolist() == [False, True]
+
+
+def test_the_residual_is_positive_on_the_left_of_travel() -> None:
+    tables = SpanPolynomials(uniform_knots(6, 3, SPACING), 3)
+    distinct = SPACING * np.column_stack([np.arange(6.0), np.zeros(6)])
+    pose = np.array([6.0, 0.0, np.pi])
+    function = projection_function(tables, np.array([[0.0, -2.0], [0.0, 1.5]]), np.array([3.0, 3.0]))
+    residual, by_pose, _ = function(pose, distinct.ravel())
+    np.testing.assert_allclose(residual, [2.0, -1.5], atol=1e-12)
+    np.testing.assert_allclose(by_pose[:, :2], [[0.0, 1.0], [0.0, 1.0]], atol=1e-12)
+
+
+def test_to_map_is_the_rigid_transform() -> None:
+    points = to_map(np.array([[1.0, 2.0], [1.0, 0.0]]), np.array([[3.0, 4.0, np.pi / 2], [0.0, 0.0, np.pi]]))
+    np.testing.assert_allclose(points, [[1.0, 5.0], [-1.0, 0.0]], atol=1e-12)
+
+
+def test_sigma_across_against_monte_carlo() -> None:
+    """A sample deviation has a relative standard error of 1 / sqrt(2 n); five are allowed."""
+    rng = np.random.default_rng(6)
+    count, theta, angle = 100_000, 2.1, 0.4
+    covariance = np.array([[0.04, 0.015], [0.015, 0.01]])
+    noise = rng.multivariate_normal(np.zeros(2), covariance, count)
+    normal = np.array([np.cos(angle), np.sin(angle)])
+    turned = to_map(noise, np.tile([5.0, -3.0, theta], (count, 1))) - np.array([5.0, -3.0])
+    samples = turned @ normal + rng.normal(0.0, SIGMA_MODEL, count)
+    sigma = sigma_across(normal[None], covariance[None], np.array([[5.0, -3.0, theta]]), SIGMA_MODEL)
+    assert abs(samples.std() / sigma[0] - 1.0) < 5.0 / np.sqrt(2.0 * count)
+
+
+# --- both directions, the foot point held ----------------------------------------------------------------
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), degree=st.integers(1, 4), kind=st.sampled_from(["open", "periodic"]))
+def test_jacobians_of_the_offset_from_a_held_foot_point(seed: int, degree: int, kind: str) -> None:
+    """Isotropic readings, whose whitening doesn't turn with the pose; foot points metres away, then held."""
+    rng = np.random.default_rng(seed)
+    tables, distinct = random_curve(rng, degree, kind)
+    pose = np.append(rng.uniform(-20.0, 20.0, 2), rng.uniform(-np.pi, np.pi))
+    points, u = readings_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 15))
+    found, vehicle = find(tables, distinct, points, u), to_vehicle(points, pose)
+    covariances = np.tile(0.01 * np.eye(2), (len(u), 1, 1))
+    columns = control_columns(tables, found.span)
+
+    def function(pose: Array, control: Array) -> tuple[Array, Array, Array]:
+        position = np.einsum("mj,mjd->md", found.basis, control.reshape(-1, 2)[columns])
+        held, poses = replace(found, position=position), np.tile(pose, (len(u), 1))
+        rows = project_to_point(to_map(vehicle, poses), covariances, poses, held, SIGMA_MODEL)
+        by_control = np.zeros((len(u), 2, len(distinct), 2))
+        for row, at in enumerate(columns):
+            np.add.at(by_control[row], (slice(None), at), rows.by_control[row])
+        return rows.residual.ravel(), rows.by_pose.reshape(-1, 3), by_control.reshape(2 * len(u), -1)
+
+    assert_jacobians(function, [pose, distinct.ravel()])
+
+
+def test_the_offset_is_as_unlikely_as_the_reading_and_turns_with_it() -> None:
+    """|r|^2 is the squared Mahalanobis distance by the covariance in the map frame; both see one distance."""
+    rng = np.random.default_rng(7)
+    tables, distinct = random_curve(rng, 3, "open")
+    points, u = readings_beside(rng, tables, distinct, rng.uniform(-3.0, 3.0, 20))
+    foot, poses = find(tables, distinct, points, u), np.column_stack([*points.T, rng.uniform(-3, 3, len(u))])
+    covariances = np.tile(np.array([[0.04, 0.015], [0.015, 0.01]]), (len(u), 1, 1))
+    rows = project_to_point(points, covariances, poses, foot, SIGMA_MODEL)
+    for row, theta in enumerate(poses[:, 2]):
+        R = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+        S = R @ covariances[row] @ R.T + SIGMA_MODEL**2 * np.eye(2)
+        d = foot.distance[row] * foot.normal_unit[row]
+        assert np.sum(rows.residual[row] ** 2) == pytest.approx(d @ np.linalg.solve(S, d))
+    round_ones = np.tile(0.01 * np.eye(2), (len(u), 1, 1))
+    across = project(points, round_ones, poses, foot, SIGMA_MODEL)
+    both = project_to_point(points, round_ones, poses, foot, SIGMA_MODEL)
+    np.testing.assert_allclose(
+        np.linalg.norm(both.residual, axis=1), np.abs(across.residual) / across.sigma, rtol=1e-6
+    )
+
+
+def test_huber_weights_bound_the_pull_of_a_row() -> None:
+    """Weight times residual is the derivative of Huber's loss: the residual itself, then the threshold."""
+    z = np.array([-50.0, -1.5, -0.2, 0.0, 1.0, 1.5, 2.0, 1e6])
+    np.testing.assert_allclose(huber_weights(z, 1.5) * z, np.clip(z, -1.5, 1.5), rtol=1e-15)
+    np.testing.assert_array_equal(huber_weights(z, np.inf), 1.0)

@@ -1,0 +1,367 @@
+"""The fixed-lag window: what a batch finds, what it knows of itself, and which factors are made anew."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.factors.odometry import compose
+from pathspace_graph.graph.gaussian import graph_of, keys_of, normal_equations
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
+from pathspace_graph.graph.rows import LinearFactor, Rows
+from pathspace_graph.graph.variables import Layout
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.run import split_odometry
+from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
+
+from ..scenes.drives import ODOMETRY_SIGMA, bean_track, lap_log
+from ..scenes.graph import columns_of
+from ..scenes.linear_drive import LinearDrive
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+# --- a linear drive --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lag", [1, 3])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_window_on_a_linear_drive_is_full_batch(lag: int, seed: int) -> None:
+    """Mean and joint covariance of all that it still knows, however many poses have left."""
+    drive = LinearDrive(lag, seed)
+    drive.drive(14)
+    smoother, keys = drive.smoother, drive.smoother.variables.keys
+    assert len(smoother.times) == lag + 1
+    assert keys.tolist() == np.delete(drive.keys, np.arange(13, 13 + 14 - lag - 1)).tolist()
+    np.testing.assert_allclose(smoother.variables.values, drive.mean(keys), rtol=1e-8, atol=1e-8)
+    expected = drive.covariance(keys)
+    np.testing.assert_allclose(smoother.covariance(keys), expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_covariance_is_in_the_order_of_the_keys() -> None:
+    drive = LinearDrive(3)
+    drive.drive(6)
+    keys = np.array([pose_key(5), control_keys(0, np.array(2)), CALIBRATION_KEY, pose_key(3)])
+    np.testing.assert_allclose(drive.smoother.covariance(keys), drive.covariance(keys), rtol=1e-7, atol=1e-10)
+
+
+def test_the_prior_is_the_schur_complement_of_what_has_left() -> None:
+    """Of the factors of the poses that left, without those of the window and without the weak priors."""
+    drive = LinearDrive(2)
+    drive.drive(3)
+    smoother = drive.smoother
+    while smoother.times[-1] - smoother.times[0] < 3.0:
+        drive.predict()
+        smoother.step()
+    before = smoother.linear_graph()
+    smoother.marginalize()
+    layout = smoother.layout
+    left = np.setdiff1d(keys_of(before), layout.keys)
+    assert left.tolist() == [pose_key(0)]
+    whole = Layout(keys_of(before))
+    joint = np.linalg.inv(normal_equations(before, whole)[0])
+    stay = whole.entries(layout.keys)
+    after = np.linalg.inv(normal_equations(smoother.linear_graph(), layout)[0])
+    np.testing.assert_allclose(after, joint[np.ix_(stay, stay)], rtol=1e-8, atol=1e-11)
+
+
+def test_a_damped_step_adds_to_the_diagonal_of_the_map_points_alone() -> None:
+    drive = LinearDrive(4)
+    drive.drive(4)
+    smoother = drive.smoother
+    hessian, vector = normal_equations(smoother.linear_graph(), smoother.layout)
+    now = smoother.variables.change(np.arange(smoother.layout.size))
+    points = np.flatnonzero(np.isin(np.repeat(smoother.layout.keys, smoother.layout.widths), drive.keys[1:7]))
+    descent = smoother.factorize(0.3)
+    np.testing.assert_allclose(descent, vector - hessian @ now, atol=1e-8 * np.abs(vector).max())
+    hessian[points, points] += 0.3**-2
+    assert smoother.last_step is not None
+    lower = np.tril(smoother.last_step.factor)
+    np.testing.assert_allclose(lower @ lower.T, hessian, atol=1e-10 * hessian.max())
+
+
+def test_looking_at_the_graph_changes_nothing() -> None:
+    drive, left_alone = LinearDrive(3), LinearDrive(3)
+    for one in (drive, left_alone):
+        one.drive(6)
+    drive.smoother.linear_graph()
+    drive.smoother.covariance(pose_keys(np.array([5])))
+    for one in (drive, left_alone):
+        one.drive(3)
+    np.testing.assert_array_equal(drive.smoother.variables.values, left_alone.smoother.variables.values)
+
+
+def test_a_variable_that_nothing_holds_is_named() -> None:
+    drive = LinearDrive(3)
+    drive.drive(5)
+    drive.smoother.variables.insert(pose_keys(np.array([0])), np.zeros(POSE))
+    with pytest.raises(SingularSystemError, match=r"none on x0$"):
+        drive.smoother.covariance(pose_keys(np.array([4])))
+
+
+def test_forgetting_a_point_removes_what_had_left_and_keeps_what_is_in_the_window() -> None:
+    """The prior knows nothing of it any more, and of all others as much as before."""
+    drive = LinearDrive(2)
+    drive.drive(8)
+    smoother, gone = drive.smoother, control_keys(0, np.array([5, 6]))
+    layout = Layout(keys_of(smoother.prior))
+    assert np.isin(gone, layout.keys).all()
+    rest = Layout(np.setdiff1d(layout.keys, gone))
+    stay = layout.entries(rest.keys)
+    hessian, vector = normal_equations(smoother.prior, layout)
+    hessian = hessian + 1e-9 * np.eye(len(hessian))
+    joint = np.linalg.inv(hessian)
+    epoch = smoother.epoch
+    smoother.forget(gone)
+    assert smoother.epoch > epoch
+    found, found_vector = normal_equations(smoother.prior, rest)
+    found = found + 1e-9 * np.eye(len(found))
+    expected = np.linalg.inv(joint[np.ix_(stay, stay)])
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+    mean = (joint @ vector)[stay]
+    np.testing.assert_allclose(found_vector, expected @ mean, atol=1e-4 * np.abs(found_vector).max())
+    assert np.isfinite(smoother.covariance(gone)).all()
+
+
+def test_substituted_points_know_what_the_old_ones_did() -> None:
+    """Three points that were, to a shift, a matrix times two new ones: as in a dense change of variables."""
+    drive = LinearDrive(2)
+    drive.drive(14)
+    smoother, rng, sigma = drive.smoother, np.random.default_rng(0), 0.2
+    old, new = control_keys(0, np.arange(3)), control_keys(1, np.arange(2))
+    layout = Layout(keys_of(smoother.prior))
+    information, vector = normal_equations(smoother.prior, layout)
+    reference = smoother.variables.reference[smoother.variables.layout.entries(layout.keys)].copy()
+    change, points = rng.normal(size=(3, 2)), rng.normal(size=(2, 2))
+    smoother.substitute(old, new, points, change, sigma)
+    rest = np.setdiff1d(layout.keys, old)
+    found_layout = Layout(np.sort(np.append(rest, new)))
+    matrix = np.zeros((layout.size, found_layout.size))
+    matrix[layout.entries(rest), found_layout.entries(rest)] = 1.0
+    matrix[np.ix_(layout.entries(old), found_layout.entries(new))] = np.kron(change, np.eye(2))
+    shift = np.zeros(layout.size)
+    shift[layout.entries(old)] = sigma**2
+    raised = information @ np.linalg.inv(np.eye(layout.size) + shift[:, None] * information)
+    lowered = np.linalg.solve(np.eye(layout.size) + information * shift, vector)
+    moved = smoother.variables.reference[smoother.variables.layout.entries(found_layout.keys)]
+    lowered = lowered - raised @ (matrix @ moved - reference)
+    found, found_vector = normal_equations(smoother.prior, found_layout)
+    np.testing.assert_allclose(found, matrix.T @ raised @ matrix, atol=1e-9 * np.abs(found).max())
+    np.testing.assert_allclose(found_vector, matrix.T @ lowered, atol=1e-9 * np.abs(found_vector).max())
+    assert not np.isin(old, smoother.variables.keys).any()
+    np.testing.assert_array_equal(smoother.variables.of(new), points.ravel())
+
+
+# --- which factors are made anew -------------------------------------------------------------------------
+
+
+def drive_bean(settings: MapperSettings, cycles: int) -> FixedLagMapper:
+    """A mapper somewhere on a lap, with the tolerances that hold after it has closed."""
+    mapper = FixedLagMapper(settings, ODOMETRY_SIGMA)
+    mapper.smoother.window.exact = False
+    for _, (odometry, cycle) in zip(range(cycles), split_odometry(lap_log(bean_track(), 0.0)), strict=False):
+        mapper.update(odometry, cycle)
+    return mapper
+
+
+def factors_of_cycles(mapper: FixedLagMapper) -> dict[int, LinearFactor]:
+    return dict(mapper.smoother.window.of_cycle)
+
+
+def test_factors_are_kept_as_long_as_nothing_has_moved_by_the_tolerance() -> None:
+    mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(1e3, 1e3)), 60)
+    mapper.smoother.step(0.5)
+    before, weak = factors_of_cycles(mapper), dict(mapper.smoother.window.gauge)
+    mapper.poses[:] += 0.3
+    mapper.smoother.step(0.5)
+    after = factors_of_cycles(mapper)
+    assert len(before) == len(mapper.poses) == len(after)
+    assert all(after[cycle] is factor for cycle, factor in before.items())
+    assert all(mapper.smoother.window.gauge[owner] is factor for owner, factor in weak.items())
+
+
+def test_all_factors_are_new_in_every_step_while_the_loop_is_open() -> None:
+    mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(1e3, 1e3)), 60)
+    mapper.smoother.window.exact = True
+    mapper.smoother.step(0.5)
+    before = factors_of_cycles(mapper)
+    mapper.smoother.step(0.5)
+    after = factors_of_cycles(mapper)
+    assert not any(after[cycle] is factor for cycle, factor in before.items())
+    assert FixedLagMapper().smoother.window.exact
+
+
+def test_the_tolerance_holds_once_the_loop_has_closed() -> None:
+    mapper = FixedLagMapper(odometry_sigma=ODOMETRY_SIGMA)
+    for odometry, cycle in split_odometry(lap_log(bean_track(), 45.0)):
+        mapper.update(odometry, cycle)
+        assert mapper.smoother.window.exact is not mapper.closed
+    assert mapper.closed
+
+
+def test_all_factors_are_new_where_everything_has_moved() -> None:
+    mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(1e-12, 1e-12)), 60)
+    mapper.smoother.step(0.5)
+    before, weak = factors_of_cycles(mapper), dict(mapper.smoother.window.gauge)
+    mapper.smoother.variables.values[:] += 1e-9
+    mapper.smoother.factorize(0.5)
+    after = factors_of_cycles(mapper)
+    assert not any(after[cycle] is factor for cycle, factor in before.items())
+    assert not any(mapper.smoother.window.gauge[owner] is factor for owner, factor in weak.items())
+
+
+@pytest.mark.parametrize(("entry", "size"), [(0, 0.02), (1, 0.02), (2, 0.002)])
+def test_a_pose_that_has_moved_makes_the_factors_that_hold_it_anew(entry: int, size: float) -> None:
+    """Its own cycle's, and that of the cycle before, whose odometry leads to it."""
+    mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(0.01, 0.001)), 60)
+    smoother = mapper.smoother
+    smoother.step(0.5)
+    smoother.variables.values[:] = smoother.variables.linearized
+    before, slot = factors_of_cycles(mapper), 7
+    mapper.poses[slot, entry] += 0.4 * size
+    smoother.factorize(0.5)
+    assert all(smoother.window.of_cycle[cycle] is factor for cycle, factor in before.items())
+    mapper.poses[slot, entry] += size
+    smoother.factorize(0.5)
+    new = [
+        cycle - smoother.first_cycle
+        for cycle, f in before.items()
+        if smoother.window.of_cycle[cycle] is not f
+    ]
+    assert new == [slot - 1, slot]
+
+
+@pytest.mark.parametrize("into_use", [False, True])
+def test_a_reading_that_goes_in_or_out_of_use_makes_its_cycle_stale(into_use: bool) -> None:
+    mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(1e3, 1e3)), 60)
+    smoother, readings = mapper.smoother, mapper.smoother.map.readings
+    cycle = smoother.first_cycle + 5
+    row = np.flatnonzero(readings.used & (readings.cycle == cycle))[:1]
+    where = readings.boundary[row].copy(), readings.u[row].copy()
+    smoother.step(0.5)
+    if into_use:
+        readings.release(row)
+        smoother.step(0.5)
+    before = factors_of_cycles(mapper)
+    rows = height(before[cycle])
+    if into_use:
+        readings.take(row, *where)
+    else:
+        readings.release(row)
+    smoother.step(0.5)
+    new = [c for c, factor in before.items() if smoother.window.of_cycle[c] is not factor]
+    assert new == [cycle]
+    assert height(smoother.window.of_cycle[cycle]) == rows + (1 if into_use else -1)
+    again = smoother.window.of_cycle[cycle]
+    smoother.step(0.5)
+    assert smoother.window.of_cycle[cycle] is again
+    assert not readings.changed.any()
+
+
+def height(factor: LinearFactor) -> int:
+    """Rows of a factor."""
+    return len(factor.linear.jacobian()[1])
+
+
+def test_the_steps_system_is_that_of_the_graph_at_the_estimate() -> None:
+    """Where everything is linearized anew: nothing stale, nothing twice, nothing left out."""
+    settings = MapperSettings(relinearize=RelinearizeSettings(1e-12, 1e-12))
+    smoother = drive_bean(settings, 60).smoother
+    smoother.factorize()
+    assert smoother.last_step is not None
+    lower = np.tril(smoother.last_step.factor)
+    hessian, _ = normal_equations(smoother.linear_graph(), smoother.layout)
+    np.testing.assert_allclose(lower @ lower.T, hessian, atol=1e-9 * hessian.max())
+
+
+# --- uncertainty -----------------------------------------------------------------------------------------
+
+
+def numeric_end(mapper: FixedLagMapper) -> tuple[Array, Array, Array]:
+    """Derivatives of the newest pose by the one before, by the calibration, and by the odometry's noise."""
+    start, odometry = mapper.poses[-2].copy(), mapper.smoother.window.odometry
+    delta, G = odometry.deltas[-1], odometry.by_calibration[-1]
+    b = mapper.calibration.copy()
+
+    def end(x: Array, c: Array, w: Array) -> Array:
+        return compose(compose(x, delta), w - G @ c)
+
+    columns = []
+    for at, size in ((0, POSE), (1, 2), (2, POSE)):
+        inputs, matrix = [start, b, np.zeros(POSE)], np.zeros((POSE, size))
+        for j in range(size):
+            sides = []
+            for step in (1e-6, -1e-6):
+                moved = [one.copy() for one in inputs]
+                moved[at][j] += step
+                sides.append(end(*moved))
+            matrix[:, j] = (sides[0] - sides[1]) / 2e-6
+        columns.append(matrix)
+    return columns[0], columns[1], columns[2]
+
+
+@pytest.mark.parametrize("together", [1, 2])
+def test_predicted_is_that_of_the_dense_joint_covariance_with_the_newest_pose(together: int) -> None:
+    """The newest pose was no part of the step: it is reached by its odometry, whose noise adds to it."""
+    mapper = drive_bean(MapperSettings(), 59)
+    smoother, odometry = mapper.smoother, list(split_odometry(lap_log(bean_track(), 0.0)))[59]
+    mapper._predict(odometry[0], odometry[1].t)
+    step = smoother.last_step
+    assert step is not None
+    lower = np.tril(step.factor)
+    joint = np.linalg.inv(lower @ lower.T)
+    by_last, by_calibration, by_noise = numeric_end(mapper)
+    size = step.layout.size
+    reach = np.zeros((POSE, size))
+    reach[:, columns_of(pose_keys(np.array([smoother.next_cycle - 2])), step.layout.keys)] = by_last
+    reach[:, columns_of(np.array([CALIBRATION_KEY]), step.layout.keys)] = by_calibration
+    whitener = smoother.window.odometry.whiteners[-1]
+    noise = by_noise @ np.linalg.inv(whitener.T @ whitener) @ by_noise.T
+    whole = np.block([[joint, joint @ reach.T], [reach @ joint, reach @ joint @ reach.T + noise]])
+    everything = np.append(step.layout.keys, pose_key(smoother.next_cycle - 1))
+
+    rng, newest = np.random.default_rng(0), smoother.next_cycle - 1
+    cycles = np.repeat([newest, newest - 1, newest, newest - 12], together)
+    points = rng.choice(smoother.map.state.map_keys, (len(cycles), 2), replace=True)
+    points[points[:, 0] == points[:, 1], 1] = smoother.map.state.map_keys[0]
+    keys = np.column_stack([pose_keys(cycles), points])
+    rows = Rows(keys, rng.normal(size=(len(keys), POSE + 4)), np.zeros(len(keys)), cycles)
+    J = np.zeros((len(keys), size + POSE))
+    for i in range(len(keys)):
+        np.add.at(J[i], columns_of(keys[i], everything), rows.jacobian[i])
+    dense = J @ whole @ J.T
+    found = smoother.predicted(rows, together)
+    assert found.shape == (len(keys) // together, together, together)
+    for i, block in enumerate(found):
+        own = slice(i * together, (i + 1) * together)
+        np.testing.assert_allclose(block, dense[own, own], rtol=1e-5, atol=1e-9)
+
+
+def test_covariance_is_the_dense_inverse_of_the_graph_at_the_estimate() -> None:
+    smoother = drive_bean(MapperSettings(), 60).smoother
+    hessian, _ = normal_equations(smoother.linear_graph(), smoother.layout)
+    keys = np.append(pose_keys(np.array([59, 45])), smoother.layout.keys[[3, 0]])
+    entries = columns_of(keys, smoother.layout.keys)
+    expected = np.linalg.inv(hessian)[np.ix_(entries, entries)]
+    np.testing.assert_allclose(smoother.covariance(keys), expected, rtol=1e-6, atol=1e-9)
+
+
+# --- closing ---------------------------------------------------------------------------------------------
+
+
+def test_a_loop_is_solved_with_its_keyframes_and_without_them_afterwards() -> None:
+    mapper = drive_bean(MapperSettings(), 100)
+    smoother = mapper.smoother
+    assert smoother.submaps is not None and len(smoother.submaps.keyframes) > 1
+    before = smoother.variables.values.copy()
+    keys = smoother.variables.keys
+    stay = ~np.isin(keys, smoother.variables.keyframes)
+    before = smoother.variables.of(keys[stay])
+    smoother.solve_loop(2, 10.0)
+    assert smoother.submaps is None and len(smoother.inactive) == 0
+    np.testing.assert_array_equal(smoother.variables.keys, keys[stay])
+    assert len(smoother.variables.keyframes) == 0
+    np.testing.assert_allclose(smoother.variables.of(keys[stay]), before, atol=0.3)
+    assert set(keys_of(graph_of(smoother.prior)).tolist()) <= set(smoother.variables.keys.tolist())

@@ -1,0 +1,211 @@
+"""A log survives a round trip exactly, and every kind of bad input is told with file and row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from pathspace_graph.errors import InputError, OutputError
+from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth, read_log, write_log
+from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+
+FINITE = st.floats(-1e6, 1e6, allow_nan=False)
+
+
+def small_log() -> Log:
+    rng = np.random.default_rng(0)
+    cycles = tuple(
+        Detections(
+            t, rng.normal(size=(3, 2)), np.tile([[0.02, 0.001], [0.001, 0.03]], (3, 1, 1)), np.arange(3)
+        )
+        for t in (0.0, 0.1, 0.2)
+    )
+    t = np.arange(11) / 50
+    poses = rng.normal(size=(11, 3))
+    truth = Truth(t, poses, rng.normal(size=(4, 2)), np.array([0, 1, 2, 0]), np.array([0, 1, -1] * 3))
+    source = {"track": 'a "quoted" \\ name\n', "Umlaut": "Zürich \x7f"}
+    sensor = SensorInfo(range_max=15.0, fov=1.9)
+    return Log(
+        Odometry(t, rng.normal(size=(11, 3))), cycles, np.array([0.1, 0.2, 1e-5]), sensor, source, truth
+    )
+
+
+def assert_same(a: Log, b: Log) -> None:
+    np.testing.assert_array_equal(a.odometry.t, b.odometry.t)
+    np.testing.assert_array_equal(a.odometry.twist, b.odometry.twist)
+    np.testing.assert_array_equal(a.odometry_sigma, b.odometry_sigma)
+    assert a.sensor == b.sensor
+    assert dict(a.source) == dict(b.source)
+    assert len(a.cycles) == len(b.cycles)
+    for one, other in zip(a.cycles, b.cycles, strict=True):
+        assert one.t == other.t
+        np.testing.assert_array_equal(one.points_vehicle, other.points_vehicle)
+        np.testing.assert_array_equal(one.covariances, other.covariances)
+        np.testing.assert_array_equal(one.labels, other.labels)
+    if a.truth is None or b.truth is None:
+        assert a.truth is b.truth
+        return
+    for name in ("pose_t", "poses", "cones", "cone_labels", "associations"):
+        np.testing.assert_array_equal(getattr(a.truth, name), getattr(b.truth, name))
+
+
+def test_round_trip_is_exact(tmp_path: Path) -> None:
+    log = small_log()
+    write_log(log, tmp_path / "log")
+    assert_same(read_log(tmp_path / "log"), log)
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(twist=arrays(float, (4, 3), elements=FINITE), point=arrays(float, (2,), elements=FINITE), t0=FINITE)
+def test_round_trip_is_exact_for_any_numbers(
+    twist: np.ndarray, point: np.ndarray, t0: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("log") / "log"
+    t = t0 + np.arange(4.0)
+    cycle = Detections(t0 + 0.3, point[None], np.array([[[0.1, 0.02], [0.02, 0.3]]]), np.array([RIGHT]))
+    log = Log(Odometry(t, twist), (cycle,), np.ones(3))
+    write_log(log, folder)
+    assert_same(read_log(folder), log)
+
+
+def test_second_write_keeps_the_first(tmp_path: Path) -> None:
+    log = small_log()
+    write_log(log, tmp_path / "log")
+    write_log(log, tmp_path / "log")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["log", "log.~1~"]
+    assert_same(read_log(tmp_path / "log.~1~"), log)
+
+
+def test_write_refuses_a_foreign_folder(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("precious")
+    with pytest.raises(OutputError, match=r"log\.toml"):
+        write_log(small_log(), tmp_path)
+    assert (tmp_path / "mine.txt").read_text() == "precious"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A hand-written log of two odometry rows and two detections, without truth."""
+    (tmp_path / "log.toml").write_text('format = "pathspace-log/1"\n[odometry]\nsigma = [0.1, 0.1, 0.01]\n')
+    (tmp_path / "odometry.csv").write_text("t,vx,vy,wz\n0,1,0,0\n0.5,1,0,0.1\n")
+    (tmp_path / "detections.csv").write_text(
+        "t,x,y,label,xx,xy,yy\n0,3,1,left,0.1,0,0.1\n0.1,4,-1,right,0.1,0,0.1\n"
+    )
+    return tmp_path
+
+
+def test_minimal_log(folder: Path) -> None:
+    log = read_log(folder)
+    assert log.truth is None
+    assert log.sensor == SensorInfo()
+    assert [cycle.t for cycle in log.cycles] == [0.0, 0.1]
+    assert [cycle.labels.tolist() for cycle in log.cycles] == [[LEFT], [RIGHT]]
+
+
+def test_columns_may_be_in_any_order_with_more_of_them_and_in_any_dress(folder: Path) -> None:
+    text = 'label,extra, yy ,xy,xx,y,x,t\r\n"blue",?,0.1,0,0.2, 1 ,"3",0\r\nYellow,,0.1,0,0.2,-1,3,0\r\n\r\n'
+    text += "cone?,,0.1,0,0.2,-1,3,0.1\r\n"
+    (folder / "detections.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
+    log = read_log(folder)
+    assert [cycle.labels.tolist() for cycle in log.cycles] == [[LEFT, RIGHT], [UNKNOWN]]
+    np.testing.assert_array_equal(log.cycles[0].points_vehicle, [[3, 1], [3, -1]])
+    np.testing.assert_array_equal(log.cycles[0].covariances[0], [[0.2, 0], [0, 0.1]])
+
+
+def test_no_detections_is_a_log_without_cycles(folder: Path) -> None:
+    (folder / "detections.csv").write_text("t,x,y,label,xx,xy,yy\n")
+    assert read_log(folder).cycles == ()
+
+
+@pytest.mark.parametrize("name", ["log.toml", "odometry.csv", "detections.csv"])
+def test_missing_or_empty_file(folder: Path, name: str) -> None:
+    (folder / name).write_text("")
+    with pytest.raises(InputError, match=f"{name}.*expected"):
+        read_log(folder)
+    (folder / name).unlink()
+    with pytest.raises(InputError, match=f"{name}: expected a file, found none"):
+        read_log(folder)
+
+
+def test_missing_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected a log folder"):
+        read_log(tmp_path / "absent")
+
+
+BAD_ROWS = [
+    ("odometry.csv", "t,vx,vy,wz\n", 2, "at least one reading"),
+    ("odometry.csv", "t,vx,vy\n0,1,0\n", 1, "column 'wz'"),
+    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.5,fast,0,0\n", 3, "number in column 'vx', found 'fast'"),
+    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.5,1,nan,0\n", 3, "finite number in column 'vy'"),
+    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.5,1,0,-inf\n", 3, "finite number in column 'wz'"),
+    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1,1,0,0\n1,1,0,0\n", 4, "later than the row before"),
+    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1,1,0,0\n0.5,1,0,0\n", 4, "later than the row before"),
+    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n\n1,1,0\n", 4, "expected 4 fields, found 3"),
+    ("odometry.csv", "t,vx,vy,wz\n0,1,,0\n", 2, "number in column 'vy', found ''"),
+    ("odometry.csv", "t,vx,vy,wz,t\n0,1,0,0,0\n", 1, "more than one"),
+    ("detections.csv", "t,x,y,label,xx,xy\n", 1, "column 'yy'"),
+    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,?,1,left,1,0,1\n", 2, "number in column 'x'"),
+    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,3,1,left,1,0,1\n0,3,inf,left,1,0,1\n", 3, "finite"),
+    ("detections.csv", "t,x,y,label,xx,xy,yy\n0.2,3,1,left,1,0,1\n0.1,3,1,left,1,0,1\n", 3, "not earlier"),
+    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,3,1,left,1,0,1\n0,3,1,left,1,2,1\n", 3, "positive definite"),
+    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,3,1,left,1,1,1\n", 2, "positive definite"),
+    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,3,1,left,-1,0,-1\n", 2, "positive definite"),
+    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,3,1,left,0,0,0\n", 2, "positive definite"),
+    ("detections.csv", "t,x,y,label,xx,xy,yy\n-0.1,3,1,left,1,0,1\n", 2, "before the first odometry"),
+    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,3,1,left,1,0,1\n1.6,3,1,left,1,0,1\n", 3, "after the last"),
+    ("truth_poses.csv", "t,x,y,theta\n0,0,0,0\n0,0,0,0\n", 3, "later than the row before"),
+    ("truth_cones.csv", "x,y,label\n0,word,left\n", 2, "number in column 'y'"),
+    ("truth_associations.csv", "cone\n-1\n0\n", 3, "-1 or the index"),
+    ("truth_associations.csv", "cone\n-1\n-1.5\n", 3, "-1 or the index"),
+    ("truth_associations.csv", "cone\n-1\n", None, "each of 2 detections"),
+    ("log.toml", 'format = "pathspace-log/1"\n[odometry]\nsigma = [\n', None, "expected TOML"),
+    ("log.toml", 'format = "pathspace-log/1"\n[odometry\n', 2, "expected TOML"),
+    ("log.toml", 'format = "pathspace-log/2"\n[odometry]\nsigma = [1, 1, 1]\n', None, "pathspace-log/1"),
+    ("log.toml", 'format = "pathspace-log/1"\n[sensor]\nfov = 1\n', None, "sigma"),
+    ("log.toml", 'format = "pathspace-log/1"\nodometry = 3\n', None, "section"),
+    ("log.toml", 'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1]\n', None, "three positive"),
+    ("log.toml", 'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 0, 1]\n', None, "three positive"),
+    ("log.toml", 'format = "pathspace-log/1"\n[odometry]\nsigma = [1, nan, 1]\n', None, "three positive"),
+    ("log.toml", 'format = "pathspace-log/1"\n[odometry]\nsigma = [1, "a", true]\n', None, "three positive"),
+    (
+        "log.toml",
+        'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1, 1]\n[sensor]\nfov = "wide"\n',
+        None,
+        "fov",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "row", "message"), BAD_ROWS)
+def test_bad_content_is_told_with_file_and_row(
+    folder: Path, name: str, text: str, row: int | None, message: str
+) -> None:
+    (folder / name).write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_log(folder)
+    assert caught.value.file == folder / name
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+    if row is not None:
+        assert caught.value.row == row
+
+
+@pytest.mark.parametrize("spoil", [lambda b: b"\xff\xfe" + b, lambda b: b + b"\x80\n"])
+def test_binary_content_is_bad_input(folder: Path, spoil: Callable[[bytes], bytes]) -> None:
+    for name in ("log.toml", "odometry.csv", "detections.csv"):
+        good = (folder / name).read_bytes()
+        (folder / name).write_bytes(spoil(good))
+        with pytest.raises(InputError, match=name):
+            read_log(folder)
+        (folder / name).write_bytes(good)
+
+
+def test_last_twist_is_held_for_a_while(folder: Path) -> None:
+    (folder / "detections.csv").write_text("t,x,y,label,xx,xy,yy\n1.4,3,1,left,1,0,1\n")
+    assert read_log(folder).cycles[0].t == 1.4

@@ -1,0 +1,253 @@
+"""Maps on disk: the contract of FORMATS, held against scipy and against everything a bad file may hold."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.interpolate import BSpline as ScipyBSpline
+
+from pathspace_graph.errors import InputError, OutputError
+from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, map_from_json, map_to_json, read_map
+from pathspace_graph.io.results import CycleRecord, RunResult, write_result
+from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.spline.bspline import BSpline
+
+
+def covariance(size: int, seed: int) -> np.ndarray:
+    root = np.random.default_rng(seed).normal(0.0, 0.1, (2 * size, 2 * size))
+    return root @ root.T
+
+
+def closed_spline(seed: int = 0, m: int = 9) -> BSpline:
+    rng = np.random.default_rng(seed)
+    angle = np.arange(m) * 2 * np.pi / m
+    points = 30.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1) + rng.normal(0.0, 1.0, (m, 2))
+    return BSpline.periodic_from(np.concatenate([[0.0], np.cumsum(rng.uniform(5.0, 30.0, m))]), points)
+
+
+def spline_map() -> Map:
+    rng = np.random.default_rng(1)
+    opened = BSpline.clamped_from(np.linspace(0.0, 50.0, 6), rng.normal(0.0, 20.0, (7, 2)), degree=2)
+    return Map(
+        closed=True,
+        boundaries={
+            RIGHT: SplineBoundary(opened, covariance(7, 2)),
+            LEFT: SplineBoundary(closed_spline(), covariance(9, 3)),
+        },
+    )
+
+
+def result() -> RunResult:
+    rng = np.random.default_rng(4)
+    return RunResult(
+        estimator="fixed-lag",
+        settings={},
+        laps=1,
+        map=spline_map(),
+        trajectory_t=np.array([0.1, 0.2, 1 / 3]),
+        trajectory=np.column_stack([rng.normal(0.0, 10.0, (3, 2)), [0.0, np.pi, -3.0]]),
+        cycles=(
+            CycleRecord(0, 0.1, 1e-3, 0, 4, 7, 1),
+            CycleRecord(1, 0.2, np.float64(2e-3), 9, 7, 12, 2),
+        ),
+    )
+
+
+def test_scipy_evaluates_the_written_map_the_same() -> None:
+    track = spline_map()
+    written = json.loads(json.dumps(map_to_json(track)))
+    for name, label in (("left", LEFT), ("right", RIGHT)):
+        content, boundary = written["boundaries"][name], track.boundaries[label]
+        assert isinstance(boundary, SplineBoundary)
+        knots, points, degree = (np.array(content[key]) for key in ("knots", "control_points", "degree"))
+        n = len(points)
+        assert len(knots) == n + degree + 1
+        u = np.linspace(knots[degree], knots[n], 101)
+        np.testing.assert_allclose(
+            ScipyBSpline(knots, points, int(degree))(u), boundary.spline.evaluate(u), atol=1e-12
+        )
+
+
+def test_a_periodic_boundary_repeats_its_first_control_points_and_counts_them_once() -> None:
+    content = map_to_json(spline_map())["boundaries"]["left"]
+    assert content["periodic"] is True
+    assert len(content["control_points"]) == 9 + 3
+    assert content["control_points"][-3:] == content["control_points"][:3]
+    assert content["size"] == 9
+    assert np.shape(content["covariance"]) == (18, 18)
+
+
+def test_what_is_written_is_read_back_exactly(tmp_path: Path) -> None:
+    original = result()
+    write_result(tmp_path / "map", original, {})
+    track = read_map(tmp_path / "map")
+    assert track.closed and track.size == 16 and sorted(track.boundaries) == [LEFT, RIGHT]
+    for label, boundary in original.map.boundaries.items():
+        read = track.boundaries[label]
+        assert isinstance(read, SplineBoundary) and isinstance(boundary, SplineBoundary)
+        np.testing.assert_array_equal(read.spline.knots, boundary.spline.knots)
+        np.testing.assert_array_equal(read.spline.control_points, boundary.spline.control_points)
+        np.testing.assert_array_equal(read.covariance, boundary.covariance)
+        assert (read.spline.degree, read.spline.periodic) == (
+            boundary.spline.degree,
+            boundary.spline.periodic,
+        )
+
+
+def test_a_map_of_points_and_an_empty_one_make_the_round_trip() -> None:
+    points = np.random.default_rng(5).normal(0.0, 10.0, (4, 2))
+    original = Map(False, {RIGHT: PointBoundary(points, covariance(4, 6)), LEFT: _no_points()})
+    track = map_from_json(json.loads(json.dumps(map_to_json(original))))
+    right = track.boundaries[RIGHT]
+    assert isinstance(right, PointBoundary)
+    np.testing.assert_array_equal(right.points, points)
+    assert (track.size, track.boundaries[LEFT].size) == (4, 0)
+    assert map_from_json(map_to_json(Map(False, {}))).size == 0
+
+
+def _no_points() -> PointBoundary:
+    return PointBoundary(np.zeros((0, 2)), np.zeros((0, 0)))
+
+
+def test_the_folder_holds_the_four_files_of_the_contract(tmp_path: Path) -> None:
+    original = result()
+    summary = {
+        "estimator": "fixed-lag",
+        "ate": np.float64(np.nan),
+        "laps": [{"lap": np.int64(1), "rmse": 0.5}],
+    }
+    write_result(tmp_path / "map", original, summary)
+    assert {file.name for file in (tmp_path / "map").iterdir()} == {
+        "map.json",
+        "trajectory.tum",
+        "cycles.csv",
+        "summary.json",
+    }
+    rows = (tmp_path / "map" / "cycles.csv").read_text().splitlines()
+    assert rows[:2] == ["cycle,t,seconds,size_left,size_right,readings,lap", "0,0.1,0.001,0,4,7,1"]
+    assert rows[2] == "1,0.2,0.002,9,7,12,2"
+    read = json.loads((tmp_path / "map" / "summary.json").read_text())
+    assert read == {"estimator": "fixed-lag", "ate": None, "laps": [{"lap": 1, "rmse": 0.5}]}
+
+
+def test_the_trajectory_keeps_every_digit_and_its_heading(tmp_path: Path) -> None:
+    original = result()
+    write_result(tmp_path / "map", original, {})
+    rows = np.loadtxt(tmp_path / "map" / "trajectory.tum")
+    np.testing.assert_array_equal(rows[:, 0], original.trajectory_t)
+    np.testing.assert_array_equal(rows[:, 1:3], original.trajectory[:, :2])
+    np.testing.assert_array_equal(rows[:, 3:6], 0.0)
+    np.testing.assert_allclose(2 * np.arctan2(rows[:, 6], rows[:, 7]), original.trajectory[:, 2], atol=1e-15)
+
+
+def test_a_second_result_keeps_the_first_and_a_foreign_folder_is_left_alone(tmp_path: Path) -> None:
+    write_result(tmp_path / "map", result(), {"run": 1})
+    write_result(tmp_path / "map", result(), {"run": 2})
+    assert json.loads((tmp_path / "map.~1~" / "summary.json").read_text()) == {"run": 1}
+    foreign = tmp_path / "thesis"
+    foreign.mkdir()
+    (foreign / "chapter.tex").write_text("years of work")
+    with pytest.raises(OutputError):
+        write_result(foreign, result(), {})
+    assert [file.name for file in foreign.iterdir()] == ["chapter.tex"]
+
+
+def test_nothing_is_left_of_a_result_that_can_not_be_written(tmp_path: Path) -> None:
+    with pytest.raises(TypeError):
+        write_result(tmp_path / "map", result(), {"bad": object()})
+    assert list(tmp_path.iterdir()) == []
+
+
+Change = Callable[[Any], None]
+
+
+def _set(path: str, value: Any) -> Change:
+    def change(content: Any) -> None:
+        *parents, last = path.split(".")
+        for key in parents:
+            content = content[key]
+        content[last] = value
+
+    return change
+
+
+def _delete(path: str) -> Change:
+    def change(content: Any) -> None:
+        *parents, last = path.split(".")
+        for key in parents:
+            content = content[key]
+        del content[last]
+
+    return change
+
+
+def _change_first(path: str, value: Any) -> Change:
+    def change(content: Any) -> None:
+        for key in path.split("."):
+            content = content[key]
+        content[0] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (_set("format", "pathspace-map/9"), "pathspace-map/1"),
+        (_delete("format"), "pathspace-map/1"),
+        (_delete("closed"), "closed"),
+        (_set("closed", 1), "closed"),
+        (_set("boundaries", []), "boundaries"),
+        (_set("boundaries.middle", {}), "middle"),
+        (_set("boundaries.left", 3), "boundaries.left"),
+        (_delete("boundaries.left.degree"), "boundaries.left.degree"),
+        (_set("boundaries.left.degree", 0), "boundaries.left.degree"),
+        (_set("boundaries.left.degree", 2.5), "boundaries.left.degree"),
+        (_set("boundaries.left.degree", True), "boundaries.left.degree"),
+        (_set("boundaries.left.periodic", "no"), "boundaries.left.periodic"),
+        (_set("boundaries.left.knots", [0.0, 1.0]), "boundaries.left"),
+        (_change_first("boundaries.left.knots", 1e9), "boundaries.left"),
+        (_change_first("boundaries.left.knots", "x"), "boundaries.left.knots"),
+        (_change_first("boundaries.left.knots", float("nan")), "boundaries.left.knots"),
+        (_set("boundaries.left.control_points", []), "boundaries.left"),
+        (_set("boundaries.left.control_points", {}), "boundaries.left.control_points"),
+        (_change_first("boundaries.left.control_points", [1.0]), "boundaries.left.control_points"),
+        (_change_first("boundaries.left.control_points", [99.0, 0.0]), "boundaries.left"),
+        (_set("boundaries.left.size", 12), "boundaries.left.size"),
+        (_delete("boundaries.left.covariance"), "boundaries.left.covariance"),
+        (_set("boundaries.left.covariance", [[1.0]]), "boundaries.left.covariance"),
+        (_set("boundaries.left.covariance", np.eye(18)[:17].tolist()), "boundaries.left.covariance"),
+        (_set("boundaries.left.covariance", (np.eye(18) + np.eye(18, k=1)).tolist()), "symmetric"),
+        (_set("boundaries.left.covariance", (-np.eye(18)).tolist()), "positive"),
+    ],
+)
+def test_a_bad_map_is_refused_by_name(tmp_path: Path, change: Change, named: str) -> None:
+    content = copy.deepcopy(map_to_json(spline_map()))
+    change(content)
+    (tmp_path / "map.json").write_text(json.dumps(content))
+    with pytest.raises(InputError) as refusal:
+        read_map(tmp_path)
+    assert named in str(refusal.value)
+    assert refusal.value.file == tmp_path / "map.json"
+    assert "\n" not in str(refusal.value)
+
+
+def test_what_is_no_map_at_all_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"map\.json"):
+        read_map(tmp_path / "nowhere")
+    (tmp_path / "map.json").write_text('{\n"format": \n')
+    with pytest.raises(InputError, match="JSON") as refusal:
+        read_map(tmp_path)
+    assert refusal.value.row == 3
+    (tmp_path / "map.json").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="UTF-8"):
+        read_map(tmp_path)
+    (tmp_path / "map.json").write_text("[1, 2]")
+    with pytest.raises(InputError, match="object"):
+        read_map(tmp_path)

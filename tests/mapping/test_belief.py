@@ -1,0 +1,98 @@
+"""The filters' state: prediction, update, new points, changes of basis, by Monte Carlo and by algebra."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
+from pathspace_graph.mapping.belief import Belief, compose_rows, point_columns, to_map_rows, to_vehicle_rows
+
+Array = NDArray[np.float64]
+
+
+def belief_with_points(seed: int = 0) -> Belief:
+    """A pose and three points, all correlated, and a calibration."""
+    rng = np.random.default_rng(seed)
+    calibration = np.array([0.05, 0.04])
+    belief = Belief(np.array([1.0, -2.0, 0.4]), np.diag([0.2, 0.1, 0.03]) ** 2, calibration)
+    belief.sight(rng.normal(scale=5.0, size=(3, 2)), np.tile(0.04 * np.eye(2), (3, 1, 1)))
+    return belief
+
+
+def half_a_second() -> IntegratedOdometry:
+    return integrate_twists(np.full(25, 0.02), np.tile([6.0, 0.1, 0.8], (25, 1)), np.array([0.5, 0.3, 0.2]))
+
+
+def test_prediction_has_the_moments_of_a_sample() -> None:
+    belief, odometry, rng = belief_with_points(), half_a_second(), np.random.default_rng(1)
+    sample = rng.multivariate_normal(belief.mean, belief.covariance, 200_000)
+    noise = rng.multivariate_normal(np.zeros(3), odometry.covariance, 200_000)
+    moved = sample.copy()
+    error = noise - sample[:, 3:5] @ odometry.calibration_jacobian.T
+    moved[:, :3] = compose_rows(compose_rows(sample[:, :3], odometry.delta), error)
+    belief.predict(odometry)
+    np.testing.assert_allclose(belief.mean, moved.mean(axis=0), atol=3e-3)
+    np.testing.assert_allclose(belief.covariance, np.cov(moved.T), atol=1e-3)
+
+
+def test_new_points_are_where_the_vehicle_sees_them_with_its_uncertainty() -> None:
+    pose, covariance = np.array([1.0, -2.0, 0.4]), np.diag([0.2, 0.1, 0.03]) ** 2
+    belief, reading = Belief(pose, covariance), np.array([[8.0, 1.0]])
+    belief.sight(reading, 0.04 * np.eye(2)[None])
+    rng = np.random.default_rng(2)
+    poses = rng.multivariate_normal(pose, covariance, 200_000)
+    placed = to_map_rows(poses, rng.multivariate_normal(reading[0], 0.04 * np.eye(2), 200_000))
+    uncalibrated = np.delete(np.delete(belief.covariance, [3, 4], 0), [3, 4], 1)
+    np.testing.assert_allclose(uncalibrated, np.cov(np.hstack([poses, placed]).T), atol=2e-3)
+
+
+def test_the_views_of_map_and_vehicle_are_inverse() -> None:
+    rng = np.random.default_rng(3)
+    poses, points = rng.normal(size=(6, 3)), rng.normal(size=(6, 8))
+    np.testing.assert_allclose(to_vehicle_rows(poses, to_map_rows(poses, points)), points, atol=1e-12)
+
+
+def test_a_linear_update_is_the_kalman_filter() -> None:
+    """P - P H' (H P H' + R)^-1 H P, and the mean that goes with it."""
+    belief, rng = belief_with_points(), np.random.default_rng(4)
+    columns, matrix, noise = point_columns(np.array([0, 2])), rng.normal(size=(3, 4)), 0.01 * np.eye(3)
+    full = np.zeros((3, len(belief.mean)))
+    full[:, columns] = matrix
+    mean, covariance, measured = belief.mean.copy(), belief.covariance.copy(), rng.normal(size=3)
+    gain = covariance @ full.T @ np.linalg.inv(full @ covariance @ full.T + noise)
+    belief.update(columns, lambda x: x @ matrix.T, measured, noise)
+    np.testing.assert_allclose(belief.mean, mean + gain @ (measured - full @ mean), atol=1e-9)
+    np.testing.assert_allclose(belief.covariance, covariance - gain @ full @ covariance, atol=1e-9)
+
+
+def test_a_change_of_points_is_exact_and_leaves_the_rest() -> None:
+    belief = belief_with_points()
+    before, covariance = belief.mean.copy(), belief.covariance.copy()
+    matrix = np.array([[0.5, 0.5], [0.0, 1.0], [1.5, -0.5]])
+    belief.change(0, 2, matrix, np.zeros(3))
+    full = np.zeros((13, 11))
+    full[:5, :5], full[11:, 9:], full[5:11, 5:9] = np.eye(5), np.eye(2), np.kron(matrix, np.eye(2))
+    np.testing.assert_allclose(belief.mean, full @ before, atol=1e-12)
+    np.testing.assert_allclose(belief.covariance, full @ covariance @ full.T, atol=1e-12)
+
+
+def test_reordering_keeps_each_point_with_its_covariance() -> None:
+    belief = belief_with_points()
+    point, block = belief.points[2].copy(), belief.covariance[9:11, :3].copy()
+    belief.reorder(np.array([2, 0]))
+    assert belief.points.shape == (2, 2)
+    np.testing.assert_array_equal(belief.points[0], point)
+    np.testing.assert_array_equal(belief.covariance[5:7, :3], block)
+
+
+def test_readings_of_a_known_point_fix_the_pose() -> None:
+    belief = Belief(np.array([0.3, -0.2, 0.01]), np.diag([0.5, 0.5, 0.02]) ** 2)
+    known = np.array([[10.0, 2.0], [9.0, -2.0]])
+    belief.mean = np.concatenate([belief.mean, known.ravel()])
+    belief.covariance = np.pad(belief.covariance, (0, 4)) + 1e-8 * np.eye(9)
+    columns = np.concatenate([np.arange(3), point_columns(np.arange(2))])
+    for _ in range(3):
+        belief.update(columns, lambda x: to_vehicle_rows(x[:, :3], x[:, 3:]), known.ravel(), 1e-6 * np.eye(4))
+    assert np.abs(belief.pose) == pytest.approx(0.0, abs=5e-3)

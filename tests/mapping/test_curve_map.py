@@ -1,0 +1,152 @@
+"""Rows of the curves: readings across the curve or in both directions, and the weak priors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.graph.keys import POSE
+from pathspace_graph.graph.rows import Rows
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
+from pathspace_graph.spline.boundary import open_boundary
+
+from ..scenes.drives import ODOMETRY_SIGMA, ahead, corridor, exact_log, map_log
+
+Array = NDArray[np.float64]
+
+ACROSS = MapperSettings()
+POINT = MapperSettings(spline=SplineSettings(residual="point"))
+
+
+@pytest.fixture(scope="module")
+def mapper() -> FixedLagMapper:
+    """After a straight drive without noise, its poses then put 0.6 m aside, beyond Huber's threshold."""
+    found, _ = map_log(exact_log(ahead(6.0, 6.0), *corridor(60.0)))
+    found.poses[:, :2] += [0.2, 0.6]
+    return found
+
+
+def rows_of(mapper: FixedLagMapper, settings: MapperSettings) -> Rows:
+    smoother = mapper.smoother
+    track = CurveMap(settings, smoother.map.state)
+    track.readings = smoother.map.readings
+    return track.rows(np.arange(smoother.first_cycle, smoother.next_cycle))[0]
+
+
+def test_an_offset_is_two_rows_whose_part_across_the_curve_is_the_distance_s(mapper: FixedLagMapper) -> None:
+    """Of round readings on a straight curve: by pose, by control points, residual and robust weight."""
+    across, point = rows_of(mapper, ACROSS), rows_of(mapper, POINT)
+    assert len(across.residual) > 50 and np.abs(across.residual).min() > 1.5
+    np.testing.assert_array_equal(point.keys, np.repeat(across.keys, 2, axis=0))
+    np.testing.assert_array_equal(point.owner, np.repeat(across.owner, 2))
+    normal = across.jacobian[:, :2] / np.linalg.norm(across.jacobian[:, :2], axis=1)[:, None]
+    jacobian = point.jacobian.reshape(len(normal), 2, -1)
+    residual = point.residual.reshape(-1, 2)
+    np.testing.assert_allclose(np.einsum("mi,mij->mj", normal, jacobian), across.jacobian, atol=1e-6)
+    np.testing.assert_allclose(np.sum(normal * residual, axis=1), across.residual, atol=1e-6)
+
+
+def test_an_offset_holds_the_vehicle_along_a_straight_curve_and_a_distance_does_not(
+    mapper: FixedLagMapper,
+) -> None:
+    along = np.zeros(POSE)
+    along[0] = 1.0
+    assert np.abs(rows_of(mapper, ACROSS).jacobian[:, :POSE] @ along).max() < 1e-3
+    assert np.linalg.norm(rows_of(mapper, POINT).jacobian[:, :POSE] @ along) > 5.0
+
+
+def test_a_reading_that_slides_to_where_an_open_map_is_inactive_brings_all_of_it_back() -> None:
+    found, _ = map_log(exact_log(ahead(6.0, 9.0), *corridor(80.0)))
+    smoother, state = found.smoother, found.smoother.map.state
+    readings = smoother.map.readings
+    assert not state.whole and len(smoother.inactive) > 0
+    rows, size = int(readings.used.sum()), smoother.layout.size
+    reading = np.flatnonzero(readings.used)[-1]
+    readings.u[reading], readings.changed[reading] = 1.0, True
+    smoother.step(found.settings.sigma_step)
+    assert state.whole and len(smoother.inactive) == 0
+    assert smoother.layout.size > size
+    cycles = np.arange(smoother.first_cycle, smoother.next_cycle)
+    assert sum(map(len, smoother.map.rows(cycles))) == rows
+
+
+def test_rows_are_the_derivatives_of_the_distances(mapper: FixedLagMapper) -> None:
+    """By every variable of the map at once; 0.6 m aside Huber's weight is not 1, so it is held."""
+    free = replace(ACROSS, gate=replace(ACROSS.gate, huber=1e9))
+    variables, layout = mapper.smoother.variables, mapper.smoother.variables.layout
+    rows = rows_of(mapper, free)
+    dense = np.zeros((len(rows), layout.size))
+    np.put_along_axis(dense, rows.columns(layout), rows.jacobian, axis=1)
+    rng, x = np.random.default_rng(0), variables.values.copy()
+    for _ in range(5):
+        along = rng.normal(size=layout.size)
+        sides = []
+        for step in (1e-5, -1e-5):
+            variables.values[:] = x + step * along
+            sides.append(rows_of(mapper, free).residual)
+        variables.values[:] = x
+        numeric = (sides[0] - sides[1]) / 2e-5
+        np.testing.assert_allclose(dense @ along, numeric, atol=1e-4 * np.abs(numeric).max())
+
+
+def test_rows_of_some_cycles_are_those_of_the_whole_window(mapper: FixedLagMapper) -> None:
+    smoother = mapper.smoother
+    every = smoother.map.rows(np.arange(smoother.first_cycle, smoother.next_cycle))[0]
+    some = np.array([smoother.first_cycle, smoother.first_cycle + 3, smoother.next_cycle - 1])
+    rows, own = smoother.map.rows(some)[0], np.isin(every.owner, some)
+    assert 0 < own.sum() < len(own)
+    np.testing.assert_array_equal(rows.keys, every.keys[own])
+    np.testing.assert_allclose(rows.jacobian, every.jacobian[own], atol=1e-12)
+    np.testing.assert_allclose(rows.residual, every.residual[own], atol=1e-12)
+
+
+def test_a_boundary_of_two_control_points_has_no_second_differences() -> None:
+    """A curve of degree 1 whose first two cones are nearer than its spacing."""
+    settings = replace(MapperSettings(), spline=SplineSettings(degree=1))
+    track = CurveMap(settings)
+    boundary = open_boundary(settings.spline, settings.gauge)
+    points = boundary.grow(np.zeros((0, 2)), np.array([0.0, 2.0]), np.array([[0.0, 2.0], [2.0, 2.0]]))
+    track.state.add_boundary(BOUNDARIES[0], boundary, points)
+    assert boundary.size == 2
+    smooth, anchors = track.linear_gauge(False)
+    assert (len(smooth), len(anchors), len(track.gauge(False)[0])) == (0, 4, 1)
+
+
+def gauge_energy(mapper: FixedLagMapper, boundary_points: dict[int, Array]) -> float:
+    """`1/2 sum (|c_{j+1} - c_j| / h - 1)^2 / sigma^2 + 1/2 sum |c_{j+1} - 2 c_j + c_{j-1}|^2 / (sigma h)^2`,
+    which is what the weak priors come to on even knots; h their interval."""
+    gauge, energy = mapper.settings.gauge, 0.0
+    for points in boundary_points.values():
+        h = mapper.settings.spline.spacing
+        lengths = np.hypot(*np.diff(points, axis=0).T)
+        energy += 0.5 * float(np.sum(((lengths / h - 1.0) / gauge.sigma_spacing) ** 2))
+        bent = np.diff(points, n=2, axis=0)
+        energy += 0.5 * float(np.sum(bent**2)) / (gauge.sigma_smoothness * h) ** 2
+    return energy
+
+
+def test_the_weak_priors_are_the_spacing_s_and_the_second_differences(mapper: FixedLagMapper) -> None:
+    """On even knots; and nothing comes from the anchors, which hold each point where it is."""
+    track, rng = CurveMap(ACROSS, mapper.smoother.map.state.copy()), np.random.default_rng(1)
+    for label in BOUNDARIES:
+        track.state.control_points(label)[:] += 0.3 * rng.normal(size=(track.state.boundaries[label].size, 2))
+    groups = [*track.gauge(True), *track.linear_gauge(True)]
+    energy = 0.5 * sum(float(rows.residual @ rows.residual) for rows in groups)
+    points = {label: track.state.control_points(label) for label in BOUNDARIES}
+    assert energy == pytest.approx(gauge_energy(mapper, points), rel=1e-9)
+
+
+def test_a_drive_without_noise_is_mapped_with_either() -> None:
+    log = exact_log(ahead(6.0, 5.0), *corridor(50.0))
+    for settings in (ACROSS, replace(POINT, lag=1.0)):
+        found, _ = map_log(log, FixedLagMapper(settings, ODOMETRY_SIGMA))
+        for boundary in found.map().boundaries.values():
+            curve = boundary.spline.evaluate(np.linspace(*boundary.spline.domain, 50))
+            np.testing.assert_allclose(np.abs(curve[:, 1]), 2.0, atol=0.02)
+        assert set(found.map().boundaries) == set(BOUNDARIES)

@@ -1,0 +1,349 @@
+"""Loop closing: where it must happen, where it mustn't, and what it may change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.eval.metrics.table1 import cone_distances
+from pathspace_graph.factors.projection import to_map
+from pathspace_graph.graph.gaussian import keys_of, normal_equations
+from pathspace_graph.graph.keys import control_keys
+from pathspace_graph.graph.variables import Layout
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.map import SplineBoundary
+from pathspace_graph.labels import LEFT
+from pathspace_graph.mapping.registration import Matches, Registration, _certain, near_start, register
+from pathspace_graph.mapping.seam import Join, join
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.online.simplification import substitute
+from pathspace_graph.run import CycleResult, split_odometry
+from pathspace_graph.settings.knots import Knots
+from pathspace_graph.settings.mapper import ClosingSettings, MapperSettings
+from pathspace_graph.spline.boundary import relocate
+
+from ..scenes.drives import (
+    ODOMETRY_SIGMA,
+    ahead,
+    bean_track,
+    corridor,
+    exact_log,
+    lap_log,
+    map_log,
+    true_poses,
+)
+
+Array = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return lap_log(bean_track(), overrun=45.0)
+
+
+@pytest.fixture(scope="module")
+def run(log: Log) -> tuple[FixedLagMapper, list[CycleResult]]:
+    """The whole drive."""
+    return map_log(log)
+
+
+@pytest.fixture
+def before(log: Log, run: tuple[FixedLagMapper, list[CycleResult]]) -> FixedLagMapper:
+    """The mapper a cycle before it closed; each test has its own."""
+    cycle = next(k for k, result in enumerate(run[1]) if result.closed)
+    mapper, results = map_log(replace(log, cycles=log.cycles[:cycle]))
+    assert not results[-1].closed
+    return mapper
+
+
+@pytest.fixture(scope="module")
+def just_closed(log: Log, run: tuple[FixedLagMapper, list[CycleResult]]) -> FixedLagMapper:
+    """The mapper after the cycle that closed it."""
+    cycle = next(k for k, result in enumerate(run[1]) if result.closed)
+    return map_log(replace(log, cycles=log.cycles[: cycle + 1]))[0]
+
+
+def test_the_loop_closes_once_the_beginning_is_driven_again(
+    log: Log, run: tuple[FixedLagMapper, list[CycleResult]]
+) -> None:
+    mapper, results = run
+    assert mapper.closed
+    assert mapper.map().closed
+    closed = [result.closed for result in results]
+    assert closed == sorted(closed)
+    lap = bean_track().centre_line.length
+    driven = np.cumsum(np.hypot(*np.diff(true_poses(log)[:, :2], axis=0).T))
+    assert driven[closed.index(True) - 1] > lap
+
+
+def test_closed_boundaries_are_periodic_and_of_their_final_size(
+    log: Log, run: tuple[FixedLagMapper, list[CycleResult]], before: FixedLagMapper
+) -> None:
+    mapper, results = run
+    track = mapper.map()
+    assert log.truth is not None
+    assert track.size <= 0.44 * len(log.truth.cones)
+    assert track.size < before.map().size
+    assert len({result.sizes for result in results if result.closed}) == 1
+    for boundary in track.boundaries.values():
+        assert isinstance(boundary, SplineBoundary)
+        assert boundary.spline.periodic
+        assert boundary.covariance.shape == (2 * boundary.size, 2 * boundary.size)
+        assert np.linalg.eigvalsh(boundary.covariance)[0] > 0.0
+
+
+def test_a_closed_curve_has_no_seam(run: tuple[FixedLagMapper, list[CycleResult]]) -> None:
+    """Position, direction and curvature go on where the ends met."""
+    for boundary in run[0].map().boundaries.values():
+        assert isinstance(boundary, SplineBoundary)
+        low, high = boundary.spline.domain
+        for derivative in range(3):
+            ends = [boundary.spline.to_scipy()(u, nu=derivative) for u in (low, high - 1e-9)]
+            np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("when", ["just_closed", "run"])
+def test_the_closed_curves_pass_the_cones(log: Log, when: str, request: pytest.FixtureRequest) -> None:
+    """Right after closing, and after more driving."""
+    mapper = request.getfixturevalue(when)
+    mapper = mapper[0] if isinstance(mapper, tuple) else mapper
+    assert log.truth is not None
+    distances = cone_distances(mapper.map(), log.truth)
+    assert np.sqrt(np.mean(distances**2)) < 0.15
+    assert distances.max() < 0.5
+
+
+def test_closing_leaves_the_pose_where_it_is(log: Log, run: tuple[FixedLagMapper, list[CycleResult]]) -> None:
+    """Nothing had drifted."""
+    poses = np.array([result.pose for result in run[1]])
+    error = poses - true_poses(log)
+    assert np.hypot(error[:, 0], error[:, 1]).max() < 0.3
+    assert np.abs(error[:, 2]).max() < 0.03
+
+
+@pytest.mark.parametrize("when", ["just_closed", "run"])
+def test_readings_in_use_lie_on_the_closed_curve(when: str, request: pytest.FixtureRequest) -> None:
+    mapper = request.getfixturevalue(when)
+    mapper = mapper[0] if isinstance(mapper, tuple) else mapper
+    readings = mapper.smoother.map.readings
+    for label, boundary in mapper.boundaries.items():
+        rows = readings.used_on(label)
+        assert len(rows) > 20
+        points = to_map(readings.point[rows], mapper.smoother.variables.poses_at(readings.cycle[rows]))
+        on_curve = boundary.evaluate(mapper.control_points(label), readings.u[rows])
+        distances = np.hypot(*(points - on_curve).T)
+        assert np.median(distances) < 0.15
+        assert distances.max() < 0.6
+        foot = boundary.refine(mapper.control_points(label), points, readings.u[rows])
+        assert foot.interior.all()
+        assert np.median(np.abs(foot.distance)) < 0.02
+        assert np.abs(foot.distance).max() < 0.1
+
+
+def covariance_of(mapper: FixedLagMapper) -> Array:
+    """(3, 3) of the newest pose."""
+    return mapper.marginal_covariance([mapper.pose_key(mapper.smoother.next_cycle - 1)])
+
+
+def registered(mapper: FixedLagMapper, theta: float, shift: Array) -> Registration:
+    """The window of a mapper drifts by a rigid motion about the vehicle; how it is found back.
+
+    How certain the position along the track is doesn't matter here.
+    """
+    c, s = np.cos(theta), np.sin(theta)
+    centre = mapper.poses[-1, :2].copy()
+    mapper.poses[:, :2] = (mapper.poses[:, :2] - centre) @ np.array([[c, s], [-s, c]]) + centre + shift
+    mapper.poses[:, 2] += theta
+    registration = register(
+        mapper.smoother.map,
+        mapper.smoother.times,
+        covariance_of(mapper),
+        mapper.path.beginning,
+        ClosingSettings(sigma_max=10.0),
+    )
+    assert registration is not None
+    return registration
+
+
+@pytest.mark.parametrize(
+    ("theta", "shift"), [(0.0, (0.0, 0.0)), (0.02, (0.3, -0.25)), (-0.03, (-0.1, 0.4)), (0.0, (0.6, 0.0))]
+)
+def test_a_drifted_window_is_registered_back(
+    before: FixedLagMapper, theta: float, shift: tuple[float, float]
+) -> None:
+    """Across the track by the readings; along it as far as the curve's bends tell."""
+    mapper, poses_before = before, before.poses.copy()
+    registration = registered(mapper, theta, np.array(shift))
+    assert registration.motion.vector[2] == pytest.approx(-theta, abs=0.02)
+    moved = registration.motion.apply(mapper.poses[:, :2])
+    np.testing.assert_allclose(moved, poses_before[:, :2], atol=0.3)
+    readings = mapper.smoother.map.readings
+    for label, (rows, u) in registration.matches.items():
+        assert (readings.label[rows] == label).all()
+        poses = mapper.smoother.variables.poses_at(readings.cycle[rows])
+        points = registration.motion.apply(to_map(readings.point[rows], poses))
+        on_curve = mapper.boundaries[label].evaluate(mapper.control_points(label), u)
+        distances = np.hypot(*(points - on_curve).T)
+        assert np.median(distances) < 0.1
+        assert distances.max() < mapper.settings.closing.inlier_distance + 0.1
+
+
+def test_knots_by_the_cones_are_nearer_to_them_than_knots_by_curvature(before: FixedLagMapper) -> None:
+    """Of the same number of control points, and where a cone asks for one."""
+    before.smoother.reactivate()
+    state, settings = before.smoother.map.state, before.settings
+    kinds: tuple[Knots, Knots] = ("cones", "curvature")
+    for label, boundary in state.boundaries.items():
+        points = state.control_points(label)
+        joins = [join(boundary, points, settings, kind) for kind in kinds]
+        assert len(joins[0].points) == len(joins[1].points)
+        u = np.array(boundary.sighted_u)
+        u = u[u < joins[0].overlap.period - 1.0]
+        cones = boundary.evaluate(points, u)
+        off = [np.hypot(*(boundary.closed(new.knots).evaluate(new.points, u) - cones).T) for new in joins]
+        assert np.sqrt(np.mean(off[0] ** 2)) < 0.8 * np.sqrt(np.mean(off[1] ** 2))
+
+
+def prior_system(mapper: FixedLagMapper) -> tuple[Layout, Array, Array]:
+    """`1/2 d' L d - g' d` of the prior, d = value - reference."""
+    layout = Layout(keys_of(mapper.smoother.prior))
+    return layout, *normal_equations(mapper.smoother.prior, layout)
+
+
+def change_of_variables(
+    mapper: FixedLagMapper, joins: dict[int, Join], old: Layout, new: Layout
+) -> tuple[Array, Array]:
+    """`x_old = T x_new`, where what the curves don't hold stays as it is; and which entries are a curve's."""
+    matrix, curves = np.zeros((old.size, new.size)), np.zeros(old.size, bool)
+    others = np.intersect1d(old.keys, new.keys)
+    matrix[old.entries(others), new.entries(others)] = 1.0
+    for label, change in joins.items():
+        last = mapper.boundaries[label].first
+        keys = control_keys(label, np.arange(last - len(change.old_from_new), last))
+        held = old.positions(keys) >= 0
+        by_point = np.kron(change.old_from_new[held], np.eye(2))
+        onto = new.entries(np.array(mapper.control_keys(label)))
+        rows = old.entries(keys[held])
+        matrix[np.ix_(rows, onto)], curves[rows] = by_point, True
+    return matrix, curves
+
+
+@pytest.mark.parametrize("sigma", [1e-5, 0.05])
+def test_the_change_of_variables_is_exact(before: FixedLagMapper, sigma: float) -> None:
+    """`C_old = E C_new + N(0, sigma^2)`: the prior of the old curves, shifted by so much, on the new ones.
+
+    With S the covariance of the shift: `L (1 + S L)^-1` and `(1 + L S)^-1 g`, also where L is singular.
+    """
+    smoother = before.smoother
+    smoother.reactivate()
+    spline = replace(before.settings.spline, sigma_simplify=sigma)
+    smoother.map.settings = settings = replace(before.settings, spline=spline)
+    state = smoother.map.state
+    old, information, gradient = prior_system(before)
+    known = smoother.variables.reference[smoother.variables.layout.entries(old.keys)].copy()
+    joins = {b: join(one, state.control_points(b), settings, "cones") for b, one in state.boundaries.items()}
+    substitute(smoother, joins)
+    new, found, found_gradient = prior_system(before)
+    matrix, curves = change_of_variables(before, joins, old, new)
+    shift = np.diag(sigma**2 * curves)
+    expected = information @ np.linalg.inv(np.eye(old.size) + shift @ information)
+    gradient = np.linalg.solve(np.eye(old.size) + information @ shift, gradient)
+    away = matrix @ smoother.variables.reference[smoother.variables.layout.entries(new.keys)] - known
+    descent = matrix.T @ (gradient - expected @ away)
+    expected = matrix.T @ expected @ matrix
+    np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
+    np.testing.assert_allclose(found_gradient, descent, atol=1e-7 * np.abs(expected).max())
+
+
+# --- where it mustn't ------------------------------------------------------------------------------------
+
+
+def test_an_open_track_stays_open() -> None:
+    log = exact_log(ahead(10.0, 9.0), *corridor(110.0))
+    mapper, results = map_log(log)
+    assert mapper.path.length > mapper.settings.closing.min_path
+    assert not any(result.closed for result in results)
+    assert not mapper.map().closed
+
+
+def test_no_loop_is_shorter_than_the_shortest(log: Log) -> None:
+    settings = MapperSettings()
+    settings = replace(settings, closing=replace(settings.closing, min_path=1000.0))
+    mapper = FixedLagMapper(settings, ODOMETRY_SIGMA)
+    for odometry, cycle in split_odometry(replace(log, cycles=log.cycles[:175])):
+        mapper.update(odometry, cycle)
+    assert not mapper.closed
+    assert not near_start(mapper.path, mapper.poses[-1], settings.closing)
+    assert near_start(mapper.path, mapper.poses[-1], MapperSettings().closing)
+
+
+def test_standing_on_the_start_line_closes_nothing() -> None:
+    log = exact_log(ahead(0.0, 4.0), *corridor(60.0))
+    mapper, _ = map_log(log)
+    assert not near_start(mapper.path, mapper.poses[-1], mapper.settings.closing)
+    assert not mapper.closed
+
+
+def test_another_way_past_the_beginning_is_no_loop() -> None:
+    """There and back again on the same straight: the place is the same, the direction is not."""
+    turning = np.tile([6.0, 0.0, np.pi / 3.0], (150, 1))
+    twists = np.concatenate([ahead(10.0, 6.0), turning, ahead(10.0, 7.0)])
+    mapper, _ = map_log(exact_log(twists, *corridor(80.0)))
+    assert mapper.path.length > mapper.settings.closing.min_path
+    assert not mapper.closed
+
+
+@pytest.mark.parametrize(
+    ("again", "sigma", "certain"),
+    [(10.0, 0.2, True), (10.0, 0.5, False), (50.0, 0.5, True), (50.0, 5.0, False)],
+)
+def test_a_straight_driven_again_tells_no_place_along_it(again: float, sigma: float, certain: bool) -> None:
+    """However long it is: only as far as the place is known to about half a metre."""
+    rows, near = np.arange(30), np.ones(30, bool)
+    matches = Matches(rows, rows % 2, np.full(30, again), near, np.eye(3), np.zeros(3))
+    posterior = np.diag([sigma**2, 0.01, 1e-4])
+    assert _certain(matches, posterior, ClosingSettings()) is certain
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_lost_place_is_found_by_position_and_heading(
+    run: tuple[FixedLagMapper, list[CycleResult]], turned: bool
+) -> None:
+    """Where the vehicle faces the other way it can't be beside the nearest stretch."""
+    mapper = run[0]
+    boundary, points = mapper.boundaries[LEFT], mapper.control_points(LEFT)
+    for u in np.linspace(boundary.tables.low, boundary.tables.high, 7)[:-1]:
+        at = np.array([u])
+        position, tangent = boundary.evaluate(points, at)[0], boundary.evaluate(points, at, 1)[0]
+        heading = np.arctan2(tangent[1], tangent[0]) + np.pi * turned
+        pose = np.array([position[0] + 0.5 * tangent[1], position[1] - 0.5 * tangent[0], heading])
+        found = relocate(boundary, points, pose, 40.0)
+        direction = boundary.evaluate(points, np.array([found]), 1)[0]
+        assert direction @ [np.cos(heading), np.sin(heading)] > 0.0
+        if not turned:
+            away = (found - u + 0.5 * boundary.length) % boundary.length - 0.5 * boundary.length
+            assert abs(away) < 0.1
+
+
+def test_a_window_that_has_drifted_far_is_registered_back(before: FixedLagMapper) -> None:
+    """Farther than the iteration bridges, but within what the vehicle knows of itself."""
+    mapper, poses_before = before, before.poses.copy()
+    mapper.poses[:, :2] += [6.0, -5.0]
+    unsure = covariance_of(mapper) + np.diag([25.0, 25.0, 1e-3])
+    track, times = mapper.smoother.map, mapper.smoother.times
+    registration = register(track, times, unsure, mapper.path.beginning, ClosingSettings(sigma_max=10.0))
+    assert registration is not None
+    moved = registration.motion.apply(mapper.poses[:, :2])
+    np.testing.assert_allclose(moved, poses_before[:, :2], atol=0.4)
+
+
+def test_where_there_are_several_places_to_choose_from_patience_is_no_excuse() -> None:
+    rows, near = np.arange(30), np.ones(30, bool)
+    matches = Matches(rows, rows % 2, np.full(30, 50.0), near, np.eye(3), np.zeros(3))
+    posterior = np.diag([0.25, 0.01, 1e-4])
+    assert _certain(matches, posterior, ClosingSettings(), lost=False)
+    assert not _certain(matches, posterior, ClosingSettings(), lost=True)
+    assert _certain(matches, np.diag([0.04, 0.01, 1e-4]), ClosingSettings(), lost=True)

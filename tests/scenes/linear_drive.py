@@ -1,0 +1,216 @@
+"""A drive whose measurements are all linear, so that a window must find what a batch finds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.odometry import IntegratedOdometry
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
+from pathspace_graph.graph.odometry import OdometryChain
+from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.smoother import FixedLagSmoother, SmootherSettings
+from pathspace_graph.graph.variables import Variables
+
+from .graph import columns_of, dense_rows
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+POINTS = 12
+"""Map points, of which pose k sees a few about the one of its own number."""
+SIGMA_CALIBRATION = np.array([0.3, 0.5])
+SIGMA_START = np.array([0.5, 0.4, 0.3])
+NOTHING = np.zeros(0, np.intp)
+
+
+class LinearTrack:
+    """Map points in a row, `J x - z` of each cycle, and weak priors between neighbours."""
+
+    def __init__(self, seed: int) -> None:
+        self.variables = Variables()
+        self.slid = False
+        self.structure: object = object()
+        self.inactive: IntArray = NOTHING
+        self.seed = seed
+
+    def changed(self) -> IntArray:
+        return NOTHING
+
+    def measured(self, cycle: int) -> tuple[IntArray, Array, Array]:
+        """Keys (m, 3) of the rows of a cycle, J (m, 7) and z (m,)."""
+        rng = np.random.default_rng((self.seed, cycle))
+        first = np.minimum(cycle + rng.integers(0, 2, 6), POINTS - 2)
+        keys = [np.full(6, pose_key(cycle)), control_keys(0, first), control_keys(0, first + 1)]
+        return np.stack(keys, axis=1), rng.normal(size=(6, POSE + 4)) * 2.0, rng.normal(size=6) * 5.0
+
+    def rows(self, cycles: IntArray) -> list[Rows]:
+        return [self._at_values(*self.measured(int(k)), int(k)) for k in cycles]
+
+    def _at_values(self, keys: IntArray, J: Array, z: Array, owner: int) -> Rows:
+        values = np.array([self.variables.of(one) for one in keys])
+        return Rows(keys, J, (J * values).sum(axis=1) - z, np.full(len(keys), owner, np.intp))
+
+    def linearized(self, cycles: IntArray) -> None:
+        pass
+
+    def weak(self, whole: bool) -> tuple[IntArray, IntArray]:
+        """Keys (k, 2) of neighbours that are tied, and (m,) of points that are held."""
+        known = self.variables.keys
+        known = known[(known >= control_keys(0, np.array(0))) & (known < pose_key(0))]
+        active = known if whole else np.setdiff1d(known, self.inactive)
+        return np.stack([active[:-1], active[1:]], axis=1), active
+
+    def gauge(self, whole: bool) -> list[Rows]:
+        """`(c_{j+1} - c_j - (1, 2)) / 3`, a row for each coordinate."""
+        pairs, _ = self.weak(whole)
+        J = np.kron(np.array([-1.0, 1.0]), np.eye(2)) / 3.0
+        return [
+            self._at_values(np.stack([p, p]), J, np.array([1.0, 2.0]) / 3.0, int(p[0] % 5)) for p in pairs
+        ]
+
+    def linear_gauge(self, whole: bool) -> list[Rows]:
+        """`(c_j - (4, 5)) / 9`."""
+        _, points = self.weak(whole)
+        z = np.array([4.0, 5.0]) / 9.0
+        return [self._at_values(np.array([[key], [key]]), np.eye(2) / 9.0, z, int(key % 5)) for key in points]
+
+    def all_active(self) -> None:
+        self.inactive, self.structure = NOTHING, object()
+
+    def leave(self, cycle: int) -> None:
+        pass
+
+
+class LinearOdometry(OdometryChain):
+    """`W_k (x_{k+1} - x_k - delta_k + G_k b)`."""
+
+    def rows(self, variables: Variables, cycles: IntArray) -> list[Rows]:
+        slots = cycles - variables.first_cycle
+        return [self._row(variables, int(slot)) for slot in slots[slots < len(self)]]
+
+    def _row(self, variables: Variables, slot: int) -> Rows:
+        cycle, G, W = variables.first_cycle + slot, self.by_calibration[slot], self.whiteners[slot]
+        key = np.array([CALIBRATION_KEY, pose_key(cycle), pose_key(cycle + 1)])
+        J = W @ np.concatenate([G, -np.eye(POSE), np.eye(POSE)], axis=1)
+        residual = J @ variables.of(key) - W @ self.deltas[slot]
+        return Rows(np.tile(key, (POSE, 1)), J, residual, np.full(POSE, cycle, np.intp))
+
+
+@dataclass(eq=False)
+class LinearDrive:
+    """A window on a drive, and everything that was ever measured in it."""
+
+    lag: int
+    """Poses of the window, less one."""
+    seed: int = 0
+    tolerance: float = 1e-9
+    """From which change on factors are linearized anew."""
+    odometry: list[IntegratedOdometry] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        settings = SmootherSettings(
+            lag=float(self.lag),
+            tolerances=(self.tolerance, self.tolerance),
+            keyframe_interval=1e9,
+            sigma_calibration=(float(SIGMA_CALIBRATION[0]), float(SIGMA_CALIBRATION[1])),
+        )
+        self.track = LinearTrack(self.seed)
+        self.smoother = FixedLagSmoother(settings, self.track)
+        self.smoother.window.odometry = LinearOdometry()
+        self.rng = np.random.default_rng(self.seed + 100)
+        self.start = self.rng.normal(size=POSE)
+
+    @property
+    def cycles(self) -> int:
+        return self.smoother.next_cycle
+
+    def drive(self, cycles: int) -> None:
+        """So many cycles: a pose, the points that it is the first to see, a step; the oldest pose leaves."""
+        for _ in range(cycles):
+            self.predict()
+            self.smoother.step()
+            self.smoother.marginalize()
+
+    def predict(self) -> None:
+        k, smoother = self.cycles, self.smoother
+        if k == 0:
+            smoother.begin(0.0, self.start.copy(), np.diag(SIGMA_START**2))
+            self.see(np.arange(3))
+            return
+        W = np.triu(self.rng.normal(size=(POSE, POSE))) + 3.0 * np.eye(POSE)
+        covariance = np.linalg.inv(W.T @ W)
+        G = self.rng.normal(size=(POSE, 2))
+        step = IntegratedOdometry(self.rng.normal(size=POSE), covariance, G, W)
+        self.odometry.append(step)
+        smoother.follow(float(k), smoother.variables.poses[-1] + self.rng.normal(size=POSE), step)
+        if k + 2 < POINTS:
+            self.see(np.array([k + 2]))
+
+    def see(self, numbers: IntArray) -> None:
+        """New map points, anywhere."""
+        points = self.rng.normal(size=(len(numbers), 2)) * 7.0
+        self.smoother.variables.insert(control_keys(0, numbers), points.ravel())
+        self.track.structure = object()
+
+    def deactivate(self, before: int) -> None:
+        """The active ones of the first map points leave, which no pose of the window sees."""
+        keys = np.setdiff1d(control_keys(0, np.arange(before)), self.track.inactive)
+        self.smoother.deactivate(keys)
+        self.track.inactive = np.union1d(self.track.inactive, keys)
+        self.track.structure = object()
+
+    # --- the same, all at once ---------------------------------------------------------------------------
+
+    @property
+    def keys(self) -> IntArray:
+        """Calibration, all points seen so far, and every pose that there ever was."""
+        points = control_keys(0, np.arange(min(self.cycles + 2, POINTS)))
+        return np.concatenate([[CALIBRATION_KEY], points, pose_keys(np.arange(self.cycles))])
+
+    def batch(self) -> tuple[Array, Array]:
+        """`J'J` and `J'z` of everything that was ever measured, on the columns of all keys."""
+        keys = self.keys
+        matrices = [_scattered([CALIBRATION_KEY], np.diag(1.0 / SIGMA_CALIBRATION), keys)]
+        right = [np.zeros(2)]
+        matrices.append(_scattered([pose_key(0)], np.diag(1.0 / SIGMA_START), keys))
+        right.append(self.start / SIGMA_START)
+        for k in range(self.cycles):
+            own, J, z = self.track.measured(k)
+            matrices.append(dense_rows([Rows(own, J, z, np.zeros(len(z), np.intp))], keys)[0])
+            right.append(z)
+        for k, step in enumerate(self.odometry):
+            J = step.whitener @ np.concatenate(
+                [step.calibration_jacobian, -np.eye(POSE), np.eye(POSE)], axis=1
+            )
+            matrices.append(_scattered([CALIBRATION_KEY, pose_key(k), pose_key(k + 1)], J, keys))
+            right.append(step.whitener @ step.delta)
+        points = control_keys(0, np.arange(min(self.cycles + 2, POINTS))).tolist()
+        for first, second in pairwise(points):
+            J = np.kron(np.array([-1.0, 1.0]), np.eye(2)) / 3.0
+            matrices.append(_scattered([first, second], J, keys))
+            right.append(np.array([1.0, 2.0]) / 3.0)
+        for key in points:
+            matrices.append(_scattered([key], np.eye(2) / 9.0, keys))
+            right.append(np.array([4.0, 5.0]) / 9.0)
+        J, z = np.concatenate(matrices), np.concatenate(right)
+        return J.T @ J, J.T @ z
+
+    def mean(self, keys: IntArray) -> Array:
+        """Of the batch, of some keys."""
+        return np.linalg.solve(*self.batch())[columns_of(keys, self.keys)]
+
+    def covariance(self, keys: IntArray) -> Array:
+        """Of the batch, of some keys."""
+        entries = columns_of(keys, self.keys)
+        return np.linalg.inv(self.batch()[0])[np.ix_(entries, entries)]
+
+
+def _scattered(keys: Sequence[int], J: Array, among: IntArray) -> Array:
+    matrix = np.zeros((len(J), len(columns_of(among, among))))
+    matrix[:, columns_of(np.array(keys), among)] = J
+    return matrix

@@ -1,0 +1,260 @@
+"""Track files of four kinds: real ones where they are at hand, small ones written here for every trap."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pathspace_graph.errors import InputError
+from pathspace_graph.sim.track import Track, to_map_frame
+from pathspace_graph.sim.track_files import read_track
+from pathspace_graph.sim.track_generator import generate_track
+
+from ..scenes.paths import TRACKS
+
+FILES = ("pacsim/*.yaml", "fssim/*.yaml", "eufs/*.csv", "tum/*.csv")
+LAPS = {"Norisring": (2250.0, 2350.0), "bone": (95.0, 130.0), "peanut": (95.0, 130.0)}
+
+real_tracks = pytest.mark.skipif(not TRACKS.is_dir(), reason="the real tracks aren't beside the repository")
+
+
+def real_files() -> list[Path]:
+    return sorted(path for pattern in FILES for path in TRACKS.glob(pattern))
+
+
+def gaps(row: np.ndarray, closed: bool) -> np.ndarray:
+    ring = np.vstack([row, row[:1]]) if closed else row
+    return np.linalg.norm(np.diff(ring, axis=0), axis=1)
+
+
+def assert_plausible(track: Track) -> None:
+    """Rows in driving order on their own sides of a centre line that stays between them."""
+    line = track.centre_line
+    s = np.arange(0.0, line.length, 0.5)
+    points, tangents = line.points(s), line.tangents(s)
+    for row, side in ((track.left, 1.0), (track.right, -1.0)):
+        nearest = np.argmin(np.linalg.norm(row[:, None] - points, axis=-1), axis=1)
+        across = row - points[nearest]
+        tangent = tangents[nearest]
+        assert (side * (tangent[:, 0] * across[:, 1] - tangent[:, 1] * across[:, 0]) > 0.5).all()
+        steps = (np.diff(s[nearest], append=s[nearest[0]]) + line.length / 2) % line.length - line.length / 2
+        assert (steps if track.closed else steps[:-1]).min() > -1.5
+    assert line.clearance.min() > 1.0
+
+
+@real_tracks
+@pytest.mark.parametrize("path", real_files(), ids=lambda path: path.stem)
+def test_real_track(path: Path) -> None:
+    track = to_map_frame(read_track(path))
+    assert track.closed
+    np.testing.assert_array_equal(track.start, np.zeros(3))
+    low, high = LAPS.get(track.name, (127.0, 400.0))
+    assert low < track.centre_line.length < high
+    for row in (track.left, track.right):
+        assert gaps(row, closed=True).max() < 10.0
+        assert gaps(row, closed=True).min() > 0.2
+    assert_plausible(track)
+    assert (
+        np.linalg.norm(track.centre_line.points(np.zeros(1) + track.centre_line.nearest(np.zeros(3)))) < 2.0
+    )
+
+
+@real_tracks
+def test_stray_points_and_gate_cones_are_of_no_boundary() -> None:
+    assert len(read_track(TRACKS / "pacsim" / "FSG24.yaml").other) == 188
+    assert len(read_track(TRACKS / "fssim" / "FSG.yaml").other) == 4
+    bone = read_track(TRACKS / "eufs" / "bone.csv")
+    # five rows are big_orange, two of them the same cone
+    assert len(bone.other) == 3
+
+
+@real_tracks
+def test_a_first_cone_repeated_at_the_end_is_dropped() -> None:
+    track = read_track(TRACKS / "fssim" / "FSG.yaml")
+    assert (len(track.left), len(track.right)) == (94, 88)
+
+
+def eufs_text(track: Track, rng: np.random.Generator) -> str:
+    x, y, theta = track.start
+    rows = [f"car_start,{x},{y},{theta},,,"]
+    rows += [f"blue,{x},{y},0,0.01,0.01,0" for x, y in track.left]
+    rows += [f"yellow,{x},{y},0,,,0" for x, y in track.right]
+    rng.shuffle(rows)
+    return "tag,x,y,direction,x_variance,y_variance,xy_covariance\n" + "\n".join(rows) + "\n"
+
+
+def same_ring(row: np.ndarray, expected: np.ndarray) -> bool:
+    first = int(np.argmin(np.linalg.norm(row - expected[0], axis=1)))
+    return row.shape == expected.shape and np.allclose(np.roll(row, -first, axis=0), expected)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_shuffled_cones_are_put_in_driving_order(tmp_path: Path, seed: int) -> None:
+    track = generate_track(np.random.default_rng(seed))
+    (tmp_path / "t.csv").write_text(eufs_text(track, np.random.default_rng(seed)))
+    read = read_track(tmp_path / "t.csv")
+    assert read.closed
+    assert len(read.other) == 0
+    assert same_ring(read.left, track.left)
+    assert same_ring(read.right, track.right)
+
+
+@real_tracks
+@pytest.mark.parametrize("path", [p for p in real_files() if p.parent.name in ("pacsim", "fssim")], ids=str)
+def test_shuffled_real_cones_are_put_in_driving_order(tmp_path: Path, path: Path) -> None:
+    track = read_track(path)
+    (tmp_path / "t.csv").write_text(eufs_text(track, np.random.default_rng(0)))
+    read = read_track(tmp_path / "t.csv")
+    assert read.closed
+    assert same_ring(read.left, track.left)
+    assert same_ring(read.right, track.right)
+
+
+def neck_track() -> Track:
+    """A dumb-bell whose two left rows stand back to back, 0.7 m apart and with 2 m gaps, in the neck."""
+    neck = np.arange(-6.0, 6.1, 2.0)
+    angles = np.linspace(-0.75 * np.pi, 0.75 * np.pi, 10)[1:-1]
+    lobe = np.column_stack([10.5 + 5.5 * np.cos(angles), 5.5 * np.sin(angles)])
+    outer = np.linspace(-0.62 * np.pi, 0.62 * np.pi, 14)
+    outer_lobe = np.column_stack([10.5 + 9.0 * np.cos(outer), 9.0 * np.sin(outer)])
+    left = np.vstack([np.column_stack([neck, neck * 0 - 0.35]), lobe])
+    left = np.vstack([left, -left])
+    right = np.vstack([np.column_stack([neck[1:-1], neck[1:-1] * 0 - 3.9]), outer_lobe])
+    right = np.vstack([right, -right])
+    return Track(left, right, np.zeros((0, 2)), True, np.array([0.0, -2.1, 0.0]), "neck")
+
+
+def test_rows_of_one_colour_back_to_back_are_kept_apart(tmp_path: Path) -> None:
+    track = neck_track()
+    (tmp_path / "t.csv").write_text(eufs_text(track, np.random.default_rng(1)))
+    read = read_track(tmp_path / "t.csv")
+    assert read.closed
+    assert same_ring(read.left, track.left)
+    assert same_ring(read.right, track.right)
+    assert_plausible(read)
+
+
+def straight_eufs(extra: str = "") -> str:
+    rows = "".join(f"blue,{x},2,0,,,\nyellow,{x},-2,0,,,\n" for x in range(-5, 30, 5))
+    return "tag,x,y,direction,x_variance,y_variance,xy_covariance\ncar_start,-6,0,0,,,\n" + rows + extra
+
+
+def test_open_lane_with_duplicates_gate_and_marks(tmp_path: Path) -> None:
+    extra = "blue,0.1,2.1,0,,,\nbig_orange,-5.5,2,0,,,\nmidpoint,0,0,0,,,\norange,40,0,0,,,\n"
+    (tmp_path / "t.csv").write_text(straight_eufs(extra))
+    track = read_track(tmp_path / "t.csv")
+    assert not track.closed
+    np.testing.assert_allclose(track.left[:, 0], np.arange(-5.0, 30.0, 5.0))
+    np.testing.assert_allclose(track.right[:, 0], np.arange(-5.0, 30.0, 5.0))
+    assert len(track.other) == 2
+    assert track.centre_line.length == pytest.approx(30.0, abs=0.1)
+
+
+def square_yaml(**replaced: str) -> str:
+    """A PacSim square of 20 m with 4 m lanes, driven counter-clockwise from the middle of its bottom."""
+
+    def row(half: float) -> str:
+        side = np.linspace(-half, half, 5)[:-1]
+        corners = [(x, -half) for x in side] + [(half, y) for y in side]
+        corners += [(-x, half) for x in side] + [(-half, -y) for y in side]
+        return "".join(f"\n    - {{position: [{x}, {y}, 0.0], class: cone}}" for x, y in corners)
+
+    parts = {
+        "closed": "lanesFirstWithLastConnected: true",
+        "start": "start: {position: [0.0, -10.0, 0.0], orientation: [0.0, 0.0, 0.0]}",
+        "left": "left:" + row(8.0),
+        "right": "right:" + row(12.0),
+        "unknown": "unknown: []",
+        **replaced,
+    }
+    return "track:\n" + "".join(f"  {part}\n" for part in parts.values())
+
+
+def test_pacsim_square(tmp_path: Path) -> None:
+    (tmp_path / "square.yml").write_text(square_yaml(unknown="unknown: [{position: [1e-1, 2, 0], class: x}]"))
+    track = read_track(tmp_path / "square.yml")
+    assert len(track.left) == len(track.right) == 16
+    np.testing.assert_allclose(track.other, [[0.1, 2.0]])
+    assert 70.0 < track.centre_line.length < 80.0
+    moved = to_map_frame(track)
+    np.testing.assert_allclose(moved.left, track.left + np.array([0.0, 10.0]), atol=1e-12)
+
+
+BAD_YAML = [
+    ({"left": "left: []"}, "at least 3 cones of the left boundary"),
+    ({"left": "lefty: []"}, "key track.left"),
+    ({"start": "begin: 0"}, "key track.start"),
+    ({"start": "start: {position: [0, -10, 0], orientation: [0, 0]}"}, "track.start.orientation"),
+    ({"start": "start: {position: [0, 80, 0], orientation: [0, 0, 0]}"}, "start on the track"),
+    ({"start": "start: {position: [0, -10, 0], orientation: [0, 0, 3]}"}, "driving order"),
+    ({"right": "right: [{position: [1, .nan, 0]}]"}, "finite numbers at track.right[0].position"),
+    ({"right": "right: [{position: [1, word, 0]}]"}, "2 numbers at track.right[0].position"),
+    ({"right": "right: [{position: 3}]"}, "2 numbers at track.right[0].position"),
+    ({"right": "right: [{place: 3}]"}, "key track.right[0].position"),
+    ({"right": "right: {a: 3}"}, "a list at track.right"),
+    ({"closed": "lanesFirstWithLastConnected: perhaps"}, "true or false"),
+    ({"closed": "lanesFirstWithLastConnected: ["}, "expected YAML"),
+]
+
+
+@pytest.mark.parametrize(("replaced", "message"), BAD_YAML)
+def test_bad_pacsim(tmp_path: Path, replaced: dict[str, str], message: str) -> None:
+    (tmp_path / "t.yaml").write_text(square_yaml(**replaced))
+    with pytest.raises(InputError) as caught:
+        read_track(tmp_path / "t.yaml")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+BAD_CSV = [
+    (straight_eufs("blue,word,0,0,,,\n"), 17, "number in column 'x'"),
+    (straight_eufs("blue,nan,0,0,,,\n"), 17, "finite number in column 'x'"),
+    (straight_eufs("blue,1\n"), 17, "expected 7 fields"),
+    ("tag,x,direction\nblue,0,0\n", 1, "column 'y'"),
+    ("tag,x,y\nblue,0,0\nblue,1,0\nyellow,1,3\n", None, "at least 3 blue cones"),
+    (straight_eufs().replace("car_start,-6,0,0", "car_start,-6,0,north"), 2, "heading of car_start"),
+    ("# x_m,y_m,w_tr_right_m,w_tr_left_m\n0,0,1,1\n9,0,-1,1\n9,9,1,1\n", 3, "widths above 0"),
+    ("# x_m,y_m,w_tr_right_m,w_tr_left_m\n0,0,1,1\n9,0,1,1\n9,0,1,1\n", 4, "other than the one before"),
+    ("# x_m,y_m,w_tr_right_m,w_tr_left_m\n0,0,1,1\n9,0,1,1\n", None, "at least 3 points"),
+    ("# x_m,y_m,w_tr_right_m\n0,0,1\n", 1, "column 'w_tr_left_m'"),
+]
+
+
+@pytest.mark.parametrize(("text", "row", "message"), BAD_CSV)
+def test_bad_csv(tmp_path: Path, text: str, row: int | None, message: str) -> None:
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_track(tmp_path / "t.csv")
+    assert message in str(caught.value)
+    if row is not None:
+        assert caught.value.row == row
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("t.csv", "a,b\n1,2\n"), ("t.yaml", "a: 1\n"), ("t.yaml", ""), ("t.txt", "x"), ("t", "x")],
+)
+def test_unknown_kind_names_the_known_ones(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=r"PacSim.*fssim.*EUFS.*TUM"):
+        read_track(tmp_path / name)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    for name in ("t.csv", "t.yaml", "t.txt"):
+        with pytest.raises(InputError, match="found none"):
+            read_track(tmp_path / name)
+
+
+def test_tum_circle(tmp_path: Path) -> None:
+    angles = np.arange(60) * 2 * np.pi / 60
+    rows = "".join(f"{50 * np.cos(a)},{50 * np.sin(a)},4,6\n" for a in angles)
+    (tmp_path / "t.csv").write_text("# x_m,y_m,w_tr_right_m,w_tr_left_m\n" + rows)
+    track = read_track(tmp_path / "t.csv")
+    np.testing.assert_allclose(np.linalg.norm(track.left, axis=1), 44.0, atol=0.1)
+    np.testing.assert_allclose(np.linalg.norm(track.right, axis=1), 54.0, atol=0.1)
+    assert max(gaps(track.left, True).max(), gaps(track.right, True).max()) <= 5.0
+    np.testing.assert_allclose(track.start, [50.0, 0.0, np.pi / 2], atol=1e-3)
+    assert track.centre_line.length == pytest.approx(2 * np.pi * 49.0, rel=0.01)

@@ -1,0 +1,107 @@
+"""Knots where cones ask for them: at the shape that needs them, and how many."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.eval.metrics.table1 import closest_points
+from pathspace_graph.settings.knots import FitSettings
+from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.cone_knots import chosen_breaks, thin
+from pathspace_graph.spline.knots import energy_rows, fit_spline
+
+Array = NDArray[np.float64]
+
+FIT = FitSettings(rounds=1)
+
+
+def keyhole(count: int = 60) -> Array:
+    """Points (k, 2) 2 m apart: a straight, and a bend of 3 m radius in the middle of it."""
+    s = 2.0 * (np.arange(count) - count / 2)
+    heading = np.pi * np.clip(s / (np.pi * 3.0) + 0.5, 0.0, 1.0)
+    return np.cumsum(2.0 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+
+
+def along(points: Array) -> Array:
+    return np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
+
+
+def circle(count: int, noise: float) -> Array:
+    phi = 2.0 * np.pi * np.arange(count) / count
+    points = 20.0 * np.column_stack([np.cos(phi), np.sin(phi)])
+    return np.asarray(points + np.random.default_rng(0).normal(0.0, noise, points.shape))
+
+
+def test_each_step_takes_out_one_knot_and_misses_more() -> None:
+    points = keyhole()
+    u = along(points)
+    path = list(thin(points, u, float(u[-1]), False, FIT, 8))
+    assert [curve.size for curve in path] == list(range(path[0].size, 7, -1))
+    assert path[0].size == len(points) + 2
+    assert (np.diff([curve.rss for curve in path]) > -1e-6).all()
+
+
+def test_the_price_of_a_knot_is_what_the_fit_loses() -> None:
+    """The knot taken out is the one without which a least-squares fit of its own is best, of all."""
+    points = keyhole(24)
+    u = along(points)
+    path = list(thin(points, u, float(u[-1]), False, FIT, 12))
+    before, after = path[8], path[9]
+    best = min(
+        sum_of_squares(points, u, np.delete(before.breaks, k)) for k in range(1, len(before.breaks) - 1)
+    )
+    np.testing.assert_allclose(sum_of_squares(points, u, after.breaks), best, rtol=1e-6)
+
+
+def sum_of_squares(points: Array, u: Array, breaks: Array) -> float:
+    """What `thin` minimizes, bending included."""
+    frame = BSpline.clamped_from(breaks, np.zeros((len(breaks) + 2, 2)), 3)
+    stacked = np.concatenate([frame.basis_matrix(u), np.sqrt(FIT.smoothness) * energy_rows(frame)])
+    target = np.concatenate([points, np.zeros((len(stacked) - len(points), 2))])
+    solution = np.linalg.lstsq(stacked, target, rcond=None)[0]
+    return float(((stacked @ solution - target) ** 2).sum())
+
+
+def test_knots_go_where_the_curve_bends() -> None:
+    points = keyhole()
+    chosen = chosen_breaks(points, False, FIT, 8, 20)
+    middle = along(points)[len(points) // 2]
+    inside = np.abs(chosen.breaks - middle) < 10.0
+    assert inside.mean() > 0.5
+    assert 20.0 / along(points)[-1] < 0.2
+
+
+def test_it_fits_better_than_knots_at_equal_distances() -> None:
+    points = keyhole()
+    chosen = chosen_breaks(points, False, FIT, 8, 16)
+    even = np.linspace(0.0, along(points)[-1], len(chosen.breaks))
+    ours, theirs = (fit_spline(points, chosen.size, False, FIT, breaks) for breaks in (chosen.breaks, even))
+    off = [np.abs(distances(spline, points)).max() for spline in (ours, theirs)]
+    assert off[0] < 0.3 * off[1]
+
+
+def distances(spline: BSpline, points: Array) -> Array:
+    return closest_points(spline, points).distance
+
+
+def test_a_smaller_curve_is_taken_where_it_foretells_better() -> None:
+    """A circle is a curve of few control points; more of them only follow the noise."""
+    chosen = chosen_breaks(circle(80, 0.2), True, FIT, 8, 40)
+    assert chosen.size < 40
+    x = 2.0 * np.arange(60)
+    waves = chosen_breaks(np.column_stack([x, np.sin(x / 2.0)]), False, FIT, 8, 24)
+    assert waves.size == 24
+
+
+@pytest.mark.parametrize("periodic", [True, False])
+def test_the_budget_is_kept(periodic: bool) -> None:
+    assert chosen_breaks(circle(40, 0.01), periodic, FIT, 8, 17).size <= 17
+
+
+def test_knots_of_a_straight_that_needs_none_stay_spread() -> None:
+    """Every knot is then missed equally little, but for rounding: none may leave a long interval behind."""
+    points = np.column_stack([4.0 * np.arange(16.0), np.zeros(16)])
+    *_, last = thin(points, points[:, 0], 60.0, False, FIT, 8)
+    assert np.diff(last.breaks).max() <= 4 * 4.0 + 1e-9

@@ -1,0 +1,131 @@
+"""The house: which room may import which, no circles, no import inside a function, no crowded folder."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from functools import cache
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+from .scenes.paths import ROOT
+
+PACKAGE = "pathspace_graph"
+BESIDE = ("factors", "sim", "eval")
+"""Folders at the root that are parts of the package."""
+MOST_FILES = 15
+EXTRAS = {"distributed"}
+"""Optional packages, which are imported only where they are needed."""
+
+LEAVES = {"errors", "labels", "progress", "stopwatch"}
+"""Modules that any room may import; `errors` is the only one that they import themselves."""
+ESTIMATORS = {"online", "batch", "ckf", "landmark"}
+BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "run"}
+BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping"}
+BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"sim", "estimators"}
+
+ARROWS: dict[str, set[str]] = {
+    **{leaf: set() for leaf in LEAVES},
+    "factors": set(),
+    "settings": set(),
+    "laps": set(),
+    "spline": {"factors", "settings"},
+    "io": {"spline"},
+    "sim": {"io"},
+    "graph": {"factors"},
+    "run": {"io", "laps"},
+    "mapping": BELOW_MAPPING,
+    **dict.fromkeys(ESTIMATORS, BELOW_ESTIMATORS),
+    "estimators": BELOW_ESTIMATORS | ESTIMATORS,
+    "eval.metrics": BELOW_EVAL,
+    "eval.tables": BELOW_EVAL | {"eval.metrics"},
+    "eval.figures": BELOW_EVAL | {"eval.metrics"},
+    "eval.study": BELOW_EVAL | {"eval.metrics", "eval.tables", "eval.figures"},
+    "eval.compare": BELOW_EVAL | {"eval.metrics", "eval.tables", "eval.figures", "eval.study"},
+    "eval.scaling": BELOW_EVAL | {"eval.metrics", "eval.tables", "eval.figures", "eval.study"},
+    "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.tables", "eval.figures", "eval.study"},
+    "commands": BELOW_EVAL
+    | {f"eval.{room}" for room in ("metrics", "tables", "figures", "study", "compare", "scaling")},
+    "cli": {"commands"},
+    "__main__": {"cli"},
+}
+"""What each room may import, beside itself and the leaves: arrows point down only."""
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Every module of the package by its name without the package's own."""
+    files = {}
+    for home in (ROOT / PACKAGE, *(ROOT / folder for folder in BESIDE)):
+        for file in sorted(home.rglob("*.py")):
+            parts = file.relative_to(ROOT / PACKAGE if home.name == PACKAGE else ROOT).with_suffix("").parts
+            files[".".join(parts)] = file
+    return files
+
+
+def imports(module: str, file: Path) -> Iterator[tuple[str, ast.ImportFrom]]:
+    """Modules of the package that one imports, by name without the package's own, and the statements."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        if node.level:
+            parts = [*module.split(".")[: -node.level], *(node.module.split(".") if node.module else [])]
+        elif (node.module or "").split(".")[0] == PACKAGE:
+            parts = str(node.module).split(".")[1:]
+        else:
+            continue
+        home = ".".join(parts)
+        for alias in node.names:
+            inner = f"{home}.{alias.name}".strip(".")
+            yield (inner if inner in modules() else home), node
+
+
+def room_of(module: str) -> str:
+    """The folder that a module lies in, or the module itself where it lies at the top."""
+    return module.rpartition(".")[0] or module
+
+
+def test_every_room_has_its_arrows_written_down() -> None:
+    rooms = {room_of(module) for module in modules() if not module.endswith("__init__")}
+    assert rooms == set(ARROWS)
+
+
+@pytest.mark.parametrize("room", ARROWS)
+def test_a_room_imports_only_what_lies_below_it(room: str) -> None:
+    allowed = ARROWS[room] | LEAVES | {room}
+    for module, file in modules().items():
+        if room_of(module) == room and not module.endswith("__init__"):
+            for imported, _ in imports(module, file):
+                assert room_of(imported) in allowed, f"{module} imports {imported}"
+
+
+def test_the_arrows_have_no_circle() -> None:
+    tuple(TopologicalSorter(ARROWS).static_order())
+
+
+def test_the_imports_have_no_circle() -> None:
+    known = {module: {name for name, _ in imports(module, file)} for module, file in modules().items()}
+    del known["__init__"]  # its imports are for type checkers; at run time names are looked up when asked for
+    tuple(TopologicalSorter({module: names - {module} for module, names in known.items()}).static_order())
+
+
+def test_no_import_hides_inside_a_function() -> None:
+    for module, file in modules().items():
+        for function in ast.walk(ast.parse(file.read_text())):
+            if isinstance(function, ast.FunctionDef):
+                hidden = {name for node in ast.walk(function) for name in imported_by(node)}
+                assert hidden <= EXTRAS, f"{module}: {function.name}"
+
+
+def imported_by(node: ast.AST) -> list[str]:
+    """Top-level names of the packages that a statement imports."""
+    if isinstance(node, ast.Import):
+        return [alias.name.split(".")[0] for alias in node.names]
+    return [(node.module or "").split(".")[0]] if isinstance(node, ast.ImportFrom) else []
+
+
+def test_no_folder_is_crowded() -> None:
+    for folder in {file.parent for file in (*modules().values(), *(ROOT / "tests").rglob("*.py"))}:
+        assert len(list(folder.glob("*.py"))) <= MOST_FILES, folder
