@@ -49,7 +49,7 @@ def survey_factor(mapper: FixedLagMapper, point: Array) -> gtsam.NonlinearFactor
     if LEFT not in mapper.boundaries:
         return None
     boundary, points = mapper.boundaries[LEFT], mapper.control_points(LEFT)
-    end = np.array([boundary.confirmed])
+    end = np.array([boundary.confirmed_end])
     foot = boundary.find(points, point[None], np.zeros(1), end)
     if not foot.interior[0] or abs(foot.distance[0]) > AWAY:
         return None

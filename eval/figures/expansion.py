@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pathspace_graph.ckf.expansion import proximity_chain
-from pathspace_graph.ckf.fit import fit_readings
+from pathspace_graph.ckf.fit import fit_detections
 from pathspace_graph.factors.bspline import end_change_matrix
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.settings.comparison import CkfSettings
@@ -22,8 +22,8 @@ from .map_plot import uncertainty_band
 from .style import (
     FigureStyle,
     draw_control_points,
+    draw_detections,
     draw_ellipses,
-    draw_readings,
     figure_context,
     fit_height,
     frame,
@@ -69,7 +69,7 @@ class ExpansionScene:
 class Expansion:
     """The three steps."""
 
-    readings: Array
+    detections: Array
     """(m, 2) m."""
     sigma: float
     """Of each reading (m)."""
@@ -89,24 +89,24 @@ def expansion(scene: ExpansionScene | None = None) -> Expansion:
     """Classify the readings, lead the curve on to the last of their chain, update it with all others."""
     scene = scene or ExpansionScene()
     before = _known_curve(scene)
-    readings = _on_bend(scene, np.array(scene.seen), np.array(scene.inside))
-    covariances = np.tile(scene.sigma_reading**2 * np.eye(2), (len(readings), 1, 1))
-    expands = expanding(before.spline, readings, scene.threshold, scene.separation)
+    detections = _on_bend(scene, np.array(scene.seen), np.array(scene.inside))
+    covariances = np.tile(scene.sigma_reading**2 * np.eye(2), (len(detections), 1, 1))
+    expands = expanding(before.spline, detections, scene.threshold, scene.separation)
     beyond = np.flatnonzero(expands)
     end = before.spline.evaluate(np.array([before.spline.domain[1]]))[0]
-    order = beyond[proximity_chain(readings[beyond], end)]
-    extended = extend(before, readings[order[-1]], covariances[order[-1]])
-    rest = np.arange(len(readings)) != order[-1]
-    updated = update(extended, readings[rest], covariances[rest])
-    return Expansion(readings, scene.sigma_reading, expands, order, before, extended, updated)
+    order = beyond[proximity_chain(detections[beyond], end)]
+    extended = extend(before, detections[order[-1]], covariances[order[-1]])
+    rest = np.arange(len(detections)) != order[-1]
+    updated = update(extended, detections[rest], covariances[rest])
+    return Expansion(detections, scene.sigma_reading, expands, order, before, extended, updated)
 
 
-def expanding(spline: BSpline, readings: Array, threshold: float, separation: float) -> Bools:
+def expanding(spline: BSpline, detections: Array, threshold: float, separation: float) -> Bools:
     """(m,) the paper's three conditions: closest to S(1), beyond a threshold from C_n, and from C_(n-1)."""
-    feet = spline.foot_points(readings)
+    feet = spline.foot_points(detections)
     last, before = spline.control_points[-1], spline.control_points[-2]
-    far = np.linalg.norm(readings - last, axis=1) > threshold
-    apart = np.linalg.norm(readings - before, axis=1) > separation
+    far = np.linalg.norm(detections - last, axis=1) > threshold
+    apart = np.linalg.norm(detections - before, axis=1) > separation
     return np.asarray((feet.u >= spline.domain[1] - _AT_END) & far & apart)
 
 
@@ -118,11 +118,11 @@ def extend(boundary: SplineBoundary, reading: Array, covariance: Array) -> Splin
     return SplineBoundary(longer, block_diag(change @ boundary.covariance @ change.T, covariance))
 
 
-def update(boundary: SplineBoundary, readings: Array, covariances: Array) -> SplineBoundary:
+def update(boundary: SplineBoundary, detections: Array, covariances: Array) -> SplineBoundary:
     """One Kalman update of the control points with S_z of readings (m, 2), (m, 2, 2) in the map frame."""
     spline, n = boundary.spline, boundary.size
-    basis = spline.basis_matrix(spline.foot_points(readings).u)
-    fitted = fit_readings(basis, readings, covariances, spline.control_points, CkfSettings())
+    basis = spline.basis_matrix(spline.foot_points(detections).u)
+    fitted = fit_detections(basis, detections, covariances, spline.control_points, CkfSettings())
     combine = np.kron(fitted.basis(), np.eye(2)).T
     H = combine @ np.kron(fitted.taken, np.eye(2))
     P = boundary.covariance
@@ -162,7 +162,7 @@ def _on_bend(scene: ExpansionScene, along: Array, inside: Array) -> Array:
 def plot_expansion(data: Expansion, style: FigureStyle | None = None) -> Figure:
     """(a) readings classified, (b) the curve led on to the last of the chain, (c) updated with all others."""
     style = style or FigureStyle()
-    nothing = np.zeros(len(data.readings), dtype=bool)
+    nothing = np.zeros(len(data.detections), dtype=bool)
     led = nothing.copy()
     led[data.order[-1]] = True
     with figure_context(style):
@@ -200,13 +200,13 @@ def _draw_step(
     axes.plot(*spline.evaluate(u).T, color=color, linewidth=style.curve_width, zorder=3, label=name)
     draw_control_points(axes, spline.control_points, color, style, f"{name}, control points")
     for chosen, of, what in (
-        (~expands, style.reading_color, "readings that update, 2σ"),
+        (~expands, style.detection_color, "readings that update, 2σ"),
         (expands, style.sigma_color, "readings that expand, 2σ"),
     ):
-        own = data.readings[chosen]
+        own = data.detections[chosen]
         draw_ellipses(axes, own, np.tile(data.sigma**2 * np.eye(2), (len(own), 1, 1)), of, style)
-        draw_readings(axes, own, of, style, what)
-    together = np.concatenate([data.readings, data.updated.spline.control_points])
+        draw_detections(axes, own, of, style, what)
+    together = np.concatenate([data.detections, data.updated.spline.control_points])
     low, high = together.min(axis=0) - 1.0, together.max(axis=0) + 0.8
     frame(axes, (low[0], low[1]), (high[0], high[1]))
 
@@ -215,7 +215,7 @@ def _draw_chain(axes: Axes, data: Expansion, style: FigureStyle) -> None:
     """From the end along the proximity chain."""
     spline = data.before.spline
     end = spline.evaluate(np.array([spline.domain[1]]))
-    chain = np.concatenate([end, data.readings[data.order]])
+    chain = np.concatenate([end, data.detections[data.order]])
     axes.plot(
         *chain.T, color=style.sigma_color, linewidth=0.8, linestyle=":", zorder=2, label="proximity chain"
     )

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pathspace_graph.ckf.fit import SplineReading, fit_readings
+from pathspace_graph.ckf.fit import SplineMeasurement, fit_detections
 from pathspace_graph.mapping.cubature import cubature_points, square_root
 from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.spline.bspline import BSpline
@@ -17,8 +17,8 @@ from pathspace_graph.spline.bspline import BSpline
 from .style import (
     FigureStyle,
     draw_control_points,
+    draw_detections,
     draw_ellipses,
-    draw_readings,
     figure_context,
     fit_height,
     frame,
@@ -57,7 +57,7 @@ class Fit:
 
     curve: BSpline
     """S_mu."""
-    readings: Array
+    detections: Array
     """z (m, 2), m."""
     covariances: Array
     """(m, 2, 2), m^2."""
@@ -69,7 +69,7 @@ class Fit:
     """X (4 m, m, 2), m."""
     fitted_points: Array
     """Z (4 m, n, 2): control points fitted to each, m."""
-    reading: SplineReading
+    reading: SplineMeasurement
     """S_z."""
 
     @property
@@ -84,21 +84,27 @@ def fit(scene: FitScene | None = None) -> Fit:
     x = scene.spacing * np.arange(scene.control_points)
     points = np.stack([x, -scene.swing * np.cos(2.0 * np.pi * x / x[-1])], axis=1)
     curve = BSpline.open_uniform(points, interval=scene.spacing).clamp()
-    readings = _beside(curve, np.array(scene.shares), np.array(scene.offsets))
-    covariances = _ray_covariances(readings - np.array(scene.vehicle), scene.sigmas)
-    feet = curve.foot_points(readings).u
+    detections = _beside(curve, np.array(scene.shares), np.array(scene.offsets))
+    covariances = _ray_covariances(detections - np.array(scene.vehicle), scene.sigmas)
+    feet = curve.foot_points(detections).u
     basis = curve.basis_matrix(feet)
-    reading = fit_readings(
-        basis, readings, covariances, curve.control_points, CkfSettings(ridge=scene.ridge, penalty="solution")
+    reading = fit_detections(
+        basis,
+        detections,
+        covariances,
+        curve.control_points,
+        CkfSettings(ridge=scene.ridge, penalty="solution"),
     )
-    m = len(readings)
+    m = len(detections)
     joint = np.zeros((m, 2, m, 2))
     joint[np.arange(m), :, np.arange(m), :] = covariances
-    sigma_points = cubature_points(readings.ravel(), square_root(joint.reshape(2 * m, 2 * m))).reshape(
+    sigma_points = cubature_points(detections.ravel(), square_root(joint.reshape(2 * m, 2 * m))).reshape(
         -1, m, 2
     )
     moved = np.einsum("nm,kmd->knd", reading.gain, sigma_points - basis @ curve.control_points)
-    return Fit(curve, readings, covariances, feet, basis, sigma_points, curve.control_points + moved, reading)
+    return Fit(
+        curve, detections, covariances, feet, basis, sigma_points, curve.control_points + moved, reading
+    )
 
 
 def _beside(curve: BSpline, shares: Array, offsets: Array) -> Array:
@@ -134,7 +140,7 @@ def plot_fit(data: Fit, style: FigureStyle | None = None) -> Figure:
         _draw_sigma_points(sigma, data, style)
         _draw_fitted(fitted, data, style)
         _draw_basis(basis, data, style)
-        shown = np.concatenate([data.curve.control_points, data.readings])
+        shown = np.concatenate([data.curve.control_points, data.detections])
         low, high = shown.min(axis=0) - (1.0, 1.6), np.add(shown.max(axis=0), (1.0, 1.9))
         for axes in (closest, sigma, fitted):
             frame(axes, (low[0], low[1]), (high[0], high[1]))
@@ -160,10 +166,10 @@ def _draw_closest(axes: Axes, data: Fit, style: FigureStyle) -> None:
     _draw_state(axes, data, style)
     draw_control_points(axes, data.curve.control_points, style.curve_color, style, r"$C_\mu$")
     nearest = data.curve.evaluate(data.feet)
-    for reading, foot in zip(data.readings, nearest, strict=True):
+    for reading, foot in zip(data.detections, nearest, strict=True):
         axes.plot(*np.stack([reading, foot]).T, color=style.truth_color, linewidth=0.7, zorder=4)
-    draw_ellipses(axes, data.readings, data.covariances, style.reading_color, style)
-    draw_readings(axes, data.readings, style.reading_color, style, "readings $z$ (a: 2σ)")
+    draw_ellipses(axes, data.detections, data.covariances, style.detection_color, style)
+    draw_detections(axes, data.detections, style.detection_color, style, "readings $z$ (a: 2σ)")
     axes.plot(
         *nearest.T,
         linestyle="none",
@@ -183,7 +189,7 @@ def _draw_sigma_points(axes: Axes, data: Fit, style: FigureStyle) -> None:
         label = None if number else "splines $Z$"
         axes.plot(*curve.T, color=style.faint_color, linewidth=style.thin_width, zorder=2, label=label)
     _draw_state(axes, data, style)
-    draw_readings(axes, data.readings, style.reading_color, style, "readings $z$ (a: 2σ)")
+    draw_detections(axes, data.detections, style.detection_color, style, "readings $z$ (a: 2σ)")
     axes.plot(
         *data.sigma_points.reshape(-1, 2).T,
         linestyle="none",
@@ -208,7 +214,7 @@ def _draw_fitted(axes: Axes, data: Fit, style: FigureStyle) -> None:
     )
     draw_control_points(axes, data.reading.points, style.fitted_color, style, "$C_z$, 2σ")
     draw_ellipses(axes, data.reading.points, point_blocks(data.reading.covariance), style.fitted_color, style)
-    draw_readings(axes, data.readings, style.reading_color, style, "readings $z$ (a: 2σ)")
+    draw_detections(axes, data.detections, style.detection_color, style, "readings $z$ (a: 2σ)")
     axes.set_title("(c) their mean and covariance: the reading $S_z$")
 
 

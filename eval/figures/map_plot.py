@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.files import atomic_file
 from pathspace_graph.io.log import Log, Truth
-from pathspace_graph.io.map import Boundary, Map, PointBoundary, SplineBoundary
+from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 
@@ -163,7 +163,7 @@ def curve_parameters(spline: BSpline, samples_per_span: int) -> Array:
 # --- layers ----------------------------------------------------------------------------------------------
 
 
-def draw_boundary(axes: Axes, boundary: Boundary, label: int, band_scale: float, style: PlotStyle) -> None:
+def draw_boundary(axes: Axes, boundary: MapBoundary, label: int, band_scale: float, style: PlotStyle) -> None:
     """A curve with its band and control points, or landmarks with their ellipses, in the map frame (m)."""
     if isinstance(boundary, PointBoundary):
         _draw_landmarks(axes, boundary, label, band_scale, style)

@@ -43,7 +43,7 @@ class FigureStyle:
     """Of what is fitted or updated: the paper's purple."""
     other_color: str = ORANGE
     """Of what it is held against."""
-    reading_color: str = GREEN
+    detection_color: str = GREEN
     """Of readings."""
     sigma_color: str = RED
     """Of sigma points and of what is marked."""
@@ -120,7 +120,7 @@ def draw_control_points(axes: Axes, points: Array, color: str, style: FigureStyl
     )
 
 
-def draw_readings(axes: Axes, points: Array, color: str, style: FigureStyle, label: str) -> None:
+def draw_detections(axes: Axes, points: Array, color: str, style: FigureStyle, label: str) -> None:
     """Filled circles."""
     axes.plot(
         *points.T,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import wrap_angle
-from pathspace_graph.io.map import Boundary, SplineBoundary
+from pathspace_graph.io.map import MapBoundary, SplineBoundary
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import NAMES
 
@@ -49,7 +49,7 @@ def gap(run: RunResult, reference: RunResult) -> Gap:
     return Gap(curves, *(root_mean_square(error) for error in errors))
 
 
-def _points(boundary: Boundary) -> Array:
+def _points(boundary: MapBoundary) -> Array:
     """(k, 2) points on the curve, or the landmarks."""
     if not isinstance(boundary, SplineBoundary):
         return boundary.points

@@ -44,10 +44,10 @@ class Limit:
 def limit(log: Log, track: Map) -> Limit:
     """sqrt(l^2 + f^2) of a simulated log and the map that was made of it."""
     truth = _truth(log)
-    return Limit(l=landmark_rmse(solve_told_landmarks(log), truth), f=fit_rmse(track, truth))
+    return Limit(l=landmark_rmse(solve_oracle_landmarks(log), truth), f=fit_rmse(track, truth))
 
 
-def solve_told_landmarks(log: Log, *, with_covariance: bool = False) -> LandmarkSolution:
+def solve_oracle_landmarks(log: Log, *, with_covariance: bool = False) -> LandmarkSolution:
     """The landmark batch that is *told* which true cone every reading saw; landmark ids are true cones."""
     truth = _truth(log)
     if truth.associations is None:

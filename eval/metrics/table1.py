@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.odometry import wrap_angle
 from pathspace_graph.io.log import Truth
-from pathspace_graph.io.map import Boundary, Map, SplineBoundary
+from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import LapSettings, lap_end_indices
 from pathspace_graph.spline.bspline import BSpline
@@ -99,7 +99,7 @@ def cone_distances(track: Map, truth: Truth) -> Array:
     return distances[np.isin(truth.cone_labels, BOUNDARIES)]
 
 
-def boundary_distances(boundary: Boundary, points_map: Array) -> Array:
+def boundary_distances(boundary: MapBoundary, points_map: Array) -> Array:
     """(k,) m: from each point (k, 2) to the closest point of the spline, or to the nearest landmark."""
     if isinstance(boundary, SplineBoundary):
         feet = closest_points(boundary.spline, points_map)

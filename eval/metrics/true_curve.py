@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator
 
 from pathspace_graph.io.log import Truth
-from pathspace_graph.io.map import Boundary, SplineBoundary
+from pathspace_graph.io.map import MapBoundary, SplineBoundary
 from pathspace_graph.laps import lap_end_indices
 
 from .limit import driving_order
@@ -51,7 +51,7 @@ def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
     return np.asarray(Akima1DInterpolator(along, around)(stations), dtype=float)
 
 
-def mapped_points(boundary: Boundary, step: float = MAPPED_STEP) -> Array:
+def mapped_points(boundary: MapBoundary, step: float = MAPPED_STEP) -> Array:
     """(k, 2) points, m, equal lengths apart on a mapped curve, `step` (m) at most; or the landmarks."""
     if not isinstance(boundary, SplineBoundary):
         return boundary.points

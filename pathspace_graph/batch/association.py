@@ -8,18 +8,18 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.projection import project, to_map
 from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_keys
 from pathspace_graph.labels import UNKNOWN
-from pathspace_graph.mapping.detections import Readings
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
-from pathspace_graph.spline.boundary import SAME_WAY
+from pathspace_graph.spline.boundary import SAME_DIRECTION
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
-OTHER_WAY = 100.0
+OTHER_DIRECTION = 100.0
 """A curve that leads another way counts as so much farther (m): taken only where no other does."""
-STATION_STEP = 1.0
+POSE_U_STEP = 1.0
 """Step (m) along a curve at which stations are looked for."""
 
 
@@ -37,8 +37,8 @@ def locate_poses(state: State) -> None:
     """
     for label, boundary in state.boundaries.items():
         low, length = boundary.tables.low, boundary.length
-        u = low + length * (np.arange(int(np.ceil(length / STATION_STEP))) + 0.5) / np.ceil(
-            length / STATION_STEP
+        u = low + length * (np.arange(int(np.ceil(length / POSE_U_STEP))) + 0.5) / np.ceil(
+            length / POSE_U_STEP
         )
         position, tangent = (boundary.evaluate(state.control_points(label), u, order) for order in (0, 1))
         tangent /= np.maximum(np.hypot(*tangent.T), np.finfo(float).tiny)[:, None]
@@ -47,12 +47,14 @@ def locate_poses(state: State) -> None:
         offset_y = poses[:, 1:2] - position[:, 1]
         heading = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
         square = offset_x**2 + offset_y**2
-        square[heading @ tangent.T < SAME_WAY] += OTHER_WAY**2
+        square[heading @ tangent.T < SAME_DIRECTION] += OTHER_DIRECTION**2
         nearest = u[square.argmin(axis=1)]
-        state.stations[label] = np.unwrap(nearest, period=length) if boundary.periodic else nearest
+        state.pose_u[label] = np.unwrap(nearest, period=length) if boundary.periodic else nearest
 
 
-def associate(state: State, readings: Readings, settings: MapperSettings, gate: float, strict: bool) -> int:
+def associate(
+    state: State, detections: DetectionTable, settings: MapperSettings, gate: float, strict: bool
+) -> int:
     """Put every reading into use that lies within `gate` sigmas of its curve; gives how many changed.
 
     Searched for in the stretch that is visible from the reading's pose; where `strict`, what isn't explained
@@ -60,37 +62,42 @@ def associate(state: State, readings: Readings, settings: MapperSettings, gate: 
     A label is believed; a reading of unknown colour goes to the curve that it fits better, but not before
     curves are where they belong: cones of no boundary stand beside them.
     """
-    before = np.where(readings.used, readings.boundary, UNKNOWN)
-    boundary_of, u = np.full(len(readings), UNKNOWN), readings.u.copy()
+    before = np.where(detections.used, detections.boundary, UNKNOWN)
+    boundary_of, u = np.full(len(detections), UNKNOWN), detections.u.copy()
     for whole in (False, True) if strict else (False,):
         left = boundary_of == UNKNOWN
-        best = np.full(len(readings), gate)
+        best = np.full(len(detections), gate)
         for label in state.boundaries:
-            named = (readings.label == label) | (strict & (readings.label == UNKNOWN))
+            named = (detections.label == label) | (strict & (detections.label == UNKNOWN))
             rows = np.flatnonzero(left & named)
-            misfit, foot_u = _misfit(state, readings, settings, label, rows, whole)
+            misfit, foot_u = _misfit(state, detections, settings, label, rows, whole)
             nearer = misfit < best[rows]
             chosen = rows[nearer]
             best[chosen], boundary_of[chosen], u[chosen] = misfit[nearer], label, foot_u[nearer]
-    readings.release(np.arange(len(readings)))
+    detections.release(np.arange(len(detections)))
     used = np.flatnonzero(boundary_of != UNKNOWN)
-    readings.take(used, boundary_of[used], u[used])
+    detections.take(used, boundary_of[used], u[used])
     return int((before != boundary_of).sum())
 
 
 def _misfit(
-    state: State, readings: Readings, settings: MapperSettings, label: int, rows: IntArray, whole: bool
+    state: State,
+    detections: DetectionTable,
+    settings: MapperSettings,
+    label: int,
+    rows: IntArray,
+    whole: bool,
 ) -> tuple[Array, Array]:
     """(m,) distance of readings from a curve in sigmas, infinite where it isn't theirs; foot points (m,)."""
-    boundary, poses = state.boundaries[label], state.variables.poses_at(readings.cycle[rows])
-    points = to_map(readings.point[rows], poses)
+    boundary, poses = state.boundaries[label], state.variables.poses_at(detections.cycle[rows])
+    points = to_map(detections.point[rows], poses)
     if whole:
         low, high = np.full(len(rows), boundary.tables.low), np.full(len(rows), boundary.tables.high)
         foot = boundary.find(state.control_points(label), points, low, high)
     else:
-        begin = _nearest_in_view(state, readings.cycle[rows], points, label, settings.gate)
+        begin = _nearest_in_view(state, detections.cycle[rows], points, label, settings.gate)
         foot = boundary.refine(state.control_points(label), points, begin)
-    projected = project(points, readings.covariance[rows], poses, foot, settings.spline.sigma_model)
+    projected = project(points, detections.covariance[rows], poses, foot, settings.spline.sigma_model)
     possible = foot.interior & (np.abs(foot.distance) < settings.gate.rough)
     return np.where(possible, np.abs(foot.distance) / projected.sigma, np.inf), foot.u
 
@@ -98,8 +105,8 @@ def _misfit(
 def _nearest_in_view(state: State, cycles: IntArray, points: Array, label: int, gate: GateSettings) -> Array:
     """(m,) the parameter nearest to each point (m, 2) among those that its pose sees, a step apart."""
     boundary = state.boundaries[label]
-    ahead = np.arange(-gate.view_behind, gate.view_ahead + STATION_STEP, STATION_STEP)
-    u = state.stations[label][:, None] + ahead
+    ahead = np.arange(-gate.view_behind, gate.view_ahead + POSE_U_STEP, POSE_U_STEP)
+    u = state.pose_u[label][:, None] + ahead
     seen = boundary.evaluate(state.control_points(label), u.ravel()).reshape(*u.shape, 2)
     square = (seen[cycles, :, 0] - points[:, :1]) ** 2
     square += (seen[cycles, :, 1] - points[:, 1:]) ** 2

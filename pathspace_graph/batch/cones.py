@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.projection import to_map
-from pathspace_graph.mapping.detections import Readings
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -36,7 +36,7 @@ FOLD = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class SightedCones:
+class ConeClusters:
     """What the readings of a boundary are heaped around, in the order of travel."""
 
     points: Array
@@ -46,18 +46,20 @@ class SightedCones:
     count: IntArray
     """(k,) readings of each."""
 
-    def kept(self, which: BoolArray) -> SightedCones:
+    def kept(self, which: BoolArray) -> ConeClusters:
         """Those alone that `which` (k,) is true of."""
-        return SightedCones(self.points[which], self.u[which], self.count[which])
+        return ConeClusters(self.points[which], self.u[which], self.count[which])
 
-    def joined(self, other: SightedCones) -> SightedCones:
+    def joined(self, other: ConeClusters) -> ConeClusters:
         """Both, in order."""
         order = np.argsort(np.concatenate([self.u, other.u]), kind="stable")
         pairs = zip((self.points, self.u, self.count), (other.points, other.u, other.count), strict=True)
-        return SightedCones(*(np.concatenate(pair)[order] for pair in pairs))
+        return ConeClusters(*(np.concatenate(pair)[order] for pair in pairs))
 
 
-def sighted_cones(state: State, readings: Readings, label: int, settings: MapperSettings) -> SightedCones:
+def cone_clusters(
+    state: State, detections: DetectionTable, label: int, settings: MapperSettings
+) -> ConeClusters:
     """What the readings on a curve are heaped around.
 
     What is seen again and again beside a curve, but too far from it to be used, is a cone of it as well: the
@@ -66,18 +68,18 @@ def sighted_cones(state: State, readings: Readings, label: int, settings: Mapper
     vehicle passed them, as a curve may have taken two of them in the wrong one in a hairpin.
     """
     boundary = state.boundaries[label]
-    rows = np.flatnonzero(readings.label == label)
-    points = to_map(readings.point[rows], state.variables.poses_at(readings.cycle[rows]))
-    used = readings.used[rows] & (readings.boundary[rows] == label)
-    beside, ending, u = used.copy(), used.copy(), readings.u[rows].copy()
+    rows = np.flatnonzero(detections.label == label)
+    points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
+    used = detections.used[rows] & (detections.boundary[rows] == label)
+    beside, ending, u = used.copy(), used.copy(), detections.u[rows].copy()
     beside[~used], ending[~used], u[~used] = _beside(state, points[~used], label, settings)
     if boundary.periodic:
-        u = np.mod(u - way_begin(state, label), boundary.length)
+        u = np.mod(u - path_begin(state, label), boundary.length)
     else:
-        u = u - way_begin(state, label)
-    weight = 1.0 / np.trace(readings.covariance[rows], axis1=1, axis2=2)
+        u = u - path_begin(state, label)
+    weight = 1.0 / np.trace(detections.covariance[rows], axis1=1, axis2=2)
 
-    def heaped(which: BoolArray) -> SightedCones:
+    def heaped(which: BoolArray) -> ConeClusters:
         return cluster(points[which], u[which], weight[which], boundary.length, boundary.periodic, settings)
 
     cones = heaped(ending)
@@ -94,11 +96,11 @@ def sighted_cones(state: State, readings: Readings, label: int, settings: Mapper
 
 def last_lap(state: State, label: int) -> Array:
     """(l, 3) the poses of the last way around a closed curve, map frame."""
-    stations = state.stations[label]
+    stations = state.pose_u[label]
     return np.asarray(state.poses[stations > stations[-1] - state.boundaries[label].length])
 
 
-def as_passed(cones: SightedCones, lap: Array) -> SightedCones:
+def as_passed(cones: ConeClusters, lap: Array) -> ConeClusters:
     """In the order of the way driven, poses (l, 3), abeam of each: from the nearest pose, ahead or behind."""
     driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(lap[:, :2], axis=0).T)))
     offset = cones.points[:, None] - lap[:, :2]
@@ -106,18 +108,18 @@ def as_passed(cones: SightedCones, lap: Array) -> SightedCones:
     dx, dy = offset[np.arange(len(nearest)), nearest].T
     ahead = dx * np.cos(lap[nearest, 2]) + dy * np.sin(lap[nearest, 2])
     order = np.argsort(driven[nearest] + ahead, kind="stable")
-    return SightedCones(cones.points[order], cones.u[order], cones.count[order])
+    return ConeClusters(cones.points[order], cones.u[order], cones.count[order])
 
 
-def cone_counts(state: State, readings: Readings, settings: MapperSettings) -> list[int]:
+def cone_counts(state: State, detections: DetectionTable, settings: MapperSettings) -> list[int]:
     """How many cones were sighted of each boundary."""
-    return [len(sighted_cones(state, readings, label, settings).u) for label in state.boundaries]
+    return [len(cone_clusters(state, detections, label, settings).u) for label in state.boundaries]
 
 
-def way_begin(state: State, label: int) -> float:
+def path_begin(state: State, label: int) -> float:
     """Parameter of a curve at which the places of its cones are counted from."""
     boundary = state.boundaries[label]
-    return float(state.stations[label][0]) if boundary.periodic else boundary.tables.low
+    return float(state.pose_u[label][0]) if boundary.periodic else boundary.tables.low
 
 
 def _beside(
@@ -143,7 +145,7 @@ def _far_from(points: Array, cones: Array, radius: float) -> BoolArray:
 
 def cluster(
     points: Array, u: Array, weight: Array, length: float, periodic: bool, settings: MapperSettings
-) -> SightedCones:
+) -> ConeClusters:
     """Peaks of the density of readings (m, 2) along a way, at least `growth.sightings` readings each.
 
     u (m,) in [0, length]: places along the way (m); weight (m,): information, 1/m^2.
@@ -152,11 +154,11 @@ def cluster(
     member = _nearest(u, peaks, length if periodic else np.inf, settings)
     count = np.bincount(member[member >= 0], minlength=len(peaks))
     typical = float(np.median(count)) if len(count) else 0.0
-    cones = SightedCones(_means(points, weight, member, len(peaks)), peaks, count)
+    cones = ConeClusters(_means(points, weight, member, len(peaks)), peaks, count)
     return unfolded(cones.kept(count >= max(settings.growth.sightings, SELDOM * typical)), periodic)
 
 
-def unfolded(cones: SightedCones, periodic: bool) -> SightedCones:
+def unfolded(cones: ConeClusters, periodic: bool) -> ConeClusters:
     """Without cones at which the way would turn back on itself at once: one cone, put down twice."""
     points = cones.points
     if len(points) < FEWEST:

@@ -15,7 +15,7 @@ from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.candidates import SIDES
-from pathspace_graph.mapping.detections import Readings
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.measurements import Chain
 from pathspace_graph.mapping.path import along_and_across
 from pathspace_graph.mapping.state import State
@@ -60,7 +60,7 @@ class Recurrence:
     """What the heading gains in a lap, by the odometry (rad)."""
 
 
-def start_odometry(chain: Chain, readings: Readings, settings: MapperSettings) -> State:
+def start_odometry(chain: Chain, detections: DetectionTable, settings: MapperSettings) -> State:
     """Poses by dead reckoning, laps tied together where the way repeats, and curves through lap 1's cones."""
     poses = chain.dead_reckoned(np.zeros(CALIBRATION_SIZE))
     recurrence = find_recurrence(poses, settings)
@@ -70,7 +70,7 @@ def start_odometry(chain: Chain, readings: Readings, settings: MapperSettings) -
         poses, calibration = tie_laps(chain, recurrence, calibration)
     state = State()
     for label in BOUNDARIES:
-        _begin_boundary(state, label, poses, recurrence, readings, settings)
+        _begin_boundary(state, label, poses, recurrence, detections, settings)
     add_drive(state, poses, calibration)
     return state
 
@@ -212,18 +212,18 @@ def _begin_boundary(
     label: int,
     poses: Array,
     recurrence: Recurrence,
-    readings: Readings,
+    detections: DetectionTable,
     settings: MapperSettings,
 ) -> None:
     """A curve through what was seen of a boundary in the first lap, beside the path of that lap."""
     closed = bool(np.isfinite(recurrence.lap))
     first = recurrence.driven < recurrence.lap
-    rows = np.flatnonzero((readings.label == label) & first[readings.cycle])
+    rows = np.flatnonzero((detections.label == label) & first[detections.cycle])
     if len(rows) == 0 or first.sum() < 2:
         return
-    points = to_map(readings.point[rows], poses[readings.cycle[rows]])
-    station, kept, length = _beside_path(points, readings.cycle[rows], label, poses, recurrence, settings)
-    weight = 1.0 / np.trace(readings.covariance[rows[kept]], axis1=1, axis2=2)
+    points = to_map(detections.point[rows], poses[detections.cycle[rows]])
+    station, kept, length = _beside_path(points, detections.cycle[rows], label, poses, recurrence, settings)
+    weight = 1.0 / np.trace(detections.covariance[rows[kept]], axis1=1, axis2=2)
     cones = cluster(points[kept], station[kept], weight, length, closed, settings)
     if len(cones.points) < LEAST_CONES:
         return

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.graph.keys import CONTROL_LETTERS
 from pathspace_graph.graph.variables import Layout
-from pathspace_graph.mapping.detections import Readings
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.knots import FitSettings
 from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
@@ -20,7 +20,7 @@ from pathspace_graph.spline.cone_knots import chosen_breaks
 from pathspace_graph.spline.knots import fit_spline, refit
 
 from .association import associate, locate_poses
-from .cones import FEWEST, sighted_cones
+from .cones import FEWEST, cone_clusters
 
 Array = NDArray[np.float64]
 
@@ -38,14 +38,14 @@ def on_knots_of(spline: BSpline, settings: MapperSettings) -> tuple[Boundary, Ar
     """A boundary that is this curve, all of it confirmed, and its control points (m, 2)."""
     spline = spline if spline.periodic else spline.unclamp()
     boundary = Boundary(spline.knots, spline.periodic, exact_settings(settings.spline), settings.gauge)
-    boundary.confirmed = boundary.tables.high
+    boundary.confirmed_end = boundary.tables.high
     return boundary, spline.distinct_control_points
 
 
-def reknot(state: State, readings: Readings, settings: MapperSettings, dense: bool = False) -> State:
+def reknot(state: State, detections: DetectionTable, settings: MapperSettings, dense: bool = False) -> State:
     """Every curve anew, through the cones sighted along it; `dense`: on so many knots that it meets them."""
     state = state.copy()
-    cones = {label: sighted_cones(state, readings, label, settings) for label in state.boundaries}
+    cones = {label: cone_clusters(state, detections, label, settings) for label in state.boundaries}
     share = size_share({label: len(own.points) for label, own in cones.items()}, settings)
     for label, boundary in list(state.boundaries.items()):
         points = cones[label].points
@@ -95,7 +95,7 @@ def exact_settings(spline: SplineSettings) -> SplineSettings:
 
 
 def simplified(
-    state: State, covariance: Array, readings: Readings, settings: MapperSettings
+    state: State, covariance: Array, detections: DetectionTable, settings: MapperSettings
 ) -> tuple[State, Array]:
     """The same poses beside curves on the knots that the cones ask for, and their joint covariance (n, n).
 
@@ -104,14 +104,14 @@ def simplified(
     number of readings averages out: in the first seconds that turns the vehicle, and with it the whole map,
     by up to a degree, several times what its covariance says.
     """
-    following = reknot(state, readings, settings)
+    following = reknot(state, detections, settings)
     change = np.zeros((following.map_points.size, state.map_points.size))
     for label, boundary in state.boundaries.items():
         new, points = following.boundaries[label], following.control_points(label)
         by_points = new_from_old(boundary, state.control_points(label), new, points)
         change[map_block(following, label), map_block(state, label)] = np.kron(by_points, np.eye(2))
     locate_poses(following)
-    associate(following, readings, settings, settings.batch.gate, strict=True)
+    associate(following, detections, settings, settings.batch.gate, strict=True)
     return following, change @ covariance @ change.T
 
 

@@ -19,8 +19,8 @@ from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
-from pathspace_graph.mapping.detections import Readings
-from pathspace_graph.mapping.measurements import Chain, collect_readings, integrate_log
+from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import settings_dict
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
@@ -108,25 +108,25 @@ class BatchMapper:
         if start == "online" and self.online is None:
             raise SettingsError("start online: expected an online mapper to begin with, found none")
         chain = integrate_log(log, self.odometry_sigma, settings.odometry)
-        readings = collect_readings(log)
-        system = BatchSystem(readings, chain, settings, Biweight(batch.loose_gate))
+        detections = collect_detections(log)
+        system = BatchSystem(detections, chain, settings, Biweight(batch.loose_gate))
         optimizer = Optimizer(system, batch)
         watch.lap("integrate")
         online = None
         if start == "online" and self.online is not None:
             state, online = start_online(log, self.online(self.settings, self.odometry_sigma))
         else:
-            state = start_odometry(chain, readings, settings)
+            state = start_odometry(chain, detections, settings)
         watch.lap("start")
         state = optimizer.hold_map(state, batch.pose_steps, batch.loose_gate)
         watch.lap("poses")
-        at, convergence = _optimum(optimizer, state, readings, settings, on_round)
+        at, convergence = _optimum(optimizer, state, detections, settings, on_round)
         watch.lap("optimum")
         joint = system.eliminated(at).joint(at.state.map_keys)
         watch.lap("covariance")
-        readings = deepcopy(readings)  # those of the problem stay as they were solved for
-        state, joint = simplified(at.state, joint, readings, settings)
-        scatter = scatter_of_cones(state, readings, settings)
+        detections = deepcopy(detections)  # those of the problem stay as they were solved for
+        state, joint = simplified(at.state, joint, detections, settings)
+        scatter = scatter_of_cones(state, detections, settings)
         watch.lap("simplify")
         return BatchResult(
             estimator=NAME,
@@ -135,7 +135,7 @@ class BatchMapper:
             scatter=scatter,
             trajectory_t=chain.stamps,
             trajectory=at.state.poses.copy(),
-            cycles=_records(state, readings, chain, sum(watch.laps.values())),
+            cycles=_records(state, detections, chain, sum(watch.laps.values())),
             laps=_completed(at.state.poses),
             converged=convergence.converged,
             convergence=convergence,
@@ -151,7 +151,7 @@ class BatchMapper:
 def _optimum(
     optimizer: Optimizer,
     state: State,
-    readings: Readings,
+    detections: DetectionTable,
     settings: MapperSettings,
     on_round: Callable[[], None] | None,
 ) -> tuple[Evaluation, Convergence]:
@@ -161,12 +161,12 @@ def _optimum(
     """
     batch = settings.batch
     rough = Schedule(batch.loose_gate, batch.rough_rounds, batch.rough_tolerance)
-    at, _ = optimizer.run(reknot(state, readings, settings, dense=True), rough, on_round)
+    at, _ = optimizer.run(reknot(state, detections, settings, dense=True), rough, on_round)
     fine = Schedule(batch.gate, batch.max_rounds)
     for _ in range(batch.knot_passes):
-        cones = cone_counts(at.state, readings, settings)
-        at, convergence = optimizer.run(reknot(at.state, readings, settings, dense=True), fine, on_round)
-        if cone_counts(at.state, readings, settings) == cones:
+        cones = cone_counts(at.state, detections, settings)
+        at, convergence = optimizer.run(reknot(at.state, detections, settings, dense=True), fine, on_round)
+        if cone_counts(at.state, detections, settings) == cones:
             break
     return at, convergence
 
@@ -194,10 +194,12 @@ def _map(state: State, joint: Array, scatter: Scatter) -> Map:
     return Map(closed, boundaries)
 
 
-def _records(state: State, readings: Readings, chain: Chain, seconds: float) -> tuple[CycleRecord, ...]:
+def _records(
+    state: State, detections: DetectionTable, chain: Chain, seconds: float
+) -> tuple[CycleRecord, ...]:
     """A record of each cycle: its share of the time, its readings in use, its lap."""
     left, right = (state.boundaries[b].size if b in state.boundaries else 0 for b in (LEFT, RIGHT))
-    used = np.bincount(readings.cycle[readings.used], minlength=len(chain))
+    used = np.bincount(detections.cycle[detections.used], minlength=len(chain))
     counter = LapCounter()
     return tuple(
         CycleRecord(

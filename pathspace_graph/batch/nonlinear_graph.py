@@ -104,9 +104,9 @@ def _projections(system: BatchSystem, at: Evaluation, label: int) -> Iterator[gt
     A reading that is as sure in every direction keeps its sigma however the curve turns.
     """
     p, boundary, keys = at.projected[label], at.state.boundaries[label], at.state.keys(label).tolist()
-    scale, readings = system.scale(p), system.readings
-    weighted, cycle = np.flatnonzero(scale > 0.0), readings.cycle[p.rows]
-    points = to_map(readings.point[p.rows], at.state.variables.poses_at(cycle))
+    scale, detections = system.scale(p), system.detections
+    weighted, cycle = np.flatnonzero(scale > 0.0), detections.cycle[p.rows]
+    points = to_map(detections.point[p.rows], at.state.variables.poses_at(cycle))
     room = _room(boundary, at.state.control_points(label), points, p.foot.u)
     for one in np.split(weighted, np.flatnonzero(np.diff(cycle[weighted])) + 1):
         if len(one) == 0:
@@ -115,7 +115,7 @@ def _projections(system: BatchSystem, at: Evaluation, label: int) -> Iterator[gt
             pose_key(cycle[one[0]]),
             keys,
             boundary.tables,
-            points_vehicle=readings.point[p.rows[one]],
+            points_vehicle=detections.point[p.rows[one]],
             covariances=scale[one, None, None] ** -2.0 * np.eye(2),
             low=p.foot.u[one] - room[one],
             high=p.foot.u[one] + room[one],

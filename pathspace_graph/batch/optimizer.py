@@ -108,7 +108,7 @@ class Optimizer:
         system = self.system
         if not strict:
             locate_poses(state)
-        associate(state, system.readings, system.settings, gate, strict)
+        associate(state, system.detections, system.settings, gate, strict)
         return system.evaluate(state, hold=True)
 
     def hold_map(self, state: State, steps: int, gate: float) -> State:
@@ -160,7 +160,7 @@ class Optimizer:
     def _accept(self, at: Evaluation) -> None:
         """Foot points are refined from where they are now."""
         for projected in at.projected.values():
-            self.system.readings.u[projected.rows] = projected.foot.u
+            self.system.detections.u[projected.rows] = projected.foot.u
 
     def _report(self, at: Evaluation, rounds: int, reason: str, converged: bool) -> Convergence:
         gradient = gradient_norm(self.system.rows(at), at.state.variables.layout)

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import foot_points
-from pathspace_graph.mapping.detections import Readings
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .cones import FEWEST, FOLD, sighted_cones, way_begin
+from .cones import FEWEST, FOLD, cone_clusters, path_begin
 from .knots import fit_through
 
 Array = NDArray[np.float64]
@@ -55,13 +55,13 @@ class Scatter:
         return np.asarray(np.sqrt(self.seen**2 + share**2 * max(self.unseen**2 - self.seen**2, 0.0)))
 
 
-def scatter_of_cones(state: State, readings: Readings, settings: MapperSettings) -> Scatter:
+def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperSettings) -> Scatter:
     """How far the sighted cones stand off the curves that the state has, and off curves without them."""
     seen, unseen = [np.zeros(0)], [np.zeros(0)]
     places, lengths = {}, {}
     for label, boundary in state.boundaries.items():
-        cones = sighted_cones(state, readings, label, settings)
-        near = way_begin(state, label) + cones.u
+        cones = cone_clusters(state, detections, label, settings)
+        near = path_begin(state, label) + cones.u
         foot = boundary.find(state.control_points(label), cones.points, near - FOLD, near + FOLD)
         seen.append(foot.distance)
         unseen.append(left_out(cones.points, boundary.periodic, settings, boundary.size / max(len(near), 1)))

@@ -15,7 +15,7 @@ from pathspace_graph.io.results import CycleRecord, RunResult
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import OnlineEstimate, OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import SAME_WAY, Boundary
+from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary
 
 from .association import add_drive
 from .knots import exact_settings
@@ -55,7 +55,7 @@ class CurveMapper(OnlineEstimator, Protocol):
     def control_points(self, label: int) -> Array:
         """Control points (m, 2) of a boundary, map frame, m."""
 
-    def station(self, label: int) -> float:
+    def pose_parameter(self, label: int) -> float:
         """Parameter (m) on a boundary of the point beside the newest pose, laps adding up."""
 
 
@@ -79,7 +79,7 @@ class Recorder:
         """The mapper's update, and a note."""
         result = self.mapper.update(odometry, detections)
         for label, boundary in self.mapper.boundaries.items():
-            u = np.array([self.mapper.station(label)])
+            u = np.array([self.mapper.pose_parameter(label)])
             points = self.mapper.control_points(label)
             position, along = (boundary.evaluate(points, u, order)[0] for order in (0, 1))
             place = Place(self._cycle, float(u[0]), position, float(np.arctan2(along[1], along[0])))
@@ -115,7 +115,7 @@ def unwrap(poses: Array) -> Array:
 def _take_over(state: State, label: int, boundary: Boundary, control_points: Array) -> None:
     """A boundary of the same knots for the batch."""
     own = Boundary(boundary.knots, boundary.periodic, exact_settings(boundary.settings), boundary.gauge)
-    own.confirmed = boundary.confirmed
+    own.confirmed_end = boundary.confirmed_end
     state.add_boundary(label, own, control_points)
 
 
@@ -156,4 +156,6 @@ def _beside(place: Place, recorder: Recorder, poses: Array) -> bool:
     pose = poses[place.cycle]
     away = float(np.hypot(*(pose[:2] - place.position)))
     limit = recorder.settings.growth.max_lateral
-    return place.cycle < recorder.closed_at and away < limit and np.cos(place.heading - pose[2]) > SAME_WAY
+    return (
+        place.cycle < recorder.closed_at and away < limit and np.cos(place.heading - pose[2]) > SAME_DIRECTION
+    )

@@ -14,7 +14,7 @@ from pathspace_graph.graph.elimination import Elimination, linear_graph, map_hel
 from pathspace_graph.graph.keys import are_poses, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
-from pathspace_graph.mapping.detections import Readings
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.measurements import Chain
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
@@ -107,14 +107,16 @@ class Evaluation:
 class BatchSystem:
     """`min 1/2 |odometry|^2 + sum rho(readings) + 1/2 |spacing, smoothness, calibration, first pose|^2`."""
 
-    def __init__(self, readings: Readings, chain: Chain, settings: MapperSettings, kernel: Kernel) -> None:
-        self.readings = readings
+    def __init__(
+        self, detections: DetectionTable, chain: Chain, settings: MapperSettings, kernel: Kernel
+    ) -> None:
+        self.detections = detections
         self.chain = chain
         self.settings = settings
         self.kernel = kernel
         self.gauges: dict[int, CurveGauge] = {}
         """What holds each curve where readings don't."""
-        self._sigma = np.ones(len(readings))
+        self._sigma = np.ones(len(detections))
 
     def begin(self, state: State) -> None:
         """The curves' own gauges, where control points are now: to be called when knots change."""
@@ -131,7 +133,7 @@ class BatchSystem:
         """
         projected = {label: self._project(state, label, hold) for label in state.boundaries}
         odometry = self.chain.terms(state.poses, state.calibration)
-        cost = self._readings_cost(projected) + 0.5 * float((odometry[0] ** 2).sum())
+        cost = self._detections_cost(projected) + 0.5 * float((odometry[0] ** 2).sum())
         cost += sum(
             self.gauges[label].cost(state.control_points(label), state.poses) for label in state.boundaries
         )
@@ -139,21 +141,21 @@ class BatchSystem:
         return Evaluation(state, projected, odometry, cost)
 
     def _project(self, state: State, label: int, hold: bool) -> Projected:
-        readings = self.readings
-        rows = readings.used_on(label)
-        poses = state.variables.poses_at(readings.cycle[rows])
-        points = to_map(readings.point[rows], poses)
-        foot = state.boundaries[label].refine(state.control_points(label), points, readings.u[rows])
+        detections = self.detections
+        rows = detections.used_on(label)
+        poses = state.variables.poses_at(detections.cycle[rows])
+        points = to_map(detections.point[rows], poses)
+        foot = state.boundaries[label].refine(state.control_points(label), points, detections.u[rows])
         sigma_model = self.settings.spline.sigma_model
-        projection = project(points, readings.covariance[rows], poses, foot, sigma_model)
+        projection = project(points, detections.covariance[rows], poses, foot, sigma_model)
         if hold:
             self._sigma[rows] = projection.sigma
         return Projected(rows, foot, projection, self._sigma[rows])
 
-    def _readings_cost(self, projected: dict[int, Projected]) -> float:
+    def _detections_cost(self, projected: dict[int, Projected]) -> float:
         used = sum(int(p.foot.interior.sum()) for p in projected.values())
         losses = sum(float(self.kernel.loss(p.whitened[p.foot.interior]).sum()) for p in projected.values())
-        return losses + self.kernel.ceiling * (len(self.readings) - used)
+        return losses + self.kernel.ceiling * (len(self.detections) - used)
 
     # --- linear factors ----------------------------------------------------------------------------------
 
@@ -163,14 +165,14 @@ class BatchSystem:
         groups = self.chain.rows(at.odometry, state.poses[0], state.calibration)
         for label, gauge in self.gauges.items():
             points = state.control_points(label)
-            groups += [self.reading_rows(at, label), gauge.beside(points, state.poses)]
+            groups += [self.detection_rows(at, label), gauge.beside(points, state.poses)]
             groups += [gauge.smooth(points), gauge.anchor()]
         return groups
 
-    def reading_rows(self, at: Evaluation, label: int) -> Rows:
+    def detection_rows(self, at: Evaluation, label: int) -> Rows:
         """The readings in use on a boundary, on the control points of their span and their pose."""
         p, state = at.projected[label], at.state
-        cycle, scale = self.readings.cycle[p.rows], self.scale(p)
+        cycle, scale = self.detections.cycle[p.rows], self.scale(p)
         control = state.keys(label)[state.boundaries[label].columns(p.foot.span)]
         by_control = p.projection.by_control.reshape(len(cycle), 2 * control.shape[1])
         return Rows(

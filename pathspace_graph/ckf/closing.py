@@ -12,7 +12,7 @@ from pathspace_graph.graph.keys import POSE, pose_keys
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.registration import Motion, register
-from pathspace_graph.mapping.seam import Join, join
+from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit
@@ -51,11 +51,11 @@ def _recent(state: CurveState, cycles: list[tuple[Array, Detections]]) -> CurveM
         track.state.add_boundary(label, state.boundary(label), state.control_points(label))
     for cycle, (pose, detections) in enumerate(cycles):
         track.variables.insert(pose_keys(np.array([cycle])), pose)
-        track.readings.append(detections, cycle)
+        track.detections.append(detections, cycle)
     return track
 
 
-def tie(state: CurveState, motion: Motion) -> bool:
+def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
     """One Kalman update: the end of each curve, where the motion lays it on its beginning, is the beginning.
 
     `n . (S(u) - S(w)) = 0`, with u along the end, w its association on the early segment, and n the normal
@@ -98,7 +98,7 @@ def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Arra
     return u[on], foot.u[on]
 
 
-def simplify(state: CurveState, sighted: dict[int, list[Array]]) -> None:
+def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
     """Both curves become periodic, on curvature-weighted knots (paper: Simplification).
 
     Sampling the curve and fitting it by least squares is linear in its control points once the knots are
@@ -106,18 +106,22 @@ def simplify(state: CurveState, sighted: dict[int, list[Array]]) -> None:
     """
     for label in state.curves:
         boundary = state.boundary(label)
-        points, zero = np.array(sighted[label]).reshape(-1, 2), np.zeros(len(sighted[label]))
-        foot = boundary.find(state.control_points(label), points, zero, zero + boundary.confirmed)
-        boundary.sighted_u = np.sort(foot.u).tolist()
-        joined = join(boundary, state.control_points(label), state.settings, state.settings.ckf.knots)
-        curve, matrix = periodic_refit(state.spline(label), joined, state.settings)
+        points, zero = np.array(observed[label]).reshape(-1, 2), np.zeros(len(observed[label]))
+        foot = boundary.find(state.control_points(label), points, zero, zero + boundary.confirmed_end)
+        boundary.cone_parameters = np.sort(foot.u).tolist()
+        periodic_curve = make_periodic(
+            boundary, state.control_points(label), state.settings, state.settings.ckf.knots
+        )
+        curve, matrix = periodic_refit(state.spline(label), periodic_curve, state.settings)
         state.replace(label, curve, matrix, state.settings.spline.sigma_simplify)
-        state.stations[label] = float(joined.overlap.new_parameter(np.array([state.stations[label]]))[0])
+        state.pose_u[label] = float(periodic_curve.overlap.new_parameter(np.array([state.pose_u[label]]))[0])
 
 
-def periodic_refit(spline: BSpline, joined: Join, settings: MapperSettings) -> tuple[BSpline, Array]:
+def periodic_refit(
+    spline: BSpline, periodic_curve: PeriodicCurve, settings: MapperSettings
+) -> tuple[BSpline, Array]:
     """The closed curve's knots, and the matrix (m, n) from the open curve's control points to its own."""
     degree = settings.spline.degree
-    points = np.concatenate([joined.points, joined.points[:degree]])
-    curve = BSpline(joined.knots, points, degree, periodic=True)
-    return curve, refit(spline, curve, joined.overlap.new_parameter).new_from_old
+    points = np.concatenate([periodic_curve.points, periodic_curve.points[:degree]])
+    curve = BSpline(periodic_curve.knots, points, degree, periodic=True)
+    return curve, refit(spline, curve, periodic_curve.overlap.new_parameter).new_from_old

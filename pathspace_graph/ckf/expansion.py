@@ -11,8 +11,8 @@ from pathspace_graph.factors.projection import to_map
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.candidates import SIDES, Candidates, End, chain
-from pathspace_graph.mapping.path import Way
-from pathspace_graph.mapping.tentative import Sightings
+from pathspace_graph.mapping.path import PathAhead
+from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .state import CurveState
@@ -36,60 +36,60 @@ class Expansion:
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
-        self.sightings = {label: Sightings(settings.growth) for label in BOUNDARIES}
+        self.tentative = {label: TentativeTracks(settings.growth) for label in BOUNDARIES}
         """Everything seen lately, by colour."""
-        self.sighted: dict[int, list[Array]] = {label: [] for label in BOUNDARIES}
+        self.observed: dict[int, list[Array]] = {label: [] for label in BOUNDARIES}
         """Every distinct cone that was seen often enough, (2,), map frame."""
 
-    def sight(self, state: CurveState, detections: Detections) -> None:
+    def observe(self, state: CurveState, detections: Detections) -> None:
         """All readings of a cycle."""
         points = to_map(detections.points_vehicle, np.tile(state.pose, (len(detections.labels), 1)))
         variances = np.trace(detections.covariances, axis1=1, axis2=2)
-        for label, sightings in self.sightings.items():
+        for label, tentative in self.tentative.items():
             of = detections.labels == label
-            sightings.add(points[of], variances[of], detections.t)
-            known, radius = self.sighted[label], self.settings.growth.merge_radius
-            for point in sightings.points[sightings.confirmed()]:
+            tentative.add(points[of], variances[of], detections.t)
+            known, radius = self.observed[label], self.settings.growth.merge_radius
+            for point in tentative.points[tentative.confirmed()]:
                 if not known or np.hypot(*(np.array(known[-RECENT:]) - point).T).min() > radius:
                     known.append(point.copy())
 
     def expand(
-        self, state: CurveState, detections: Detections, way: Way, free: NDArray[np.bool_]
+        self, state: CurveState, detections: Detections, path_ahead: PathAhead, free: NDArray[np.bool_]
     ) -> set[int]:
         """Begin each curve or lead it on, by readings that no curve takes (`free` (m,)); gives the grown."""
         grown: set[int] = set()
         for label in BOUNDARIES:
             rows = np.flatnonzero(free & (detections.labels == label))
-            found = self._candidates(state, label, detections, rows, way)
+            found = self._candidates(state, label, detections, rows, path_ahead)
             if label not in state.curves:
                 self._begin(state, label, detections, found)
-            elif self._extend(state, label, detections, found) or self._carry_on(state, label, way):
+            elif self._extend(state, label, detections, found) or self._carry_on(state, label, path_ahead):
                 grown.add(label)
         return grown
 
     def _candidates(
-        self, state: CurveState, label: int, detections: Detections, rows: IntArray, way: Way
+        self, state: CurveState, label: int, detections: Detections, rows: IntArray, path_ahead: PathAhead
     ) -> Candidates:
         """Readings of trusted sightings that come next along the way; their indices are the cycle's rows."""
-        settings, sightings = self.settings.growth, self.sightings[label]
+        settings, tentative = self.settings.growth, self.tentative[label]
         points = to_map(detections.points_vehicle[rows], np.tile(state.pose, (len(rows), 1)))
-        trusted = sightings.points[self._undisputed(label, sightings.confirmed())]
+        trusted = tentative.points[self._undisputed(label, tentative.confirmed())]
         offset = points[:, None] - trusted[None]
         near = np.hypot(offset[..., 0], offset[..., 1]).min(axis=1, initial=np.inf) < settings.merge_radius
-        stations, lateral = way.locate(points)
+        stations, lateral = path_ahead.locate(points)
         found = Candidates(points, rows, stations, SIDES[label] * lateral)
-        found = found.where(near & (stations <= way.stations[-1]) & (found.sides > 0.0))
+        found = found.where(near & (stations <= path_ahead.stations[-1]) & (found.sides > 0.0))
         found = found.where(np.argsort(found.stations))
         end = None
         if label in state.curves:
-            end = _end(state, label, way, self.settings.growth.end_behind)
+            end = _end(state, label, path_ahead, self.settings.growth.end_behind)
             found = found.where(self._beyond(state, label, found, end)) if len(found.points) else found
         return found.where(chain(found, settings, end))
 
     def _undisputed(self, label: int, indices: IntArray) -> IntArray:
         """Those sightings that aren't seen oftener in another colour, as in the other estimators."""
-        own, votes = self.sightings[label], self.sightings[label].counts[indices].astype(np.float64)
-        for other in (self.sightings[b] for b in BOUNDARIES if b != label):
+        own, votes = self.tentative[label], self.tentative[label].counts[indices].astype(np.float64)
+        for other in (self.tentative[b] for b in BOUNDARIES if b != label):
             offset = own.points[indices, None] - other.points
             near = np.hypot(offset[..., 0], offset[..., 1]) < self.settings.growth.merge_radius
             votes -= near @ other.counts
@@ -135,14 +135,14 @@ class Expansion:
         model = self.settings.ckf.sigma_model**2 * np.eye(2)
         return np.asarray(detections.covariances[rows] + model)
 
-    def _carry_on(self, state: CurveState, label: int, way: Way) -> bool:
+    def _carry_on(self, state: CurveState, label: int, path_ahead: PathAhead) -> bool:
         """The vehicle has passed a stranded end: lead it beside the way nearly as far as the vehicle is."""
         settings = self.settings.growth
-        end = _end(state, label, way, settings.end_behind)
-        if end.station >= way.driven - settings.stranded:
+        end = _end(state, label, path_ahead, settings.end_behind)
+        if end.station >= path_ahead.driven - settings.stranded:
             return False
         side = SIDES[label] * max(end.side, settings.min_lateral)
-        point = way.beside(way.driven - settings.stranded_left * settings.stranded, side)
+        point = path_ahead.beside(path_ahead.driven - settings.stranded_left * settings.stranded, side)
         if np.hypot(*(point - end.position)) < settings.min_carry:
             return False
         c, s = np.cos(state.pose[2]), np.sin(state.pose[2])
@@ -173,8 +173,8 @@ def _end_position(state: CurveState, label: int) -> Array:
     return np.array(state.control_points(label)[-1])
 
 
-def _end(state: CurveState, label: int, way: Way, behind: float) -> End:
+def _end(state: CurveState, label: int, path_ahead: PathAhead, behind: float) -> End:
     """The end of a curve, beside the latest stretch of the way, from `behind` (m) on."""
     position = _end_position(state, label)
-    station, lateral = way.since(way.driven - behind).locate(position[None])
+    station, lateral = path_ahead.since(path_ahead.driven - behind).locate(position[None])
     return End(position, float(station[0]), SIDES[label] * float(lateral[0]))

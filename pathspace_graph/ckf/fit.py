@@ -52,7 +52,7 @@ _RANK: Final = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class SplineReading:
+class SplineMeasurement:
     """S_z, in the frame of the readings, on the control points that it is of."""
 
     points: Array
@@ -88,9 +88,9 @@ def ridge_gain(basis: Array, settings: CkfSettings) -> Array:
     return np.asarray(np.linalg.lstsq(gram, basis.T, rcond=None)[0])
 
 
-def fit_readings(
-    basis: Array, readings: Array, covariances: Array, known: Array, settings: CkfSettings
-) -> SplineReading:
+def fit_detections(
+    basis: Array, detections: Array, covariances: Array, known: Array, settings: CkfSettings
+) -> SplineMeasurement:
     """S_z of readings (m, 2) with covariances (m, 2, 2): a cubature transform through the ridge regression.
 
     basis (m, r) at their foot points; known (r, 2): the control points, in the frame of the readings.
@@ -105,5 +105,5 @@ def fit_readings(
         fitted = kept + np.einsum("rm,kmd->krd", gain, samples.reshape(-1, m, 2))
         return np.asarray(fitted.reshape(len(samples), -1))
 
-    fitted = transform(fit, readings.ravel(), joint.reshape(2 * m, 2 * m))
-    return SplineReading(fitted.mean.reshape(r, 2), fitted.covariance, gain, gain @ basis, known)
+    fitted = transform(fit, detections.ravel(), joint.reshape(2 * m, 2 * m))
+    return SplineMeasurement(fitted.mean.reshape(r, 2), fitted.covariance, gain, gain @ basis, known)

@@ -17,7 +17,7 @@ from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 from pathspace_graph.stopwatch import Stopwatch
 
 from .association import OnCurve, classify
-from .closing import associate_early, simplify, tie
+from .closing import associate_early, simplify, update_by_correspondences
 from .expansion import Expansion
 from .state import CurveState
 from .update import update
@@ -74,12 +74,12 @@ class CkfMapper:
         """Lead the ends on; then the readings that lie on the new stretch update it with the rest."""
         if self.closed:
             return found
-        self.expansion.sight(self.state, detections)
+        self.expansion.observe(self.state, detections)
         free = np.ones(len(detections.labels), bool)
         for on in found.values():
             free[on.rows] = False
-        way = self.path.ahead(self.state.pose, self.settings.ckf.reach)
-        grown = self.expansion.expand(self.state, detections, way, free)
+        path_ahead = self.path.ahead(self.state.pose, self.settings.ckf.reach)
+        grown = self.expansion.expand(self.state, detections, path_ahead, free)
         return classify(self.state, detections) if grown else found
 
     def _close(self, detections: Detections) -> None:
@@ -95,8 +95,8 @@ class CkfMapper:
             return
         self._closing_tried = self.path.length
         motion = associate_early(state, self._recent, self.path.beginning)
-        if motion is not None and tie(state, motion):
-            simplify(state, self.expansion.sighted)
+        if motion is not None and update_by_correspondences(state, motion):
+            simplify(state, self.expansion.observed)
             self.closed = True
 
     def _result(self, t: float, readings: int, stages: dict[str, float]) -> CycleResult:

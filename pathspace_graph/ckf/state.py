@@ -26,7 +26,7 @@ class CurveState:
         """Mean and covariance of x."""
         self.curves: dict[int, BSpline] = {}
         """The curves by label; of their control points only the number is up to date, see `spline`."""
-        self.stations: dict[int, float] = {}
+        self.pose_u: dict[int, float] = {}
         """Parameter of the vehicle's foot point on each curve; not wrapped."""
 
     @property
@@ -67,7 +67,7 @@ class CurveState:
         """The vehicle's station on each curve: near the last one, or anew where that can't be its own."""
         gate = self.settings.gate
         heading = np.array([np.cos(self.pose[2]), np.sin(self.pose[2])])
-        for label, station in self.stations.items():
+        for label, station in self.pose_u.items():
             low, high = np.array([station - gate.station_behind]), np.array([station + gate.station_ahead])
             foot = self.find(label, self.pose[None, :2], low, high)
             u = float(foot.u[0])
@@ -76,27 +76,27 @@ class CurveState:
             if self.curves[label].periodic:
                 begin, end = self.curves[label].domain
                 u += (end - begin) * round((station - u) / (end - begin))
-            self.stations[label] = u
+            self.pose_u[label] = u
 
     def visible(self, label: int, count: int) -> tuple[Array, Array]:
         """Limits (count,) of the stretch of a curve that the vehicle sees."""
-        gate, station = self.settings.gate, self.stations[label]
+        gate, station = self.settings.gate, self.pose_u[label]
         return np.full(count, station - gate.view_behind), np.full(count, station + gate.view_ahead)
 
     # --- what changes the curves -------------------------------------------------------------------------
 
-    def begin(self, label: int, readings: Array, covariances: Array) -> None:
+    def begin(self, label: int, detections: Array, covariances: Array) -> None:
         """A clamped curve of one span along the polyline of readings (k >= 2, 2) of the vehicle frame."""
-        belief, p, k = self.belief, self.settings.spline.degree, len(readings)
+        belief, p, k = self.belief, self.settings.spline.degree, len(detections)
         count = len(belief.points)
-        belief.sight(readings, covariances)
-        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(readings, axis=0).T)))
+        belief.observe(detections, covariances)
+        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(detections, axis=0).T)))
         at = np.linspace(0.0, along[-1], p + 1)
         matrix = np.column_stack([np.interp(at, along, row) for row in np.eye(k)])
         belief.change(count, count + k, matrix, np.full(p + 1, self.settings.ckf.sigma_start))
         knots = clamped_knots(np.array([0.0, along[-1]]), p)
         self._take_up(label, BSpline(knots, belief.points[count:], p), p + 1)
-        self.stations[label] = 0.0
+        self.pose_u[label] = 0.0
 
     def extend(self, label: int, reading: Array, covariance: Array) -> None:
         """Lead a curve on to a reading (2,) of the vehicle frame: unclamp, insert, clamp (Hu et al. 2002).
@@ -104,7 +104,7 @@ class CurveState:
         The new control point has the reading's uncertainty (2, 2) and the vehicle's.
         """
         belief, spline, p = self.belief, self.spline(label), self.curves[label].degree
-        belief.sight(reading[None], covariance[None])
+        belief.observe(reading[None], covariance[None])
         knots = spline.extension_knots(belief.points[-1])
         matrix = end_change_matrix(spline.knots, p, knots)
         n, end = spline.size, self.offset(label) + spline.size
@@ -141,5 +141,5 @@ class CurveState:
         """A curve's knots as the mapper's closing and simplification take them."""
         curve, settings = self.curves[label], self.settings
         boundary = Boundary(curve.knots, curve.periodic, settings.spline, settings.gauge)
-        boundary.confirmed = boundary.tables.high
+        boundary.confirmed_end = boundary.tables.high
         return boundary

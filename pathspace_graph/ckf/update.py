@@ -13,7 +13,7 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.belief import PLANE, to_vehicle_rows
 
 from .association import OnCurve
-from .fit import SplineReading, fit_readings
+from .fit import SplineMeasurement, fit_detections
 from .state import CurveState
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ class _Part:
 
     columns: IntArray
     """(2 r,) entries of the state of the control points that it is of."""
-    fitted: SplineReading
+    fitted: SplineMeasurement
     """S_z, vehicle frame."""
     combine: Array
     """(2 r, q) the combinations of its entries that are measured."""
@@ -63,7 +63,7 @@ def _part(state: CurveState, label: int, detections: Detections, on: OnCurve) ->
     settings = state.settings.ckf
     control = np.flatnonzero(on.basis.sum(axis=0) > settings.least_basis)
     known = to_vehicle_rows(state.pose[None], state.control_points(label)[control].reshape(1, -1))
-    fitted = fit_readings(
+    fitted = fit_detections(
         on.basis[:, control],
         detections.points_vehicle[on.rows],
         _widened(state, detections.covariances[on.rows], on.tangents),

@@ -228,10 +228,10 @@ class FixedLagSmoother(Generic[M_co]):
 
     def step(self, sigma_step: float | None = None) -> None:
         """One Gauss-Newton step; where given, a map point moves `sigma_step` (m) freely, which damps it."""
-        descent = self.factorize(sigma_step)
+        negative_gradient = self.factorize(sigma_step)
         assert self.last_step is not None
         entries = self.variables.layout.entries(self.last_step.layout.keys)
-        self.variables.values[entries] += solve(self.last_step.factor, descent)
+        self.variables.values[entries] += solve(self.last_step.factor, negative_gradient)
 
     def factorize(self, sigma_step: float | None = None) -> Array:
         """The step's system and its Cholesky factor; gives the negative gradient (n,). No variable moves."""
@@ -241,13 +241,15 @@ class FixedLagSmoother(Generic[M_co]):
         user, layout = self.user_factors.linearized(self.variables), self.layout
         graph = graph_of(self.prior, *self.window.linear, *user)
         hessian, vector = normal_equations(graph, layout)
-        descent = vector - hessian @ self.variables.change(self.variables.layout.entries(layout.keys))
+        negative_gradient = vector - hessian @ self.variables.change(
+            self.variables.layout.entries(layout.keys)
+        )
         if sigma_step is not None:
             first, last = layout.block(CALIBRATION_LETTER).stop, layout.block(POSE_LETTER).start
             points = np.arange(first, last)
             hessian[points, points] += sigma_step**-2
         self.last_step = Step(layout, cholesky(hessian))
-        return descent
+        return negative_gradient
 
     # --- what is inactive --------------------------------------------------------------------------------
 

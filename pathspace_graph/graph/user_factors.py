@@ -120,8 +120,8 @@ def as_nonlinear(factor: gtsam.GaussianFactor, variables: Variables) -> gtsam.Li
     layout = Layout(np.sort(np.array(list(factor.keys()), np.intp)))
     information, vector = normal_equations(graph_of(factor), layout)
     turn = _turn(layout.keys, variables)
-    descent = vector - information @ variables.change(variables.layout.entries(layout.keys))
-    root, right = rooted(turn.T @ information @ turn, turn.T @ descent)
+    negative_gradient = vector - information @ variables.change(variables.layout.entries(layout.keys))
+    root, right = rooted(turn.T @ information @ turn, turn.T @ negative_gradient)
     linear = jacobian_factor(layout.keys, root, right)
     return gtsam.LinearContainerFactor(gtsam.JacobianFactor(linear), variables.gtsam_values(layout.keys))
 

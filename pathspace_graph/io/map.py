@@ -58,7 +58,7 @@ class PointBoundary:
         return len(self.points)
 
 
-Boundary = SplineBoundary | PointBoundary
+MapBoundary = SplineBoundary | PointBoundary
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class Map:
     closed: bool
     """Whether the track was found to be a loop."""
 
-    boundaries: Mapping[int, Boundary]
+    boundaries: Mapping[int, MapBoundary]
     """By label, LEFT and RIGHT; a boundary that could not be mapped is absent."""
 
     @property
@@ -88,7 +88,7 @@ def map_to_json(track: Map) -> dict[str, Any]:
     return {"format": FORMAT, "closed": bool(track.closed), "boundaries": boundaries}
 
 
-def _boundary_to_json(boundary: Boundary) -> dict[str, Any]:
+def _boundary_to_json(boundary: MapBoundary) -> dict[str, Any]:
     shared = {"covariance": boundary.covariance.tolist(), "size": boundary.size}
     if isinstance(boundary, PointBoundary):
         return {"points": boundary.points.tolist(), **shared}
@@ -165,7 +165,7 @@ class _Reader:
             raise self.error(f"{where}: expected {expected}")
         return array
 
-    def boundary(self, value: Any, where: str) -> Boundary:
+    def boundary(self, value: Any, where: str) -> MapBoundary:
         fields = self.object(value, where)
         if "points" in fields:
             points = self.array(fields["points"], f"{where}.points", columns=2)

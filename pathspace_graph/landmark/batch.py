@@ -19,7 +19,7 @@ from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
 from .fixed_lag import point_map
 from .reassociation import Reassociation, drop_rare
-from .start import as_landmark_readings, start_online, start_told
+from .start import as_landmark_detections, start_online, start_oracle
 from .state import LandmarkState
 from .system import LandmarkSystem
 from .tentative import duplicates
@@ -60,29 +60,29 @@ class LandmarkBatch:
     def _solve(self, log: Log, associations: Ints | None) -> LandmarkResult:
         settings = self.settings.landmark
         chain = integrate_log(log, self.odometry_sigma, self.settings.odometry)
-        readings = as_landmark_readings(log)
+        detections = as_landmark_detections(log)
         if associations is None:
-            state = start_online(log, readings, self.settings, self.odometry_sigma)
+            state = start_online(log, detections, self.settings, self.odometry_sigma)
         else:
-            state = start_told(readings, chain, associations)
-        system = LandmarkSystem(readings, chain, self.settings)
+            state = start_oracle(detections, chain, associations)
+        system = LandmarkSystem(detections, chain, self.settings)
         system.settle(state)
         rounds, converged = 0, associations is not None
         while not converged and rounds < settings.max_rounds:
             rounds += 1
-            converged = self._refresh(system, state) <= settings.settled * len(readings)
+            converged = self._refresh(system, state) <= settings.settled * len(detections)
             system.settle(state)
         return self._result(system, state, rounds, converged)
 
     def _refresh(self, system: LandmarkSystem, state: LandmarkState) -> int:
         """Associate anew, merge, drop; how many readings are of another landmark now."""
-        readings, problem = system.readings, system.eliminated(state)
-        before, known = readings.landmark.copy(), len(state)
-        Reassociation(state, readings, problem, self.settings, system.chain.stamps).run()
+        detections, problem = system.detections, system.eliminated(state)
+        before, known = detections.landmark.copy(), len(state)
+        Reassociation(state, detections, problem, self.settings, system.chain.stamps).run()
         first, second = duplicates(state, known, problem.joint, self.settings)
-        readings.merge(state.numbers[first], state.numbers[second])
-        drop_rare(state, readings, self.settings.growth.sightings)
-        return int((before != readings.landmark).sum())
+        detections.merge(state.numbers[first], state.numbers[second])
+        drop_rare(state, detections, self.settings.growth.sightings)
+        return int((before != detections.landmark).sum())
 
     def _result(
         self, system: LandmarkSystem, state: LandmarkState, rounds: int, converged: bool

@@ -22,7 +22,7 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.belief import PLANE, Belief, point_columns, to_vehicle_rows
-from pathspace_graph.mapping.tentative import Sightings
+from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 from pathspace_graph.stopwatch import Stopwatch
@@ -46,7 +46,7 @@ class LandmarkCkf:
         """`x = [pose | calibration | landmarks]`."""
         self.labels: IntArray = np.zeros(0, np.intp)
         """(n,) colour of each landmark."""
-        self.sightings = {label: Sightings(self.settings.growth) for label in BOUNDARIES}
+        self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         """What isn't a landmark yet."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
@@ -109,19 +109,19 @@ class LandmarkCkf:
         points = to_map(detections.points_vehicle, np.tile(self.belief.pose, (len(detections.labels), 1)))
         variances = np.trace(detections.covariances, axis1=1, axis2=2)
         chosen = [np.zeros(0, np.intp)]
-        for label, sightings in self.sightings.items():
+        for label, tentative in self.tentative.items():
             rows = np.flatnonzero(new & (detections.labels == label))
-            sightings.add(points[rows], variances[rows], detections.t)
-            often = np.flatnonzero(sightings.counts >= self.settings.ckf.sightings)
-            offset = points[rows][:, None] - sightings.points[often][None]
+            tentative.add(points[rows], variances[rows], detections.t)
+            often = np.flatnonzero(tentative.counts >= self.settings.ckf.sightings)
+            offset = points[rows][:, None] - tentative.points[often][None]
             distance = np.hypot(offset[..., 0], offset[..., 1])
             if distance.size:
                 nearest = np.unique(distance.argmin(axis=0)[distance.min(axis=0) < self._radius])
                 chosen.append(rows[nearest])
-                sightings.remove(often[distance.min(axis=0) < self._radius])
+                tentative.remove(often[distance.min(axis=0) < self._radius])
         rows = np.concatenate(chosen)
         if len(rows):
-            self.belief.sight(detections.points_vehicle[rows], detections.covariances[rows])
+            self.belief.observe(detections.points_vehicle[rows], detections.covariances[rows])
             self.labels = np.concatenate([self.labels, detections.labels[rows]])
 
     @property

@@ -125,7 +125,7 @@ def _believed(smoother: LandmarkSmoother, pairs: Pairs) -> bool:
     return bool(enough and len(labels) >= settings.min_pairs and pairs.distance < joint)
 
 
-def bend(smoother: LandmarkSmoother, pairs: Pairs) -> None:
+def optimize_loop(smoother: LandmarkSmoother, pairs: Pairs) -> None:
     """Solve the whole loop with the pairs tied, each submap relinearized in its own frame.
 
     The pairs are to be merged next.

@@ -14,17 +14,17 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import smoother_settings
 from pathspace_graph.mapping.registration import near_start
-from pathspace_graph.mapping.tentative import Sightings
+from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 from pathspace_graph.stopwatch import Stopwatch
 
 from .association import NONE, PLANE
-from .closing import bend, merge, recognize
+from .closing import merge, optimize_loop, recognize
 from .landmark_map import LandmarkMap
 from .prediction import assign
 from .state import LandmarkState
-from .tentative import duplicates, sighted_by
+from .tentative import detected_by, duplicates
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -46,7 +46,7 @@ class LandmarkFixedLag:
         self.smoother.window.exact = True
         self.path = DrivenPath(self.settings.path)
         """The way driven."""
-        self.sightings = {label: Sightings(self.settings.growth) for label in BOUNDARIES}
+        self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         """What isn't a landmark yet."""
         self.closed = False
         """Whether the loop has closed."""
@@ -60,8 +60,8 @@ class LandmarkFixedLag:
         driven = integrate_twists(durations, odometry.twist, self.odometry_sigma)
         self.path.update(self.smoother.drive(detections.t, driven, self.settings.odometry.sigmas_start))
         watch.lap("predict")
-        new = self.smoother.map.readings.append(detections, self.smoother.next_cycle - 1)
-        assign(self.smoother, new, self._open_to_readings())
+        new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
+        assign(self.smoother, new, self._open_to_detections())
         watch.lap("associate")
         created = self._create(new, detections.t)
         watch.lap("create")
@@ -76,32 +76,32 @@ class LandmarkFixedLag:
 
     def _create(self, new: slice, t: float) -> bool:
         """Readings of no landmark are sightings; those seen often enough become landmarks. True if any."""
-        readings, created = self.smoother.map.readings, False
-        rows = new.start + np.flatnonzero(readings.landmark[new] == NONE)
-        for label, sightings in self.sightings.items():
-            of = rows[readings.label[rows] == label]
-            points = to_map(readings.point[of], self.smoother.variables.poses_at(readings.cycle[of]))
-            sightings.add(points, np.trace(readings.covariance[of], axis1=1, axis2=2), t)
-            confirmed = sightings.confirmed()
+        detections, created = self.smoother.map.detections, False
+        rows = new.start + np.flatnonzero(detections.landmark[new] == NONE)
+        for label, tentative in self.tentative.items():
+            of = rows[detections.label[rows] == label]
+            points = to_map(detections.point[of], self.smoother.variables.poses_at(detections.cycle[of]))
+            tentative.add(points, np.trace(detections.covariance[of], axis1=1, axis2=2), t)
+            confirmed = tentative.confirmed()
             if len(confirmed):
-                self._found(label, sightings.points[confirmed].copy())
-                sightings.remove(confirmed)
+                self._found(label, tentative.points[confirmed].copy())
+                tentative.remove(confirmed)
                 created = True
         return created
 
     def _found(self, label: int, points: Array) -> None:
         """New landmarks at points (k, 2) that readings in the window saw; those readings are of them."""
-        readings, state = self.smoother.map.readings, self.smoother.map.state
-        rows = np.flatnonzero((readings.label == label) & (readings.landmark == NONE))
-        cycles = readings.cycle[rows]
-        seen = to_map(readings.point[rows], self.smoother.variables.poses_at(cycles))
-        chosen, which = sighted_by(seen, cycles, points, self.settings.growth)
+        detections, state = self.smoother.map.detections, self.smoother.map.state
+        rows = np.flatnonzero((detections.label == label) & (detections.landmark == NONE))
+        cycles = detections.cycle[rows]
+        seen = to_map(detections.point[rows], self.smoother.variables.poses_at(cycles))
+        chosen, which = detected_by(seen, cycles, points, self.settings.growth)
         held, which = np.unique(which, return_inverse=True)  # nothing would hold the others
         numbers = state.add(points[held], np.full(len(held), label, np.intp))[which]
-        readings.take(rows[chosen], numbers)
-        state.vote(readings.label[rows[chosen]], numbers)
+        detections.take(rows[chosen], numbers)
+        state.vote(detections.label[rows[chosen]], numbers)
 
-    def _open_to_readings(self) -> NDArray[np.bool_]:
+    def _open_to_detections(self) -> NDArray[np.bool_]:
         """(n,) landmarks that readings may be of: until the loop has closed, near the start not the old ones.
 
         Drift is common to all that is seen: there one reading alone can't tell which old landmark it is of.
@@ -118,8 +118,8 @@ class LandmarkFixedLag:
 
     def _look_back(self) -> None:
         """Every few metres: close the loop where old landmarks are seen, then merge what is one cone."""
-        readings, state, length = self.smoother.map.readings, self.smoother.map.state, self.path.length
-        seen = np.unique(readings.landmark[readings.used])
+        detections, state, length = self.smoother.map.detections, self.smoother.map.state, self.path.length
+        seen = np.unique(detections.landmark[detections.used])
         self._last_seen = np.append(self._last_seen, np.zeros(state.born - len(self._last_seen)))
         self._last_seen[seen] = length
         if length - self._tried < self.settings.closing.check_interval:
@@ -133,7 +133,7 @@ class LandmarkFixedLag:
             reach = settings.radius + settings.drift * length
             pairs = recognize(self.smoother, state.positions(seen), np.flatnonzero(self._old()), reach)
             if pairs is not None:
-                bend(self.smoother, pairs)
+                optimize_loop(self.smoother, pairs)
                 self._merge(pairs.first, pairs.second)
                 self.closed, self.smoother.window.exact = True, False
 
@@ -145,8 +145,8 @@ class LandmarkFixedLag:
         merge(self.smoother, first, second)
 
     def _result(self, t: float, stages: dict[str, float]) -> CycleResult:
-        readings, state = self.smoother.map.readings, self.smoother.map.state
-        used = int((readings.used & (readings.cycle == self.smoother.next_cycle - 1)).sum())
+        detections, state = self.smoother.map.detections, self.smoother.map.state
+        used = int((detections.used & (detections.cycle == self.smoother.next_cycle - 1)).sum())
         left, right = (int((state.labels == label).sum()) for label in (LEFT, RIGHT))
         pose = self.smoother.variables.poses[-1].copy()
         return CycleResult(t, pose, (left, right), used, self.closed, stages)

@@ -14,7 +14,7 @@ from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .state import LandmarkReadings, LandmarkState
+from .state import LandmarkDetections, LandmarkState
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -31,7 +31,7 @@ class LandmarkMap:
         self.state = LandmarkState()
         """The landmarks, and all variables."""
         self.variables = self.state.variables
-        self.readings = LandmarkReadings()
+        self.detections = LandmarkDetections()
         """Readings of the poses in the window."""
         self.ties: IntArray = np.zeros((0, 2), np.intp)
         """(k, 2) numbers of landmarks that are held together while the loop closes."""
@@ -40,18 +40,18 @@ class LandmarkMap:
 
     def changed(self) -> IntArray:
         """(k,) cycles whose readings in use have changed since they were linearized last."""
-        return self.readings.cycle[self.readings.changed]
+        return self.detections.cycle[self.detections.changed]
 
     def rows(self, cycles: IntArray) -> list[Rows]:
         """Two rows for each reading in use of some cycles."""
         wanted = np.zeros(len(self.variables.poses), bool)
         wanted[cycles - self.variables.first_cycle] = True
-        chosen = self.readings.used & wanted[self.readings.cycle - self.variables.first_cycle]
-        return [landmark_rows(self.state, self.readings, np.flatnonzero(chosen), self.settings.gate.huber)]
+        chosen = self.detections.used & wanted[self.detections.cycle - self.variables.first_cycle]
+        return [landmark_rows(self.state, self.detections, np.flatnonzero(chosen), self.settings.gate.huber)]
 
     def linearized(self, cycles: IntArray) -> None:
         """The rows of these cycles are those of the graph from now on."""
-        self.readings.changed[:] = False
+        self.detections.changed[:] = False
 
     @property
     def structure(self) -> object:
@@ -78,13 +78,13 @@ class LandmarkMap:
 
     def leave(self, cycle: int) -> None:
         """The pose of a cycle, the window's oldest, has left with its readings."""
-        self.readings.keep_from(cycle + 1)
+        self.detections.keep_from(cycle + 1)
 
     def merge(self, first: IntArray, second: IntArray) -> None:
         """Landmarks at positions `first` (k,) have become those at `second` (k,), with readings and votes."""
         state = self.state
         gone, kept = state.numbers[first], state.numbers[second]
-        self.readings.merge(gone, kept)
+        self.detections.merge(gone, kept)
         np.add.at(state.votes, second, state.votes[first])
         stays = np.ones(len(state), bool)
         stays[first] = False
@@ -97,15 +97,17 @@ LandmarkSmoother: TypeAlias = FixedLagSmoother[LandmarkMap]
 """The engine on landmarks."""
 
 
-def landmark_rows(state: LandmarkState, readings: LandmarkReadings, chosen: IntArray, huber: float) -> Rows:
+def landmark_rows(
+    state: LandmarkState, detections: LandmarkDetections, chosen: IntArray, huber: float
+) -> Rows:
     """`w W (R^T (l - t) - z)` of readings (m,) that are of a landmark, `W' W = K^-1`.
 
     w is the root of each row's own Huber weight.
     """
-    cycles, numbers = readings.cycle[chosen], readings.landmark[chosen]
+    cycles, numbers = detections.cycle[chosen], detections.landmark[chosen]
     points = state.landmarks[state.positions(numbers)]
-    seen = landmark_residuals(state.variables.poses_at(cycles), points, readings.point[chosen])
-    white = whiteners(readings.covariance[chosen])
+    seen = landmark_residuals(state.variables.poses_at(cycles), points, detections.point[chosen])
+    white = whiteners(detections.covariance[chosen])
     residual = np.einsum("mij,mj->mi", white, seen.residual)
     weight = np.sqrt(huber_weights(residual, huber))
     jacobian = white @ np.concatenate([seen.by_pose, seen.by_landmark], axis=2)

@@ -16,7 +16,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.mapping.measurements import integrate_log
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .start import as_landmark_readings, start_told
+from .start import as_landmark_detections, start_oracle
 from .system import LandmarkSystem
 
 Array = NDArray[np.float64]
@@ -56,9 +56,9 @@ def solve_landmarks(
     """
     settings = settings or MapperSettings()
     settings = replace(settings, gate=replace(settings.gate, huber=np.inf))
-    chain, readings = integrate_log(log, log.odometry_sigma, settings.odometry), as_landmark_readings(log)
-    system = LandmarkSystem(readings, chain, settings)
-    state = start_told(readings, chain, associations)
+    chain, detections = integrate_log(log, log.odometry_sigma, settings.odometry), as_landmark_detections(log)
+    system = LandmarkSystem(detections, chain, settings)
+    state = start_oracle(detections, chain, associations)
     system.settle(state)
     return LandmarkSolution(
         trajectory_t=chain.stamps,

@@ -36,26 +36,28 @@ def assign(smoother: LandmarkSmoother, new: slice, eligible: BoolArray) -> None:
 
     eligible (n,): landmarks that they may be of.
     """
-    readings, state, settings = smoother.map.readings, smoother.map.state, smoother.map.settings.landmark
+    detections, state, settings = smoother.map.detections, smoother.map.state, smoother.map.settings.landmark
     rows = np.arange(new.start, new.stop)
     candidates = nearby(smoother, rows, settings.rough)
     seen = predict(smoother, candidates[eligible[candidates]])
     gates, numbers = Gates.of_probabilities(settings.match, settings.create), state.numbers[seen.landmarks]
-    any_colour = pair_costs(readings.point[rows], readings.covariance[rows], seen.points, seen.covariances)
-    may_be = compatible(readings.label[rows], state.labels[seen.landmarks])
+    any_colour = pair_costs(
+        detections.point[rows], detections.covariance[rows], seen.points, seen.covariances
+    )
+    may_be = compatible(detections.label[rows], state.labels[seen.landmarks])
     found = associate(np.where(may_be, any_colour, np.inf), gates)
     matched = found.landmark != NONE
-    readings.take(rows[matched], numbers[found.landmark[matched]])
+    detections.take(rows[matched], numbers[found.landmark[matched]])
     explained = (any_colour < gates.match).any(axis=1)  # in the wrong colour, maybe: that makes no new one
-    readings.landmark[rows[~matched & (~found.new | explained)]] = LEFT_OUT
+    detections.landmark[rows[~matched & (~found.new | explained)]] = LEFT_OUT
     if explained.any():
-        state.vote(readings.label[rows[explained]], numbers[any_colour[explained].argmin(axis=1)])
+        state.vote(detections.label[rows[explained]], numbers[any_colour[explained].argmin(axis=1)])
 
 
 def nearby(smoother: LandmarkSmoother, rows: IntArray, rough: float) -> IntArray:
     """Landmarks within `rough` (m) of any of these readings."""
-    readings = smoother.map.readings
-    points = to_map(readings.point[rows], smoother.variables.poses_at(readings.cycle[rows]))
+    detections = smoother.map.detections
+    points = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
     offset = points[:, None] - smoother.map.state.landmarks[None]
     return np.flatnonzero((np.hypot(offset[..., 0], offset[..., 1]) < rough).any(axis=0))
 

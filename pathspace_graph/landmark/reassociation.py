@@ -14,12 +14,12 @@ from pathspace_graph.factors.projection import to_map
 from pathspace_graph.graph.elimination import Elimination
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.tentative import Sightings
+from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import NONE, PLANE, Gates, associate, compatible, kept_costs, squared_mahalanobis
-from .state import LandmarkReadings, LandmarkState
-from .tentative import sighted_by
+from .state import LandmarkDetections, LandmarkState
+from .tentative import detected_by
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -32,15 +32,15 @@ class Reassociation:
     def __init__(
         self,
         state: LandmarkState,
-        readings: LandmarkReadings,
+        detections: LandmarkDetections,
         problem: Elimination,
         settings: MapperSettings,
         stamps: Array,
     ) -> None:
-        self.state, self.readings, self.problem = state, readings, problem
+        self.state, self.detections, self.problem = state, detections, problem
         self.settings, self.stamps = settings, stamps
         self.gates = Gates.of_probabilities(settings.landmark.match, settings.landmark.create)
-        self.points = to_map(readings.point, state.variables.poses_at(readings.cycle))
+        self.points = to_map(detections.point, state.variables.poses_at(detections.cycle))
 
     def run(self) -> None:
         """Readings are of the landmarks that the assignment says; those of none may make new ones."""
@@ -49,21 +49,21 @@ class Reassociation:
 
     def _assign(self) -> IntArray:
         """Every cycle's assignment; gives the readings that are of no landmark."""
-        readings = self.readings
+        detections = self.detections
         rows, landmarks, distances = self._near()
         cost = self._costs(rows, landmarks)
-        held = readings.landmark[rows] == self.state.numbers[landmarks]
+        held = detections.landmark[rows] == self.state.numbers[landmarks]
         cost = kept_costs(cost, held, self.gates)
-        recolour(self.state, readings.label, rows, landmarks, cost, self.gates.match)
-        readings.landmark[:] = NONE
-        free = np.ones(len(readings), bool)
-        starts = np.searchsorted(readings.cycle[rows], np.arange(len(self.stamps) + 1))
+        recolour(self.state, detections.label, rows, landmarks, cost, self.gates.match)
+        detections.landmark[:] = NONE
+        free = np.ones(len(detections), bool)
+        starts = np.searchsorted(detections.cycle[rows], np.arange(len(self.stamps) + 1))
         for begin, end in pairwise(starts.tolist()):
             self._assign_cycle(rows[begin:end], landmarks[begin:end], cost[begin:end], free)
         # what is on a landmark in the other colour, or would be merged with one, isn't a new one
         known = (cost < self.gates.match) | (distances < self.settings.growth.merge_radius)
         free[rows[known]] = False
-        return np.flatnonzero(free & ~readings.used)
+        return np.flatnonzero(free & ~detections.used)
 
     def _assign_cycle(self, rows: IntArray, landmarks: IntArray, cost: Array, free: BoolArray) -> None:
         """The assignment of one cycle's pairs (k,); `free` (R,) keeps which readings may be new."""
@@ -71,10 +71,10 @@ class Reassociation:
         candidates, j = np.unique(landmarks, return_inverse=True)
         table = np.full((len(own), len(candidates)), np.inf)
         table[i, j] = cost
-        table[~compatible(self.readings.label[own], self.state.labels[candidates])] = np.inf
+        table[~compatible(self.detections.label[own], self.state.labels[candidates])] = np.inf
         found = associate(table, self.gates)
         matched = found.landmark != NONE
-        self.readings.take(own[matched], self.state.numbers[candidates[found.landmark[matched]]])
+        self.detections.take(own[matched], self.state.numbers[candidates[found.landmark[matched]]])
         free[own] = found.new
 
     def _near(self) -> tuple[IntArray, IntArray, Array]:
@@ -86,34 +86,39 @@ class Reassociation:
 
     def _costs(self, rows: IntArray, landmarks: IntArray) -> Array:
         """(k,) squared Mahalanobis distances of pairs."""
-        state, readings = self.state, self.readings
-        cycles, poses = readings.cycle[rows], state.variables.poses_at(readings.cycle[rows])
-        r = landmark_residuals(poses, state.landmarks[landmarks], readings.point[rows])
+        state, detections = self.state, self.detections
+        cycles, poses = detections.cycle[rows], state.variables.poses_at(detections.cycle[rows])
+        r = landmark_residuals(poses, state.landmarks[landmarks], detections.point[rows])
         jacobian = np.concatenate([r.by_pose, r.by_landmark], axis=2)
         spread = predicted(self.problem, cycles, state.keys[landmarks], jacobian)
-        return squared_mahalanobis(r.residual, spread + readings.covariance[rows])
+        return squared_mahalanobis(r.residual, spread + detections.covariance[rows])
 
     def _create(self, free: IntArray) -> None:
         """New landmarks where readings of none come together, as online."""
-        readings = self.readings
+        detections = self.detections
         for label in BOUNDARIES:
-            own = free[readings.label[free] == label]
+            own = free[detections.label[free] == label]
             points = self._confirmed(own)
-            which, sighted = sighted_by(self.points[own], readings.cycle[own], points, self.settings.growth)
+            which, observed = detected_by(
+                self.points[own], detections.cycle[own], points, self.settings.growth
+            )
             numbers = self.state.add(points, np.full(len(points), label, np.intp))
-            readings.take(own[which], numbers[sighted])
+            detections.take(own[which], numbers[observed])
 
     def _confirmed(self, rows: IntArray) -> Array:
         """(k, 2) what was sighted often enough, m, map frame; in a batch nothing is forgotten."""
-        readings, sightings = self.readings, Sightings(replace(self.settings.growth, forget_after=np.inf))
-        variances = np.trace(readings.covariance[rows], axis1=1, axis2=2)
+        detections, tentative = (
+            self.detections,
+            TentativeTracks(replace(self.settings.growth, forget_after=np.inf)),
+        )
+        variances = np.trace(detections.covariance[rows], axis1=1, axis2=2)
         found = [np.zeros((0, PLANE))]
-        for cycle in np.unique(readings.cycle[rows]):
-            now = readings.cycle[rows] == cycle
-            sightings.add(self.points[rows[now]], variances[now], float(self.stamps[cycle]))
-            confirmed = sightings.confirmed()
-            found.append(sightings.points[confirmed])
-            sightings.remove(confirmed)
+        for cycle in np.unique(detections.cycle[rows]):
+            now = detections.cycle[rows] == cycle
+            tentative.add(self.points[rows[now]], variances[now], float(self.stamps[cycle]))
+            confirmed = tentative.confirmed()
+            found.append(tentative.points[confirmed])
+            tentative.remove(confirmed)
         return np.concatenate(found)
 
 
@@ -141,10 +146,10 @@ def predicted(problem: Elimination, cycles: IntArray, keys: IntArray, jacobian: 
     return np.asarray(jacobian @ joint @ np.swapaxes(jacobian, 1, 2))
 
 
-def drop_rare(state: LandmarkState, readings: LandmarkReadings, fewest: int) -> None:
+def drop_rare(state: LandmarkState, detections: LandmarkDetections, fewest: int) -> None:
     """Landmarks with fewer readings than `fewest` are taken out, and those readings are of none."""
-    counts = np.bincount(state.positions(readings.landmark[readings.used]), minlength=len(state))
+    counts = np.bincount(state.positions(detections.landmark[detections.used]), minlength=len(state))
     gone = counts < fewest
-    readings.landmark[np.isin(readings.landmark, state.numbers[gone])] = NONE
+    detections.landmark[np.isin(detections.landmark, state.numbers[gone])] = NONE
     state.variables.remove(state.keys[gone])
     state.keep(~gone)

@@ -84,7 +84,7 @@ class LandmarkState:
 
 
 @dataclass
-class LandmarkReadings:
+class LandmarkDetections:
     """Readings, oldest first, and what each is of: columns of equal length."""
 
     cycle: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
@@ -111,7 +111,7 @@ class LandmarkReadings:
     def append(self, detections: Detections, cycle: int) -> slice:
         """Add the readings of one cycle, of no landmark yet; gives their rows."""
         start, m = len(self), len(detections.labels)
-        new = LandmarkReadings(
+        new = LandmarkDetections(
             np.full(m, cycle, np.intp),
             np.asarray(detections.points_vehicle, float),
             np.asarray(detections.covariances, float),

@@ -16,7 +16,7 @@ from pathspace_graph.mapping.measurements import Chain
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .landmark_map import landmark_rows
-from .state import LandmarkReadings, LandmarkState
+from .state import LandmarkDetections, LandmarkState
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ class LandmarkSystem:
     The associations are held: a reading of no landmark costs nothing.
     """
 
-    readings: LandmarkReadings
+    detections: LandmarkDetections
     """Of the whole log."""
     chain: Chain
     """Its odometry."""
@@ -38,7 +38,7 @@ class LandmarkSystem:
         """Half the sum of squares at a state, Huber's loss in place of the readings' own."""
         poses, calibration = state.variables.poses, state.variables.calibration
         residual, _ = self.chain.terms(poses, calibration)
-        losses = huber_loss(self._reading_rows(state, np.inf).residual, self.settings.gate.huber)
+        losses = huber_loss(self._detection_rows(state, np.inf).residual, self.settings.gate.huber)
         cost = 0.5 * (residual**2).sum() + losses.sum() + self.chain.prior_cost(poses[0], calibration)
         return float(cost)
 
@@ -46,15 +46,15 @@ class LandmarkSystem:
         """Gauss-Newton's rows at a state, each of a reading's rows weighted as Huber's loss has it."""
         poses, calibration = state.variables.poses, state.variables.calibration
         rows = self.chain.rows(self.chain.terms(poses, calibration), poses[0], calibration)
-        return [*rows, self._reading_rows(state, self.settings.gate.huber)]
+        return [*rows, self._detection_rows(state, self.settings.gate.huber)]
 
     def eliminated(self, state: LandmarkState) -> Elimination:
         """The system that they make, with the poses eliminated."""
         return Elimination(linear_graph(self.rows(state), state.variables), state.variables.layout)
 
-    def _reading_rows(self, state: LandmarkState, huber: float) -> Rows:
+    def _detection_rows(self, state: LandmarkState, huber: float) -> Rows:
         """The readings in use, whitened; a factor takes those of some poses on one side of the track."""
-        rows = landmark_rows(state, self.readings, np.flatnonzero(self.readings.used), huber)
+        rows = landmark_rows(state, self.detections, np.flatnonzero(self.detections.used), huber)
         labels = state.labels[state.positions(indices(rows.keys[:, 1]))]
         return replace(rows, owner=owners(rows.owner, labels == RIGHT))
 

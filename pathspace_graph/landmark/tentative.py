@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
-def sighted_by(
+def detected_by(
     points: Array, cycles: IntArray, landmarks: Array, settings: GrowthSettings
 ) -> tuple[IntArray, IntArray]:
     """Which of the readings (m, 2), map frame, made new landmarks (k, 2): rows, and the landmark of each.

@@ -95,16 +95,16 @@ class Belief:
         covariance = self.covariance[np.ix_(columns, columns)]
         return transform(lambda x: to_vehicle_rows(x[:, :POSE], x[:, POSE:]), self.mean[columns], covariance)
 
-    def sight(self, readings: Array, covariances: Array) -> None:
+    def observe(self, detections: Array, covariances: Array) -> None:
         """New points, the last of x from now on: readings (k, 2) of the vehicle frame with (k, 2, 2)."""
-        k = len(readings)
+        k = len(detections)
         columns = np.arange(POSE)
         own = np.zeros((POSE + PLANE * k, POSE + PLANE * k))
         own[:POSE, :POSE] = self.covariance[:POSE, :POSE]
         for i, covariance in enumerate(covariances):
             block = slice(POSE + PLANE * i, POSE + PLANE * (i + 1))
             own[block, block] = covariance
-        mean = np.concatenate([self.pose, readings.ravel()])
+        mean = np.concatenate([self.pose, detections.ravel()])
         placed = transform(lambda x: to_map_rows(x[:, :POSE], x[:, POSE:]), mean, own)
         cross = placed.slope[:, :POSE] @ self.covariance[columns]
         self.mean = np.concatenate([self.mean, placed.mean])
@@ -154,10 +154,10 @@ def compose_rows(poses: Array, deltas: Array) -> Array:
     )
 
 
-def to_map_rows(poses: Array, readings: Array) -> Array:
+def to_map_rows(poses: Array, detections: Array) -> Array:
     """`R z + t`: for each of k poses (k, 3) its r readings (k, 2 r) of the vehicle frame -> map (k, 2 r)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-    x, y = readings[:, 0::2], readings[:, 1::2]
+    x, y = detections[:, 0::2], detections[:, 1::2]
     placed = np.stack([c * x - s * y + poses[:, :1], s * x + c * y + poses[:, 1:2]], axis=2)
     return placed.reshape(len(poses), -1)
 

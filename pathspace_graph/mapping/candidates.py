@@ -58,12 +58,12 @@ def undisputed(smoother: CurveSmoother, label: int, points: Array, radius: float
     A sensor that takes a cone for one of the other boundary now and then sees it in its true colour oftener.
     Readings in the window count, in use or not, within `radius` (m).
     """
-    readings = smoother.map.readings
-    rows = np.flatnonzero(readings.label != UNKNOWN)
-    seen = to_map(readings.point[rows], smoother.variables.poses_at(readings.cycle[rows]))
+    detections = smoother.map.detections
+    rows = np.flatnonzero(detections.label != UNKNOWN)
+    seen = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
     offset = points[:, None] - seen
     near = offset[:, :, 0] ** 2 + offset[:, :, 1] ** 2 < radius**2
-    votes = near @ np.where(readings.label[rows] == label, 1, -1)
+    votes = near @ np.where(detections.label[rows] == label, 1, -1)
     return np.asarray(votes >= 0)
 
 

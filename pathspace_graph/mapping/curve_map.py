@@ -16,7 +16,7 @@ from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Gauge
 
-from .detections import Readings
+from .detections import DetectionTable
 from .state import State
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ class CurveMap:
         self.state = state or State()
         """The curves, and all variables."""
         self.variables = self.state.variables
-        self.readings = Readings()
+        self.detections = DetectionTable()
         """Readings of the poses in the window."""
         self.slid = False
         """Whether a reading of the rows asked for last has slid to where an open curve is inactive."""
@@ -44,7 +44,7 @@ class CurveMap:
 
     def changed(self) -> IntArray:
         """(k,) cycles whose readings in use have changed since they were linearized last."""
-        return self.readings.cycle[self.readings.changed]
+        return self.detections.cycle[self.detections.changed]
 
     def rows(self, cycles: IntArray) -> list[Rows]:
         """`w_i n_i . (R z_i + t - S(u_i)) / sigma_i` of the readings in use of some cycles.
@@ -52,20 +52,20 @@ class CurveMap:
         Keys [pose | control points of the span]; w the root of the Huber weight, zero where the foot point is
         not interior. The readings are left as they are. Of the residual `point` two rows each.
         """
-        state, readings, settings = self.state, self.readings, self.settings
+        state, detections, settings = self.state, self.detections, self.settings
         if not state.boundaries or len(cycles) == 0:
             return []
         wanted = np.zeros(int(cycles[-1]) + 1, bool)
         wanted[cycles] = True
-        rows = np.flatnonzero(readings.used[: readings.cycle.searchsorted(len(wanted))])
-        rows = rows[wanted[readings.cycle[rows]]]
-        curves, cycle = state.curves, readings.cycle[rows]
-        curve = curves.number(readings.boundary[rows])
+        rows = np.flatnonzero(detections.used[: detections.cycle.searchsorted(len(wanted))])
+        rows = rows[wanted[detections.cycle[rows]]]
+        curves, cycle = state.curves, detections.cycle[rows]
+        curve = curves.number(detections.boundary[rows])
         poses = self.variables.poses_at(cycle)
-        points = to_map(readings.point[rows], poses)
-        foot = curves.refine(state.map_points, points, curve, readings.u[rows])
+        points = to_map(detections.point[rows], poses)
+        foot = curves.refine(state.map_points, points, curve, detections.u[rows])
         self._found, self.slid = (rows, foot.u), curves.cut_off(curve, foot)
-        measured = points, readings.covariance[rows], poses, foot, settings
+        measured = points, detections.covariance[rows], poses, foot, settings
         jacobian, residual = (
             _to_point(*measured) if settings.spline.residual == "point" else _across(*measured)
         )
@@ -77,7 +77,7 @@ class CurveMap:
         """The rows that were asked for last, of these cycles, are those of the graph from now on."""
         if len(cycles) and self.state.boundaries:
             rows, u = self._found
-            self.readings.u[rows], self.readings.changed[:] = u, False
+            self.detections.u[rows], self.detections.changed[:] = u, False
 
     def all_active(self) -> None:
         """Every control point is active again."""
@@ -85,8 +85,8 @@ class CurveMap:
 
     def leave(self, cycle: int) -> None:
         """The pose of a cycle, the window's oldest, has left with its readings."""
-        self.readings.keep_from(cycle + 1)
-        self.state.drop_oldest_stations()
+        self.detections.keep_from(cycle + 1)
+        self.state.drop_oldest_pose_u()
 
     # --- weak priors -------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ BoolArray = NDArray[np.bool_]
 
 
 @dataclass
-class Readings:
+class DetectionTable:
     """Columns of equal length, oldest reading first."""
 
     cycle: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
@@ -43,7 +43,7 @@ class Readings:
         """Add the readings of one cycle, none used yet; gives their rows."""
         m = len(detections.labels)
         start = len(self)
-        new = Readings(
+        new = DetectionTable(
             np.full(m, cycle, np.intp),
             np.asarray(detections.points_vehicle, float),
             np.asarray(detections.covariances, float),

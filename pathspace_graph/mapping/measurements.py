@@ -16,7 +16,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import OdometrySettings
 
-from .detections import Readings
+from .detections import DetectionTable
 
 Array = NDArray[np.float64]
 
@@ -89,11 +89,11 @@ def _integrate(t: Array, twist: Array, end: float, sigma: Array) -> IntegratedOd
     return integrate_twists(np.diff(np.append(t, end)), twist, sigma)
 
 
-def collect_readings(log: Log) -> Readings:
+def collect_detections(log: Log) -> DetectionTable:
     """Every reading of a log, none in use."""
     cycles = log.cycles
     labels = np.concatenate([np.zeros(0, np.intp), *(cycle.labels for cycle in cycles)]).astype(np.intp)
-    return Readings(
+    return DetectionTable(
         cycle=np.repeat(np.arange(len(cycles)), [len(cycle.labels) for cycle in cycles]).astype(np.intp),
         point=np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in cycles)]),
         covariance=np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in cycles)]),

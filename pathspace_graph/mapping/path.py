@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
+class PathAhead:
     """The path driven and an arc ahead of the vehicle, as one polyline."""
 
     points: Array
@@ -27,10 +27,10 @@ class Way:
         """Stations (m,) and signed distances (m,), left positive, of points (m, 2)."""
         return along_and_across(points, self.points, self.stations)
 
-    def since(self, station: float) -> Way:
+    def since(self, station: float) -> PathAhead:
         """What of it comes after a station (m), from the last position before that on."""
         first = max(int(self.stations.searchsorted(station)) - 1, 0)
-        return Way(self.points[first:], self.stations[first:], self.driven)
+        return PathAhead(self.points[first:], self.stations[first:], self.driven)
 
     def beside(self, station: float, lateral: float) -> Array:
         """(2,) the point at about a station, so far to the left of the way."""
@@ -103,7 +103,7 @@ class DrivenPath:
             now = float(np.clip(rate / speed, -limit, limit))
             self.curvature += self.settings.curvature_gain * (now - self.curvature)
 
-    def ahead(self, pose: Array, reach: float) -> Way:
+    def ahead(self, pose: Array, reach: float) -> PathAhead:
         """The path driven, and an arc of the current curvature for `reach` metres ahead of `pose` (3,)."""
         step = self.settings.step
         s = np.arange(0.0, reach + step, step)
@@ -112,7 +112,7 @@ class DrivenPath:
         direction = np.column_stack([np.cos(pose[2] + angle), np.sin(pose[2] + angle)])
         behind = self.stations < self.length - 0.5 * step
         points = np.concatenate([self.points[behind], pose[:2] + chord[:, None] * direction])
-        return Way(points, np.concatenate([self.stations[behind], self.length + s]), self.length)
+        return PathAhead(points, np.concatenate([self.stations[behind], self.length + s]), self.length)
 
 
 def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array, Array]:

@@ -49,7 +49,7 @@ class Matches:
     """(m,) whether they lie on it."""
     hessian: Array
     """(3, 3) of the motion, from the readings within reach."""
-    descent: Array
+    negative_gradient: Array
     """(3,) negative gradient."""
 
     def agreeing(self, label: int) -> tuple[IntArray, Array]:
@@ -74,8 +74,8 @@ def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool
         return False
     drift = settings.radius + settings.drift * path.length
     away = np.hypot(*(path.beginning[:, :2] - pose[:2]).T)
-    same_way = np.cos(path.beginning[:, 2] - pose[2]) > np.cos(settings.heading)
-    return bool((same_way & (away < drift)).any())
+    same_direction = np.cos(path.beginning[:, 2] - pose[2]) > np.cos(settings.heading)
+    return bool((same_direction & (away < drift)).any())
 
 
 def register(
@@ -103,8 +103,8 @@ def register(
         vector = [vector, *starts][int(np.argmax(agreement))]
     for reach in _reaches(settings):
         matches = _match(track, settings, recent, points, Motion(centre, vector), reach)
-        descent = matches.descent - prior @ vector
-        vector = vector + np.linalg.solve(matches.hessian + prior, descent)
+        negative_gradient = matches.negative_gradient - prior @ vector
+        vector = vector + np.linalg.solve(matches.hessian + prior, negative_gradient)
     posterior = np.linalg.inv(matches.hessian + prior)
     labels = track.state.boundaries
     if not (_agree(matches, list(labels), settings) and _certain(matches, posterior, settings, lost)):
@@ -123,10 +123,10 @@ def _motions(pose: Array, beginning: Array, settings: ClosingSettings) -> list[A
 
 def _recent(track: CurveMap, times: Sequence[float], seconds: float) -> tuple[IntArray, Array]:
     """Coloured readings of the newest poses, and where they are in the map (m, 2)."""
-    readings, variables, stamps = track.readings, track.variables, np.asarray(times)
-    rows = np.flatnonzero(stamps[readings.cycle - variables.first_cycle] > stamps[-1] - seconds)
-    rows = rows[np.isin(readings.label[rows], list(track.state.boundaries))]
-    return rows, to_map(readings.point[rows], variables.poses_at(readings.cycle[rows]))
+    detections, variables, stamps = track.detections, track.variables, np.asarray(times)
+    rows = np.flatnonzero(stamps[detections.cycle - variables.first_cycle] > stamps[-1] - seconds)
+    rows = rows[np.isin(detections.label[rows], list(track.state.boundaries))]
+    return rows, to_map(detections.point[rows], variables.poses_at(detections.cycle[rows]))
 
 
 def _reaches(settings: ClosingSettings) -> Iterator[float]:
@@ -145,25 +145,25 @@ def _match(
 ) -> Matches:
     """Readings against the beginning; those within reach (m) pull."""
     state = track.state
-    labels, moved = track.readings.label[recent], motion.apply(points)
-    hessian, descent = np.zeros((3, 3)), np.zeros(3)
+    labels, moved = track.detections.label[recent], motion.apply(points)
+    hessian, negative_gradient = np.zeros((3, 3)), np.zeros(3)
     rows, u, near = [recent[:0]], [np.zeros(0)], [np.zeros(0, bool)]
     for label, boundary in state.boundaries.items():
         of = np.flatnonzero(labels == label)
         low = np.zeros(len(of))
-        high = low + min(settings.beginning, settings.beginning_share * boundary.confirmed)
+        high = low + min(settings.beginning, settings.beginning_share * boundary.confirmed_end)
         foot = boundary.find(state.control_points(label), moved[of], low, high)
         pulls = foot.interior & (np.abs(foot.distance) < reach)
         n, arm = foot.normal_unit[pulls], moved[of[pulls]] - motion.centre - motion.vector[:2]
         by_motion = np.column_stack([n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]]) / settings.sigma_reading
         hessian += by_motion.T @ by_motion
-        descent -= by_motion.T @ foot.distance[pulls] / settings.sigma_reading
+        negative_gradient -= by_motion.T @ foot.distance[pulls] / settings.sigma_reading
         rows.append(recent[of[foot.interior]])
         u.append(foot.u[foot.interior])
         near.append(np.abs(foot.distance[foot.interior]) < settings.inlier_distance)
     matched = np.concatenate(rows)
-    of_rows = track.readings.label[matched]
-    return Matches(matched, of_rows, np.concatenate(u), np.concatenate(near), hessian, descent)
+    of_rows = track.detections.label[matched]
+    return Matches(matched, of_rows, np.concatenate(u), np.concatenate(near), hessian, negative_gradient)
 
 
 def _agree(matches: Matches, labels: list[int], settings: ClosingSettings) -> bool:

@@ -38,7 +38,7 @@ class Overlap:
 
 
 @dataclass(frozen=True, eq=False)
-class Join:
+class PeriodicCurve:
     """How an open curve becomes periodic."""
 
     overlap: Overlap
@@ -51,14 +51,16 @@ class Join:
     """(n, m) E."""
 
 
-def join(boundary: Boundary, control_points: Array, settings: MapperSettings, knots: Knots) -> Join:
+def make_periodic(
+    boundary: Boundary, control_points: Array, settings: MapperSettings, knots: Knots
+) -> PeriodicCurve:
     """The periodic curve nearest to an open one with control points (n, 2)."""
     spline = boundary.spline(control_points)
     overlap = find_overlap(boundary, control_points, settings.closing)
     breaks = _breaks(boundary, control_points, overlap.period, settings, knots)
     frame = BSpline.periodic_from(breaks, np.zeros((len(breaks) - 1, 2)), boundary.degree)
     change = refit(spline, frame, overlap.new_parameter)
-    return Join(overlap, frame.knots, change.new_from_old @ control_points, change.old_from_new)
+    return PeriodicCurve(overlap, frame.knots, change.new_from_old @ control_points, change.old_from_new)
 
 
 def _breaks(
@@ -68,7 +70,7 @@ def _breaks(
 
     A cone is where it lies on the curve as that is now.
     """
-    u = np.array(boundary.sighted_u)
+    u = np.array(boundary.cone_parameters)
     u = _apart(u[u < period - settings.closing.seam_margin], settings.growth.merge_radius)
     size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
     if knots == "curvature" or size >= len(u):
@@ -93,16 +95,16 @@ def find_overlap(boundary: Boundary, control_points: Array, settings: ClosingSet
 
     Where the end doesn't reach the beginning, the gap is closed straight.
     """
-    confirmed = boundary.confirmed
-    late = confirmed - settings.beginning - settings.join_margin
-    late = max(late, settings.join_share * confirmed)
-    ends = boundary.evaluate(control_points, np.array([0.0, confirmed]))
-    foot = boundary.find(control_points, ends[:1], np.array([late]), np.array([confirmed]))
+    confirmed_end = boundary.confirmed_end
+    late = confirmed_end - settings.beginning - settings.join_margin
+    late = max(late, settings.join_share * confirmed_end)
+    ends = boundary.evaluate(control_points, np.array([0.0, confirmed_end]))
+    foot = boundary.find(control_points, ends[:1], np.array([late]), np.array([confirmed_end]))
     if not foot.interior[0]:
-        period = confirmed + float(np.hypot(*(ends[0] - ends[1])))
+        period = confirmed_end + float(np.hypot(*(ends[0] - ends[1])))
         return Overlap(period, np.array([period, period + 1.0]), np.array([0.0, 1.0]))
     seam = float(foot.u[0])
-    u = np.linspace(seam, confirmed, max(int((confirmed - seam) / settings.overlap_step), 1) + 1)
+    u = np.linspace(seam, confirmed_end, max(int((confirmed_end - seam) / settings.overlap_step), 1) + 1)
     w = _on_beginning(boundary, control_points, u, settings.overlap_room)
     beyond = EXTRAPOLATED * boundary.nominal[0]
     return Overlap(seam, np.append(u, u[-1] + beyond), np.append(w, w[-1] + beyond))

@@ -26,14 +26,14 @@ class State:
         self.narrowed: dict[int, IntArray] = {}
         """Where not all of a boundary's control points are active, those (k,) that are: one stretch, in
         driving order, counted from the boundary's first."""
-        self.stations: dict[int, Array] = {}
+        self.pose_u: dict[int, Array] = {}
         """For each boundary the parameter (P,) of each pose's foot point on it; not wrapped."""
         self._curves: Curves | None = None
 
     def copy(self) -> State:
         """The same curves, which may be replaced, with values and stations of their own."""
         other = State(self.variables.copy())
-        other.boundaries, other.stations = dict(self.boundaries), dict(self.stations)
+        other.boundaries, other.pose_u = dict(self.boundaries), dict(self.pose_u)
         return other
 
     # --- by key ------------------------------------------------------------------------------------------
@@ -105,6 +105,6 @@ class State:
         self.variables.remove(self.keys(label))
         self.add_boundary(label, boundary, control_points)
 
-    def drop_oldest_stations(self) -> None:
+    def drop_oldest_pose_u(self) -> None:
         """The oldest pose has left the window."""
-        self.stations = {label: u[1:] for label, u in self.stations.items()}
+        self.pose_u = {label: u[1:] for label, u in self.pose_u.items()}

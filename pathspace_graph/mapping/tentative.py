@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
-class Sightings:
+class TentativeTracks:
     """Points (n, 2) in the map frame of one label, merged within a radius and counted."""
 
     def __init__(self, settings: GrowthSettings) -> None:

@@ -53,10 +53,10 @@ def _worthwhile(smoother: CurveSmoother, needed: dict[int, IntArray]) -> bool:
 
 def _needed(smoother: CurveSmoother, label: int, room: float = 0.0) -> IntArray:
     """Control points (k,) of what the window's poses see in this cycle and the next, and `room` (m) ahead."""
-    boundary, stations = smoother.map.state.boundaries[label], smoother.map.state.stations[label]
+    boundary, pose_u = smoother.map.state.boundaries[label], smoother.map.state.pose_u[label]
     gate, slide = smoother.map.settings.gate, smoother.map.settings.spline.refine_room
-    low = float(stations.min()) - gate.view_behind - slide
-    high = float(stations.max()) + gate.view_ahead + gate.station_ahead + slide + room
+    low = float(pose_u.min()) - gate.view_behind - slide
+    high = float(pose_u.max()) + gate.view_ahead + gate.station_ahead + slide + room
     if boundary.periodic and high - low >= boundary.length:
         return boundary.everything
     first, last = boundary.tables.locate(np.array([low, high]))[0]

@@ -27,8 +27,8 @@ from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.stopwatch import Stopwatch
 
 from .activation import narrow
-from .association import admit
-from .closing import bend, tie
+from .association import associate
+from .closing import apply_correspondences, optimize_loop
 from .growth import Growth
 from .nonlinear_graph import window_graph
 from .simplification import simplify
@@ -129,18 +129,18 @@ class FixedLagMapper:
 
     def _classify(self, detections: Detections) -> None:
         """Which readings update a curve, and which are sightings of what no curve explains yet."""
-        new = self.smoother.map.readings.append(detections, self.smoother.next_cycle - 1)
+        new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
         if self.boundaries:
-            admit(self.smoother, self._grown)
+            associate(self.smoother, self._grown)
         if not self.closed:
-            self.growth.sight(self.smoother, new, detections.t)
+            self.growth.observe(self.smoother, new, detections.t)
 
     def _expand(self) -> None:
         """Lead each open end through the sightings that come next along the way driven."""
         self._grown = frozenset()
         if not self.closed:
-            way = self.path.ahead(self.poses[-1], self.settings.growth.reach)
-            self._grown = self.growth.expand(self.smoother, way)
+            path_ahead = self.path.ahead(self.poses[-1], self.settings.growth.reach)
+            self._grown = self.growth.expand(self.smoother, path_ahead)
 
     def _close(self) -> bool:
         """Bend the drive so that the newest readings lie on the beginning; True in the cycle that does."""
@@ -156,8 +156,8 @@ class FixedLagMapper:
         registration = register(self.smoother.map, self.smoother.times, covariance, beginning, settings)
         if registration is None:
             return False
-        tie(self.smoother, registration)
-        bend(self.smoother)
+        apply_correspondences(self.smoother, registration)
+        optimize_loop(self.smoother)
         self.closed = True
         return True
 
@@ -168,8 +168,8 @@ class FixedLagMapper:
         self.smoother.window.exact = False
 
     def _result(self, t: float, stages: dict[str, float]) -> CycleResult:
-        readings = self.smoother.map.readings
-        used = int(readings.used[readings.cycle.searchsorted(self.smoother.next_cycle - 1) :].sum())
+        detections = self.smoother.map.detections
+        used = int(detections.used[detections.cycle.searchsorted(self.smoother.next_cycle - 1) :].sum())
         left, right = (self.boundaries[b].size if b in self.boundaries else 0 for b in (LEFT, RIGHT))
         return CycleResult(t, self.poses[-1].copy(), (left, right), used, self.closed, stages)
 
@@ -249,9 +249,9 @@ class FixedLagMapper:
         self.smoother.refresh()
         return self.smoother.map.state.control_points(label)
 
-    def station(self, label: int) -> float:
+    def pose_parameter(self, label: int) -> float:
         """Parameter (m) on a boundary of the point beside the newest pose; on a closed one laps add up."""
-        return float(self.smoother.map.state.stations[label][-1])
+        return float(self.smoother.map.state.pose_u[label][-1])
 
     @property
     def poses(self) -> Array:

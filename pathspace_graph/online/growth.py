@@ -9,8 +9,8 @@ from pathspace_graph.factors.projection import to_map
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.candidates import SIDES, Candidates, End, chain, undisputed
 from pathspace_graph.mapping.curve_map import CurveSmoother
-from pathspace_graph.mapping.path import Way
-from pathspace_graph.mapping.tentative import Sightings
+from pathspace_graph.mapping.path import PathAhead
+from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.settings.mapper import GrowthSettings
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
@@ -23,43 +23,45 @@ class Growth:
 
     def __init__(self, settings: GrowthSettings) -> None:
         self.settings = settings
-        self.sightings = {label: Sightings(settings) for label in BOUNDARIES}
+        self.tentative = {label: TentativeTracks(settings) for label in BOUNDARIES}
 
-    def sight(self, smoother: CurveSmoother, new: slice, t: float) -> None:
+    def observe(self, smoother: CurveSmoother, new: slice, t: float) -> None:
         """New readings that no curve takes are sightings."""
-        readings = smoother.map.readings
+        detections = smoother.map.detections
         rows = np.arange(new.start, new.stop)
-        rows = rows[~readings.used[rows]]
-        points = to_map(readings.point[rows], smoother.variables.poses_at(readings.cycle[rows]))
-        variances = np.trace(readings.covariance[rows], axis1=1, axis2=2)
+        rows = rows[~detections.used[rows]]
+        points = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
+        variances = np.trace(detections.covariance[rows], axis1=1, axis2=2)
         for label in BOUNDARIES:
-            of = readings.label[rows] == label
-            self.sightings[label].add(points[of], variances[of], t)
+            of = detections.label[rows] == label
+            self.tentative[label].add(points[of], variances[of], t)
 
-    def expand(self, smoother: CurveSmoother, way: Way) -> frozenset[int]:
+    def expand(self, smoother: CurveSmoother, path_ahead: PathAhead) -> frozenset[int]:
         """Begin each boundary, or lead its end on through what comes next; gives those that were led on."""
         grown = set()
         for label in BOUNDARIES:
             if label not in smoother.map.state.boundaries:
-                self._begin(smoother, label, way)
-            elif self._lead_on(smoother, label, way):
+                self._begin(smoother, label, path_ahead)
+            elif self._lead_on(smoother, label, path_ahead):
                 grown.add(label)
         return frozenset(grown)
 
     def clear(self) -> None:
         """Forget all sightings."""
-        for sightings in self.sightings.values():
-            sightings.clear()
+        for tentative in self.tentative.values():
+            tentative.clear()
 
-    def _candidates(self, smoother: CurveSmoother, label: int, way: Way, end: End | None) -> Candidates:
+    def _candidates(
+        self, smoother: CurveSmoother, label: int, path_ahead: PathAhead, end: End | None
+    ) -> Candidates:
         """Trusted sightings within reach that follow one another, from an end on where there is one."""
-        settings, indices = self.settings, self.sightings[label].confirmed()
-        points = self.sightings[label].points[indices]
+        settings, indices = self.settings, self.tentative[label].confirmed()
+        points = self.tentative[label].points[indices]
         if len(points) == 0:
             return Candidates(points, indices, np.zeros(0), np.zeros(0))
-        stations, lateral = way.locate(points)
+        stations, lateral = path_ahead.locate(points)
         found = Candidates(points, indices, stations, SIDES[label] * lateral)
-        found = found.where((stations <= way.stations[-1]) & (found.sides > 0.0))
+        found = found.where((stations <= path_ahead.stations[-1]) & (found.sides > 0.0))
         if end is None:
             found = found.where(found.sides < settings.max_lateral)
         else:
@@ -70,9 +72,9 @@ class Growth:
         found = found.where(np.argsort(found.stations))
         return found.where(chain(found, settings, end))
 
-    def _begin(self, smoother: CurveSmoother, label: int, way: Way) -> None:
+    def _begin(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> None:
         """A new curve through the first sightings."""
-        found = self._candidates(smoother, label, way, None)
+        found = self._candidates(smoother, label, path_ahead, None)
         if len(found.points) < 2:
             return
         state, settings = smoother.map.state, smoother.map.settings
@@ -81,90 +83,90 @@ class Growth:
         control_points = boundary.grow(np.zeros((0, 2)), u, found.points)
         state.add_boundary(label, boundary, control_points)
         self._consume(smoother, label, found, u)
-        state.stations[label] = np.zeros(len(state.poses))
+        state.pose_u[label] = np.zeros(len(state.poses))
         _stand_again(smoother, label, 0.0)
 
-    def _lead_on(self, smoother: CurveSmoother, label: int, way: Way) -> bool:
+    def _lead_on(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> bool:
         """Extend a curve, from where its cones are in order; True where it has changed."""
         boundary, settings = smoother.map.state.boundaries[label], self.settings
-        kept = in_order(boundary, way, settings)
-        if kept == len(boundary.sighted):
-            return self._extend(smoother, label, way, settings.end_behind)
+        kept = in_order(boundary, path_ahead, settings)
+        if kept == len(boundary.observed):
+            return self._extend(smoother, label, path_ahead, settings.end_behind)
         self._take_back(smoother, label, kept)
-        from_u = boundary.confirmed
-        self._extend(smoother, label, way, settings.recall)
+        from_u = boundary.confirmed_end
+        self._extend(smoother, label, path_ahead, settings.recall)
         _stand_again(smoother, label, from_u)
         return True
 
-    def _extend(self, smoother: CurveSmoother, label: int, way: Way, behind: float) -> bool:
+    def _extend(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead, behind: float) -> bool:
         """Extend by every sighting that comes next, or carry a stranded end on; True where it grew.
 
         The end is beside the way since so far (m) behind the vehicle.
         """
         settings = self.settings
-        end = _end(smoother, label, way.since(way.driven - behind))
-        found = self._candidates(smoother, label, way, end)
+        end = _end(smoother, label, path_ahead.since(path_ahead.driven - behind))
+        found = self._candidates(smoother, label, path_ahead, end)
         if len(found.points):
             u = lead(smoother, label, end.position, found.points)
             self._consume(smoother, label, found, u)
             return True
-        if end.station < way.driven - settings.stranded:
-            return _carry_on(smoother, label, way, end)
+        if end.station < path_ahead.driven - settings.stranded:
+            return _carry_on(smoother, label, path_ahead, end)
         return False
 
     def _take_back(self, smoother: CurveSmoother, label: int, kept: int) -> None:
         """Only the first `kept` cones hold a curve: the others are sightings that may lead it on again."""
-        boundary, readings = smoother.map.state.boundaries[label], smoother.map.readings
-        self.sightings[label].restore(np.array(boundary.sighted[kept:]), smoother.times[-1])
+        boundary, detections = smoother.map.state.boundaries[label], smoother.map.detections
+        self.tentative[label].restore(np.array(boundary.observed[kept:]), smoother.times[-1])
         boundary.take_back(kept)
         smoother.forget(smoother.map.state.keys(label)[boundary.settled(boundary.size) :])
-        rows = readings.used_on(label)
-        readings.release(rows[readings.u[rows] > boundary.trusted])
+        rows = detections.used_on(label)
+        detections.release(rows[detections.u[rows] > boundary.trusted])
 
     def _consume(self, smoother: CurveSmoother, label: int, found: Candidates, u: Array) -> None:
         """Sightings that are on the curve, at u (k,), now: their readings update it."""
-        boundary, state, readings = (
+        boundary, state, detections = (
             smoother.map.state.boundaries[label],
             smoother.map.state,
-            smoother.map.readings,
+            smoother.map.detections,
         )
-        boundary.sighted.extend(found.points)
-        boundary.sighted_u.extend(u.tolist())
-        self.sightings[label].remove(found.indices)
-        rows = readings.pending(label)
-        rows = rows[readings.label[rows] == label]
-        points = to_map(readings.point[rows], state.variables.poses_at(readings.cycle[rows]))
+        boundary.observed.extend(found.points)
+        boundary.cone_parameters.extend(u.tolist())
+        self.tentative[label].remove(found.indices)
+        rows = detections.pending(label)
+        rows = rows[detections.label[rows] == label]
+        points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
         offset = points[:, None, :] - found.points[None]
         radius = self.settings.merge_radius
         near = np.hypot(offset[:, :, 0], offset[:, :, 1]).min(axis=1) < radius
         rows, points = rows[near], points[near]
         low = np.full(len(rows), u[0] - radius)
         high = boundary.believed(np.full(len(rows), np.inf))
-        readings.take(rows, label, boundary.find(state.control_points(label), points, low, high).u)
+        detections.take(rows, label, boundary.find(state.control_points(label), points, low, high).u)
 
 
-def in_order(boundary: Boundary, way: Way, settings: GrowthSettings) -> int:
+def in_order(boundary: Boundary, path_ahead: PathAhead, settings: GrowthSettings) -> int:
     """How many of the cones that a curve was led through are in the order in which they were passed.
 
     What comes next is told from an arc ahead; in a hairpin a row of cones may come back nearer than it goes
     away, and only when the vehicle is past them all it is known which was which. Of the last `recall` metres
     of the curve; the first cone of them is left where it is.
     """
-    first = int(np.searchsorted(boundary.sighted_u, boundary.confirmed - settings.recall))
-    recent = np.array(boundary.sighted[first:]).reshape(-1, 2)
+    first = int(np.searchsorted(boundary.cone_parameters, boundary.confirmed_end - settings.recall))
+    recent = np.array(boundary.observed[first:]).reshape(-1, 2)
     if len(recent) < 3:
-        return len(boundary.sighted)
-    station, _ = way.since(way.driven - settings.recall).locate(recent)
-    passed = np.where(station <= way.driven, station, np.inf)
+        return len(boundary.observed)
+    station, _ = path_ahead.since(path_ahead.driven - settings.recall).locate(recent)
+    passed = np.where(station <= path_ahead.driven, station, np.inf)
     later = np.minimum.accumulate(passed[::-1])[::-1]
     wrong = np.flatnonzero(passed[1:-1] > later[2:] + settings.station_margin)
-    return first + 1 + int(wrong[0]) if len(wrong) else len(boundary.sighted)
+    return first + 1 + int(wrong[0]) if len(wrong) else len(boundary.observed)
 
 
 def lead(smoother: CurveSmoother, label: int, end: Array, points: Array) -> Array:
     """Lead a curve from its end (2,) through points (k, 2), parametrized by their distances: u (k,)."""
     boundary = smoother.map.state.boundaries[label]
-    u = boundary.confirmed + np.cumsum(_lengths(np.concatenate([end[None], points])))
+    u = boundary.confirmed_end + np.cumsum(_lengths(np.concatenate([end[None], points])))
     known = smoother.map.state.control_points(label)
     control_points = boundary.grow(known.copy(), u, points)
     known[:] = control_points[: len(known)]
@@ -173,12 +175,12 @@ def lead(smoother: CurveSmoother, label: int, end: Array, points: Array) -> Arra
     return np.asarray(u)
 
 
-def _carry_on(smoother: CurveSmoother, label: int, way: Way, end: End) -> bool:
+def _carry_on(smoother: CurveSmoother, label: int, path_ahead: PathAhead, end: End) -> bool:
     """The vehicle has passed a stranded end: lead it beside the way nearly as far as the vehicle is."""
     settings = smoother.map.settings.growth
     side = max(end.side, settings.min_lateral)
-    station = way.driven - settings.stranded_left * settings.stranded
-    point = way.beside(station, SIDES[label] * side)
+    station = path_ahead.driven - settings.stranded_left * settings.stranded
+    point = path_ahead.beside(station, SIDES[label] * side)
     if np.hypot(*(point - end.position)) < settings.min_carry:
         return False
     lead(smoother, label, end.position, point[None])
@@ -188,18 +190,18 @@ def _carry_on(smoother: CurveSmoother, label: int, way: Way, end: End) -> bool:
 def _stand_again(smoother: CurveSmoother, label: int, from_u: float) -> None:
     """Stations, on a curve that was led on anew from `from_u` on, of the poses that were past that."""
     state, boundary = smoother.map.state, smoother.map.state.boundaries[label]
-    stations = state.stations[label]
+    stations = state.pose_u[label]
     late = stations >= from_u
     poses = state.poses[late, :2]
-    low, high = np.full(len(poses), from_u), np.full(len(poses), boundary.confirmed)
+    low, high = np.full(len(poses), from_u), np.full(len(poses), boundary.confirmed_end)
     stations[late] = boundary.find(state.control_points(label), poses, low, high).u
 
 
-def _end(smoother: CurveSmoother, label: int, way: Way) -> End:
+def _end(smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> End:
     boundary = smoother.map.state.boundaries[label]
-    u = np.array([boundary.confirmed])
+    u = np.array([boundary.confirmed_end])
     position = boundary.evaluate(smoother.map.state.control_points(label), u)
-    station, lateral = way.locate(position)
+    station, lateral = path_ahead.locate(position)
     return End(position[0], float(station[0]), SIDES[label] * float(lateral[0]))
 
 

@@ -23,7 +23,7 @@ from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .fixed_lag import FixedLagMapper
-from .nonlinear_graph import gauge_factors, reading_factors
+from .nonlinear_graph import detection_factors, gauge_factors
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -60,7 +60,7 @@ class IncrementalSolver:
         self._add_odometry(smoother)
         for label in smoother.map.state.boundaries:
             self._add_control_points(smoother, label)
-            self._add_readings(smoother, label)
+            self._add_detections(smoother, label)
         self._solve(smoother)
 
     def _restart(self, smoother: CurveSmoother) -> None:
@@ -115,18 +115,18 @@ class IncrementalSolver:
                 self._graph.add(factor)
         self._sizes[label] = boundary.size
 
-    def _add_readings(self, smoother: CurveSmoother, label: int) -> None:
+    def _add_detections(self, smoother: CurveSmoother, label: int) -> None:
         """A spline-projection factor for the readings of each pose that are newly in use."""
-        readings, boundary = smoother.map.readings, smoother.map.state.boundaries[label]
-        rows = readings.used_on(label)
-        number = rows - readings.cycle.searchsorted(readings.cycle[rows])
-        names = list(zip(readings.cycle[rows].tolist(), number.tolist(), strict=True))
+        detections, boundary = smoother.map.detections, smoother.map.state.boundaries[label]
+        rows = detections.used_on(label)
+        number = rows - detections.cycle.searchsorted(detections.cycle[rows])
+        names = list(zip(detections.cycle[rows].tolist(), number.tolist(), strict=True))
         gone = np.array([indices(np.array(key)) for key in self._left], np.intp)
         fresh = np.array([name not in self._held for name in names], bool)
         self._held.update(names)
-        rows = rows[fresh & ~np.isin(readings.cycle[rows], gone)]
+        rows = rows[fresh & ~np.isin(detections.cycle[rows], gone)]
         room = np.full(len(rows), self.settings.spline.refine_room)
-        for factor in reading_factors(label, boundary, readings, rows, self.settings, (room, room)):
+        for factor in detection_factors(label, boundary, detections, rows, self.settings, (room, room)):
             self._graph.add(factor)
 
     # --- the estimate ------------------------------------------------------------------------------------

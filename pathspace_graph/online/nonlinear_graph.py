@@ -18,7 +18,7 @@ from pathspace_graph.graph.keys import control_keys, pose_key
 from pathspace_graph.graph.odometry import odometry_factor
 from pathspace_graph.graph.user_factors import as_nonlinear
 from pathspace_graph.mapping.curve_map import CurveSmoother
-from pathspace_graph.mapping.detections import Readings
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.settings.mapper import GaugeSettings, MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
@@ -31,13 +31,13 @@ def window_graph(smoother: CurveSmoother) -> gtsam.NonlinearFactorGraph:
 
     Linearized at the estimate it is the mapper's own system, in GTSAM's tangents of the poses.
     """
-    state, readings, settings = smoother.map.state, smoother.map.readings, smoother.map.settings
+    state, detections, settings = smoother.map.state, smoother.map.detections, smoother.map.settings
     graph = gtsam.NonlinearFactorGraph()
     for label, boundary in state.boundaries.items():
         active = state.active(label)
-        rows = readings.used_on(label)
-        room = _room(boundary, active, readings.u[rows], settings.spline.refine_room)
-        _add(graph, reading_factors(label, boundary, readings, rows, settings, room))
+        rows = detections.used_on(label)
+        room = _room(boundary, active, detections.u[rows], settings.spline.refine_room)
+        _add(graph, detection_factors(label, boundary, detections, rows, settings, room))
         _add(graph, gauge_factors(label, boundary, active, settings.gauge))
         anchor = gtsam.noiseModel.Isotropic.Sigma(2, settings.gauge.sigma_anchor)
         points = state.control_points(label)[active]
@@ -55,10 +55,10 @@ def _add(graph: gtsam.NonlinearFactorGraph, factors: Sequence[gtsam.NonlinearFac
         graph.add(factor)
 
 
-def reading_factors(
+def detection_factors(
     label: int,
     boundary: Boundary,
-    readings: Readings,
+    detections: DetectionTable,
     rows: IntArray,
     settings: MapperSettings,
     room: tuple[Array, Array],
@@ -67,15 +67,19 @@ def reading_factors(
 
     `room`: how far before and past its parameter (m,), (m,) each foot point may be.
     """
-    keys, u, cycles = control_keys(label, boundary.numbers).tolist(), readings.u[rows], readings.cycle[rows]
+    keys, u, cycles = (
+        control_keys(label, boundary.numbers).tolist(),
+        detections.u[rows],
+        detections.cycle[rows],
+    )
     low, high = u - room[0], boundary.believed(u + room[1])
     return [
         spline_projection_factor(
             pose_key(cycle),
             keys,
             boundary.tables,
-            points_vehicle=readings.point[rows[own]],
-            covariances=readings.covariance[rows[own]],
+            points_vehicle=detections.point[rows[own]],
+            covariances=detections.covariance[rows[own]],
             low=low[own],
             high=high[own],
             sigma_model=settings.spline.sigma_model,

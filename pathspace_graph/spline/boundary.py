@@ -19,7 +19,7 @@ IntArray = NDArray[np.intp]
 
 ROUND_OFF = 1e-9
 """Parameters (m) this near to a knot are on it."""
-SAME_WAY = 0.5
+SAME_DIRECTION = 0.5
 """Cosine of the largest angle between a vehicle's heading and the direction of the curve beside it."""
 
 
@@ -55,11 +55,11 @@ class Boundary:
         self.gauge = gauge
         self.degree = settings.degree
         self.periodic = periodic
-        self.confirmed = 0.0
+        self.confirmed_end = 0.0
         """Parameter up to which sightings hold the curve; beyond it is extrapolated."""
-        self.sighted: list[Array] = []
+        self.observed: list[Array] = []
         """Every distinct sighting that the curve was led through, (2,), map frame, ..."""
-        self.sighted_u: list[float] = []
+        self.cone_parameters: list[float] = []
         """... and at which parameter."""
         self._set_tables(SpanPolynomials(knots, self.degree, periodic))
 
@@ -153,7 +153,7 @@ class Boundary:
     @property
     def trusted(self) -> float:
         """Parameter up to which the curve is believed: what an open one only extrapolates isn't."""
-        return np.inf if self.periodic else self.confirmed + self.settings.confirmed_margin
+        return np.inf if self.periodic else self.confirmed_end + self.settings.confirmed_margin
 
     def believed(self, high: Array) -> Array:
         """Upper limits of stretches, (m,), kept off what an open curve only extrapolates."""
@@ -167,7 +167,7 @@ class Boundary:
     def closed(self, knots: Array) -> Boundary:
         """The boundary on periodic knots, all of it confirmed, with control points of new keys."""
         boundary = Boundary(knots, True, self.settings, self.gauge, self.first + self.size)
-        boundary.confirmed = boundary.tables.high
+        boundary.confirmed_end = boundary.tables.high
         return boundary
 
     def grow(self, control_points: Array, targets_u: Array, targets: Array) -> Array:
@@ -183,24 +183,24 @@ class Boundary:
             last = self.knots[-1] + spacing * np.arange(1, missing + 1)
             self._set_tables(self.tables.extended(np.concatenate([self.knots, last])))
         placed = self._place(control_points, self.settled(old), targets_u, targets)
-        self.confirmed = float(targets_u[-1])
+        self.confirmed_end = float(targets_u[-1])
         return placed
 
     def settled(self, size: int) -> int:
         """How many of the first `size` control points act before `confirmed`."""
-        return max(int(np.searchsorted(self.knots[:size], self.confirmed - ROUND_OFF)) - 1, 0)
+        return max(int(np.searchsorted(self.knots[:size], self.confirmed_end - ROUND_OFF)) - 1, 0)
 
     def take_back(self, kept: int) -> None:
         """Only the first `kept` sightings hold the curve."""
-        self.confirmed = self.sighted_u[kept - 1]
-        del self.sighted[kept:], self.sighted_u[kept:]
+        self.confirmed_end = self.cone_parameters[kept - 1]
+        del self.observed[kept:], self.cone_parameters[kept:]
 
     def _place(self, control_points: Array, kept: int, targets_u: Array, targets: Array) -> Array:
         """Least squares of the control points from index `kept` on, through targets and the kept stretch."""
         held_u = np.zeros(0)
         if len(control_points):
-            start = max(self.confirmed - self.nominal[0], 0.0)
-            held_u = np.linspace(start, self.confirmed, self.settings.fit_held)
+            start = max(self.confirmed_end - self.nominal[0], 0.0)
+            held_u = np.linspace(start, self.confirmed_end, self.settings.fit_held)
         held = self._held(control_points, held_u)
         values, span = self.tables.evaluate(np.concatenate([held_u, targets_u]))
         columns = self.columns(span)
@@ -238,14 +238,14 @@ def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float
     """
     low, high = boundary.tables.low, boundary.tables.high
     if not boundary.periodic:
-        low, high = max(low, boundary.confirmed - room), float(boundary.believed(np.array(high)))
+        low, high = max(low, boundary.confirmed_end - room), float(boundary.believed(np.array(high)))
     u = np.append(np.arange(low, high, boundary.settings.search_step), high)
     offset = boundary.evaluate(control_points, u) - pose[:2]
     tangent = boundary.evaluate(control_points, u, 1)
     along = tangent @ np.array([np.cos(pose[2]), np.sin(pose[2])])
-    same_way = along > SAME_WAY * np.hypot(tangent[:, 0], tangent[:, 1])
-    if not same_way.any():
+    same_direction = along > SAME_DIRECTION * np.hypot(tangent[:, 0], tangent[:, 1])
+    if not same_direction.any():
         return high
-    distance = np.where(same_way, np.hypot(offset[:, 0], offset[:, 1]), np.inf)
+    distance = np.where(same_direction, np.hypot(offset[:, 0], offset[:, 1]), np.inf)
     start = u[np.argmin(distance)]
     return float(boundary.refine(control_points, pose[None, :2], np.array([start])).u[0])

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.knots import new_from_old, reknot, simplified
-from pathspace_graph.mapping.detections import Readings
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -15,12 +15,12 @@ from ..scenes.batch import settled, straight
 Array = NDArray[np.float64]
 
 
-def dense_scene() -> tuple[State, Readings, MapperSettings]:
+def dense_scene() -> tuple[State, DetectionTable, MapperSettings]:
     """A straight drive beside curves of nearly a control point for each cone."""
     system, state = straight()
-    state = reknot(state, system.readings, system.settings, dense=True)
+    state = reknot(state, system.detections, system.settings, dense=True)
     system.begin(state)
-    return settled(system, state), system.readings, system.settings
+    return settled(system, state), system.detections, system.settings
 
 
 def by_shift(state: State, axis: int) -> Array:
@@ -34,8 +34,8 @@ def by_turn(state: State) -> Array:
 
 
 def test_the_drive_stays_and_the_curves_have_fewer_control_points_on_the_same_lines() -> None:
-    state, readings, settings = dense_scene()
-    thin, _ = simplified(state, np.eye(state.map_points.size), readings, settings)
+    state, detections, settings = dense_scene()
+    thin, _ = simplified(state, np.eye(state.map_points.size), detections, settings)
     np.testing.assert_array_equal(thin.poses, state.poses)
     np.testing.assert_array_equal(thin.calibration, state.calibration)
     for label, boundary in thin.boundaries.items():
@@ -47,10 +47,10 @@ def test_the_drive_stays_and_the_curves_have_fewer_control_points_on_the_same_li
 
 def test_a_map_that_is_uncertain_as_a_whole_stays_so() -> None:
     """`F 1 = 1`, and F takes the control points of a line to those of the same line."""
-    state, readings, settings = dense_scene()
+    state, detections, settings = dense_scene()
     for direction in (lambda s: by_shift(s, 0), lambda s: by_shift(s, 1), by_turn):
         dense = direction(state)
-        thin, covariance = simplified(state, np.outer(dense, dense), readings, settings)
+        thin, covariance = simplified(state, np.outer(dense, dense), detections, settings)
         expected = direction(thin)
         across = np.arange(1, thin.map_points.size, 2)
         np.testing.assert_allclose(

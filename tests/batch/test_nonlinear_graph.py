@@ -72,13 +72,13 @@ def test_its_linearization_is_ours() -> None:
     ours = result.system.linear_graph(result.optimum)
     ordering = state.variables.layout.ordering
     information, vector = theirs.hessian(ordering)
-    expected, descent = ours.hessian(ordering)
+    expected, negative_gradient = ours.hessian(ordering)
     turn = turns(state)
     size = np.sqrt(np.diagonal(expected))
     np.testing.assert_allclose(
         turn @ information @ turn.T / np.outer(size, size), expected / np.outer(size, size), atol=1e-7
     )
-    np.testing.assert_allclose(turn @ vector / size, descent / size, atol=1e-6)
+    np.testing.assert_allclose(turn @ vector / size, negative_gradient / size, atol=1e-6)
 
 
 def test_its_gradient_vanishes_at_the_optimum() -> None:

@@ -14,7 +14,7 @@ from pathspace_graph.batch.mapper import own_settings
 from pathspace_graph.batch.optimizer import gradient_norm
 from pathspace_graph.batch.system import BatchSystem, Biweight, Kernel, moved
 from pathspace_graph.graph.keys import pose_key
-from pathspace_graph.mapping.measurements import Chain, collect_readings, integrate_log
+from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -31,14 +31,14 @@ def small_system() -> tuple[BatchSystem, State]:
     log = lap_log(bean_track())
     settings = own_settings(MapperSettings())
     chain = integrate_log(log, log.odometry_sigma, settings.odometry)
-    readings = collect_readings(log)
-    readings.point = readings.point + np.random.default_rng(1).normal(0.0, 0.1, readings.point.shape)
-    state = start_odometry(chain, readings, settings)
-    system = BatchSystem(readings, chain, settings, Kernel(settings.gate.chi, settings.gate.huber))
+    detections = collect_detections(log)
+    detections.point = detections.point + np.random.default_rng(1).normal(0.0, 0.1, detections.point.shape)
+    state = start_odometry(chain, detections, settings)
+    system = BatchSystem(detections, chain, settings, Kernel(settings.gate.chi, settings.gate.huber))
     system.begin(state)
     state = moved(state, np.random.default_rng(2).normal(0.0, 0.01, state.variables.layout.size))
     locate_poses(state)
-    associate(state, readings, settings, 8.0, False)
+    associate(state, detections, settings, 8.0, False)
     system.evaluate(state, hold=True)
     return system, state
 
@@ -52,15 +52,15 @@ def test_dead_reckoning_of_an_exact_log_is_the_truth() -> None:
 def test_the_gradient_is_that_of_the_cost() -> None:
     system, state = small_system()
     at, layout = system.evaluate(state), state.variables.layout
-    information, descent = system.linear_graph(at).hessian(layout.ordering)
+    information, negative_gradient = system.linear_graph(at).hessian(layout.ordering)
     rng = np.random.default_rng(5)
     for _ in range(5):
         direction = rng.normal(size=layout.size)
         h = 1e-5
         costs = [system.evaluate(moved(state, s * h * direction)).cost for s in (1.0, -1.0)]
         slope = (costs[0] - costs[1]) / (2.0 * h)
-        np.testing.assert_allclose(-descent @ direction, slope, rtol=1e-4)
-    norm = np.linalg.norm(descent / np.sqrt(np.diagonal(information)))
+        np.testing.assert_allclose(-negative_gradient @ direction, slope, rtol=1e-4)
+    norm = np.linalg.norm(negative_gradient / np.sqrt(np.diagonal(information)))
     np.testing.assert_allclose(gradient_norm(system.rows(at), layout), norm)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.ckf.fit import fit_readings, regularization, ridge_gain
+from pathspace_graph.ckf.fit import fit_detections, regularization, ridge_gain
 from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.spline.bspline import BSpline
 
@@ -42,7 +42,7 @@ def test_the_fit_is_the_minimum_of_the_cost_that_its_solution_belongs_to() -> No
     u = np.array([9.0, 14.0, 15.5])
     basis, known = spline.basis_matrix(u), spline.control_points
     readings = readings_beside(spline, u, 0.8)
-    fitted = fit_readings(basis, readings, np.tile(COVARIANCE, (3, 1, 1)), known, settings).points
+    fitted = fit_detections(basis, readings, np.tile(COVARIANCE, (3, 1, 1)), known, settings).points
     slope = basis.T @ (basis @ fitted - readings) + regularization(basis, settings) @ (fitted - known)
     np.testing.assert_allclose(slope, 0.0, atol=1e-10)
 
@@ -53,7 +53,7 @@ def test_it_interpolates_where_readings_are_and_keeps_to_the_prior_elsewhere() -
     basis, readings = spline.basis_matrix(u), readings_beside(spline, u, 0.8)
     settings, covariances = CkfSettings(ridge=1e-6), np.tile(COVARIANCE, (3, 1, 1))
     fitted = spline.with_points(
-        fit_readings(basis, readings, covariances, spline.control_points, settings).points
+        fit_detections(basis, readings, covariances, spline.control_points, settings).points
     )
     np.testing.assert_allclose(fitted.evaluate(u), readings, atol=1e-4)
     away = np.linspace(28.0, 40.0, 30)
@@ -66,7 +66,9 @@ def test_a_stronger_ridge_moves_the_curve_less() -> None:
     readings = readings_beside(spline, u, 1.0)
     moved = [
         np.abs(
-            fit_readings(basis, readings, covariances, spline.control_points, CkfSettings(ridge=ridge)).points
+            fit_detections(
+                basis, readings, covariances, spline.control_points, CkfSettings(ridge=ridge)
+            ).points
             - spline.control_points
         ).max()
         for ridge in (0.01, 0.1, 1.0, 10.0)
@@ -79,7 +81,7 @@ def test_the_readings_uncertainty_goes_through_the_fit() -> None:
     spline, u = curve(), np.array([10.0, 13.0])
     basis, settings = spline.basis_matrix(u), CkfSettings()
     covariances = np.stack([COVARIANCE, 2.0 * COVARIANCE])
-    reading = fit_readings(basis, spline.evaluate(u), covariances, spline.control_points, settings)
+    reading = fit_detections(basis, spline.evaluate(u), covariances, spline.control_points, settings)
     gain = np.kron(ridge_gain(basis, settings), np.eye(2))
     joint = np.block([[covariances[0], np.zeros((2, 2))], [np.zeros((2, 2)), covariances[1]]])
     np.testing.assert_allclose(reading.covariance, gain @ joint @ gain.T, atol=1e-12)
@@ -91,7 +93,7 @@ def test_readings_on_the_curve_fit_the_curve() -> None:
     spline, u, rng = curve(), np.array([10.0, 13.0, 14.0]), np.random.default_rng(0)
     basis, covariances, settings = spline.basis_matrix(u), np.tile(COVARIANCE, (3, 1, 1)), CkfSettings()
     other = spline.with_points(spline.control_points + rng.normal(size=spline.control_points.shape))
-    fitted = fit_readings(basis, other.evaluate(u), covariances, spline.control_points, settings)
+    fitted = fit_detections(basis, other.evaluate(u), covariances, spline.control_points, settings)
     np.testing.assert_allclose(fitted.refitted(other.control_points[None])[0], fitted.points, atol=1e-9)
     combine = fitted.basis()
     assert combine.shape == (13, 3)

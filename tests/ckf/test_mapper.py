@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.ckf.association import classify
-from pathspace_graph.ckf.closing import tie
+from pathspace_graph.ckf.closing import update_by_correspondences
 from pathspace_graph.ckf.expansion import proximity_chain
 from pathspace_graph.ckf.mapper import CkfMapper
 from pathspace_graph.ckf.state import CurveState
@@ -202,7 +202,7 @@ def test_a_fitted_prediction_takes_from_the_readings_what_a_filter_on_them_would
 def test_closing_waits_for_the_end_to_reach_its_beginning() -> None:
     state = state_with_curve()
     before = state.belief.mean.copy()
-    assert not tie(state, Motion(np.zeros(2), np.array([0.0, 50.0, 0.0])))
+    assert not update_by_correspondences(state, Motion(np.zeros(2), np.array([0.0, 50.0, 0.0])))
     np.testing.assert_array_equal(state.belief.mean, before)
 
 
@@ -214,6 +214,6 @@ def test_a_lost_vehicle_is_found_again_on_a_closed_curve() -> None:
     state.belief.covariance = np.eye(len(state.belief.mean))
     state.curves[LEFT] = BSpline.periodic_from(np.linspace(0.0, 60.0, 13), points)
     right = float(state.spline(LEFT).foot_points(np.array([[8.0, 0.0]])).u[0])
-    state.stations[LEFT] = right + 30.0
+    state.pose_u[LEFT] = right + 30.0
     state.locate_vehicle()
-    assert state.stations[LEFT] % 60.0 == pytest.approx(right % 60.0, abs=1e-3)
+    assert state.pose_u[LEFT] % 60.0 == pytest.approx(right % 60.0, abs=1e-3)

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline as ScipyBSpline
 
-from pathspace_graph.cli import COMMANDS, main, one_line
+from pathspace_graph.cli import COMMANDS, main
 from pathspace_graph.commands import online as commands_online
+from pathspace_graph.commands.options import one_line
 from pathspace_graph.io.log import Detections, Log, read_log, write_log
 from pathspace_graph.io.map import read_map
 from pathspace_graph.labels import LEFT, NAMES, RIGHT

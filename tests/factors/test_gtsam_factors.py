@@ -37,12 +37,12 @@ from ..scenes.gtsam import (
     all_rows,
     curves,
     dense,
+    detection_rows,
     in_tangents,
     integrate_noisy,
     make_scene,
     nonlinear_graph,
     projection_factor,
-    reading_rows,
     solve_window,
     to_state,
     to_values,
@@ -62,14 +62,16 @@ def test_the_factors_linear_system_is_that_of_the_kernels_rows(scene: Scene) -> 
     state = scene.state + np.random.default_rng(1).normal(0.0, 0.05, scene.state.shape)
     state[MAP + 2 : MAP + 2 + POSE] = scene.start  # the prior's tangent is the state's only where it holds
     groups = all_rows(scene, state)
-    assert (np.abs(reading_rows(scene, 0, state)[2]) > np.sqrt(HUBER)).any()
+    assert (np.abs(detection_rows(scene, 0, state)[2]) > np.sqrt(HUBER)).any()
     J, r = dense(groups, len(state))
     J = in_tangents(scene, state, J)
     poses = [gtsam.symbol("x", k) for k in range(POSES)]
     ordering = gtsam.Ordering([*CONTROL_KEYS[0], *CONTROL_KEYS[1], CALIBRATION_KEY, *poses])
-    hessian, descent = nonlinear_graph(scene).linearize(to_values(scene, state)).hessian(ordering)
+    hessian, negative_gradient = nonlinear_graph(scene).linearize(to_values(scene, state)).hessian(ordering)
     np.testing.assert_allclose(hessian, J.T @ J, atol=1e-9 * np.abs(hessian).max(), rtol=0.0)
-    np.testing.assert_allclose(descent, -J.T @ r, atol=1e-9 * np.abs(descent).max(), rtol=0.0)
+    np.testing.assert_allclose(
+        negative_gradient, -J.T @ r, atol=1e-9 * np.abs(negative_gradient).max(), rtol=0.0
+    )
 
 
 @pytest.mark.parametrize(

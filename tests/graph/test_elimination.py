@@ -135,10 +135,10 @@ def test_poses_that_nothing_holds_are_singular() -> None:
 def test_a_map_that_nothing_holds_is_singular_but_where_it_is_damped() -> None:
     rng = np.random.default_rng(7)
     variables = random_variables(rng, 10, 3)
-    odometry, readings, first, points = random_rows(rng, 10, 3)
-    readings.jacobian[:, :POINT] = 0.0
+    odometry, detections, first, points = random_rows(rng, 10, 3)
+    detections.jacobian[:, :POINT] = 0.0
     on_calibration = points.where(points.keys[:, 0] == CALIBRATION_KEY)
-    groups = [odometry, readings, first, on_calibration]
+    groups = [odometry, detections, first, on_calibration]
     problem = Elimination(linear_graph(groups, variables), variables.layout)
     for answer in (lambda: problem.step(np.zeros(8)), lambda: problem.map_covariance):
         with pytest.raises(SingularSystemError, match="positive definite"):

@@ -214,10 +214,10 @@ def test_eliminate_gives_the_schur_complement_and_the_conditional_mean(gone: Int
     graph, hessian, vector = random_graph(rng, CHAIN)
     conditional, remaining = eliminate(graph, gone)
     rest = np.setdiff1d(KEYS, gone)
-    information, descent = schur(hessian, vector, columns_of(gone, KEYS))
+    information, negative_gradient = schur(hessian, vector, columns_of(gone, KEYS))
     found, found_vector = normal_equations(remaining, Layout(rest))
     np.testing.assert_allclose(found, information, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(found_vector, descent, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(found_vector, negative_gradient, rtol=1e-8, atol=1e-8)
     x = rng.normal(size=len(found_vector))
     own, others = columns_of(gone, KEYS), columns_of(rest, KEYS)
     mean = np.linalg.solve(hessian[np.ix_(own, own)], vector[own] - hessian[np.ix_(own, others)] @ x)
@@ -243,9 +243,9 @@ def test_marginalize_is_the_marginal_of_gtsam_and_of_the_covariance(key: int) ->
     graph, hessian, vector = random_graph(np.random.default_rng(13), CHAIN)
     rest = Layout(np.setdiff1d(KEYS, [key]))
     found, found_vector = normal_equations(marginalize(graph, np.array([key])), rest)
-    information, descent = schur(hessian, vector, columns_of(np.array([key]), KEYS))
+    information, negative_gradient = schur(hessian, vector, columns_of(np.array([key]), KEYS))
     np.testing.assert_allclose(found, information, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(found_vector, descent, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(found_vector, negative_gradient, rtol=1e-8, atol=1e-8)
     native = graph.marginal(gtsam.KeyVector(rest.keys.tolist())).hessian(rest.ordering)
     np.testing.assert_allclose(found, native[0], rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(found_vector, native[1], rtol=1e-8, atol=1e-8)
@@ -255,10 +255,10 @@ def test_marginalize_takes_several_variables_and_leaves_out_those_that_nothing_h
     graph, hessian, vector = random_graph(np.random.default_rng(20), CHAIN)
     gone, unheld = POSE_KEYS[[0, 2]], RIGHT_KEYS[-1:] + 9
     remaining = marginalize(graph, np.append(unheld, gone))
-    information, descent = schur(hessian, vector, columns_of(gone, KEYS))
+    information, negative_gradient = schur(hessian, vector, columns_of(gone, KEYS))
     found, found_vector = normal_equations(remaining, Layout(np.setdiff1d(KEYS, gone)))
     np.testing.assert_allclose(found, information, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(found_vector, descent, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(found_vector, negative_gradient, rtol=1e-8, atol=1e-8)
     assert marginalize(graph, np.append(unheld, unheld + 1)) is graph
 
 
@@ -291,10 +291,10 @@ def test_forgetting_leaves_the_others_as_sure_as_before(unknown: bool) -> None:
         gone = np.append(gone, free)
     left = forget(graph, Layout(np.sort(gone)), rng.normal(size=2 * len(gone)))
     assert np.isin(gone, keys_of(left)).sum() == 0
-    information, descent = schur(hessian, vector, columns_of(LEFT_KEYS[[1, 3]], KEYS))
+    information, negative_gradient = schur(hessian, vector, columns_of(LEFT_KEYS[[1, 3]], KEYS))
     found, found_vector = normal_equations(left, Layout(rest))
     np.testing.assert_allclose(np.linalg.inv(found), np.linalg.inv(information), rtol=1e-4, atol=1e-7)
-    mean = np.linalg.solve(information, descent)
+    mean = np.linalg.solve(information, negative_gradient)
     np.testing.assert_allclose(np.linalg.solve(found, found_vector), mean, atol=1e-4)
 
 
@@ -304,9 +304,11 @@ def test_conditioned_holds_one_variable_where_it_is_told() -> None:
     held, value = int(POSE_KEYS[1]), rng.normal(size=POSE)
     rest = np.setdiff1d(KEYS, [held])
     own, known = columns_of(rest, KEYS), columns_of(np.array([held]), KEYS)
-    information, descent = conditioned(graph, Layout(rest), held, value)
+    information, negative_gradient = conditioned(graph, Layout(rest), held, value)
     np.testing.assert_allclose(information, hessian[np.ix_(own, own)], atol=1e-10)
-    np.testing.assert_allclose(descent, vector[own] - hessian[np.ix_(own, known)] @ value, atol=1e-10)
+    np.testing.assert_allclose(
+        negative_gradient, vector[own] - hessian[np.ix_(own, known)] @ value, atol=1e-10
+    )
 
 
 def test_a_graph_of_graphs_nets_and_factors_has_all_of_their_factors() -> None:

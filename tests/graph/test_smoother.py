@@ -74,8 +74,8 @@ def test_a_damped_step_adds_to_the_diagonal_of_the_map_points_alone() -> None:
     hessian, vector = normal_equations(smoother.linear_graph(), smoother.layout)
     now = smoother.variables.change(np.arange(smoother.layout.size))
     points = np.flatnonzero(np.isin(np.repeat(smoother.layout.keys, smoother.layout.widths), drive.keys[1:7]))
-    descent = smoother.factorize(0.3)
-    np.testing.assert_allclose(descent, vector - hessian @ now, atol=1e-8 * np.abs(vector).max())
+    negative_gradient = smoother.factorize(0.3)
+    np.testing.assert_allclose(negative_gradient, vector - hessian @ now, atol=1e-8 * np.abs(vector).max())
     hessian[points, points] += 0.3**-2
     assert smoother.last_step is not None
     lower = np.tril(smoother.last_step.factor)
@@ -236,20 +236,20 @@ def test_a_pose_that_has_moved_makes_the_factors_that_hold_it_anew(entry: int, s
 @pytest.mark.parametrize("into_use", [False, True])
 def test_a_reading_that_goes_in_or_out_of_use_makes_its_cycle_stale(into_use: bool) -> None:
     mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(1e3, 1e3)), 60)
-    smoother, readings = mapper.smoother, mapper.smoother.map.readings
+    smoother, detections = mapper.smoother, mapper.smoother.map.detections
     cycle = smoother.first_cycle + 5
-    row = np.flatnonzero(readings.used & (readings.cycle == cycle))[:1]
-    where = readings.boundary[row].copy(), readings.u[row].copy()
+    row = np.flatnonzero(detections.used & (detections.cycle == cycle))[:1]
+    where = detections.boundary[row].copy(), detections.u[row].copy()
     smoother.step(0.5)
     if into_use:
-        readings.release(row)
+        detections.release(row)
         smoother.step(0.5)
     before = factors_of_cycles(mapper)
     rows = height(before[cycle])
     if into_use:
-        readings.take(row, *where)
+        detections.take(row, *where)
     else:
-        readings.release(row)
+        detections.release(row)
     smoother.step(0.5)
     new = [c for c, factor in before.items() if smoother.window.of_cycle[c] is not factor]
     assert new == [cycle]
@@ -257,7 +257,7 @@ def test_a_reading_that_goes_in_or_out_of_use_makes_its_cycle_stale(into_use: bo
     again = smoother.window.of_cycle[cycle]
     smoother.step(0.5)
     assert smoother.window.of_cycle[cycle] is again
-    assert not readings.changed.any()
+    assert not detections.changed.any()
 
 
 def height(factor: LinearFactor) -> int:

@@ -89,10 +89,10 @@ def test_a_factor_is_the_derivative_of_the_energy(seed: int) -> None:
     """Far from the submap's own point, at any heading, and whatever the references."""
     rng = np.random.default_rng(seed)
     submap, x = random_submap(rng), rng.normal(size=SIZE + POSE) * 3.0
-    hessian, descent = linearized(submap, x, rng)
+    hessian, negative_gradient = linearized(submap, x, rng)
     steps = 1e-6 * np.eye(len(x))
     numeric = np.array([(energy(submap, x + h) - energy(submap, x - h)) / 2e-6 for h in steps])
-    np.testing.assert_allclose(descent, -numeric, rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(negative_gradient, -numeric, rtol=1e-6, atol=1e-5)
     differences = [seen_from(*parts(x + h)) - seen_from(*parts(x - h)) for h in steps]
     jacobian = submap.root @ np.array(differences).T / 2e-6
     np.testing.assert_allclose(hessian, jacobian.T @ jacobian, rtol=1e-6, atol=1e-5)
@@ -168,7 +168,7 @@ def random_drive(rng: np.random.Generator, late: int) -> Drive:
     return Drive(variables, tuple(own if k >= late else own[own != hidden] for k, own in enumerate(seen)))
 
 
-def reading_rows(drive: Drive, k: int, rng: np.random.Generator) -> Rows:
+def detection_rows(drive: Drive, k: int, rng: np.random.Generator) -> Rows:
     """`R_k' (c_j - t_k) - z`, with random z."""
     pose = drive.variables.of(drive.poses[k : k + 1])
     inverse, keys, jacobian = turn(pose[2]).T, [], []
@@ -213,7 +213,7 @@ def test_the_submaps_are_the_dense_marginal_where_they_were_linearized(interval:
     drive = random_drive(rng, late)
     variables, keys = drive.variables, drive.variables.keys
     moved = variables.values - variables.reference
-    groups = [[reading_rows(drive, k, rng), odometry_rows(drive, k, rng)] for k in range(8)]
+    groups = [[detection_rows(drive, k, rng), odometry_rows(drive, k, rng)] for k in range(8)]
     J, r, _ = dense_rows([rows for own in groups for rows in own], keys)
     hessian, vector = J.T @ J, J.T @ (J @ moved - r)
 
@@ -221,7 +221,7 @@ def test_the_submaps_are_the_dense_marginal_where_they_were_linearized(interval:
     own = columns_of(np.array([CALIBRATION_KEY, drive.poses[0]]), keys)
     hessian[np.ix_(own, own)] += A.T @ A
     vector[own] += A.T @ b
-    information, descent = schur(hessian, vector, columns_of(drive.poses[:-1], keys))
+    information, negative_gradient = schur(hessian, vector, columns_of(drive.poses[:-1], keys))
 
     assert len(submaps.finished) == len(submaps.keyframes) == {0.5: 8, 2.5: 3, 100.0: 1}[interval]
     submaps.insert_keyframes(variables)
@@ -232,7 +232,7 @@ def test_the_submaps_are_the_dense_marginal_where_they_were_linearized(interval:
     found, found_descent = schur(*normal_equations(graph, whole), gone)
     scale = np.abs(information).max()
     np.testing.assert_allclose(found, information, rtol=1e-8, atol=1e-9 * scale)
-    np.testing.assert_allclose(found_descent, descent, rtol=1e-8, atol=1e-9 * scale)
+    np.testing.assert_allclose(found_descent, negative_gradient, rtol=1e-8, atol=1e-9 * scale)
 
 
 @pytest.mark.parametrize("interval", [0.5, 2.5])
@@ -241,12 +241,12 @@ def test_a_whole_drive_turned_with_its_start_is_known_as_well_as_before(interval
     rng = np.random.default_rng(8)
     drive = random_drive(rng, 0)
     variables = drive.variables
-    groups = [[reading_rows(drive, k, rng), odometry_rows(drive, k, rng)] for k in range(8)]
+    groups = [[detection_rows(drive, k, rng), odometry_rows(drive, k, rng)] for k in range(8)]
     submaps, *_ = drive_on(drive, groups, interval)
     submaps.first = graph_of()
     submaps.insert_keyframes(variables)
     before = normal_equations(submaps.graph(variables), variables.layout)
-    descent = before[1] - before[0] @ (variables.values - variables.reference)
+    negative_gradient = before[1] - before[0] @ (variables.values - variables.reference)
     theta, shift = 2.3, np.array([40.0, -7.0])
     rotation = np.eye(variables.layout.size)
     for key in variables.keys[1:].tolist():
@@ -259,13 +259,13 @@ def test_a_whole_drive_turned_with_its_start_is_known_as_well_as_before(interval
     scale = np.abs(before[0]).max()
     np.testing.assert_allclose(after[0], rotation @ before[0] @ rotation.T, atol=1e-9 * scale)
     turned = after[1] - after[0] @ (variables.values - variables.reference)
-    np.testing.assert_allclose(turned, rotation @ descent, atol=1e-9 * scale)
+    np.testing.assert_allclose(turned, rotation @ negative_gradient, atol=1e-9 * scale)
 
 
 def test_submaps_forget_map_points_and_go_on() -> None:
     rng = np.random.default_rng(9)
     drive = random_drive(rng, 0)
-    groups = [[reading_rows(drive, k, rng), odometry_rows(drive, k, rng)] for k in range(8)]
+    groups = [[detection_rows(drive, k, rng), odometry_rows(drive, k, rng)] for k in range(8)]
     submaps, *_ = drive_on(drive, groups, 2.5)
     gone = control_keys(1, np.array([1, 2]))
     assert any(np.isin(gone, submap.keys.keys).any() for submap in submaps.finished)

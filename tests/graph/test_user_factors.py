@@ -345,8 +345,8 @@ def test_a_factor_on_points_is_relinearized_again_when_they_come_back() -> None:
         drive.smoother.step()
     variables = drive.smoother.variables
     gradient = normal_equations(drive.smoother.linear_graph(), drive.smoother.layout)
-    descent = gradient[1] - gradient[0] @ (variables.values - variables.reference)
-    np.testing.assert_allclose(descent, 0.0, atol=1e-5)
+    negative_gradient = gradient[1] - gradient[0] @ (variables.values - variables.reference)
+    np.testing.assert_allclose(negative_gradient, 0.0, atol=1e-5)
 
 
 def surveyed(cycle: int, label: int, aside: float) -> tuple[FixedLagMapper, Array]:

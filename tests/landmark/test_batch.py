@@ -9,7 +9,7 @@ from gtsam.symbol_shorthand import C, L, X
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from pathspace_graph.eval.metrics.limit import solve_told_landmarks
+from pathspace_graph.eval.metrics.limit import solve_oracle_landmarks
 from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
 from pathspace_graph.factors.landmark import landmark_residuals
 from pathspace_graph.factors.odometry import integrate_twists
@@ -21,7 +21,7 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.landmark.batch import LandmarkBatch
 from pathspace_graph.landmark.oracle import solve_landmarks
 from pathspace_graph.landmark.reassociation import drop_rare, predicted
-from pathspace_graph.landmark.start import as_landmark_readings, start_told
+from pathspace_graph.landmark.start import as_landmark_detections, start_oracle
 from pathspace_graph.landmark.state import LandmarkState
 from pathspace_graph.landmark.system import LandmarkSystem
 from pathspace_graph.landmark.tentative import duplicates
@@ -44,8 +44,8 @@ def part_of(log: Log, cycles: int) -> tuple[Log, NDArray[np.int_]]:
     """The beginning of a log, and its true associations."""
     assert log.truth is not None and log.truth.associations is not None
     kept = log.cycles[:cycles]
-    readings = sum(len(cycle.labels) for cycle in kept)
-    return Log(log.odometry, kept, log.odometry_sigma), log.truth.associations[:readings]
+    detections = sum(len(cycle.labels) for cycle in kept)
+    return Log(log.odometry, kept, log.odometry_sigma), log.truth.associations[:detections]
 
 
 def gtsam_optimum(log: Log, associations: NDArray[np.int_]) -> gtsam.Values:
@@ -89,7 +89,7 @@ def test_told_it_is_gtsams_optimum(log: Log) -> None:
 def test_what_it_is_not_told_it_finds(log: Log) -> None:
     assert log.truth is not None and log.truth.associations is not None
     batch = LandmarkBatch(odometry_sigma=log.odometry_sigma)
-    result, told = batch.solve(log), solve_told_landmarks(log)
+    result, told = batch.solve(log), solve_oracle_landmarks(log)
     assert result.converged
     assert result.map.closed and result.laps == 2
     assert len(result.trajectory) == len(log.cycles)
@@ -104,10 +104,10 @@ def test_what_it_is_not_told_it_finds(log: Log) -> None:
 def told_system(log: Log, cycles: int) -> tuple[LandmarkSystem, LandmarkState]:
     short, associations = part_of(log, cycles)
     settings = MapperSettings()
-    readings = as_landmark_readings(short)
+    detections = as_landmark_detections(short)
     chain = integrate_log(short, log.odometry_sigma, settings.odometry)
-    state = start_told(readings, chain, associations)
-    return LandmarkSystem(readings, chain, settings), state
+    state = start_oracle(detections, chain, associations)
+    return LandmarkSystem(detections, chain, settings), state
 
 
 def whole_system(system: LandmarkSystem, state: LandmarkState) -> tuple[Array, Array]:
@@ -154,33 +154,33 @@ def test_the_cost_falls_along_the_gradient_of_the_rows(log: Log) -> None:
 
 def test_two_of_one_cone_are_merged_and_two_cones_are_not(log: Log) -> None:
     system, state = told_system(log, 60)
-    readings, settings, count = system.readings, system.settings, len(state)
-    numbers, sightings = np.unique(readings.landmark[readings.used], return_counts=True)
-    often = numbers[sightings.argmax()]
+    detections, settings, count = system.detections, system.settings, len(state)
+    numbers, counts = np.unique(detections.landmark[detections.used], return_counts=True)
+    often = numbers[counts.argmax()]
     own = state.positions(np.array([often]))
     twin = state.add(state.landmarks[own] + 0.05, state.labels[own])
-    mine = np.flatnonzero(readings.landmark == often)
-    readings.take(mine[::2], np.repeat(twin, len(mine[::2])))
+    mine = np.flatnonzero(detections.landmark == often)
+    detections.take(mine[::2], np.repeat(twin, len(mine[::2])))
     system.settle(state)
     first, second = duplicates(state, len(state), system.eliminated(state).joint, settings)
-    readings.merge(state.numbers[first], state.numbers[second])
-    drop_rare(state, readings, 1)
+    detections.merge(state.numbers[first], state.numbers[second])
+    drop_rare(state, detections, 1)
     assert len(state) == len(state.landmarks) == count
-    assert (readings.landmark[mine] == often).all()
+    assert (detections.landmark[mine] == often).all()
 
 
 def test_rare_ones_are_dropped_and_the_others_keep_their_readings(log: Log) -> None:
     system, state = told_system(log, 60)
-    readings = system.readings
-    numbers, counts = np.unique(readings.landmark[readings.used], return_counts=True)
+    detections = system.detections
+    numbers, counts = np.unique(detections.landmark[detections.used], return_counts=True)
     fewest = int(np.sort(counts)[len(counts) // 3]) + 1
-    before, points = readings.landmark.copy(), state.landmarks.copy()
-    drop_rare(state, readings, fewest)
+    before, points = detections.landmark.copy(), state.landmarks.copy()
+    drop_rare(state, detections, fewest)
     np.testing.assert_array_equal(state.numbers, numbers[counts >= fewest])
     np.testing.assert_array_equal(state.landmarks, points[counts >= fewest])
     kept = np.isin(before, state.numbers)
-    np.testing.assert_array_equal(readings.landmark[kept], before[kept])
-    assert (readings.landmark[~kept] == -1).all()
+    np.testing.assert_array_equal(detections.landmark[kept], before[kept])
+    assert (detections.landmark[~kept] == -1).all()
 
 
 def test_a_log_in_which_nothing_is_seen_is_an_empty_map() -> None:

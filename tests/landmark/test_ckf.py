@@ -58,8 +58,8 @@ def test_one_false_detection_makes_no_landmark_unless_told_so() -> None:
         covariances = np.concatenate([c.covariances, 0.01 * np.eye(2)[None]])
         return Detections(c.t, points, covariances, np.append(c.labels, LEFT))
 
-    def size(sightings: int) -> int:
-        settings = MapperSettings(ckf=replace(MapperSettings().ckf, sightings=sightings))
+    def size(tentative: int) -> int:
+        settings = MapperSettings(ckf=replace(MapperSettings().ckf, sightings=tentative))
         mapper = LandmarkCkf(settings, log.odometry_sigma)
         for k, (odometry, cycle) in enumerate(split_odometry(log)):
             mapper.update(odometry, with_ghost(cycle) if k == 30 else cycle)

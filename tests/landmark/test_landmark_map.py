@@ -49,8 +49,8 @@ def see_all(smoother: LandmarkSmoother, cycle: int, noise: float) -> None:
         smoother.map.state.add(CONES + 0.1, LABELS)
     seen = see(t, np.array([SPEED * t, 0.0, 0.0]), CONES, LABELS)
     noisy = seen.points_vehicle + noise * rng.normal(0.0, 0.1, seen.points_vehicle.shape)
-    rows = smoother.map.readings.append(replace(seen, points_vehicle=noisy), cycle)
-    smoother.map.readings.take(np.arange(rows.start, rows.stop), np.arange(len(CONES)))
+    rows = smoother.map.detections.append(replace(seen, points_vehicle=noisy), cycle)
+    smoother.map.detections.take(np.arange(rows.start, rows.stop), np.arange(len(CONES)))
 
 
 def driven(cycles: int, settings: MapperSettings = QUADRATIC, noise: float = 1.0) -> LandmarkSmoother:
@@ -140,18 +140,18 @@ def test_merging_is_the_constraint_that_both_are_one(tolerance: float) -> None:
     smoother = driven(8, replace(QUADRATIC, lag=0.3, relinearize=stale))
     layout, variables, state = smoother.layout, smoother.variables, smoother.map.state
     hessian, vector = normal_equations(smoother.linear_graph(), layout)
-    descent = vector - hessian @ (variables.values - variables.reference)
+    negative_gradient = vector - hessian @ (variables.values - variables.reference)
     constraint = np.zeros((2, layout.size))
     constraint[:, layout.entries(state.keys[[4]])] = np.eye(2)
     constraint[:, layout.entries(state.keys[[0]])] = -np.eye(2)
     kkt = np.block([[hessian, constraint.T], [constraint, np.zeros((2, 2))]])
-    step = np.linalg.solve(kkt, np.append(descent, -constraint @ variables.values))[: layout.size]
+    step = np.linalg.solve(kkt, np.append(negative_gradient, -constraint @ variables.values))[: layout.size]
     expected = (variables.values + step)[layout.entries(state.keys[:4])]
     before = state.landmarks[0].copy()
     merge(smoother, np.array([4]), np.array([0]))
     np.testing.assert_array_equal(state.numbers, np.arange(4))
     assert smoother.map.became == {4: 0}
-    assert set(smoother.map.readings.landmark.tolist()) == {0, 1, 2, 3}
+    assert set(smoother.map.detections.landmark.tolist()) == {0, 1, 2, 3}
     np.testing.assert_allclose(state.landmarks, expected.reshape(-1, 2), atol=1e-3)
     assert np.abs(expected[:2] - before).max() > 0.01
 
@@ -181,10 +181,10 @@ def test_a_key_that_the_graph_does_not_hold_merges_into_nothing() -> None:
     np.testing.assert_allclose(found[1], vector, atol=1e-9)
 
 
-@pytest.mark.parametrize("sighted", [2, 0])
-def test_a_landmark_has_the_colour_of_most_of_its_readings(sighted: int) -> None:
+@pytest.mark.parametrize("observed", [2, 0])
+def test_a_landmark_has_the_colour_of_most_of_its_readings(observed: int) -> None:
     state = LandmarkState()
-    state.born = 10 * sighted  # numbers, not positions
+    state.born = 10 * observed  # numbers, not positions
     n = state.add(CONES, LABELS)
     state.vote(np.array([RIGHT, RIGHT, RIGHT]), n[[0, 0, 1]])
     np.testing.assert_array_equal(state.labels, [RIGHT, RIGHT, LEFT, RIGHT, LEFT])

@@ -8,7 +8,7 @@ import pytest
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.landmark.state import LandmarkState
-from pathspace_graph.landmark.tentative import duplicates, near_pairs, one_cone, sighted_by
+from pathspace_graph.landmark.tentative import detected_by, duplicates, near_pairs, one_cone
 from pathspace_graph.settings.comparison import LandmarkSettings
 from pathspace_graph.settings.mapper import GrowthSettings, MapperSettings
 
@@ -17,7 +17,7 @@ def test_each_pose_gives_a_landmark_one_reading_the_nearest() -> None:
     landmarks = np.array([[0.0, 0.0], [5.0, 0.0]])
     points = np.array([[0.3, 0.0], [0.1, 0.0], [0.2, 0.0], [4.9, 0.0], [2.5, 0.0]])
     cycles = np.array([0, 0, 1, 1, 1])
-    rows, which = sighted_by(points, cycles, landmarks, GrowthSettings(merge_radius=1.0))
+    rows, which = detected_by(points, cycles, landmarks, GrowthSettings(merge_radius=1.0))
     order = np.argsort(rows)
     np.testing.assert_array_equal(rows[order], [1, 2, 3])
     np.testing.assert_array_equal(which[order], [0, 0, 1])
@@ -25,7 +25,7 @@ def test_each_pose_gives_a_landmark_one_reading_the_nearest() -> None:
 
 def test_no_landmarks_and_no_readings() -> None:
     for points, landmarks in ((0, 2), (2, 0)):
-        found = sighted_by(
+        found = detected_by(
             np.zeros((points, 2)), np.zeros(points, np.intp), np.zeros((landmarks, 2)), GrowthSettings()
         )
         assert [len(column) for column in found] == [0, 0]

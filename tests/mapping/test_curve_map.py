@@ -35,7 +35,7 @@ def mapper() -> FixedLagMapper:
 def rows_of(mapper: FixedLagMapper, settings: MapperSettings) -> Rows:
     smoother = mapper.smoother
     track = CurveMap(settings, smoother.map.state)
-    track.readings = smoother.map.readings
+    track.detections = smoother.map.detections
     return track.rows(np.arange(smoother.first_cycle, smoother.next_cycle))[0]
 
 
@@ -64,11 +64,11 @@ def test_an_offset_holds_the_vehicle_along_a_straight_curve_and_a_distance_does_
 def test_a_reading_that_slides_to_where_an_open_map_is_inactive_brings_all_of_it_back() -> None:
     found, _ = map_log(exact_log(ahead(6.0, 9.0), *corridor(80.0)))
     smoother, state = found.smoother, found.smoother.map.state
-    readings = smoother.map.readings
+    detections = smoother.map.detections
     assert not state.whole and len(smoother.inactive) > 0
-    rows, size = int(readings.used.sum()), smoother.layout.size
-    reading = np.flatnonzero(readings.used)[-1]
-    readings.u[reading], readings.changed[reading] = 1.0, True
+    rows, size = int(detections.used.sum()), smoother.layout.size
+    reading = np.flatnonzero(detections.used)[-1]
+    detections.u[reading], detections.changed[reading] = 1.0, True
     smoother.step(found.settings.sigma_step)
     assert state.whole and len(smoother.inactive) == 0
     assert smoother.layout.size > size

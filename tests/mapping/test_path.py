@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pathspace_graph.mapping.path import DrivenPath, Way, along_and_across
+from pathspace_graph.mapping.path import DrivenPath, PathAhead, along_and_across
 from pathspace_graph.settings.mapper import PathSettings
 
 Array = NDArray[np.float64]
@@ -54,12 +54,12 @@ def test_the_curvature_is_smoothed_clipped_and_not_taken_from_a_creeping_vehicle
 
 def test_the_prediction_of_a_straight_goes_on_straight() -> None:
     path = driven([0.0, 1.0, 2.0, 3.0], step=0.5)
-    way = path.ahead(np.array([3.0, 0.0, 0.0]), 2.0)
-    np.testing.assert_allclose(way.points[:, 0], [0.0, 1.0, 2.0, 3.0, 3.5, 4.0, 4.5, 5.0])
-    np.testing.assert_allclose(way.stations, way.points[:, 0])
-    np.testing.assert_array_equal(way.points[:, 1], 0.0)
-    assert way.driven == 3.0
-    np.testing.assert_allclose(way.beside(3.4, -2.0), [3.5, -2.0])
+    path_ahead = path.ahead(np.array([3.0, 0.0, 0.0]), 2.0)
+    np.testing.assert_allclose(path_ahead.points[:, 0], [0.0, 1.0, 2.0, 3.0, 3.5, 4.0, 4.5, 5.0])
+    np.testing.assert_allclose(path_ahead.stations, path_ahead.points[:, 0])
+    np.testing.assert_array_equal(path_ahead.points[:, 1], 0.0)
+    assert path_ahead.driven == 3.0
+    np.testing.assert_allclose(path_ahead.beside(3.4, -2.0), [3.5, -2.0])
 
 
 @pytest.mark.parametrize(("station", "first"), [(-1.0, 0), (0.5, 0), (1.0, 0), (1.5, 1), (2.0, 1), (9.0, 3)])
@@ -67,7 +67,7 @@ def test_the_way_since_a_station_begins_at_the_last_position_before_it(station: 
     """Positions a metre apart, but for one gap of 4 m: the segment that holds the station is kept whole."""
     stations = np.array([0.0, 1.0, 2.0, 6.0])
     points = np.column_stack([stations, np.zeros(4)])
-    since = Way(points, stations, 2.0).since(station)
+    since = PathAhead(points, stations, 2.0).since(station)
     np.testing.assert_array_equal(since.stations, stations[first:])
     np.testing.assert_array_equal(since.points, points[first:])
     assert since.driven == 2.0
@@ -78,12 +78,12 @@ def test_the_prediction_of_a_turn_is_its_circle(radius: float) -> None:
     """Heading along y at (1, 0): the centre is `radius` to the left."""
     path = driven([1.0])
     path.curvature = 1.0 / radius
-    way = path.ahead(np.array([1.0, 0.0, np.pi / 2]), 6.0)
-    angle = way.stations / radius
+    path_ahead = path.ahead(np.array([1.0, 0.0, np.pi / 2]), 6.0)
+    angle = path_ahead.stations / radius
     expected = np.column_stack([1.0 - radius * (1.0 - np.cos(angle)), radius * np.sin(angle)])
-    np.testing.assert_allclose(way.points, expected, atol=1e-12)
-    np.testing.assert_allclose(np.diff(way.stations), 0.3)
-    assert way.stations[-1] >= 6.0
+    np.testing.assert_allclose(path_ahead.points, expected, atol=1e-12)
+    np.testing.assert_allclose(np.diff(path_ahead.stations), 0.3)
+    assert path_ahead.stations[-1] >= 6.0
 
 
 CORNER = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.mapping.tentative import Sightings
+from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.settings.mapper import GrowthSettings
 
 Array = NDArray[np.float64]
@@ -14,17 +14,17 @@ Array = NDArray[np.float64]
 SETTINGS = GrowthSettings(sightings=3, merge_radius=1.0, forget_after=6.0)
 
 
-def sightings(*readings: tuple[float, float, float, float]) -> Sightings:
+def tentative(*detections: tuple[float, float, float, float]) -> TentativeTracks:
     """Sightings after readings (x, y, variance, t), one at a time."""
-    found = Sightings(SETTINGS)
-    for x, y, variance, t in readings:
+    found = TentativeTracks(SETTINGS)
+    for x, y, variance, t in detections:
         found.add(np.array([[x, y]]), np.array([variance]), t)
     return found
 
 
 def test_a_merged_sighting_is_the_weighted_mean() -> None:
     """Weights 1 and 2: a third of the way is left to the first."""
-    found = sightings((0.0, 0.0, 1.0, 0.0), (0.3, -0.6, 0.5, 0.1))
+    found = tentative((0.0, 0.0, 1.0, 0.0), (0.3, -0.6, 0.5, 0.1))
     np.testing.assert_allclose(found.points, [[0.2, -0.4]], atol=1e-15)
     assert found.weights.tolist() == [3.0]
     assert found.counts.tolist() == [2]
@@ -32,7 +32,7 @@ def test_a_merged_sighting_is_the_weighted_mean() -> None:
 
 
 def test_two_readings_of_one_cycle_merge_one_after_the_other() -> None:
-    found = sightings((0.0, 0.0, 1.0, 0.0))
+    found = tentative((0.0, 0.0, 1.0, 0.0))
     found.add(np.array([[0.6, 0.0], [0.0, 0.3]]), np.ones(2), 0.1)
     np.testing.assert_allclose(found.points, [[0.2, 0.1]], atol=1e-15)
     assert found.counts.tolist() == [3]
@@ -40,37 +40,37 @@ def test_two_readings_of_one_cycle_merge_one_after_the_other() -> None:
 
 @pytest.mark.parametrize(("distance", "count"), [(0.99, 1), (1.01, 2)])
 def test_only_what_is_near_merges(distance: float, count: int) -> None:
-    assert len(sightings((0.0, 0.0, 1.0, 0.0), (distance, 0.0, 1.0, 0.1)).points) == count
+    assert len(tentative((0.0, 0.0, 1.0, 0.0), (distance, 0.0, 1.0, 0.1)).points) == count
 
 
 def test_a_reading_goes_to_the_nearest() -> None:
-    found = sightings((0.0, 0.0, 1.0, 0.0), (1.5, 0.0, 1.0, 0.0), (0.9, 0.0, 1.0, 0.1))
+    found = tentative((0.0, 0.0, 1.0, 0.0), (1.5, 0.0, 1.0, 0.0), (0.9, 0.0, 1.0, 0.1))
     np.testing.assert_allclose(found.points, [[0.0, 0.0], [1.2, 0.0]], atol=1e-15)
     assert found.counts.tolist() == [1, 2]
 
 
 def test_confirmed_when_seen_three_times() -> None:
     twice = [(0.0, 0.0, 1.0, 0.1 * k) for k in range(2)]
-    assert sightings(*twice).confirmed().tolist() == []
-    found = sightings((9.0, 0.0, 1.0, 0.0), *twice, (0.1, 0.0, 1.0, 0.2))
+    assert tentative(*twice).confirmed().tolist() == []
+    found = tentative((9.0, 0.0, 1.0, 0.0), *twice, (0.1, 0.0, 1.0, 0.2))
     assert found.confirmed().tolist() == [1]
 
 
 @pytest.mark.parametrize(("t", "left"), [(5.9, 2), (6.1, 1), (6.3, 0)])
 def test_what_is_not_seen_again_is_forgotten(t: float, left: int) -> None:
     """Also in a cycle in which nothing is seen."""
-    found = sightings((0.0, 0.0, 1.0, 0.0), (5.0, 0.0, 1.0, 0.2))
+    found = tentative((0.0, 0.0, 1.0, 0.0), (5.0, 0.0, 1.0, 0.2))
     found.add(np.zeros((0, 2)), np.zeros(0), t)
     assert len(found.points) == len(found.weights) == len(found.counts) == len(found.last_t) == left
 
 
 def test_seeing_it_again_keeps_it() -> None:
-    found = sightings((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 1.0, 5.0), (9.0, 0.0, 1.0, 10.0))
+    found = tentative((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 1.0, 5.0), (9.0, 0.0, 1.0, 10.0))
     assert found.counts.tolist() == [2, 1]
 
 
 def test_remove_and_clear() -> None:
-    found = sightings(*((3.0 * k, 0.0, 1.0, 0.1 * k) for k in range(3)))
+    found = tentative(*((3.0 * k, 0.0, 1.0, 0.1 * k) for k in range(3)))
     found.remove(np.array([1]))
     np.testing.assert_array_equal(found.points[:, 0], [0.0, 6.0])
     np.testing.assert_array_equal(found.last_t, [0.0, 0.2])

@@ -17,7 +17,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
 from pathspace_graph.mapping.registration import Matches, Registration, _certain, near_start, register
-from pathspace_graph.mapping.seam import Join, join
+from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.online.simplification import substitute
 from pathspace_graph.run import CycleResult, split_odometry
@@ -128,16 +128,16 @@ def test_closing_leaves_the_pose_where_it_is(log: Log, run: tuple[FixedLagMapper
 def test_readings_in_use_lie_on_the_closed_curve(when: str, request: pytest.FixtureRequest) -> None:
     mapper = request.getfixturevalue(when)
     mapper = mapper[0] if isinstance(mapper, tuple) else mapper
-    readings = mapper.smoother.map.readings
+    detections = mapper.smoother.map.detections
     for label, boundary in mapper.boundaries.items():
-        rows = readings.used_on(label)
+        rows = detections.used_on(label)
         assert len(rows) > 20
-        points = to_map(readings.point[rows], mapper.smoother.variables.poses_at(readings.cycle[rows]))
-        on_curve = boundary.evaluate(mapper.control_points(label), readings.u[rows])
+        points = to_map(detections.point[rows], mapper.smoother.variables.poses_at(detections.cycle[rows]))
+        on_curve = boundary.evaluate(mapper.control_points(label), detections.u[rows])
         distances = np.hypot(*(points - on_curve).T)
         assert np.median(distances) < 0.15
         assert distances.max() < 0.6
-        foot = boundary.refine(mapper.control_points(label), points, readings.u[rows])
+        foot = boundary.refine(mapper.control_points(label), points, detections.u[rows])
         assert foot.interior.all()
         assert np.median(np.abs(foot.distance)) < 0.02
         assert np.abs(foot.distance).max() < 0.1
@@ -180,11 +180,11 @@ def test_a_drifted_window_is_registered_back(
     assert registration.motion.vector[2] == pytest.approx(-theta, abs=0.02)
     moved = registration.motion.apply(mapper.poses[:, :2])
     np.testing.assert_allclose(moved, poses_before[:, :2], atol=0.3)
-    readings = mapper.smoother.map.readings
+    detections = mapper.smoother.map.detections
     for label, (rows, u) in registration.matches.items():
-        assert (readings.label[rows] == label).all()
-        poses = mapper.smoother.variables.poses_at(readings.cycle[rows])
-        points = registration.motion.apply(to_map(readings.point[rows], poses))
+        assert (detections.label[rows] == label).all()
+        poses = mapper.smoother.variables.poses_at(detections.cycle[rows])
+        points = registration.motion.apply(to_map(detections.point[rows], poses))
         on_curve = mapper.boundaries[label].evaluate(mapper.control_points(label), u)
         distances = np.hypot(*(points - on_curve).T)
         assert np.median(distances) < 0.1
@@ -198,12 +198,12 @@ def test_knots_by_the_cones_are_nearer_to_them_than_knots_by_curvature(before: F
     kinds: tuple[Knots, Knots] = ("cones", "curvature")
     for label, boundary in state.boundaries.items():
         points = state.control_points(label)
-        joins = [join(boundary, points, settings, kind) for kind in kinds]
-        assert len(joins[0].points) == len(joins[1].points)
-        u = np.array(boundary.sighted_u)
-        u = u[u < joins[0].overlap.period - 1.0]
+        periodic = [make_periodic(boundary, points, settings, kind) for kind in kinds]
+        assert len(periodic[0].points) == len(periodic[1].points)
+        u = np.array(boundary.cone_parameters)
+        u = u[u < periodic[0].overlap.period - 1.0]
         cones = boundary.evaluate(points, u)
-        off = [np.hypot(*(boundary.closed(new.knots).evaluate(new.points, u) - cones).T) for new in joins]
+        off = [np.hypot(*(boundary.closed(new.knots).evaluate(new.points, u) - cones).T) for new in periodic]
         assert np.sqrt(np.mean(off[0] ** 2)) < 0.8 * np.sqrt(np.mean(off[1] ** 2))
 
 
@@ -214,13 +214,13 @@ def prior_system(mapper: FixedLagMapper) -> tuple[Layout, Array, Array]:
 
 
 def change_of_variables(
-    mapper: FixedLagMapper, joins: dict[int, Join], old: Layout, new: Layout
+    mapper: FixedLagMapper, periodic: dict[int, PeriodicCurve], old: Layout, new: Layout
 ) -> tuple[Array, Array]:
     """`x_old = T x_new`, where what the curves don't hold stays as it is; and which entries are a curve's."""
     matrix, curves = np.zeros((old.size, new.size)), np.zeros(old.size, bool)
     others = np.intersect1d(old.keys, new.keys)
     matrix[old.entries(others), new.entries(others)] = 1.0
-    for label, change in joins.items():
+    for label, change in periodic.items():
         last = mapper.boundaries[label].first
         keys = control_keys(label, np.arange(last - len(change.old_from_new), last))
         held = old.positions(keys) >= 0
@@ -244,18 +244,21 @@ def test_the_change_of_variables_is_exact(before: FixedLagMapper, sigma: float) 
     state = smoother.map.state
     old, information, gradient = prior_system(before)
     known = smoother.variables.reference[smoother.variables.layout.entries(old.keys)].copy()
-    joins = {b: join(one, state.control_points(b), settings, "cones") for b, one in state.boundaries.items()}
-    substitute(smoother, joins)
+    periodic = {
+        b: make_periodic(one, state.control_points(b), settings, "cones")
+        for b, one in state.boundaries.items()
+    }
+    substitute(smoother, periodic)
     new, found, found_gradient = prior_system(before)
-    matrix, curves = change_of_variables(before, joins, old, new)
+    matrix, curves = change_of_variables(before, periodic, old, new)
     shift = np.diag(sigma**2 * curves)
     expected = information @ np.linalg.inv(np.eye(old.size) + shift @ information)
     gradient = np.linalg.solve(np.eye(old.size) + information @ shift, gradient)
     away = matrix @ smoother.variables.reference[smoother.variables.layout.entries(new.keys)] - known
-    descent = matrix.T @ (gradient - expected @ away)
+    negative_gradient = matrix.T @ (gradient - expected @ away)
     expected = matrix.T @ expected @ matrix
     np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
-    np.testing.assert_allclose(found_gradient, descent, atol=1e-7 * np.abs(expected).max())
+    np.testing.assert_allclose(found_gradient, negative_gradient, atol=1e-7 * np.abs(expected).max())
 
 
 # --- where it mustn't ------------------------------------------------------------------------------------

@@ -176,7 +176,7 @@ def test_unknown_readings_that_either_curve_would_take_are_left_out() -> None:
     labels = np.where(np.arange(len(labels)) % 3 == 0, UNKNOWN, labels)
     mapper, _ = map_log(exact_log(ahead(8.0, 4.0), cones, labels))
     assert set(mapper.boundaries) == {LEFT, RIGHT}
-    assert not mapper.smoother.map.readings.used[mapper.smoother.map.readings.label == UNKNOWN].any()
+    assert not mapper.smoother.map.detections.used[mapper.smoother.map.detections.label == UNKNOWN].any()
 
 
 def test_unknown_readings_on_a_curve_are_used() -> None:
@@ -184,11 +184,11 @@ def test_unknown_readings_on_a_curve_are_used() -> None:
     cones, labels = corridor(100.0)
     labels = np.where(np.arange(len(labels)) % 3 == 0, UNKNOWN, labels)
     mapper, _ = map_log(exact_log(ahead(8.0, 8.0), cones, labels))
-    readings = mapper.smoother.map.readings
-    used = readings.used & (readings.label == UNKNOWN)
+    detections = mapper.smoother.map.detections
+    used = detections.used & (detections.label == UNKNOWN)
     assert used.sum() > 10
-    y = to_map(readings.point[used], mapper.smoother.variables.poses_at(readings.cycle[used]))[:, 1]
-    np.testing.assert_array_equal(readings.boundary[used], np.where(y > 0.0, LEFT, RIGHT))
+    y = to_map(detections.point[used], mapper.smoother.variables.poses_at(detections.cycle[used]))[:, 1]
+    np.testing.assert_array_equal(detections.boundary[used], np.where(y > 0.0, LEFT, RIGHT))
     for label, line in ((LEFT, 2.0), (RIGHT, -2.0)):
         assert straightness(mapper.map(), label, line, 60.0) < 0.02
 
@@ -201,8 +201,8 @@ def test_cones_of_a_start_line_beside_the_boundary_do_not_bend_it() -> None:
         ahead(8.0, 8.0), np.concatenate([cones, gate]), np.append(labels, np.full(len(gate), UNKNOWN))
     )
     mapper, _ = map_log(log)
-    readings = mapper.smoother.map.readings
-    assert not readings.used[readings.label == UNKNOWN].any()
+    detections = mapper.smoother.map.detections
+    assert not detections.used[detections.label == UNKNOWN].any()
     for label, line in ((LEFT, 2.0), (RIGHT, -2.0)):
         assert straightness(mapper.map(), label, line, 60.0) < 1e-6
 

@@ -13,7 +13,7 @@ from pathspace_graph.eval.metrics.true_curve import mapped_points, true_curve
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.candidates import undisputed
-from pathspace_graph.mapping.path import Way
+from pathspace_graph.mapping.path import PathAhead
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -97,16 +97,18 @@ def test_a_boundary_is_not_led_over_cones_of_which_most_readings_have_the_other_
 def test_an_end_nearer_to_an_older_stretch_of_the_path_does_not_follow_that() -> None:
     """An older stretch ran against this one, 3 m to the left of it; what was sighted beside it is its own."""
     mapper, _ = map_log(exact_log(ahead(8.0, 5.0), *corridor(100.0)))
-    boundary, sightings = mapper.boundaries[LEFT], mapper.growth.sightings[LEFT]
-    confirmed, size = boundary.confirmed, boundary.size
-    sightings.clear()
+    boundary, tentative = mapper.boundaries[LEFT], mapper.growth.tentative[LEFT]
+    confirmed, size = boundary.confirmed_end, boundary.size
+    tentative.clear()
     for t in (5.0, 5.1, 5.2):
-        sightings.add(np.array([[36.0, 1.0], [32.0, 1.0], [28.0, 1.0]]), np.full(3, 0.01), t)
+        tentative.add(np.array([[36.0, 1.0], [32.0, 1.0], [28.0, 1.0]]), np.full(3, 0.01), t)
     x = mapper.poses[-1, 0]
     points = np.array([[60.0, 3.0], [0.0, 3.0], [0.0, 0.0], [x, 0.0], [x + 7.0, 0.0]])
     stations = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
-    assert mapper.growth.expand(mapper.smoother, Way(points, stations, float(stations[3]))) == frozenset()
-    assert (boundary.confirmed, boundary.size) == (confirmed, size)
+    assert (
+        mapper.growth.expand(mapper.smoother, PathAhead(points, stations, float(stations[3]))) == frozenset()
+    )
+    assert (boundary.confirmed_end, boundary.size) == (confirmed, size)
 
 
 # --- the order of the drive --------------------------------------------------------------------------------

@@ -94,11 +94,11 @@ def own_system(mapper: FixedLagMapper) -> tuple[Array, Array]:
 
 
 def test_its_linearization_is_the_mapper_s_own_system(mapper: FixedLagMapper) -> None:
-    hessian, descent = own_system(mapper)
+    hessian, negative_gradient = own_system(mapper)
     linear = mapper.graph().linearize(mapper.values())
     found, found_descent = linear.hessian(mapper.smoother.layout.ordering)
     np.testing.assert_allclose(found, hessian, atol=1e-8 * np.abs(hessian).max())
-    np.testing.assert_allclose(found_descent, descent, atol=1e-7 * np.abs(hessian).max())
+    np.testing.assert_allclose(found_descent, negative_gradient, atol=1e-7 * np.abs(hessian).max())
     largest = np.sqrt(np.outer(np.diag(hessian), np.diag(hessian)))
     assert (np.abs(found - hessian) <= 1e-5 * largest).all()
 

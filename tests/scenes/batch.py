@@ -12,7 +12,7 @@ from pathspace_graph.batch.association import associate, locate_poses
 from pathspace_graph.batch.dead_reckoning import start_odometry
 from pathspace_graph.batch.mapper import own_settings
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved
-from pathspace_graph.mapping.measurements import Chain, collect_readings, integrate_log
+from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -35,12 +35,12 @@ def straight(seconds: float = 6.0, smoothness: float = SMOOTHNESS) -> tuple[Batc
     cones, labels = corridor(60.0)
     log = exact_log(ahead(6.0, seconds), cones, labels)
     settings = own_settings(whole)
-    chain, readings = integrate_log(log, log.odometry_sigma, settings.odometry), collect_readings(log)
-    state = start_odometry(chain, readings, settings)
-    system = BatchSystem(readings, chain, settings, Biweight(LEAST_SQUARES))
+    chain, detections = integrate_log(log, log.odometry_sigma, settings.odometry), collect_detections(log)
+    state = start_odometry(chain, detections, settings)
+    system = BatchSystem(detections, chain, settings, Biweight(LEAST_SQUARES))
     system.begin(state)
     locate_poses(state)
-    associate(state, readings, settings, settings.batch.gate, True)
+    associate(state, detections, settings, settings.batch.gate, True)
     system.evaluate(state, hold=True)
     return system, settled(system, state)
 
@@ -50,7 +50,7 @@ def settled(system: BatchSystem, state: State, steps: int = 4) -> State:
     for _ in range(steps):
         at = system.evaluate(state)
         for projected in at.projected.values():
-            system.readings.u[projected.rows] = projected.foot.u
+            system.detections.u[projected.rows] = projected.foot.u
         problem = system.eliminated(at)
         state = moved(state, problem.step(np.zeros(problem.map.size)))
     return state
@@ -58,17 +58,17 @@ def settled(system: BatchSystem, state: State, steps: int = 4) -> State:
 
 def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, Array]:
     """The same drive measured with noise as the problem has it; also the calibration (2,) that it hides."""
-    readings, chain = system.readings, system.chain
+    detections, chain = system.detections, system.chain
     odometry = system.settings.odometry
     calibration = rng.normal(0.0, [odometry.sigma_scale, odometry.sigma_bias])
-    sigma = np.sqrt(readings.covariance[:, 0, 0] + system.settings.spline.sigma_model**2)
-    points = readings.point + sigma[:, None] * rng.normal(size=readings.point.shape)
+    sigma = np.sqrt(detections.covariance[:, 0, 0] + system.settings.spline.sigma_model**2)
+    points = detections.point + sigma[:, None] * rng.normal(size=detections.point.shape)
     driven = chain.odometry
     noise = np.linalg.solve(driven.whiteners, rng.normal(size=(*driven.deltas.shape, 1)))[..., 0]
     local = noise + driven.by_calibration @ calibration
     first = rng.multivariate_normal(chain.first, np.linalg.inv(chain.first_information))
     noisy = BatchSystem(
-        replace(readings, point=points, u=readings.u.copy()),
+        replace(detections, point=points, u=detections.u.copy()),
         _turned(replace(chain, first=first), local),
         system.settings,
         system.kernel,

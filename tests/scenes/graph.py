@@ -54,11 +54,11 @@ def random_rows(rng: np.random.Generator, sets: list[IntArray], count: int, owne
 
 def random_groups(rng: np.random.Generator, owners: int = 4) -> list[Rows]:
     """Readings of three control points, odometry with its calibration, spacings, and a group of none."""
-    readings = random_rows(rng, [POSE_KEYS, LEFT_KEYS[:2], LEFT_KEYS[2:], RIGHT_KEYS], 60, owners)
+    detections = random_rows(rng, [POSE_KEYS, LEFT_KEYS[:2], LEFT_KEYS[2:], RIGHT_KEYS], 60, owners)
     odometry = random_rows(rng, [KEYS[:1], POSE_KEYS[:2], POSE_KEYS[2:]], 30, owners)
     spacing = random_rows(rng, [RIGHT_KEYS[:1], RIGHT_KEYS[1:]], 5, owners)
     nothing = Rows(np.zeros((0, 2), np.intp), np.zeros((0, 4)), np.zeros(0), np.zeros(0, np.intp))
-    return [readings, nothing, odometry, spacing]
+    return [detections, nothing, odometry, spacing]
 
 
 def dense_rows(groups: list[Rows], keys: IntArray) -> tuple[Array, Array, IntArray]:

@@ -123,7 +123,7 @@ def search(scene: Scene, label: int) -> Array:
     return foot_points(TABLES, scene.control(label, scene.state), points, *whole, 0.5).u
 
 
-def reading_rows(scene: Scene, label: int, state: Array) -> Rows:
+def detection_rows(scene: Scene, label: int, state: Array) -> Rows:
     """All readings of a boundary at once, by the kernels."""
     slots, u = scene.slots[label], scene.u[label]
     poses = scene.poses(state)[slots]
@@ -187,7 +187,7 @@ def prior_rows_of(scene: Scene, state: Array) -> list[Rows]:
 def all_rows(scene: Scene, state: Array) -> list[Rows]:
     groups = [*prior_rows_of(scene, state), odometry_rows(scene, state)]
     for label in (0, 1):
-        groups += [reading_rows(scene, label, state), *gauge_rows(scene, label, state)]
+        groups += [detection_rows(scene, label, state), *gauge_rows(scene, label, state)]
     return groups
 
 

@@ -92,8 +92,8 @@ def test_stays_between_the_cones_and_wanders(seed: int) -> None:
 
 def test_drives_its_laps_and_a_little_more(driven: tuple[Track, Drive]) -> None:
     track, d = driven
-    way = np.linalg.norm(np.diff(d.poses[:, :2], axis=0), axis=1).sum()
-    assert way == pytest.approx(2 * track.centre_line.length + 10.0, rel=0.01)
+    path_ahead = np.linalg.norm(np.diff(d.poses[:, :2], axis=0), axis=1).sum()
+    assert path_ahead == pytest.approx(2 * track.centre_line.length + 10.0, rel=0.01)
     # after two laps it is beyond the start again, where it began
     assert np.linalg.norm(d.poses[-1, :2]) == pytest.approx(10.0, abs=1.5)
     assert d.poses[-1, 0] > 0

@@ -52,14 +52,14 @@ def test_readings_beyond_the_end_expand_and_the_last_of_their_chain_is_interpola
     np.testing.assert_array_equal(data.expands, [False, False, True, True, True])
     np.testing.assert_array_equal(data.order, [2, 3, 4])
     end = data.extended.spline.evaluate(np.array([data.extended.spline.domain[1]]))[0]
-    np.testing.assert_allclose(end, data.readings[4], atol=1e-9)
+    np.testing.assert_allclose(end, data.detections[4], atol=1e-9)
 
 
 def test_the_three_conditions_of_an_expansion() -> None:
     straight = BSpline.clamped_from(np.array([0.0, 6.0]), np.array([[0.0, 0], [2, 0], [4, 0], [6, 0]]))
-    readings = np.array([[3.0, 1.0], [7.0, 0.0], [6.5, 2.5], [9.0, 0.0]])
-    np.testing.assert_array_equal(expanding(straight, readings, 2.0, 4.0), [False, False, False, True])
-    np.testing.assert_array_equal(expanding(straight, readings, 0.5, 1.0), [False, True, True, True])
+    detections = np.array([[3.0, 1.0], [7.0, 0.0], [6.5, 2.5], [9.0, 0.0]])
+    np.testing.assert_array_equal(expanding(straight, detections, 2.0, 4.0), [False, False, False, True])
+    np.testing.assert_array_equal(expanding(straight, detections, 0.5, 1.0), [False, True, True, True])
 
 
 def test_extension_leaves_the_curve_and_its_uncertainty_as_they_were() -> None:
@@ -76,7 +76,7 @@ def test_extension_leaves_the_curve_and_its_uncertainty_as_they_were() -> None:
 
 def test_the_covariance_of_an_extension_is_that_of_extended_samples() -> None:
     data, rng = expansion(), np.random.default_rng(4)
-    reading, scene = data.readings[4], ExpansionScene()
+    reading, scene = data.detections[4], ExpansionScene()
     extended = extend(data.before, reading, scene.sigma_reading**2 * np.eye(2))
     drawn = rng.multivariate_normal(data.before.spline.control_points.ravel(), data.before.covariance, 4000)
     knots = extended.spline.knots
@@ -94,7 +94,7 @@ def test_the_covariance_of_an_extension_is_that_of_extended_samples() -> None:
 def test_the_update_draws_the_curve_to_the_readings_and_makes_it_surer() -> None:
     data = expansion()
     before, after = (
-        np.abs(boundary.spline.foot_points(data.readings[:4]).distance)
+        np.abs(boundary.spline.foot_points(data.detections[:4]).distance)
         for boundary in (data.extended, data.updated)
     )
     assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
@@ -125,8 +125,8 @@ def test_each_spline_is_the_ridge_regression_of_its_sigma_point() -> None:
 
 def test_the_fit_lies_between_the_curve_and_the_readings_and_moves_what_the_basis_touches() -> None:
     data = fit()
-    before = data.curve.foot_points(data.readings).distance
-    after = data.fitted.foot_points(data.readings).distance
+    before = data.curve.foot_points(data.detections).distance
+    after = data.fitted.foot_points(data.detections).distance
     assert (np.abs(after) < 0.3 * np.abs(before)).all()
     touched = data.basis.sum(axis=0) > 0.0
     moved = np.linalg.norm(data.reading.points - data.curve.control_points, axis=1)

@@ -12,7 +12,7 @@ from pathspace_graph.eval.metrics.limit import (
     fit_rmse,
     landmark_rmse,
     limit,
-    solve_told_landmarks,
+    solve_oracle_landmarks,
 )
 from pathspace_graph.eval.metrics.table1 import ate, root_mean_square
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
@@ -79,7 +79,7 @@ def _detect(
 def test_without_noise_the_batch_is_exact() -> None:
     log = circle_log(noise=0.0)
     assert log.truth is not None
-    solution = solve_told_landmarks(log)
+    solution = solve_oracle_landmarks(log)
     assert len(solution.landmarks) == 36
     assert landmark_rmse(solution, log.truth) < 1e-6
     assert ate(solution.trajectory_t, solution.trajectory, log.truth) < 1e-6
@@ -92,7 +92,7 @@ def test_with_noise_the_errors_are_as_large_as_the_covariance_says() -> None:
     for seed in range(6):
         log = circle_log(noise=1.0, seed=seed)
         assert log.truth is not None
-        solution = solve_told_landmarks(log, with_covariance=True)
+        solution = solve_oracle_landmarks(log, with_covariance=True)
         errors = (solution.landmarks - log.truth.cones[solution.landmark_ids]).ravel()
         assert solution.covariance is not None
         ratios.append(errors @ np.linalg.solve(solution.covariance, errors) / len(errors))
@@ -108,11 +108,11 @@ CERTAIN = MapperSettings(
 """A vehicle that stands turns by its yaw rate's bias, unless that is known."""
 
 
-def standing_log(readings: Array, covariances: Array) -> Log:
+def standing_log(detections: Array, covariances: Array) -> Log:
     """A vehicle that stands and knows it, and sees one point once a cycle."""
-    n = len(readings)
+    n = len(detections)
     cycles = tuple(
-        Detections(0.1 * k, readings[k : k + 1], covariances[k : k + 1], np.array([UNKNOWN]))
+        Detections(0.1 * k, detections[k : k + 1], covariances[k : k + 1], np.array([UNKNOWN]))
         for k in range(n)
     )
     odometry = Odometry(np.array([0.0, 0.1 * n]), np.zeros((2, 3)))
@@ -123,22 +123,22 @@ def test_a_landmark_seen_standing_is_the_information_weighted_mean() -> None:
     rng = np.random.default_rng(0)
     roots = rng.normal(0.0, 2e-3, (8, 2, 2)) + 1e-3 * np.eye(2)
     covariances = roots @ np.swapaxes(roots, 1, 2)
-    readings = np.array([3.0, -4.0]) + np.einsum("kij,kj->ki", roots, rng.normal(0.0, 1.0, (8, 2)))
+    detections = np.array([3.0, -4.0]) + np.einsum("kij,kj->ki", roots, rng.normal(0.0, 1.0, (8, 2)))
     solution = solve_landmarks(
-        standing_log(readings, covariances), np.zeros(8, dtype=int), with_covariance=True, settings=CERTAIN
+        standing_log(detections, covariances), np.zeros(8, dtype=int), with_covariance=True, settings=CERTAIN
     )
     weights = np.linalg.inv(covariances)
     covariance = np.linalg.inv(weights.sum(axis=0))
-    mean = covariance @ np.einsum("kij,kj->i", weights, readings)
+    mean = covariance @ np.einsum("kij,kj->i", weights, detections)
     np.testing.assert_allclose(solution.landmarks, [mean], atol=2e-5)
     assert solution.covariance is not None
     np.testing.assert_allclose(solution.covariance, covariance, atol=0.05 * covariance.max())
 
 
 def test_false_positives_are_left_out_and_colours_not_looked_at() -> None:
-    readings = np.array([[5.0, 1.0], [50.0, 50.0], [5.0, 1.2]])
+    detections = np.array([[5.0, 1.0], [50.0, 50.0], [5.0, 1.2]])
     covariances = np.tile(1e-4 * np.eye(2), (3, 1, 1))
-    solution = solve_landmarks(standing_log(readings, covariances), np.array([7, -1, 7]), settings=CERTAIN)
+    solution = solve_landmarks(standing_log(detections, covariances), np.array([7, -1, 7]), settings=CERTAIN)
     np.testing.assert_array_equal(solution.landmark_ids, [7])
     np.testing.assert_allclose(solution.landmarks, [[5.0, 1.1]], atol=1e-3)
     assert solution.trajectory.shape == (3, 3)
@@ -146,8 +146,8 @@ def test_false_positives_are_left_out_and_colours_not_looked_at() -> None:
 
 def test_a_log_in_which_nothing_is_seen_gives_the_odometry() -> None:
     log = circle_log(noise=0.0)
-    readings = sum(len(cycle.labels) for cycle in log.cycles)
-    solution = solve_landmarks(log, np.full(readings, -1), with_covariance=True)
+    detections = sum(len(cycle.labels) for cycle in log.cycles)
+    solution = solve_landmarks(log, np.full(detections, -1), with_covariance=True)
     assert solution.landmarks.shape == (0, 2)
     assert solution.covariance is not None and solution.covariance.shape == (0, 0)
     np.testing.assert_allclose(
@@ -177,7 +177,7 @@ def test_the_limit_is_both_together() -> None:
     log = circle_log(noise=1.0)
     assert log.truth is not None
     found = limit(log, exact_ring_map(6))
-    assert found.l == landmark_rmse(solve_told_landmarks(log), log.truth) > 0.0
+    assert found.l == landmark_rmse(solve_oracle_landmarks(log), log.truth) > 0.0
     assert found.f == fit_rmse(exact_ring_map(6), log.truth)
     assert Limit(l=0.3, f=0.4).total == pytest.approx(0.5)
 
@@ -185,7 +185,7 @@ def test_the_limit_is_both_together() -> None:
 def test_unknown_cones_are_not_counted() -> None:
     log = circle_log(noise=1.0)
     assert log.truth is not None
-    solution = solve_told_landmarks(log)
+    solution = solve_oracle_landmarks(log)
     some = log.truth.cone_labels.copy()
     some[16:] = UNKNOWN
     told = Truth(log.truth.pose_t, log.truth.poses, log.truth.cones, some)
@@ -212,4 +212,4 @@ def test_a_log_without_truth_has_no_limit() -> None:
     assert log.truth is not None
     told = Truth(log.truth.pose_t, log.truth.poses, log.truth.cones, log.truth.cone_labels)
     with pytest.raises(ValueError, match="associations"):
-        solve_told_landmarks(Log(log.odometry, log.cycles, log.odometry_sigma, truth=told))
+        solve_oracle_landmarks(Log(log.odometry, log.cycles, log.odometry_sigma, truth=told))
