@@ -16,7 +16,7 @@ from pathspace_graph.graph.variables import Variables
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.candidates import SIDES
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.measurements import Chain
+from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.mapping.path import along_and_across
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import ClosingSettings, MapperSettings
@@ -60,7 +60,7 @@ class Recurrence:
     """What the heading gains in a lap, by the odometry (rad)."""
 
 
-def start_odometry(chain: Chain, detections: DetectionTable, settings: MapperSettings) -> State:
+def start_odometry(chain: LogOdometry, detections: DetectionTable, settings: MapperSettings) -> State:
     """Poses by dead reckoning, laps tied together where the way repeats, and curves through lap 1's cones."""
     poses = chain.dead_reckoned(np.zeros(CALIBRATION_SIZE))
     recurrence = find_recurrence(poses, settings)
@@ -127,7 +127,7 @@ def _profile(poses: Array, driven: Array) -> Profile:
     return Profile(np.column_stack([x, y]), heading, (heading[later] - heading[before]) / SMOOTHING)
 
 
-def _bias(chain: Chain, recurrence: Recurrence) -> Array:
+def _bias(chain: LogOdometry, recurrence: Recurrence) -> Array:
     """(2,) the calibration at which a lap turns by whole turns."""
     whole = 2.0 * np.pi * np.round(recurrence.turn / (2.0 * np.pi))
     laps = recurrence.driven[-1] / recurrence.lap
@@ -165,7 +165,7 @@ class Ties:
         )
 
 
-def tie_laps(chain: Chain, recurrence: Recurrence, calibration: Array) -> tuple[Array, Array]:
+def tie_laps(chain: LogOdometry, recurrence: Recurrence, calibration: Array) -> tuple[Array, Array]:
     """Poses (P, 3) and calibration (2,): every lap passes the same reference poses, about.
 
     The reference poses are unknown themselves: poses of cycles past the last.

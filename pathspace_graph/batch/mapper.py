@@ -20,7 +20,7 @@ from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
+from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import settings_dict
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
@@ -108,7 +108,7 @@ class BatchMapper:
         if start == "online" and self.online is None:
             raise SettingsError("start online: expected an online mapper to begin with, found none")
         chain = integrate_log(log, self.odometry_sigma, settings.odometry)
-        detections = collect_detections(log)
+        detections = DetectionTable.of(log.cycles)
         system = BatchSystem(detections, chain, settings, Biweight(batch.loose_gate))
         optimizer = Optimizer(system, batch)
         watch.lap("integrate")
@@ -195,7 +195,7 @@ def _map(state: State, joint: Array, scatter: Scatter) -> Map:
 
 
 def _records(
-    state: State, detections: DetectionTable, chain: Chain, seconds: float
+    state: State, detections: DetectionTable, chain: LogOdometry, seconds: float
 ) -> tuple[CycleRecord, ...]:
     """A record of each cycle: its share of the time, its readings in use, its lap."""
     left, right = (state.boundaries[b].size if b in state.boundaries else 0 for b in (LEFT, RIGHT))

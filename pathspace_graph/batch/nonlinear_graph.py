@@ -18,7 +18,7 @@ from pathspace_graph.factors.gtsam_factors import (
 from pathspace_graph.factors.projection import to_map
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_key
 from pathspace_graph.graph.odometry import odometry_factor
-from pathspace_graph.mapping.measurements import Chain
+from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.spline.boundary import Boundary
 
 from .gauge import CurveGauge
@@ -55,13 +55,13 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     return graph
 
 
-def _odometry(chain: Chain) -> Iterator[gtsam.NonlinearFactor]:
+def _odometry(chain: LogOdometry) -> Iterator[gtsam.NonlinearFactor]:
     """Between every two cycles."""
     for k, interval in enumerate(chain.odometry.intervals):
         yield odometry_factor(k, interval)
 
 
-def _priors(chain: Chain, heading: float) -> Iterator[gtsam.NonlinearFactor]:
+def _priors(chain: LogOdometry, heading: float) -> Iterator[gtsam.NonlinearFactor]:
     """Of the first pose and of the calibration; GTSAM has the former in the frame of that pose."""
     turn = np.eye(POSE)
     turn[:2, :2] = rotation(heading)

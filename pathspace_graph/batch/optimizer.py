@@ -160,7 +160,7 @@ class Optimizer:
     def _accept(self, at: Evaluation) -> None:
         """Foot points are refined from where they are now."""
         for projected in at.projected.values():
-            self.system.detections.u[projected.rows] = projected.foot.u
+            self.system.detections.refine(projected.rows, projected.foot.u)
 
     def _report(self, at: Evaluation, rounds: int, reason: str, converged: bool) -> Convergence:
         gradient = gradient_norm(self.system.rows(at), at.state.variables.layout)

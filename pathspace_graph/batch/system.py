@@ -15,7 +15,7 @@ from pathspace_graph.graph.keys import are_poses, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.measurements import Chain
+from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -99,7 +99,7 @@ class Evaluation:
     projected: dict[int, Projected]
     """Of each boundary."""
     odometry: tuple[Array, Array]
-    """What `Chain.terms` gives."""
+    """What `LogOdometry.terms` gives."""
     cost: float
     """Half the sum of squares, robust losses in place of the readings' own."""
 
@@ -108,7 +108,7 @@ class BatchSystem:
     """`min 1/2 |odometry|^2 + sum rho(readings) + 1/2 |spacing, smoothness, calibration, first pose|^2`."""
 
     def __init__(
-        self, detections: DetectionTable, chain: Chain, settings: MapperSettings, kernel: Kernel
+        self, detections: DetectionTable, chain: LogOdometry, settings: MapperSettings, kernel: Kernel
     ) -> None:
         self.detections = detections
         self.chain = chain

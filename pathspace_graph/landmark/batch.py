@@ -13,14 +13,14 @@ from pathspace_graph.graph.keys import POSE
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import BatchRun
 from pathspace_graph.laps import LapCounter
-from pathspace_graph.mapping.measurements import integrate_log
+from pathspace_graph.mapping.log_odometry import integrate_log
 from pathspace_graph.run import settings_dict
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
 from .fixed_lag import point_map
 from .reassociation import Reassociation, drop_rare
-from .start import as_landmark_detections, start_online, start_oracle
-from .state import LandmarkState
+from .start import start_online, start_oracle
+from .state import LandmarkDetections, LandmarkState
 from .system import LandmarkSystem
 from .tentative import duplicates
 
@@ -60,7 +60,7 @@ class LandmarkBatch:
     def _solve(self, log: Log, associations: Ints | None) -> LandmarkResult:
         settings = self.settings.landmark
         chain = integrate_log(log, self.odometry_sigma, self.settings.odometry)
-        detections = as_landmark_detections(log)
+        detections = LandmarkDetections.of(log.cycles)
         if associations is None:
             state = start_online(log, detections, self.settings, self.odometry_sigma)
         else:

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.io.log import Log
-from pathspace_graph.mapping.measurements import integrate_log
+from pathspace_graph.mapping.log_odometry import integrate_log
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .start import as_landmark_detections, start_oracle
+from .start import start_oracle
+from .state import LandmarkDetections
 from .system import LandmarkSystem
 
 Array = NDArray[np.float64]
@@ -56,7 +57,10 @@ def solve_landmarks(
     """
     settings = settings or MapperSettings()
     settings = replace(settings, gate=replace(settings.gate, huber=np.inf))
-    chain, detections = integrate_log(log, log.odometry_sigma, settings.odometry), as_landmark_detections(log)
+    chain, detections = (
+        integrate_log(log, log.odometry_sigma, settings.odometry),
+        LandmarkDetections.of(log.cycles),
+    )
     system = LandmarkSystem(detections, chain, settings)
     state = start_oracle(detections, chain, associations)
     system.settle(state)

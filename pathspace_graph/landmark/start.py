@@ -10,7 +10,7 @@ from pathspace_graph.factors.projection import to_map
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
-from pathspace_graph.mapping.measurements import Chain, collect_detections
+from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -22,14 +22,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-def as_landmark_detections(log: Log) -> LandmarkDetections:
-    """Every reading of a log, none in use."""
-    plain = collect_detections(log)
-    nothing = np.full(len(plain), NONE, np.intp)
-    return LandmarkDetections(plain.cycle, plain.point, plain.covariance, plain.label, nothing, plain.changed)
-
-
-def start_oracle(detections: LandmarkDetections, chain: Chain, associations: Ints) -> LandmarkState:
+def start_oracle(detections: LandmarkDetections, chain: LogOdometry, associations: Ints) -> LandmarkState:
     """Dead reckoning, each landmark where it was seen first; its colour that of most of its readings."""
     told = np.flatnonzero(associations >= 0)
     numbers, first, landmark = np.unique(associations[told], return_index=True, return_inverse=True)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.graph.keys import LANDMARK_LETTER, POINT, landmark_keys
 from pathspace_graph.graph.variables import Variables
-from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.detections import DetectionColumns
 
 from .association import NONE
 
@@ -84,51 +84,19 @@ class LandmarkState:
 
 
 @dataclass
-class LandmarkDetections:
-    """Readings, oldest first, and what each is of: columns of equal length."""
+class LandmarkDetections(DetectionColumns):
+    """Holds detections with the landmark that each of them is of."""
 
-    cycle: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Perception cycle that each was made in."""
-    point: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    """Reading in the vehicle frame (m)."""
-    covariance: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
-    """Its covariance in the vehicle frame (m^2)."""
-    label: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """What the sensor says: LEFT, RIGHT or UNKNOWN."""
     landmark: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
     """Number of the landmark that it is of; else NONE or LEFT_OUT."""
-    changed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
-    """Whether it came into use since its cycle was linearized last."""
-
-    def __len__(self) -> int:
-        return len(self.cycle)
 
     @property
     def used(self) -> NDArray[np.bool_]:
         """(m,) whether each is of a landmark, and so a row of the graph."""
         return self.landmark >= 0
 
-    def append(self, detections: Detections, cycle: int) -> slice:
-        """Add the readings of one cycle, of no landmark yet; gives their rows."""
-        start, m = len(self), len(detections.labels)
-        new = LandmarkDetections(
-            np.full(m, cycle, np.intp),
-            np.asarray(detections.points_vehicle, float),
-            np.asarray(detections.covariances, float),
-            np.asarray(detections.labels, np.intp),
-            np.full(m, NONE, np.intp),
-            np.zeros(m, bool),
-        )
-        for column in fields(self):
-            both = [getattr(self, column.name), getattr(new, column.name)]
-            setattr(self, column.name, np.concatenate(both))
-        return slice(start, start + m)
-
-    def keep_from(self, cycle: int) -> None:
-        """Forget the readings of earlier cycles."""
-        first = int(self.cycle.searchsorted(cycle))
-        for column in fields(self):
-            setattr(self, column.name, getattr(self, column.name)[first:])
+    def _clear_associations(self) -> None:
+        self.landmark = np.full(len(self), NONE, np.intp)
 
     def merge(self, gone: IntArray, kept: IntArray) -> None:
         """Readings of landmarks `gone` (k,), by number, are of `kept` (k,) from now on."""

@@ -12,7 +12,7 @@ from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
 from pathspace_graph.graph.keys import indices
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.labels import RIGHT
-from pathspace_graph.mapping.measurements import Chain
+from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .landmark_map import landmark_rows
@@ -30,7 +30,7 @@ class LandmarkSystem:
 
     detections: LandmarkDetections
     """Of the whole log."""
-    chain: Chain
+    chain: LogOdometry
     """Its odometry."""
     settings: MapperSettings
 

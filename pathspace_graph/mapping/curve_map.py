@@ -55,10 +55,7 @@ class CurveMap:
         state, detections, settings = self.state, self.detections, self.settings
         if not state.boundaries or len(cycles) == 0:
             return []
-        wanted = np.zeros(int(cycles[-1]) + 1, bool)
-        wanted[cycles] = True
-        rows = np.flatnonzero(detections.used[: detections.cycle.searchsorted(len(wanted))])
-        rows = rows[wanted[detections.cycle[rows]]]
+        rows = np.flatnonzero(detections.used & detections.in_cycles(cycles))
         curves, cycle = state.curves, detections.cycle[rows]
         curve = curves.number(detections.boundary[rows])
         poses = self.variables.poses_at(cycle)
@@ -76,8 +73,8 @@ class CurveMap:
     def linearized(self, cycles: IntArray) -> None:
         """The rows that were asked for last, of these cycles, are those of the graph from now on."""
         if len(cycles) and self.state.boundaries:
-            rows, u = self._found
-            self.detections.u[rows], self.detections.changed[:] = u, False
+            self.detections.refine(*self._found)
+            self.detections.mark_linearized()
 
     def all_active(self) -> None:
         """Every control point is active again."""

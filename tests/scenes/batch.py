@@ -12,7 +12,8 @@ from pathspace_graph.batch.association import associate, locate_poses
 from pathspace_graph.batch.dead_reckoning import start_odometry
 from pathspace_graph.batch.mapper import own_settings
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved
-from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
+from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -35,7 +36,10 @@ def straight(seconds: float = 6.0, smoothness: float = SMOOTHNESS) -> tuple[Batc
     cones, labels = corridor(60.0)
     log = exact_log(ahead(6.0, seconds), cones, labels)
     settings = own_settings(whole)
-    chain, detections = integrate_log(log, log.odometry_sigma, settings.odometry), collect_detections(log)
+    chain, detections = (
+        integrate_log(log, log.odometry_sigma, settings.odometry),
+        DetectionTable.of(log.cycles),
+    )
     state = start_odometry(chain, detections, settings)
     system = BatchSystem(detections, chain, settings, Biweight(LEAST_SQUARES))
     system.begin(state)
@@ -50,7 +54,7 @@ def settled(system: BatchSystem, state: State, steps: int = 4) -> State:
     for _ in range(steps):
         at = system.evaluate(state)
         for projected in at.projected.values():
-            system.detections.u[projected.rows] = projected.foot.u
+            system.detections.refine(projected.rows, projected.foot.u)
         problem = system.eliminated(at)
         state = moved(state, problem.step(np.zeros(problem.map.size)))
     return state
@@ -76,7 +80,7 @@ def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, A
     return noisy, calibration
 
 
-def _turned(chain: Chain, local: Array) -> Chain:
+def _turned(chain: LogOdometry, local: Array) -> LogOdometry:
     """With errors (P - 1, 3) in the frame of each motion's end."""
     odometry = copy(chain.odometry)
     c, s = np.cos(odometry.deltas[:, 2]), np.sin(odometry.deltas[:, 2])

@@ -1,0 +1,89 @@
+"""The odometry of a whole log: the batch optimizations hold their poses against it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.odometry import compose
+from pathspace_graph.graph.elimination import owners
+from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_key
+from pathspace_graph.graph.odometry import OdometryChain, calibrated_delta, odometry_rows
+from pathspace_graph.graph.rows import Rows
+from pathspace_graph.io.log import Log
+from pathspace_graph.run import split_odometry
+from pathspace_graph.settings.mapper import OdometrySettings
+
+from .prediction import integrate
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LogOdometry:
+    """Holds the prior of the first pose, and the motion from each cycle's pose to the next."""
+
+    stamps: Array
+    """(P,) These are the stamps of the perception cycles (s)."""
+    first: Array
+    """(3,) The first cycle has this pose in the map frame, by odometry from the first odometry stamp."""
+    first_information: Array
+    """(3, 3) This is the inverse of the first pose's covariance, map frame."""
+    odometry: OdometryChain
+    """The chain has P - 1 intervals, one from each cycle's pose to the next."""
+    calibration_sigma: Array
+    """(2,) The calibration (scale error [-], yaw-rate bias [rad/s]) has this prior standard deviation."""
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def dead_reckoned(self, calibration: Array) -> Array:
+        """Returns poses (P, 3) by odometry alone, corrected by a calibration (2,); theta is not wrapped."""
+        poses = [self.first]
+        for interval in self.odometry.intervals:
+            poses.append(compose(poses[-1], calibrated_delta(interval, calibration)))
+        return np.array(poses)
+
+    def terms(self, poses: Array, calibration: Array) -> tuple[Array, Array]:
+        """Returns whitened residuals (P - 1, 3) and their derivatives (P - 1, 3, 8).
+
+        The columns of the derivatives are [calibration | pose | next pose].
+        """
+        return self.odometry.terms(slice(None), poses, calibration)
+
+    def prior_cost(self, first: Array, calibration: Array) -> float:
+        """Returns the cost of the priors on the first pose (3,) and on the calibration (2,)."""
+        off, whitened = first - self.first, calibration / self.calibration_sigma
+        return 0.5 * float(off @ self.first_information @ off + whitened @ whitened)
+
+    def rows(self, terms: tuple[Array, Array], first: Array, calibration: Array) -> list[Rows]:
+        """Returns the rows of `terms`, and of both priors at a first pose (3,) and a calibration (2,)."""
+        start = np.arange(len(self.odometry))
+        root = np.asarray(np.linalg.cholesky(self.first_information).T, np.float64)
+        return [
+            odometry_rows(start, terms, owners(start)),
+            _prior(pose_key(0), root, first - self.first),
+            _prior(CALIBRATION_KEY, np.diag(1.0 / self.calibration_sigma), calibration),
+        ]
+
+
+def _prior(key: int, root: Array, off: Array) -> Rows:
+    """Returns the rows `root off` on one variable; they belong to the first factor."""
+    return Rows(np.full((len(off), 1), key), root, root @ off, np.zeros(len(off), np.intp))
+
+
+def integrate_log(log: Log, sigma: Array, settings: OdometrySettings) -> LogOdometry:
+    """Integrates the odometry between the cycles of a log.
+
+    sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s).
+    """
+    steps = [integrate(odometry, cycle.t, sigma) for odometry, cycle in split_odometry(log)]
+    return LogOdometry(
+        stamps=np.array([cycle.t for cycle in log.cycles]),
+        first=compose(np.zeros(3), steps[0].delta),
+        first_information=np.linalg.inv(steps[0].covariance + np.diag(settings.sigmas_start) ** 2),
+        odometry=OdometryChain(steps[1:]),
+        calibration_sigma=np.array([settings.sigma_scale, settings.sigma_bias]),
+    )
