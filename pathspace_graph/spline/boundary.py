@@ -1,4 +1,4 @@
-"""A track boundary as the mappers hold it: an open spline that grows, and becomes periodic at loop closure."""
+"""A track boundary as the mappers hold it: an open spline that grows, and is periodic after loop closure."""
 
 from __future__ import annotations
 
