@@ -32,7 +32,7 @@ def narrow(smoother: CurveSmoother) -> None:
         return
     keys = [state.keys(label)[gone] for label, gone in zip(active, leaving, strict=True)]
     smoother.deactivate(np.concatenate(keys))
-    state.narrowed = active
+    state.active_stretch = active
 
 
 def _holds(active: IntArray, needed: IntArray, size: int) -> bool:
