@@ -1,4 +1,4 @@
-"""The state of the paper's filters: the vehicle's pose and points of the map, with one covariance."""
+"""The belief of the paper's filters: the vehicle's pose and the map's points, with one joint covariance."""
 
 from __future__ import annotations
 
@@ -19,45 +19,46 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 PLANE: Final = 2
-"""Entries of a point."""
+"""A point has this number of entries."""
 HEAD: Final = POSE + CALIBRATION_SIZE
-"""Entries before the points."""
+"""The state has this number of entries before the points."""
 
 
 class Belief:
-    """`x = [pose | calibration | points]`, Gaussian: pose (x, y, theta) and points (x, y) in the map frame, m
-    and rad; the odometry's calibration (scale error of the speeds, bias of the yaw rate, rad/s).
+    """A belief is the Gaussian of `x = [pose | calibration | points]`.
 
-    A step's function depends on few entries. Cubature points are laid through those only; all others follow
-    by the joint covariance, which is what the full rule would give for them, without its cubic cost.
+    The pose (x, y, theta) and the points (x, y) are in the map frame, in m and rad. The calibration is the
+    scale error of the speeds and the bias of the yaw rate (rad/s). The function of a step depends on few
+    entries, so cubature points are drawn for these only; all other entries follow by the joint covariance.
+    The full cubature rule gives the same for them at a cubic cost.
     """
 
     def __init__(self, pose: Array, covariance: Array, calibration_sigma: Array | None = None) -> None:
         sigma = np.zeros(CALIBRATION_SIZE) if calibration_sigma is None else calibration_sigma
         self.mean: Array = np.concatenate([pose, np.zeros(CALIBRATION_SIZE)])
-        """(n,) x."""
+        """(n,) This is the mean of x."""
         self.covariance: Array = block_diag(covariance, np.diag(sigma**2))
-        """(n, n)."""
+        """(n, n) This is the joint covariance of x."""
 
     @classmethod
     def at_start(cls, settings: OdometrySettings) -> Belief:
-        """The vehicle at the first odometry stamp, no map."""
+        """Returns the belief at the first odometry stamp, without a map."""
         sigmas = np.array([settings.sigma_start, settings.sigma_start, settings.sigma_start_heading])
         calibration = np.array([settings.sigma_scale, settings.sigma_bias])
         return cls(np.zeros(POSE), np.diag(sigmas**2), calibration)
 
     @property
     def pose(self) -> Array:
-        """(3,) a view of x."""
+        """Returns a view of the mean pose (3,)."""
         return self.mean[:POSE]
 
     @property
     def points(self) -> Array:
-        """(m, 2) a view of x."""
+        """Returns a view of the mean points (m, 2)."""
         return self.mean[HEAD:].reshape(-1, PLANE)
 
     def predict(self, odometry: IntegratedOdometry) -> None:
-        """`pose <- pose * delta * (error - J calibration)`, with the covariance of the odometry's error."""
+        """Predicts `pose <- pose * delta * (error - J calibration)`, with the covariance of the error."""
         drift, size = odometry.calibration_jacobian, HEAD + POSE
         augmented = np.zeros((size, size))
         augmented[:HEAD, :HEAD] = self.covariance[:HEAD, :HEAD]
@@ -77,9 +78,9 @@ class Belief:
     def update(
         self, columns: IntArray, function: Callable[[Array], Array], measured: Array, noise: Array
     ) -> None:
-        """One Kalman update: `measured` (q,) is a function of the entries `columns` (d,), plus noise (q, q).
+        """Applies one Kalman update: `measured` (q,) is a function of the entries `columns` (d,) plus noise.
 
-        The function takes points (k, d) to (k, q).
+        The function maps points (k, d) to (k, q); the noise has the covariance (q, q).
         """
         seen = transform(function, self.mean[columns], self.covariance[np.ix_(columns, columns)])
         root = square_root(seen.covariance + noise)
@@ -90,13 +91,13 @@ class Belief:
         self._symmetrize()
 
     def seen(self, points: IntArray) -> Transformed:
-        """Where the vehicle should see points (k,): mean (2 k,) and covariance (2 k, 2 k), vehicle frame."""
+        """Returns the predicted detections of points (k,): mean (2 k,) and covariance, vehicle frame."""
         columns = np.concatenate([np.arange(POSE), point_columns(points)])
         covariance = self.covariance[np.ix_(columns, columns)]
         return transform(lambda x: to_vehicle_rows(x[:, :POSE], x[:, POSE:]), self.mean[columns], covariance)
 
     def observe(self, detections: Array, covariances: Array) -> None:
-        """New points, the last of x from now on: readings (k, 2) of the vehicle frame with (k, 2, 2)."""
+        """Appends points at detections (k, 2) with covariances (k, 2, 2), both in the vehicle frame."""
         k = len(detections)
         columns = np.arange(POSE)
         own = np.zeros((POSE + PLANE * k, POSE + PLANE * k))
@@ -111,9 +112,10 @@ class Belief:
         self.covariance = np.block([[self.covariance, cross.T], [cross, placed.covariance]])
 
     def change(self, start: int, stop: int, matrix: Array, sigma: Array) -> None:
-        """The points [start, stop) become `matrix` (k, stop - start) times them, each coordinate alike.
+        """Replaces the points [start, stop) by `matrix` (k, stop - start) times them, on both coordinates.
 
-        sigma (k,): what is added to each of them, m. The rule's own result, since the change is linear.
+        Noise of standard deviation sigma (k,) in m is added to the new points. The change is linear, so the
+        result is exact.
         """
         low, high = HEAD + PLANE * start, HEAD + PLANE * stop
         full = np.kron(matrix, np.eye(PLANE))
@@ -131,22 +133,23 @@ class Belief:
         )
 
     def reorder(self, points: IntArray) -> None:
-        """The points in another order, or some of them."""
+        """Reorders the points, or keeps only some of them, by index (k,)."""
         columns = np.concatenate([np.arange(HEAD), point_columns(points)])
         self.mean = self.mean[columns]
         self.covariance = self.covariance[np.ix_(columns, columns)]
 
     def _symmetrize(self) -> None:
+        """Removes the asymmetry of rounding errors."""
         self.covariance = 0.5 * (self.covariance + self.covariance.T)
 
 
 def point_columns(points: IntArray) -> IntArray:
-    """(2 k,) entries of x of points (k,)."""
+    """Returns the entries (2 k,) of x that hold points (k,)."""
     return (HEAD + PLANE * points[:, None] + np.arange(PLANE)).ravel()
 
 
 def compose_rows(poses: Array, deltas: Array) -> Array:
-    """`pose * delta` on SE(2), row by row: (k, 3), deltas (k, 3) or (3,); theta is not wrapped."""
+    """Composes poses (k, 3) with deltas (k, 3) or (3,) on SE(2), row by row; theta is not wrapped."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     dx, dy = deltas[..., 0], deltas[..., 1]
     return np.column_stack(
@@ -155,7 +158,7 @@ def compose_rows(poses: Array, deltas: Array) -> Array:
 
 
 def to_map_rows(poses: Array, detections: Array) -> Array:
-    """`R z + t`: for each of k poses (k, 3) its r readings (k, 2 r) of the vehicle frame -> map (k, 2 r)."""
+    """Maps r detections (k, 2 r) of each pose (k, 3) from the vehicle frame to the map frame: `R z + t`."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x, y = detections[:, 0::2], detections[:, 1::2]
     placed = np.stack([c * x - s * y + poses[:, :1], s * x + c * y + poses[:, 1:2]], axis=2)
@@ -163,7 +166,7 @@ def to_map_rows(poses: Array, detections: Array) -> Array:
 
 
 def to_vehicle_rows(poses: Array, points: Array) -> Array:
-    """`R' (p - t)`: for each of k poses (k, 3) its r points (k, 2 r) of the map -> vehicle frame (k, 2 r)."""
+    """Maps r points (k, 2 r) of each pose (k, 3) from the map frame to the vehicle frame: `R' (p - t)`."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x, y = points[:, 0::2] - poses[:, :1], points[:, 1::2] - poses[:, 1:2]
     return np.stack([c * x + s * y, c * y - s * x], axis=2).reshape(len(poses), -1)

@@ -12,43 +12,43 @@ from scipy.linalg import lapack
 
 Array = NDArray[np.float64]
 
-_LEAST_VARIANCE: Final = 1e-12
-"""Variances below this share of the largest are lifted to it, where a covariance has no Cholesky factor."""
+_LEAST_EIGENVALUE: Final = 1e-12
+"""If a covariance has no Cholesky factor, eigenvalues below this share of the largest are raised to it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Transformed:
-    """A Gaussian after a function, as the cubature rule sees it."""
+    """Holds the moments of a function of a Gaussian, by the cubature rule."""
 
     mean: Array
-    """(q,) mean of the function."""
+    """(q,) This is the mean of the function."""
     covariance: Array
-    """(q, q) covariance of the function."""
+    """(q, q) This is the covariance of the function."""
     slope: Array
-    """(q, d) statistical linearization `C_yx C_xx^-1`: so the covariance of the function with anything that
-    it doesn't depend on directly is `slope @ C_x.`, which is exact for Gaussians."""
+    """(q, d) This is the statistical linearization `C_yx C_xx^-1`. The covariance of the function with a
+    Gaussian variable z that it does not depend on directly is `slope @ C_xz`, which is exact."""
 
 
 def square_root(covariance: Array) -> Array:
-    """Lower L with `L L' = covariance` (d, d); one that is only semidefinite is lifted by round-off."""
+    """Returns lower L with `L L' = covariance` (d, d); a semidefinite one is raised by rounding errors."""
     factor, info = lapack.dpotrf(covariance, lower=1, clean=1)
     if info == 0:
         return np.asarray(factor)
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    lifted = np.maximum(values, _LEAST_VARIANCE * max(float(values[-1]), _LEAST_VARIANCE))
+    lifted = np.maximum(values, _LEAST_EIGENVALUE * max(float(values[-1]), _LEAST_EIGENVALUE))
     return np.asarray(np.linalg.qr((vectors * np.sqrt(lifted)).T)[1].T)
 
 
 def cubature_points(mean: Array, root: Array) -> Array:
-    """`mean +- sqrt(d) L e_i` (2 d, d), the positive ones first; each weighs 1 / (2 d)."""
+    """Returns the points `mean +- sqrt(d) L e_i` (2 d, d), the positive ones first; all weigh 1 / (2 d)."""
     offsets = np.sqrt(len(mean)) * root.T
     return np.concatenate([mean + offsets, mean - offsets])
 
 
 def transform(function: Callable[[Array], Array], mean: Array, covariance: Array) -> Transformed:
-    """Mean, covariance and slope of `function`, which takes points (k, d) row by row to (k, q).
+    """Returns the moments of `function`, which maps points (k, d) to (k, q) row by row.
 
-    Exact where the function is linear, and its mean where it is a polynomial of the third degree.
+    They are exact if the function is linear; the mean is exact for polynomials up to the third degree.
     """
     root = square_root(covariance)
     d = len(mean)
