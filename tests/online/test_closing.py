@@ -18,8 +18,8 @@ from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
 from pathspace_graph.mapping.registration import Matches, Registration, is_certain, near_start, register
 from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
+from pathspace_graph.online.closing import substitute
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.online.simplification import substitute
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.knots import Knots
 from pathspace_graph.settings.mapper import ClosingSettings, MapperSettings
