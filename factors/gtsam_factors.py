@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .footpoint import FootPoints, foot_points
+from .noise import huber_roots, huber_weights
 from .odometry import IntegratedOdometry, odometry_residuals
-from .projection import huber_weights, project, to_map
+from .projection import project
+from .se2 import rotation, to_map
 from .spans import SpanPolynomials
 
 Array = NDArray[np.float64]
@@ -193,22 +195,9 @@ class _BoundaryPoint:
         return np.asarray(foot.distance * scale)
 
 
-def rotation(theta: float) -> Array:
-    """R(theta) (2, 2): vehicle to map frame."""
-    c, s = np.cos(theta), np.sin(theta)
-    return np.array([[c, -s], [s, c]])
-
-
 def pose_array(pose: gtsam.Pose2) -> Array:
     """(3,) x (m), y (m), theta (rad) in (-pi, pi]."""
     return np.array([pose.x(), pose.y(), pose.theta()])
-
-
-def huber_roots(whitened: Array, threshold: float) -> Array:
-    """`sign(z) sqrt(2 rho(z))` with Huber's loss `rho = z^2 / 2`, beyond the threshold k `k (|z| - k/2)`."""
-    size = np.abs(whitened)
-    inner = np.minimum(size, threshold)
-    return np.sign(whitened) * np.sqrt(inner * (2.0 * size - inner))
 
 
 def _unwrapped(tables: SpanPolynomials) -> int:

@@ -34,13 +34,3 @@ def landmark_residuals(poses: Array, landmarks: Array, readings: Array) -> Landm
     by_theta = np.column_stack([seen[:, 1], -seen[:, 0]])
     by_pose = np.concatenate([-by_landmark, by_theta[:, :, None]], axis=2)
     return LandmarkResiduals(seen - readings, by_pose, by_landmark)
-
-
-def whiteners(covariances: Array) -> Array:
-    """(m, 2, 2) lower W with `W' W = K^-1` of covariances K (m, 2, 2): a reading's two independent rows."""
-    xx, xy, yy = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
-    out = np.zeros(covariances.shape)
-    out[:, 0, 0] = 1.0 / np.sqrt(xx)
-    out[:, 1, 1] = 1.0 / np.sqrt(yy - xy * xy / xx)
-    out[:, 1, 0] = -xy / xx * out[:, 1, 1]
-    return out

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from .se2 import se2_exp, wrap_angle
+
 Array = NDArray[np.float64]
 
 MIN_SIGMA = 1e-6
@@ -29,35 +31,6 @@ class IntegratedOdometry:
     """(3, 2) derivative of the end pose by (scale error, yaw-rate bias), in the frame of the end."""
     whitener: Array
     """(3, 3) W with `W' W = covariance^-1`: whitens a residual."""
-
-
-def wrap_angle(angle: Array) -> Array:
-    """Angle in (-pi, pi], elementwise (rad)."""
-    return -((np.pi - angle) % (2.0 * np.pi) - np.pi)
-
-
-def se2_exp(tangents: Array) -> Array:
-    """Exponential of SE(2), row by row: (k, 3) tangents (vx, vy, wz) times time -> (k, 3) relative poses."""
-    x, y, theta = tangents.T
-    half = np.where(theta == 0.0, np.finfo(float).tiny, 0.5 * theta)  # so that sin(half) / half is 1
-    sine, cosine = np.sin(half), np.cos(half)
-    sinc, cosc = sine * cosine / half, sine * sine / half
-    return np.array([sinc * x - cosc * y, cosc * x + sinc * y, theta]).T
-
-
-def compose(pose: Array, delta: Array) -> Array:
-    """`pose * delta` on SE(2): both (3,) [x, y, theta]; theta is not wrapped, so that turns accumulate."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return np.array(
-        [pose[0] + c * delta[0] - s * delta[1], pose[1] + s * delta[0] + c * delta[1], pose[2] + delta[2]]
-    )
-
-
-def between(first: Array, second: Array) -> Array:
-    """`first^-1 * second` on SE(2): (3,) [x, y, theta] in the frame of `first`."""
-    c, s = np.cos(first[2]), np.sin(first[2])
-    dx, dy = second[0] - first[0], second[1] - first[1]
-    return np.array([c * dx + s * dy, -s * dx + c * dy, second[2] - first[2]])
 
 
 def integrate_poses(durations: Array, twists: Array) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .footpoint import FootPoints
+from .noise import whiteners
 
 Array = NDArray[np.float64]
 
@@ -24,13 +25,6 @@ class ProjectionRows:
     """(m, 3) derivative by the pose (x, y, theta) in the map frame."""
     by_control: Array
     """(m, degree + 1, 2) derivative by the control points of the foot point's span."""
-
-
-def to_map(points_vehicle: Array, poses: Array) -> Array:
-    """`p = R z + t`: points (m, 2) in the vehicle frame of each row's own pose (m, 3) -> map frame (m, 2)."""
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    x, y = points_vehicle[:, 0], points_vehicle[:, 1]
-    return np.array([c * x - s * y + poses[:, 0], s * x + c * y + poses[:, 1]]).T
 
 
 def sigma_across(normals: Array, covariances: Array, poses: Array, sigma_model: float) -> Array:
@@ -69,7 +63,7 @@ def project(
 
 
 @dataclass(frozen=True)
-class PointRows:
+class OffsetRows:
     """Two rows a reading, whitened: how far it is from its foot point, and their Jacobian blocks."""
 
     residual: Array
@@ -80,9 +74,9 @@ class PointRows:
     """(m, 2, degree + 1, 2) derivative by the control points of the foot point's span."""
 
 
-def project_to_point(
+def offset_from_foot_point(
     points_map: Array, covariances: Array, poses: Array, foot: FootPoints, sigma_model: float
-) -> PointRows:
+) -> OffsetRows:
     """`r = W (p - S(u))`, `W^T W = (R K R^T + sigma_model^2 I)^-1`, with `u` held where the foot point is.
 
     For comparison with `project`, whose arguments it has: at the foot point both see the same distance, but
@@ -90,33 +84,18 @@ def project_to_point(
 
         dr/dt = W,   dr/dtheta = W J R z,   dr/dc_j = -beta_j(u) W      (J: the quarter turn)
     """
-    W = _whiteners(covariances, poses, sigma_model)
+    W = whiteners(_widened(covariances, poses, sigma_model))
     offset, arm = points_map - foot.position, points_map - poses[:, :2]
     turned = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
-    return PointRows(
+    return OffsetRows(
         residual=np.einsum("mij,mj->mi", W, offset),
         by_pose=np.concatenate([W, np.einsum("mij,mj->mi", W, turned)[:, :, None]], axis=2),
         by_control=-foot.basis[:, None, :, None] * W[:, :, None, :],
     )
 
 
-def _whiteners(covariances: Array, poses: Array, sigma_model: float) -> Array:
-    """`L^-1` (m, 2, 2) of `L L^T = R K R^T + sigma_model^2 I`, L lower triangular."""
+def _widened(covariances: Array, poses: Array, sigma_model: float) -> Array:
+    """Returns `R K R^T + sigma_model^2 I` (m, 2, 2) in the map frame, K (m, 2, 2) in the vehicle frame."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    rotation = np.moveaxis(np.array([[c, -s], [s, c]]), -1, 0)
-    turned = rotation @ covariances @ rotation.transpose(0, 2, 1)
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(turned + sigma_model**2 * np.eye(2))))
-
-
-def huber_weights(whitened: Array, threshold: float) -> Array:
-    """`w = min(1, threshold / |z|)` per row: the weight of a whitened residual in a Gauss-Newton step.
-
-    An infinite threshold gives least squares: every weight is 1.
-    """
-    return 1.0 / np.maximum(np.abs(whitened) / threshold, 1.0)
-
-
-def huber_loss(whitened: Array, threshold: float) -> Array:
-    """`rho(z) = z^2 / 2`, beyond the threshold `threshold (|z| - threshold / 2)`, per row."""
-    inner = np.minimum(np.abs(whitened), threshold)
-    return np.asarray(inner * (np.abs(whitened) - 0.5 * inner))
+    turns = np.moveaxis(np.array([[c, -s], [s, c]]), -1, 0)
+    return np.asarray(turns @ covariances @ turns.transpose(0, 2, 1) + sigma_model**2 * np.eye(2))

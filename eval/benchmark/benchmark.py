@@ -33,7 +33,7 @@ from rich.table import Table
 
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.estimators import make_online
-from pathspace_graph.graph.gaussian import combined, factors_of, graph_of, jacobian_factor
+from pathspace_graph.graph.gaussian import as_hessian_factor, factors_of, graph_of, jacobian_factor
 from pathspace_graph.graph.keys import are_poses
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.files import atomic_file, check_file_target
@@ -97,7 +97,7 @@ def linear_window(mapper: FixedLagMapper) -> LinearWindow:
     factors = factors_of(smoother.linear_graph(whole=True))
     moving = [factor for factor in factors if _is_of_a_cycle(factor)]
     held = [factor for factor in factors if not _is_of_a_cycle(factor)]
-    together = combined(graph_of(_damping(mapper), *held))
+    together = as_hessian_factor(graph_of(_damping(mapper), *held))
     return LinearWindow(graph_of(together, *moving), smoother.variables.layout)
 
 

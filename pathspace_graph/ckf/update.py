@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.keys import POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.belief import PLANE, to_vehicle_rows
@@ -77,7 +78,6 @@ def _part(state: CurveState, label: int, detections: Detections, on: OnCurve) ->
 
 def _widened(state: CurveState, covariances: Array, tangents: Array) -> Array:
     """`K + sigma_model^2 I + sigma_along^2 t t'` (m, 2, 2), vehicle frame; tangents (m, 2) in the map."""
-    c, s = np.cos(state.pose[2]), np.sin(state.pose[2])
-    t = tangents @ np.array([[c, -s], [s, c]])
+    t = tangents @ rotation(state.pose[2])
     along = state.settings.ckf.sigma_along**2 * t[:, :, None] * t[:, None, :]
     return np.asarray(covariances + state.settings.ckf.sigma_model**2 * np.eye(PLANE) + along)

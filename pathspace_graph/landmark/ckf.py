@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pathspace_graph.factors.odometry import integrate_twists
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.keys import POSE
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map, PointBoundary

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import integrate_twists
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map, PointBoundary
@@ -58,7 +58,7 @@ class LandmarkFixedLag:
         watch = Stopwatch()
         durations = np.diff(np.append(odometry.t, detections.t))
         driven = integrate_twists(durations, odometry.twist, self.odometry_sigma)
-        self.path.update(self.smoother.drive(detections.t, driven, self.settings.odometry.sigmas_start))
+        self.path.update(self.smoother.predict(detections.t, driven, self.settings.odometry.sigmas_start))
         watch.lap("predict")
         new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
         assign(self.smoother, new, self._open_to_detections())

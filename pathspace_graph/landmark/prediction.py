@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.landmark import landmark_residuals
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 
 from .association import NONE, PLANE, Gates, associate, compatible, pair_costs
 from .landmark_map import LandmarkSmoother, two_rows
@@ -74,4 +74,4 @@ def predict(smoother: LandmarkSmoother, landmarks: IntArray) -> Prediction:
         return Prediction(landmarks, seen.residual, np.zeros((k, PLANE, PLANE)))
     jacobian = np.concatenate([seen.by_pose, seen.by_landmark], axis=2)
     rows = two_rows(np.full(k, smoother.next_cycle - 1), state.numbers[landmarks], jacobian, nowhere)
-    return Prediction(landmarks, seen.residual, smoother.predicted(rows, together=PLANE))
+    return Prediction(landmarks, seen.residual, smoother.predicted_covariance(rows, together=PLANE))

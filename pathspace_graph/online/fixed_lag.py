@@ -122,7 +122,7 @@ class FixedLagMapper:
         """The newest pose, by the calibrated odometry; and how the way goes on from there."""
         durations = np.diff(np.append(odometry.t, t))
         integrated = integrate_twists(durations, odometry.twist, self.odometry_sigma)
-        self.path.update(self.smoother.drive(t, integrated, self.settings.odometry.sigmas_start))
+        self.path.update(self.smoother.predict(t, integrated, self.settings.odometry.sigmas_start))
         if self.solver is not None:
             self.smoother.submaps = None  # nothing of another solver is relinearized when the loop closes
         self.path.steer(odometry.twist)

@@ -12,7 +12,6 @@ from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.gauge import greville, smoothness_matrix
 from pathspace_graph.factors.gtsam_factors import (
     calibrated_odometry_factor,
-    huber_roots,
     linear_factor,
     odometry_factor,
     pose_array,
@@ -20,6 +19,7 @@ from pathspace_graph.factors.gtsam_factors import (
     spacing_factors,
     spline_projection_factor,
 )
+from pathspace_graph.factors.noise import huber_roots
 from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.spans import SpanPolynomials
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.landmark import landmark_residuals, whiteners
+from pathspace_graph.factors.landmark import landmark_residuals
+from pathspace_graph.factors.noise import whiteners
 
 from ..scenes.jacobians import assert_jacobians
 

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.bspline import clamped_knots, periodic_knots, uniform_knots
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
-from pathspace_graph.factors.projection import huber_weights, project, project_to_point, sigma_across, to_map
+from pathspace_graph.factors.noise import huber_weights
+from pathspace_graph.factors.projection import offset_from_foot_point, project, sigma_across
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.spans import SpanPolynomials
 
 from ..scenes.jacobians import assert_jacobians
@@ -234,7 +236,7 @@ def test_jacobians_of_the_offset_from_a_held_foot_point(seed: int, degree: int, 
     def function(pose: Array, control: Array) -> tuple[Array, Array, Array]:
         position = np.einsum("mj,mjd->md", found.basis, control.reshape(-1, 2)[columns])
         held, poses = replace(found, position=position), np.tile(pose, (len(u), 1))
-        rows = project_to_point(to_map(vehicle, poses), covariances, poses, held, SIGMA_MODEL)
+        rows = offset_from_foot_point(to_map(vehicle, poses), covariances, poses, held, SIGMA_MODEL)
         by_control = np.zeros((len(u), 2, len(distinct), 2))
         for row, at in enumerate(columns):
             np.add.at(by_control[row], (slice(None), at), rows.by_control[row])
@@ -250,7 +252,7 @@ def test_the_offset_is_as_unlikely_as_the_reading_and_turns_with_it() -> None:
     points, u = readings_beside(rng, tables, distinct, rng.uniform(-3.0, 3.0, 20))
     foot, poses = find(tables, distinct, points, u), np.column_stack([*points.T, rng.uniform(-3, 3, len(u))])
     covariances = np.tile(np.array([[0.04, 0.015], [0.015, 0.01]]), (len(u), 1, 1))
-    rows = project_to_point(points, covariances, poses, foot, SIGMA_MODEL)
+    rows = offset_from_foot_point(points, covariances, poses, foot, SIGMA_MODEL)
     for row, theta in enumerate(poses[:, 2]):
         R = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
         S = R @ covariances[row] @ R.T + SIGMA_MODEL**2 * np.eye(2)
@@ -258,7 +260,7 @@ def test_the_offset_is_as_unlikely_as_the_reading_and_turns_with_it() -> None:
         assert np.sum(rows.residual[row] ** 2) == pytest.approx(d @ np.linalg.solve(S, d))
     round_ones = np.tile(0.01 * np.eye(2), (len(u), 1, 1))
     across = project(points, round_ones, poses, foot, SIGMA_MODEL)
-    both = project_to_point(points, round_ones, poses, foot, SIGMA_MODEL)
+    both = offset_from_foot_point(points, round_ones, poses, foot, SIGMA_MODEL)
     np.testing.assert_allclose(
         np.linalg.norm(both.residual, axis=1), np.abs(across.residual) / across.sigma, rtol=1e-6
     )
