@@ -15,6 +15,7 @@ from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval.metrics.cost import StageTime, stage_times
 from pathspace_graph.eval.metrics.ghosts import GhostSettings
+from pathspace_graph.eval.metrics.measures import measure, online_cycles
 from pathspace_graph.eval.metrics.summary import lap_times
 from pathspace_graph.eval.study.workers import check_jobs, outcomes, workers
 from pathspace_graph.io.log import LOG_FILE, Log, read_log
@@ -22,7 +23,7 @@ from pathspace_graph.io.results import BatchRun, RunResult
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .metrics import Row, online_cycles, rows
+Row = dict[str, float | int | str | bool]
 
 RUN: Final = ("log", "estimator")
 """Columns that name a run."""
@@ -175,10 +176,13 @@ def run_task(task: Task, named: NamedLog, settings: MapperSettings, ghosts: Ghos
             begin = time.perf_counter()
             result = run_estimator(task.estimator, settings, named.log)
             seconds = time.perf_counter() - begin
-            measured = tuple(rows(result, named.log, seconds, ghosts))
+        rows: tuple[Row, ...] = tuple(
+            {"scope": "lap" if row.lap else "log", "lap": row.lap or result.laps, **row.values}
+            for row in measure(named.log, result, seconds, ghosts)
+        )
         cycles = online_cycles(result)
         times = tuple(stage_times(cycles)) if cycles else ()
-        return Outcome(named.name, task.estimator, result, rows=measured, times=times)
+        return Outcome(named.name, task.estimator, result, rows=rows, times=times)
     except Exception as error:  # whatever ends a run belongs into the table
         return Outcome(named.name, task.estimator, failure=_told(error))
 

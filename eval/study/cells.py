@@ -16,7 +16,8 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.eval.metrics.summary import versions
+from pathspace_graph.eval.metrics.measures import METRICS, Row, measure
+from pathspace_graph.eval.metrics.summary import lap_times, versions
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.run import run_online
@@ -26,7 +27,6 @@ from pathspace_graph.sim.track import Track
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.track_generator import generate_track
 
-from .metrics import lap_rows, lap_stamps
 from .overrides import check_name
 
 FORMAT: Final = "pathspace-cell/1"
@@ -144,7 +144,8 @@ def run_cell(cell: Cell, log: Log) -> Record:
         with threadpool_limits(limits=1):
             begin = time.perf_counter()
             result = run_estimator(cell.estimator, cell.settings, log)
-            laps = lap_rows(result, log, time.perf_counter() - begin)
+            seconds = time.perf_counter() - begin
+            laps = _lap_rows(measure(log, result, seconds, marginals=True))
         return _record(cell, laps=laps)
     except Exception as error:  # whatever ends a run belongs into the results
         return failed(cell, error)
@@ -168,8 +169,18 @@ def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
     """An online estimator cycle by cycle, with its map at each true lap's end, or a batch one at once."""
     if name in registry.ONLINE:
         estimator = registry.make_online(name, settings, log)
-        return run_online(log, estimator, name=name, snapshot_times=lap_stamps(log))
+        return run_online(log, estimator, name=name, snapshot_times=lap_times(log))
     return registry.make_batch(name, settings, log).solve(log)
+
+
+def _lap_rows(rows: list[Row]) -> list[dict[str, Any]]:
+    """Returns a row for each lap, with the metrics of the whole run beside its own.
+
+    A run that completed no lap has one row, that of the whole run as lap 1.
+    """
+    *laps, whole = rows
+    shared = {key: value for key, value in whole.values.items() if METRICS[key].scope == "run"}
+    return [{"lap": row.lap, **row.values, **shared} for row in laps] or [{"lap": 1, **whole.values}]
 
 
 def _record(cell: Cell, **what: Any) -> Record:

@@ -10,10 +10,10 @@ from typing import Any, Final
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings
 
-from .metrics import METRICS
 from .overrides import Overrides, check_name, override
 
 DEFAULT: Final = "default"

@@ -14,8 +14,9 @@ from typing import Final
 import numpy as np
 import tyro
 
+from pathspace_graph.eval.metrics.consistency import normal_errors
 from pathspace_graph.eval.metrics.limit import limit
-from pathspace_graph.eval.metrics.table1 import LapMetrics, lap_end_times, laps_metrics, normal_errors
+from pathspace_graph.eval.metrics.table1 import LapMetrics, lap_end_times, laps_metrics
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.results import CycleRecord, RunResult
