@@ -9,7 +9,7 @@ import pandas as pd
 
 from pathspace_graph.eval.metrics.measures import MEAN_DIGITS, METRICS, UNKNOWN, Metric
 from pathspace_graph.eval.metrics.paired import difference
-from pathspace_graph.eval.tables.text_table import TextTable
+from pathspace_graph.eval.metrics.text_table import TextTable
 
 from .comparison import Comparison
 

@@ -11,7 +11,7 @@ import pandas as pd
 from pathspace_graph.eval.metrics.measures import METRICS, PAPER, Metric
 from pathspace_graph.eval.metrics.summary import has_cones
 from pathspace_graph.eval.metrics.table1 import LapMetrics
-from pathspace_graph.eval.tables.text_table import TextTable
+from pathspace_graph.eval.metrics.text_table import TextTable
 
 from .comparison import Comparison
 

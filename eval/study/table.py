@@ -11,7 +11,7 @@ import pandas as pd
 
 from pathspace_graph.eval.metrics.measures import MEAN_DIGITS, METRICS
 from pathspace_graph.eval.metrics.paired import CORRECTION, LEVEL, Estimate
-from pathspace_graph.eval.tables.text_table import TextTable
+from pathspace_graph.eval.metrics.text_table import TextTable
 
 from .frame import COMBINATION, RUN
 from .statistics import Contrast, contrasts

@@ -18,13 +18,13 @@ from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.eval.metrics.consistency import Nees, map_nees
 from pathspace_graph.eval.metrics.limit import limit
 from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.eval.metrics.text_table import TextTable
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .cases import Case, CaseOptions, by_track, measure, show
-from .text_table import TextTable
 
 SAME_COST: Final = 1e-3
 """Costs that differ by no more than this share are one optimum's."""
