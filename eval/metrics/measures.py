@@ -132,8 +132,8 @@ class Row:
 
 
 def measure(
-    log: Log,
     run: RunResult,
+    log: Log,
     seconds: float | None = None,
     ghost_settings: GhostSettings | None = None,
     *,
@@ -149,7 +149,7 @@ def measure(
     oracle association and thus a simulated log (ValueError without associations).
     """
     rows = []
-    for lap, track, begin, end in _laps(log, run):
+    for lap, track, begin, end in _laps(run, log):
         values = _map_values(track, log.truth, ghost_settings, marginals)
         rows.append(Row(lap, values | _drive_values(run, log.truth, begin, end)))
     values = _map_values(run.map, log.truth, ghost_settings, marginals)
@@ -164,7 +164,7 @@ def measure(
     return [*rows, Row(None, values)]
 
 
-def _laps(log: Log, run: RunResult) -> Iterator[tuple[int, Map, float, float]]:
+def _laps(run: RunResult, log: Log) -> Iterator[tuple[int, Map, float, float]]:
     """Yields (lap, its map, begin, end); the cycles in (begin, end] s belong to the lap."""
     ends = [-np.inf, *lap_times(log)]
     true_laps = len(ends) - 1

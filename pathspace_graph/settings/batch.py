@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from .checked import Positive
+
+Start = Literal["online", "odometry"]
 
 
 @dataclass(frozen=True)
 class BatchSettings(Positive):
     """The batch optimization over a whole log."""
 
+    start: Start = "online"
+    """The optimization begins at the map of an online run over the log, or at odometry alone."""
     size: int | None = None
     """Control points of both boundaries together; where not given, the readings decide."""
     size_share: float = 0.43
