@@ -13,10 +13,10 @@ from pathspace_graph.factors.gtsam_factors import (
     pose_array,
     rotation,
     smoothness_factors,
-    spline_projection_factor,
+    spline_projection_factors,
 )
 from pathspace_graph.factors.projection import to_map
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_key
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_key, pose_keys
 from pathspace_graph.graph.odometry import odometry_factor
 from pathspace_graph.mapping.measurements import Chain
 from pathspace_graph.spline.boundary import Boundary
@@ -98,30 +98,29 @@ def beside_factor(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), keys, error)
 
 
-def _projections(system: BatchSystem, at: Evaluation, label: int) -> Iterator[gtsam.NonlinearFactor]:
+def _projections(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.CustomFactor]:
     """A factor for each cycle of the readings in use on a boundary that have any weight.
 
     A reading that is as sure in every direction keeps its sigma however the curve turns.
     """
-    p, boundary, keys = at.projected[label], at.state.boundaries[label], at.state.keys(label).tolist()
-    scale, detections = system.scale(p), system.detections
-    weighted, cycle = np.flatnonzero(scale > 0.0), detections.cycle[p.rows]
-    points = to_map(detections.point[p.rows], at.state.variables.poses_at(cycle))
-    room = _room(boundary, at.state.control_points(label), points, p.foot.u)
-    for one in np.split(weighted, np.flatnonzero(np.diff(cycle[weighted])) + 1):
-        if len(one) == 0:
-            continue
-        yield spline_projection_factor(
-            pose_key(cycle[one[0]]),
-            keys,
-            boundary.tables,
-            points_vehicle=detections.point[p.rows[one]],
-            covariances=scale[one, None, None] ** -2.0 * np.eye(2),
-            low=p.foot.u[one] - room[one],
-            high=p.foot.u[one] + room[one],
-            sigma_model=0.0,
-            huber=np.inf,
-        )
+    projected, boundary = at.projected[label], at.state.boundaries[label]
+    scale, detections = system.scale(projected), system.detections
+    weighted = scale > 0.0
+    scale, u, rows = scale[weighted], projected.foot.u[weighted], projected.rows[weighted]
+    cycles, points_vehicle = detections.cycle[rows], detections.point[rows]
+    points = to_map(points_vehicle, at.state.variables.poses_at(cycles))
+    room = _room(boundary, at.state.control_points(label), points, u)
+    return spline_projection_factors(
+        pose_keys(cycles),
+        at.state.keys(label).tolist(),
+        boundary.tables,
+        points_vehicle=points_vehicle,
+        covariances=scale[:, None, None] ** -2.0 * np.eye(2),
+        low=u - room,
+        high=u + room,
+        sigma_model=0.0,
+        huber=np.inf,
+    )
 
 
 def _room(boundary: Boundary, control_points: Array, points: Array, u: Array) -> Array:
