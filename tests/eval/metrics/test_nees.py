@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchResult
-from pathspace_graph.batch.scatter import Scatter
+from pathspace_graph.batch.simplification import Scatter
 from pathspace_graph.eval.metrics.nees import Nees, curve_nees
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, SplineBoundary
