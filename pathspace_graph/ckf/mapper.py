@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
+from pathspace_graph.mapping.measurements import integrate_odometry
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.run import CycleResult
@@ -64,8 +64,7 @@ class CkfMapper:
 
     def _predict(self, odometry: Odometry, t: float) -> None:
         """The pose by the odometry integrated since the last cycle."""
-        durations = np.diff(np.append(odometry.t, t))
-        self.state.belief.predict(integrate_twists(durations, odometry.twist, self.odometry_sigma))
+        self.state.belief.predict(integrate_odometry(odometry, t, self.odometry_sigma))
         self.state.locate_vehicle()
         self.path.update(self.state.pose.copy())
         self.path.steer(odometry.twist)

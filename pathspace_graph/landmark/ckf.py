@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.projection import to_map
 from pathspace_graph.graph.keys import POSE
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.belief import PLANE, Belief, point_columns, to_vehicle_rows
+from pathspace_graph.mapping.measurements import integrate_odometry
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
@@ -52,8 +52,7 @@ class LandmarkCkf:
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """One perception cycle: the twists since the last one, and what was detected now."""
         watch = Stopwatch()
-        durations = np.diff(np.append(odometry.t, detections.t))
-        self.belief.predict(integrate_twists(durations, odometry.twist, self.odometry_sigma))
+        self.belief.predict(integrate_odometry(odometry, detections.t, self.odometry_sigma))
         watch.lap("predict")
         found = self._associate(detections)
         watch.lap("associate")

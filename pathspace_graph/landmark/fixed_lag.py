@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.projection import to_map
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.mapping.measurements import integrate_odometry
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import smoother_settings
 from pathspace_graph.mapping.registration import near_start
@@ -56,8 +56,7 @@ class LandmarkFixedLag:
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """One perception cycle: the twists since the last one, and what was detected now."""
         watch = Stopwatch()
-        durations = np.diff(np.append(odometry.t, detections.t))
-        driven = integrate_twists(durations, odometry.twist, self.odometry_sigma)
+        driven = integrate_odometry(odometry, detections.t, self.odometry_sigma)
         self.path.update(self.smoother.drive(detections.t, driven, self.settings.odometry.sigmas_start))
         watch.lap("predict")
         new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
