@@ -9,12 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import (
-    MIN_SIGMA,
-    integrate_poses,
-    integrate_twists,
-    odometry_residuals,
-)
+from pathspace_graph.factors.odometry import MIN_SIGMA, integrate_poses, integrate_twists, odometry_residuals
 from pathspace_graph.factors.se2 import compose, se2_exp
 
 from ..scenes.jacobians import assert_jacobians
