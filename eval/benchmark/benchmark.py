@@ -16,7 +16,6 @@ graph gets every cycle right after the mapper.
 
 from __future__ import annotations
 
-import json
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -37,6 +36,7 @@ from pathspace_graph.graph.gaussian import combined, factors_of, graph_of, jacob
 from pathspace_graph.graph.keys import are_poses
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.files import atomic_file, check_file_target
+from pathspace_graph.io.json_file import write_json
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -305,17 +305,6 @@ class Benchmark:
         return measure(log, MapperSettings())
 
 
-def write_json(file: Path, figures: Iterable[Metric]) -> None:
-    """The figures as a file, a list of objects; NaN becomes null."""
-    rows = [asdict(metric) | {"value": _json_number(metric.value)} for metric in figures]
-    with atomic_file(file) as temporary:
-        temporary.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
-
-
-def _json_number(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
 def rich_table(figures: Iterable[Metric]) -> Table:
     """For a terminal: each figure beside what is asked of it."""
     table = Table("figure")
@@ -351,7 +340,8 @@ def _run(benchmark: Benchmark) -> bool:
     measurement = benchmark.measure()
     figures = metrics(measurement)
     if benchmark.json is not None:
-        write_json(benchmark.json, figures)
+        with atomic_file(benchmark.json) as temporary:
+            write_json(temporary, [asdict(metric) for metric in figures])
     console = Console(highlight=False)
     console.print(rich_table(figures))
     best = measurement.gtsam
