@@ -72,6 +72,8 @@ class GaugeSettings(Positive):
 class GateSettings(Positive):
     """Which readings are used."""
 
+    UNLIMITED = ("huber",)
+
     chi: float = 3.0
     """A reading joins the curve within this many sigmas of its joint uncertainty."""
     chi_unknown: float = 1.5
@@ -121,6 +123,8 @@ class PathSettings(Positive):
 @dataclass(frozen=True)
 class GrowthSettings(Positive):
     """How an open end grows."""
+
+    UNLIMITED = ("forget_after",)
 
     reach: float = 7.0
     """How far ahead of the vehicle along its path (m) a boundary is extended."""
