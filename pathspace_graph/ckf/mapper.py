@@ -12,9 +12,8 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import near_start
-from pathspace_graph.run import CycleResult
+from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
-from pathspace_graph.stopwatch import Stopwatch
 
 from .association import OnCurve, classify
 from .closing import associate_early, simplify, update_by_correspondences

@@ -23,9 +23,8 @@ from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.belief import PLANE, Belief, point_columns, to_vehicle_rows
 from pathspace_graph.mapping.tentative import TentativeTracks
-from pathspace_graph.run import CycleResult
+from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
-from pathspace_graph.stopwatch import Stopwatch
 
 from .association import NONE, Association, Gates, associate, compatible, pair_costs
 
