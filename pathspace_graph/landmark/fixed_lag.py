@@ -15,9 +15,8 @@ from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import smoother_settings
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks
-from pathspace_graph.run import CycleResult
+from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
-from pathspace_graph.stopwatch import Stopwatch
 
 from .association import associate_created, associate_newest
 from .closing import detect_loop, optimize_loop

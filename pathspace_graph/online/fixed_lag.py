@@ -21,10 +21,9 @@ from pathspace_graph.mapping.measurements import integrate_odometry
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import smoother_settings
 from pathspace_graph.mapping.registration import near_start, register
-from pathspace_graph.run import CycleResult
+from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 from pathspace_graph.spline.boundary import Boundary
-from pathspace_graph.stopwatch import Stopwatch
 
 from .activation import narrow
 from .association import associate
