@@ -35,7 +35,7 @@ FOLDERS = {package: folder_of(package) for package in PACKAGES}
 
 
 def python_folders() -> set[Path]:
-    """Every folder with Python code below the root, but for tests, examples, pages, and what is hidden or built."""
+    """Every folder with Python code below the root, but for tests, examples and pages, and what is built."""
     skipped = {"tests", "examples", "docs", "build", "dist"}
     files = (file.relative_to(ROOT) for file in ROOT.rglob("*.py"))
     return {
