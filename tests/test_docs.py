@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import inspect
+import json
 import os
 import re
 import subprocess
@@ -23,13 +24,16 @@ import pytest
 from pathspace_graph import FixedLagMapper, Log
 from pathspace_graph.cli import COMMANDS, _parse
 from pathspace_graph.errors import InputError
-from pathspace_graph.run import split_odometry
+from pathspace_graph.io.log import write_log
+from pathspace_graph.io.results import write_result
+from pathspace_graph.run import run_online, split_odometry
 from pathspace_graph.sim import track_files
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
 from .scenes.jacobians import numeric_jacobian
 from .scenes.paths import ROOT
+from .test_rooms import ARROWS, LEAVES
 
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 PACKAGE = "pathspace_graph"
@@ -88,8 +92,8 @@ NAMED = re.compile(r"`([a-z_]+(?:\.[a-z_]+)*):([A-Za-z_]\w*(?:\.\w+)*)`")
 """`module.path:Name.member`, without the package's own name."""
 FILE = re.compile(r"`(\.?[a-z_][\w/.-]*/[\w-]*(?:\.(?:py|md))?|\w+\.(?:py|md))`")
 """`folder/file.py` or `folder/`, below the root or below the package; other suffixes are of data."""
-WRITTEN = {"cells/", "figures/"}
-"""Folders that commands write."""
+OUTSIDE = {"cells/", "figures/", "captions.md", "table.md", "pacsim/", "fssim/", "eufs/"}
+"""Files and folders that commands write, and folders of track files."""
 ELSEWHERE = {"dead_reckoning", "compass"}
 """Modules that a page tells its reader to write."""
 
@@ -117,7 +121,7 @@ def test_named_code_exists(page: Path) -> None:
 def test_named_files_exist(page: Path) -> None:
     if page.name == "CHANGELOG.md":
         return
-    for name in set(FILE.findall(prose(page))) - WRITTEN:
+    for name in set(FILE.findall(prose(page))) - OUTSIDE:
         assert any((home / name).exists() for home in (ROOT, ROOT / PACKAGE, page.parent)), name
 
 
@@ -155,6 +159,55 @@ def test_the_graph_is_asked_as_the_architecture_page_does(log: Log) -> None:
         mapper.update(odometry, detections)
     (block,) = blocks(ROOT / "docs" / "architecture.md", "python")
     exec(compile(block, "architecture.md", "exec"), {"mapper": mapper, "gtsam": gtsam})
+
+
+def test_each_step_of_the_paper_is_two_calls_from_the_update() -> None:
+    page = text_of(ROOT / "docs" / "architecture.md")
+    steps = re.findall(r"^\| [^|]* \| `FixedLagMapper\.(\w+)` \| ([^|]*) \|", page, flags=re.MULTILINE)
+    assert len(steps) == 7
+    update = inspect.getsource(FixedLagMapper.update)
+    for method, functions in steps:
+        assert f"self.{method}(" in update
+        for _, function in NAMED.findall(functions):
+            called = function.rpartition(".")[2]
+            assert f"{called}(" in inspect.getsource(getattr(FixedLagMapper, method)), function
+
+
+def test_the_architecture_page_has_the_rooms_in_the_order_of_their_imports() -> None:
+    """A room stands below all that it may import, as `test_rooms` has it."""
+    page = text_of(ROOT / "docs" / "architecture.md")
+    table = page[page.index("## Rooms") : page.index("## What flows where")]
+    listed = re.findall(r"^\| `([a-z_.]+)` \|", table, flags=re.MULTILINE)
+    assert set(listed) == set(ARROWS) - LEAVES - {"cli", "__main__"}
+    for place, room in enumerate(listed):
+        assert ARROWS[room] <= set(listed[:place]), room
+
+
+# --- formats ---------------------------------------------------------------------------------------------
+
+
+def keys_of(content: Any) -> Iterator[str]:
+    """Every key of a JSON object and of the objects in it."""
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield key
+            yield from keys_of(value)
+
+
+def test_the_formats_page_has_every_file_column_and_key(log: Log, tmp_path: Path) -> None:
+    page = text_of(ROOT / "docs" / "formats.md")
+    write_log(log, tmp_path / "log")
+    result = run_online(log, FixedLagMapper(odometry_sigma=log.odometry_sigma))
+    write_result(tmp_path / "map", result, {})
+    for file in (*(tmp_path / "log").iterdir(), *(tmp_path / "map").iterdir()):
+        assert f"`{file.name}`" in page
+        if file.suffix == ".csv":
+            header = file.read_text().splitlines()[0]
+            assert f"`{header}`" in page
+    for key in keys_of(json.loads((tmp_path / "map" / "map.json").read_text())):
+        assert f"`{key}`" in page, key
+    for key in tomllib.loads((tmp_path / "log" / "log.toml").read_text())["sensor"]:
+        assert f"`{key}`" in page, key
 
 
 # --- extending -------------------------------------------------------------------------------------------
@@ -200,9 +253,7 @@ def run_command(folder: Path, command: str) -> str:
     paths = [str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "MPLBACKEND": "Agg"}
     arguments = [sys.executable, "-m", PACKAGE, *command.split()]
-    done = subprocess.run(
-        arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
