@@ -16,11 +16,12 @@ from pathspace_graph.eval.harness.attempts import Attempt, attempt, known_estima
 from pathspace_graph.eval.harness.workers import check_jobs, outcomes, workers
 from pathspace_graph.eval.metrics.cost import StageTime, stage_times
 from pathspace_graph.eval.metrics.ghosts import GhostSettings
+from pathspace_graph.eval.metrics.measures import measure, online_cycles
 from pathspace_graph.io.log import LOG_FILE, Log, read_log
 from pathspace_graph.io.results import BatchRun, RunResult
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .metrics import Row, online_cycles, rows
+Row = dict[str, float | int | str | bool]
 
 RUN: Final = ("log", "estimator")
 """Columns that name a run."""
@@ -172,15 +173,19 @@ def compare(
 
 def run_task(task: Task, named: NamedLog, settings: MapperSettings, ghosts: GhostSettings) -> Outcome:
     """Runs and measures; a failure is an outcome as well."""
-    measure = partial(_measure, ghosts=ghosts)
-    return _outcome(task, named, attempt(task.estimator, settings, named.log, measure))
+    what = attempt(task.estimator, settings, named.log, partial(_measure, ghosts=ghosts))
+    return _outcome(task, named, what)
 
 
 def _measure(
     result: RunResult, log: Log, seconds: float, ghosts: GhostSettings
 ) -> tuple[tuple[Row, ...], tuple[StageTime, ...]]:
+    rows: tuple[Row, ...] = tuple(
+        {"scope": "lap" if row.lap else "log", "lap": row.lap or result.laps, **row.values}
+        for row in measure(result, log, seconds, ghosts)
+    )
     cycles = online_cycles(result)
-    return tuple(rows(result, log, seconds, ghosts)), tuple(stage_times(cycles)) if cycles else ()
+    return rows, tuple(stage_times(cycles)) if cycles else ()
 
 
 def _outcome(

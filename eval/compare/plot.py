@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from pathspace_graph.eval.figures.map_plot import PlotStyle, draw_boundary, draw_start, draw_truth
 from pathspace_graph.eval.figures.style import RED, fit_height, grouped_legend
 from pathspace_graph.eval.metrics.blind_spot import BlindSpot
+from pathspace_graph.eval.metrics.measures import PAPER
 from pathspace_graph.eval.metrics.true_curve import mapped_points
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 
 from .comparison import Outcome
-from .metrics import PAPER
 
 Array = NDArray[np.float64]
 
@@ -139,11 +139,11 @@ def _draw_map(axes: Axes, track: Map, truth: Truth | None, style: PlotStyle, sta
 def _caption(outcome: Outcome) -> str:
     """Name and the paper's metrics, where they are known."""
     row = outcome.rows[-1]
-    words = {}
-    for metric in PAPER:
-        if metric.name in row:
-            name, _, unit = metric.title.removesuffix("]").partition(" [")
-            words[name] = f"{name} {metric.text(float(row[metric.name]))} {unit}".strip()
+    words = {
+        metric.key: f"{metric.title} {metric.text(float(row[metric.key]))} {metric.unit}".strip()
+        for metric in PAPER
+        if metric.key in row
+    }
     size = words.pop("size")
     return "\n".join([outcome.estimator, ", ".join(words.values()), size])
 

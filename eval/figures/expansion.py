@@ -123,7 +123,7 @@ def update(boundary: SplineBoundary, detections: Array, covariances: Array) -> S
     spline, n = boundary.spline, boundary.size
     basis = spline.basis_matrix(spline.foot_points(detections).u)
     fitted = fit_detections(basis, detections, covariances, spline.control_points, CkfSettings())
-    combine = np.kron(fitted.basis(), np.eye(2)).T
+    combine = np.kron(fitted.range_basis(), np.eye(2)).T
     H = combine @ np.kron(fitted.taken, np.eye(2))
     P = boundary.covariance
     gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + combine @ fitted.covariance @ combine.T)

@@ -8,11 +8,11 @@ from typing import Any, Final
 
 from pathspace_graph.eval.harness.attempts import Attempt, attempt
 from pathspace_graph.eval.harness.drives import Drive, identity
+from pathspace_graph.eval.metrics.measures import METRICS, measure
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.log import Log
+from pathspace_graph.io.results import RunResult
 from pathspace_graph.settings.mapper import MapperSettings
-
-from .metrics import lap_rows
 
 FORMAT: Final = "pathspace-cell/1"
 
@@ -70,3 +70,13 @@ def record_of(cell: Cell, what: Attempt[list[dict[str, Any]]]) -> Record:
 def failed(cell: Cell, error: BaseException) -> Record:
     """Returns the record of a cell that could not be run."""
     return record_of(cell, Attempt.failed(error))
+
+
+def lap_rows(run: RunResult, log: Log, seconds: float) -> list[dict[str, Any]]:
+    """Returns a row for each lap, with the metrics of the whole run beside its own.
+
+    A run that completed no lap has one row, that of the whole run as lap 1.
+    """
+    *laps, whole = measure(run, log, seconds, marginals=True)
+    shared = {key: value for key, value in whole.values.items() if METRICS[key].scope == "run"}
+    return [{"lap": row.lap, **row.values, **shared} for row in laps] or [{"lap": 1, **whole.values}]

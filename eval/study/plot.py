@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pathspace_graph.eval.figures.style import BLUE, DARK, GREY
+from pathspace_graph.eval.metrics.measures import METRICS
 
-from .metrics import METRICS
 from .statistics import Contrast, contrasts
 from .study import Study
 
@@ -116,7 +116,7 @@ def _draw_differences(axes: Axes, rows: Sequence[Contrast], style: StudyPlotStyl
         axes.errorbar(
             mean, row, xerr=bar, fmt="o", color=color, markersize=style.marker_size, elinewidth=1.0, zorder=3
         )
-    axes.set_title(metric.title, fontsize=style.font_size)
+    axes.set_title(metric.heading, fontsize=style.font_size)
     axes.tick_params(width=0.6, length=2.5)
     axes.grid(axis="x", linewidth=0.3, alpha=0.5)
 
@@ -153,8 +153,8 @@ def plot_against(study: Study, frame: pd.DataFrame, metric: str, style: StudyPlo
         pairs = [(a, b) for a, b in zip(across, up, strict=True) if a.noise == noise and a.value.count]
         for index, (a, b) in enumerate(pairs):
             _draw_point(axes, a, b, index, _label(study, a), style)
-        axes.set_xlabel(METRICS[metric].title)
-        axes.set_ylabel(METRICS[ACCURACY].title)
+        axes.set_xlabel(METRICS[metric].heading)
+        axes.set_ylabel(METRICS[ACCURACY].heading)
         axes.set_title(noise if len(study.noise) > 1 else "", fontsize=style.font_size)
         axes.grid(linewidth=0.3, alpha=0.5)
         axes.tick_params(width=0.6, length=2.5)

@@ -11,10 +11,10 @@ from typing import Any, Final
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.eval.harness.attempts import known_estimators
+from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings
 
-from .metrics import METRICS
 from .overrides import Overrides, override
 
 DEFAULT: Final = "default"

@@ -156,8 +156,8 @@ def recognizing(gap: Array, sigma: float) -> tuple[Array, Array] | None:
     smoother.last_covariance = lambda keys: covariance[  # type: ignore[method-assign]
         np.ix_(entries(keys), entries(keys))
     ]
-    found = recognize(smoother, np.arange(2 * n, 4 * n), np.arange(2 * n), reach=8.0)
-    return None if found is None else (found.first, found.second)
+    found = detect_loop(smoother, np.arange(2 * n, 4 * n), np.arange(2 * n), reach=8.0)
+    return None if found is None else (found.recent, found.old)
 
 
 def test_rows_are_recognized_as_a_whole() -> None:
