@@ -1,4 +1,4 @@
-"""The third-degree spherical-radial cubature rule (Arasaratnam and Haykin 2009)."""
+"""The third-degree spherical-radial cubature rule (Arasaratnam and Haykin 2009), the paper's transform."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from scipy.linalg import lapack
 
 Array = NDArray[np.float64]
 
-_LEAST_EIGENVALUE: Final = 1e-12
-"""If a covariance has no Cholesky factor, eigenvalues below this share of the largest are raised to it."""
+_LEAST_VARIANCE: Final = 1e-12
+"""Eigenvalues are raised to this share of the largest one where a covariance has no Cholesky factor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,29 +26,29 @@ class Transformed:
     """(q, q) This is the covariance of the function."""
     slope: Array
     """(q, d) This is the statistical linearization `C_yx C_xx^-1`. The covariance of the function with a
-    Gaussian variable z that it does not depend on directly is `slope @ C_xz`, which is exact."""
+    variable z that it does not depend on is `slope @ C_xz`, which is exact for Gaussians."""
 
 
 def square_root(covariance: Array) -> Array:
-    """Returns lower L with `L L' = covariance` (d, d); a semidefinite one is raised by rounding errors."""
+    """Returns the lower L with `L L' = covariance` (d, d). Small eigenvalues are raised if it is singular."""
     factor, info = lapack.dpotrf(covariance, lower=1, clean=1)
     if info == 0:
         return np.asarray(factor)
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    lifted = np.maximum(values, _LEAST_EIGENVALUE * max(float(values[-1]), _LEAST_EIGENVALUE))
+    lifted = np.maximum(values, _LEAST_VARIANCE * max(float(values[-1]), _LEAST_VARIANCE))
     return np.asarray(np.linalg.qr((vectors * np.sqrt(lifted)).T)[1].T)
 
 
 def cubature_points(mean: Array, root: Array) -> Array:
-    """Returns the points `mean +- sqrt(d) L e_i` (2 d, d), the positive ones first; all weigh 1 / (2 d)."""
+    """Returns `mean +- sqrt(d) L e_i` (2 d, d), the positive ones first; each has the weight 1 / (2 d)."""
     offsets = np.sqrt(len(mean)) * root.T
     return np.concatenate([mean + offsets, mean - offsets])
 
 
 def transform(function: Callable[[Array], Array], mean: Array, covariance: Array) -> Transformed:
-    """Returns the moments of `function`, which maps points (k, d) to (k, q) row by row.
+    """Returns mean, covariance and slope of `function`, which maps points (k, d) row by row to (k, q).
 
-    They are exact if the function is linear; the mean is exact for polynomials up to the third degree.
+    All are exact for a linear function, and the mean is exact for a polynomial of the third degree.
     """
     root = square_root(covariance)
     d = len(mean)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import compose
+from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.elimination import owners
 from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_key
 from pathspace_graph.graph.odometry import OdometryChain, calibrated_delta, odometry_rows
@@ -16,7 +16,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import OdometrySettings
 
-from .prediction import integrate
+from .prediction import integrate_odometry
 
 Array = NDArray[np.float64]
 
@@ -79,7 +79,7 @@ def integrate_log(log: Log, sigma: Array, settings: OdometrySettings) -> LogOdom
 
     sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s).
     """
-    steps = [integrate(odometry, cycle.t, sigma) for odometry, cycle in split_odometry(log)]
+    steps = [integrate_odometry(odometry, cycle.t, sigma) for odometry, cycle in split_odometry(log)]
     return LogOdometry(
         stamps=np.array([cycle.t for cycle in log.cycles]),
         first=compose(np.zeros(3), steps[0].delta),

@@ -16,7 +16,7 @@ from .path import DrivenPath
 Array = NDArray[np.float64]
 
 
-def integrate(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:
+def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:
     """Integrates twists, each held until the next and the last one until a stamp (s).
 
     sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s).
@@ -36,7 +36,7 @@ def predict(
 
     sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s).
     """
-    path.update(smoother.drive(t, integrate(odometry, t, sigma), settings.odometry.sigmas_start))
+    path.update(smoother.predict(t, integrate_odometry(odometry, t, sigma), settings.odometry.sigmas_start))
     path.steer(odometry.twist)
 
 

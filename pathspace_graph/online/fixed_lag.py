@@ -20,10 +20,9 @@ from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import predict, smoother_settings
 from pathspace_graph.mapping.registration import near_start, register
-from pathspace_graph.run import CycleResult
+from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 from pathspace_graph.spline.boundary import Boundary
-from pathspace_graph.stopwatch import Stopwatch
 
 from .activation import deactivate_distant
 from .association import associate
