@@ -45,7 +45,7 @@ def associate(smoother: CurveSmoother, retest: frozenset[int]) -> None:
     if len(doubtful):  # the joint uncertainty is costly, and only these need it
         feet = foot.where(doubtful)
         projected = project(points[doubtful], covariances[doubtful], poses[doubtful], feet, sigma_model)
-        variance[doubtful] += _joint_variance(smoother, detections.cycle[rows[doubtful]], feet, projected)
+        variance[doubtful] += joint_variance(smoother, detections.cycle[rows[doubtful]], feet, projected)
         accepted[doubtful] = square[doubtful] < gate.chi**2 * variance[doubtful]
     _decide(detections, rows[accepted], state.curves.labels[curve[accepted]], foot.u[accepted])
 
@@ -119,7 +119,7 @@ def _append_pose_u(state: State, label: int, u: float) -> None:
     state.pose_u[label] = np.append(known, u)
 
 
-def _joint_variance(
+def joint_variance(
     smoother: CurveSmoother, cycles: IntArray, foot: FootPoints, projected: ProjectionRows
 ) -> Array:
     """Returns `g_i' Sigma g_i` (m,) in m^2: the variance of each residual by pose and control points.
