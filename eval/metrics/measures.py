@@ -109,6 +109,7 @@ _ALL: Final = (
     Metric("normalized_error_marginals", "the same by variance of the marginals", digits=2, better="none"),
     Metric("closed", "loop closed", "%", 0, better="higher"),
     Metric("converged", "batch converged", "%", 0, better="higher", scope="run"),
+    Metric("cost", "cost of the batch", digits=1, scope="run"),
     Metric("bytes", "map", "kB", 2),
     Metric("bytes_covariance", "its covariance", "kB", 1),
     Metric("ms_mean", "update, mean", "ms", 2, time=True),
@@ -155,7 +156,7 @@ def measure(
     values = _map_values(run.map, log.truth, ghost_settings, marginals)
     values |= _drive_values(run, log.truth, -np.inf, np.inf)
     if isinstance(run, BatchRun):
-        values["converged"] = run.converged
+        values |= {"converged": run.converged, "cost": run.cost}
     if yardsticks:
         least = limit(log, run.map)
         values |= {"l": least.l, "f": least.f, "limit": least.total}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -104,5 +105,7 @@ class RunResult:
 class BatchRun(RunResult):
     """What a batch estimator gives; its maps of the laps are all the same one, that of the whole log."""
 
+    cost: float = nan
+    """The optimization ended at this cost, half the sum of the squared whitened residuals, if it is known."""
     converged: bool = True
     """Whether it ended at an optimum."""
