@@ -82,7 +82,7 @@ def test_the_rows_are_whitened_differences_and_their_derivatives() -> None:
 
 
 def test_the_drift_of_the_odometry_is_taken_out() -> None:
-    """Dead reckoning ends metres away. The aligned laps stay within decimetres, though the bias has a prior."""
+    """Dead reckoning ends metres away, the aligned laps within decimetres. The bias has a prior."""
     log, chain = drifting()
     reckoned, truth = chain.dead_reckoned(np.zeros(2)), true_poses(log)
     poses, calibration = align_laps(chain, find_recurrence(reckoned, SETTINGS), LAPS)
