@@ -6,7 +6,6 @@ from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
 
 import gtsam
 import numpy as np
@@ -22,9 +21,9 @@ from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
 from pathspace_graph.mapping.state import State
-from pathspace_graph.run import settings_dict
+from pathspace_graph.run import Stopwatch, settings_dict
+from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
-from pathspace_graph.stopwatch import Stopwatch
 
 from .cones import cone_counts
 from .dead_reckoning import start_odometry
@@ -36,7 +35,6 @@ from .start import CurveMapper, start_online
 from .system import BatchSystem, Biweight, Evaluation
 
 Array = NDArray[np.float64]
-Start = Literal["online", "odometry"]
 
 NAME = "spline"
 """This is the name of the estimator on the command line."""
@@ -102,14 +100,15 @@ class BatchMapper:
         self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
 
     def solve(
-        self, log: Log, start: Start = "online", on_round: Callable[[], None] | None = None
+        self, log: Log, start: Start | None = None, on_round: Callable[[], None] | None = None
     ) -> BatchResult:
-        """Returns the optimum, which is searched from an online run's map or from odometry alone.
+        """Returns the optimum, which is searched from an online map or from odometry alone.
 
-        `on_round` is called after each round. SettingsError if there is no online mapper to begin with.
+        By default `batch.start` decides. `on_round` is called after each round. SettingsError if there is no
+        online mapper to begin with.
         """
         with threadpool_limits(limits=1):
-            return self._solve(log, start, on_round)
+            return self._solve(log, start or self.settings.batch.start, on_round)
 
     def _solve(self, log: Log, start: Start, on_round: Callable[[], None] | None) -> BatchResult:
         settings, batch, watch = own_settings(self.settings), self.settings.batch, Stopwatch()
