@@ -13,7 +13,7 @@ from pathspace_graph.batch.dead_reckoning import start_odometry
 from pathspace_graph.batch.knots import boundary_of
 from pathspace_graph.batch.mapper import own_settings
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
