@@ -97,6 +97,10 @@ def test_a_held_pair_is_kept_however_its_assignment_is_summed() -> None:
     """At the very edge of the gate, alone or beside a reading of nothing, in any order."""
     gates = Gates(6.0, 9.0)
     cost = np.array([[np.inf, np.inf], [7.0, np.inf]])
-    for own, expected in ((cost, [UNASSOCIATED, 0]), (cost[::-1], [0, UNASSOCIATED]), (cost[:, ::-1], [UNASSOCIATED, 1])):
+    for own, expected in (
+        (cost, [UNASSOCIATED, 0]),
+        (cost[::-1], [0, UNASSOCIATED]),
+        (cost[:, ::-1], [UNASSOCIATED, 1]),
+    ):
         held = np.isfinite(own)
         assert associate(hysteresis_costs(own, held, gates), gates).landmark.tolist() == expected

@@ -20,11 +20,10 @@ from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.landmark.batch import LandmarkBatch
 from pathspace_graph.landmark.oracle import solve_landmarks
-from pathspace_graph.landmark.reassociation import remove_rare, predicted
+from pathspace_graph.landmark.reassociation import remove_rare
 from pathspace_graph.landmark.start import as_landmark_detections, start_oracle
 from pathspace_graph.landmark.state import LandmarkState
 from pathspace_graph.landmark.system import LandmarkSystem
-from pathspace_graph.landmark.tentative import duplicates
 from pathspace_graph.mapping.measurements import integrate_log
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings

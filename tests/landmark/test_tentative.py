@@ -8,7 +8,7 @@ import pytest
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.landmark.state import LandmarkState
-from pathspace_graph.landmark.tentative import associate_created, duplicates, pairs_within, compatible_pairs
+from pathspace_graph.landmark.tentative import associate_created, compatible_pairs, pairs_within
 from pathspace_graph.settings.comparison import LandmarkSettings
 from pathspace_graph.settings.mapper import GrowthSettings, MapperSettings
 
@@ -45,7 +45,11 @@ def test_a_landmark_is_merged_once_with_the_one_that_fits_best() -> None:
     spread = np.tile(0.01 * np.eye(2), (3, 1, 1))
     np.testing.assert_array_equal(compatible_pairs(first, second, offset, spread, LandmarkSettings()), [1])
     assert (
-        len(compatible_pairs(first[2:], second[2:], offset[2:], 9.0 * spread[2:] + np.eye(2), LandmarkSettings()))
+        len(
+            compatible_pairs(
+                first[2:], second[2:], offset[2:], 9.0 * spread[2:] + np.eye(2), LandmarkSettings()
+            )
+        )
         == 1
     )
 
