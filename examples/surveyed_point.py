@@ -37,7 +37,7 @@ def build_log(laps: int = 1, seed: int = 0) -> Log:
 
 
 def survey(log: Log, share: float = 0.4) -> Array:
-    """Returns the left cone (2,) after a share of the drive, in m, map frame."""
+    """Returns the left cone (2,) nearest to the vehicle after a share of the drive, in m, map frame."""
     assert log.truth is not None
     cones = log.truth.cones[log.truth.cone_labels == LEFT]
     pose = log.truth.poses[int(share * len(log.truth.poses)), :2]
