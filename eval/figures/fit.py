@@ -17,7 +17,6 @@ from pathspace_graph.sim.geometry import left_normals, unit
 from pathspace_graph.spline.bspline import BSpline
 
 from .marks import (
-    curve_parameters,
     draw_control_points,
     draw_curve,
     draw_ellipses,
@@ -191,7 +190,7 @@ def _draw_fitted(axes: Axes, data: Fit) -> None:
 
 def _draw_basis(axes: Axes, data: Fit) -> None:
     """Draws the basis functions over the parameter, and marks their values at the detections."""
-    u = curve_parameters(data.curve)
+    u = np.linspace(*data.curve.domain, 400)
     for j, values in enumerate(data.curve.basis_matrix(u).T):
         color = PURPLE if data.basis[:, j].sum() > _INVISIBLE else LIGHT
         axes.plot(np.where(values > _INVISIBLE, u, np.nan), values, color=color, linewidth=0.9, zorder=2)
