@@ -62,6 +62,40 @@ def spline_projection_factor(
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(low)), keys, function)
 
 
+def spline_projection_factors(
+    pose_keys: IntArray,
+    control_keys: Sequence[int],
+    tables: SpanPolynomials,
+    *,
+    points_vehicle: Array,
+    covariances: Array,
+    low: Array,
+    high: Array,
+    sigma_model: float,
+    huber: float,
+) -> list[gtsam.CustomFactor]:
+    """Returns a `spline_projection_factor` for each pose in pose_keys (m,), the key of each row's own pose.
+
+    The rows of one pose are neighbours. All other arguments are those of `spline_projection_factor`.
+    """
+    changes = np.flatnonzero(np.diff(pose_keys)) + 1
+    return [
+        spline_projection_factor(
+            int(pose_keys[own[0]]),
+            control_keys,
+            tables,
+            points_vehicle=points_vehicle[own],
+            covariances=covariances[own],
+            low=low[own],
+            high=high[own],
+            sigma_model=sigma_model,
+            huber=huber,
+        )
+        for own in np.split(np.arange(len(pose_keys)), changes)
+        if len(own)
+    ]
+
+
 def boundary_point_factor(
     control_keys: Sequence[int],
     tables: SpanPolynomials,

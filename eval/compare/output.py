@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from pathspace_graph.eval.figures.files import save_figures
 from pathspace_graph.eval.metrics.blind_spot import find_blind_spot
 from pathspace_graph.eval.metrics.summary import summarize, versions
-from pathspace_graph.eval.tables.text_table import TextTable
+from pathspace_graph.eval.metrics.text_table import TextTable
 from pathspace_graph.io.files import atomic_folder
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.io.results import write_result

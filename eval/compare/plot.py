@@ -28,12 +28,12 @@ from pathspace_graph.eval.figures.style import (
     set_frame,
 )
 from pathspace_graph.eval.metrics.blind_spot import BlindSpot
+from pathspace_graph.eval.metrics.measures import PAPER
 from pathspace_graph.eval.metrics.true_curve import mapped_points
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 
 from .comparison import Outcome
-from .metrics import PAPER
 
 Array = NDArray[np.float64]
 
@@ -136,11 +136,11 @@ def _draw_map(axes: Axes, track: Map, truth: Truth | None, style: MapStyle) -> N
 def _caption(outcome: Outcome) -> str:
     """Returns the estimator's name and the paper's metrics, where they are known."""
     row = outcome.rows[-1]
-    words = {}
-    for metric in PAPER:
-        if metric.name in row:
-            name, _, unit = metric.title.removesuffix("]").partition(" [")
-            words[name] = f"{name} {metric.text(float(row[metric.name]))} {unit}".strip()
+    words = {
+        metric.key: f"{metric.title} {metric.text(float(row[metric.key]))} {metric.unit}".strip()
+        for metric in PAPER
+        if metric.key in row
+    }
     size = words.pop("size")
     return "\n".join([outcome.estimator, ", ".join(words.values()), size])
 

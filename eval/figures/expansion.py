@@ -117,7 +117,7 @@ def update(boundary: SplineBoundary, detections: Array, covariances: Array) -> S
     spline, n = boundary.spline, boundary.size
     basis = spline.basis_matrix(spline.foot_points(detections).u)
     measurement = fit_detections(basis, detections, covariances, spline.control_points, CkfSettings())
-    combine = np.kron(measurement.basis(), np.eye(2)).T
+    combine = np.kron(measurement.range_basis(), np.eye(2)).T
     H = combine @ np.kron(measurement.taken, np.eye(2))
     R = combine @ measurement.covariance @ combine.T
     P = boundary.covariance

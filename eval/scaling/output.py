@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from pathspace_graph.eval.figures.files import save_figures
 from pathspace_graph.eval.metrics.summary import versions
-from pathspace_graph.eval.tables.text_table import TextTable
+from pathspace_graph.eval.metrics.text_table import TextTable
 from pathspace_graph.io.files import atomic_folder
 
 from .plot import plot_laps, plot_scaling

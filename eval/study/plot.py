@@ -20,8 +20,8 @@ from pathspace_graph.eval.figures.style import (
     figure_context,
     shared_legend,
 )
+from pathspace_graph.eval.metrics.measures import METRICS
 
-from .metrics import METRICS
 from .statistics import Contrast, contrasts
 from .study import Study
 
@@ -105,7 +105,7 @@ def _draw_differences(axes: Axes, rows: Sequence[Contrast]) -> None:
         mean, half = metric.factor * contrast.difference.mean, metric.factor * contrast.difference.half
         look: dict[str, Any] = {"color": color, "markersize": _MEAN_SIZE, "elinewidth": 1.0}
         axes.errorbar(mean, row, xerr=_bar(half), fmt="o", zorder=3, **look)
-    axes.set_title(metric.title)
+    axes.set_title(metric.heading)
     axes.grid(axis="x")
 
 
@@ -146,8 +146,8 @@ def plot_against(study: Study, frame: pd.DataFrame, metric: str) -> Figure | Non
         pairs = [(a, b) for a, b in zip(across, up, strict=True) if a.noise == noise and a.value.count]
         for index, (a, b) in enumerate(pairs):
             _draw_point(axes, a, b, index, _label(study, a))
-        axes.set_xlabel(METRICS[metric].title)
-        axes.set_ylabel(METRICS[ACCURACY].title)
+        axes.set_xlabel(METRICS[metric].heading)
+        axes.set_ylabel(METRICS[ACCURACY].heading)
         axes.set_title(noise if len(study.noise) > 1 else "")
         axes.grid()
     shared_legend(figure, loc="outside right upper")

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from pathspace_graph.eval.harness.drives import Drive
 from pathspace_graph.io.log import Log
 
-from .cells import FORMAT, Cell, Drive, Record
+from .cells import FORMAT, Cell, Record
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ def driven(cycles: int, settings: MapperSettings = QUADRATIC, noise: float = 1.0
 def test_rows_are_the_derivatives_of_their_residuals() -> None:
     smoother = driven(4)
     variables, track = smoother.variables, smoother.map
-    track.ties = np.array([[4, 0], [3, 2]])
+    track.loop_pairs = np.array([[4, 0], [3, 2]])
 
     def whitened(x: Array) -> tuple[Array, Array]:
         variables.values = x
@@ -84,10 +84,10 @@ def test_rows_are_the_derivatives_of_their_residuals() -> None:
 def test_a_tie_pulls_two_landmarks_together_as_far_as_it_is_sure() -> None:
     smoother = driven(3)
     apart = np.diff(smoother.map.state.landmarks[[0, 4]], axis=0)
-    smoother.map.ties = np.array([[4, 0]])
+    smoother.map.loop_pairs = np.array([[4, 0]])
     smoother.step()
     tied = np.diff(smoother.map.state.landmarks[[0, 4]], axis=0)
-    smoother.map.ties = np.zeros((0, 2), np.intp)
+    smoother.map.loop_pairs = np.zeros((0, 2), np.intp)
     smoother.step()
     free = np.diff(smoother.map.state.landmarks[[0, 4]], axis=0)
     assert np.hypot(*tied.T) < 0.9 * np.hypot(*apart.T)
@@ -102,7 +102,7 @@ def test_what_it_predicts_is_what_a_step_with_the_new_pose_would_say() -> None:
     found = predict(smoother, landmarks)
     pose, points = smoother.variables.poses[-1].copy(), state.landmarks[landmarks]
     rows = landmark_residuals(np.tile(pose, (2, 1)), points, np.zeros((2, 2)))
-    np.testing.assert_allclose(found.points, rows.residual)
+    np.testing.assert_allclose(found.points_vehicle, rows.residual)
     before = smoother.variables.values.copy()
     smoother.step()
     np.testing.assert_allclose(smoother.variables.values, before, atol=0.1)
@@ -150,7 +150,7 @@ def test_merging_is_the_constraint_that_both_are_one(tolerance: float) -> None:
     before = state.landmarks[0].copy()
     merge(smoother, np.array([4]), np.array([0]))
     np.testing.assert_array_equal(state.numbers, np.arange(4))
-    assert smoother.map.became == {4: 0}
+    assert smoother.map.merged_into == {4: 0}
     assert set(smoother.map.detections.landmark.tolist()) == {0, 1, 2, 3}
     np.testing.assert_allclose(state.landmarks, expected.reshape(-1, 2), atol=1e-3)
     assert np.abs(expected[:2] - before).max() > 0.01
@@ -184,7 +184,7 @@ def test_a_key_that_the_graph_does_not_hold_merges_into_nothing() -> None:
 @pytest.mark.parametrize("observed", [2, 0])
 def test_a_landmark_has_the_colour_of_most_of_its_readings(observed: int) -> None:
     state = LandmarkState()
-    state.born = 10 * observed  # numbers, not positions
+    state.next_number = 10 * observed  # numbers, not positions
     n = state.add(CONES, LABELS)
     state.vote(np.array([RIGHT, RIGHT, RIGHT]), n[[0, 0, 1]])
     np.testing.assert_array_equal(state.labels, [RIGHT, RIGHT, LEFT, RIGHT, LEFT])
