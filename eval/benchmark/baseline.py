@@ -14,6 +14,7 @@ from rich.table import Table
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.files import atomic_file
+from pathspace_graph.io.json_file import write_json
 
 from .metric import Metric
 
@@ -67,7 +68,7 @@ def write_baseline(file: Path, figures: Iterable[Metric]) -> None:
         "ratios": {metric.key: round(metric.value, 4) for metric in chosen},
     }
     with atomic_file(file) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_json(temporary, content)
 
 
 def read_baseline(file: Path) -> dict[str, float]:

@@ -7,7 +7,6 @@ and `--write-baseline` writes that baseline. Only ratios are in it, since times 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from rich.table import Table
 
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.io.files import atomic_file, check_file_target
+from pathspace_graph.io.json_file import write_json
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
@@ -66,17 +66,6 @@ class Benchmark:
         return measure(log, MapperSettings())
 
 
-def write_json(file: Path, figures: Iterable[Metric]) -> None:
-    """Writes the figures as a list of objects; NaN becomes null."""
-    rows = [asdict(metric) | {"value": _json_number(metric.value)} for metric in figures]
-    with atomic_file(file) as temporary:
-        temporary.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
-
-
-def _json_number(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
 def rich_table(figures: Iterable[Metric]) -> Table:
     """Returns a table for a terminal: each figure beside its bound."""
     table = Table("figure")
@@ -112,7 +101,8 @@ def _run(benchmark: Benchmark) -> bool:
     measurement = benchmark.measure()
     figures = metrics(measurement)
     if benchmark.json is not None:
-        write_json(benchmark.json, figures)
+        with atomic_file(benchmark.json) as temporary:
+            write_json(temporary, [asdict(metric) for metric in figures])
     console = Console(highlight=False)
     console.print(rich_table(figures))
     best = measurement.gtsam

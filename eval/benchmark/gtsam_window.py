@@ -17,7 +17,7 @@ from functools import partial
 import gtsam
 import numpy as np
 
-from pathspace_graph.graph.gaussian import combined, factors_of, graph_of, jacobian_factor
+from pathspace_graph.graph.gaussian import as_hessian_factor, factors_of, graph_of, jacobian_factor
 from pathspace_graph.graph.keys import are_poses
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -40,7 +40,7 @@ def linear_window(mapper: FixedLagMapper) -> LinearWindow:
     factors = factors_of(smoother.linear_graph(whole=True))
     cycles = [factor for factor in factors if _is_of_cycle(factor)]
     priors = [factor for factor in factors if not _is_of_cycle(factor)]
-    combined_priors = combined(graph_of(_damping(mapper), *priors))
+    combined_priors = as_hessian_factor(graph_of(_damping(mapper), *priors))
     return LinearWindow(graph_of(combined_priors, *cycles), smoother.variables.layout)
 
 

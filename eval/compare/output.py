@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from matplotlib.figure import Figure
 
@@ -14,6 +13,7 @@ from pathspace_graph.eval.metrics.blind_spot import find_blind_spot
 from pathspace_graph.eval.metrics.summary import summarize, versions
 from pathspace_graph.eval.metrics.text_table import TextTable
 from pathspace_graph.io.files import atomic_folder
+from pathspace_graph.io.json_file import write_json
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.io.results import write_result
 from pathspace_graph.settings.mapper import MapperSettings
@@ -60,7 +60,7 @@ def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings
             own = folder if len(comparison.logs) == 1 else folder / named.name
             own.mkdir(exist_ok=True)
             _write_log(own, named, comparison)
-        _write_json(folder / MARKER, comparison, settings, jobs)
+        write_json(folder / MARKER, _content(comparison, settings, jobs))
 
 
 def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
@@ -94,8 +94,8 @@ def blind_spot_figure(outcomes: list[Outcome], named: NamedLog, reference: str) 
     return None
 
 
-def _write_json(file: Path, comparison: Comparison, settings: MapperSettings, jobs: int) -> None:
-    content = {
+def _content(comparison: Comparison, settings: MapperSettings, jobs: int) -> dict[str, Any]:
+    return {
         "format": FORMAT,
         "logs": [named.name for named in comparison.logs],
         "estimators": comparison.estimators,
@@ -107,4 +107,3 @@ def _write_json(file: Path, comparison: Comparison, settings: MapperSettings, jo
         "settings": asdict(settings),
         "versions": versions(),
     }
-    file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
-from pathspace_graph.factors.odometry import wrap_angle
+from pathspace_graph.factors.se2 import wrap_angle
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES

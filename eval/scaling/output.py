@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import platform
 import resource
@@ -14,6 +13,7 @@ from pathspace_graph.eval.figures.files import save_figures
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.eval.metrics.text_table import TextTable
 from pathspace_graph.io.files import atomic_folder
+from pathspace_graph.io.json_file import write_json
 
 from .plot import plot_laps, plot_scaling
 from .points import CONES, LAPS, READINGS, Scaling, Slope
@@ -83,14 +83,13 @@ def write_scaling(out: Path, scaling: Scaling) -> None:
     with atomic_folder(out, MARKER) as folder:
         scaling.frame().to_csv(folder / "points.csv", index=False, lineterminator="\n")
         (folder / "table.md").write_text(scaling_table(scaling).markdown(), encoding="utf-8")
-        content = json.dumps(_content(scaling), indent=2, allow_nan=False)
-        (folder / MARKER).write_text(content + "\n", encoding="utf-8")
+        write_json(folder / MARKER, _content(scaling))
         save_figures(folder, {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)})
 
 
 def _content(scaling: Scaling) -> dict[str, Any]:
     at = {name: scaling.seconds_at(COMPARED_AT, name) for name in scaling.estimators}
-    content = {
+    return {
         "format": FORMAT,
         "slopes": [asdict(slope) for slope in scaling.slopes],
         "compared_at_cones": COMPARED_AT,
@@ -102,20 +101,9 @@ def _content(scaling: Scaling) -> dict[str, Any]:
         "estimator_settings": scaling.mapper,
         "versions": versions(),
     }
-    finite: dict[str, Any] = _finite(content)
-    return finite
 
 
 def _process_megabytes() -> float:
     """Returns the most memory (MB) that the process had, with all estimators loaded at once."""
     unit = 1e-6 if platform.system() == "Darwin" else 1.024e-3
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
-def _finite(value: Any) -> Any:
-    """The same with null for what JSON has no number for."""
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -8,10 +8,10 @@ from typing import Final
 import pandas as pd
 
 from pathspace_graph.eval.figures.files import SUFFIXES, render
+from pathspace_graph.io.files import replacing, write_text
 
 from .frame import times_of, without_times
 from .plot import figures
-from .store import replacing, write_text
 from .study import Study
 from .table import as_latex, as_markdown, as_text, caption, summary_tables
 

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.projection import project, to_map
+from pathspace_graph.factors.projection import project
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionTable

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_keys
 from pathspace_graph.graph.rows import Rows

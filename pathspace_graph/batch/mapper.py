@@ -21,10 +21,9 @@ from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
 from pathspace_graph.mapping.state import State
-from pathspace_graph.run import settings_dict
+from pathspace_graph.run import Stopwatch, settings_dict
 from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
-from pathspace_graph.stopwatch import Stopwatch
 
 from .cones import cone_counts
 from .dead_reckoning import start_odometry

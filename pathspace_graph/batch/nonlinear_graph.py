@@ -9,13 +9,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.gtsam_factors import (
-    pose_array,
-    rotation,
-    smoothness_factors,
-    spline_projection_factors,
-)
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.gtsam_factors import pose_array, smoothness_factors, spline_projection_factors
+from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_key, pose_keys
 from pathspace_graph.graph.odometry import odometry_factor
 from pathspace_graph.mapping.measurements import Chain

@@ -9,13 +9,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import wrap_angle
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map, wrap_angle
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.mapping.state import State
-from pathspace_graph.run import OnlineEstimate, OnlineEstimator, run_online
+from pathspace_graph.run import CycleResult, OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary
 
@@ -76,7 +75,7 @@ class Recorder:
         settings: MapperSettings = self.mapper.settings
         return settings
 
-    def update(self, odometry: Odometry, detections: Detections) -> OnlineEstimate:
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """Updates the mapper, and notes where it is."""
         result = self.mapper.update(odometry, detections)
         for label, boundary in self.mapper.boundaries.items():

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.projection import ProjectionRows, project, to_map
+from pathspace_graph.factors.projection import ProjectionRows, project
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.elimination import Elimination, linear_graph, map_held, owners
 from pathspace_graph.graph.keys import are_poses, pose_keys
 from pathspace_graph.graph.rows import Rows

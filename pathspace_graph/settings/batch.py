@@ -103,61 +103,71 @@ class ScatterSettings(Positive, group="batch.scatter"):
 
 @dataclass(frozen=True)
 class BatchSettings(Positive):
-    """The batch optimization over a whole log."""
+    """Describes the batch optimization over a whole log."""
 
     start: Start = "online"
     """The optimization begins at the map of an online run over the log, or at odometry alone."""
     size: int | None = None
-    """Control points of both boundaries together; where not given, the readings decide."""
+    """Both boundaries together have this number of control points; where it is not given, the number of cones
+    decides."""
     size_share: float = 0.43
-    """Most control points as a share of the distinct cones sighted (the paper has 0.44)."""
+    """The number of control points is at most this share of the number of distinct cones that were detected
+    (the paper has 0.44)."""
     sigma_model: float = 0.05
-    """How far cones stand off the curve that is solved for (m, one sigma), added to each reading across it.
-    Online it is larger (`spline.sigma_model`), as the curve has fewer control points there."""
+    """This is the standard deviation (m) of a cone's distance from the curves that are solved for; its square
+    is added to the variance of each detection across them. Online it is larger (`spline.sigma_model`), since
+    the curves have fewer control points there."""
     sigma_smoothness: float = 0.4
-    """Second difference of control points, as a share of their spacing: stronger than online's, as a curve
-    between cones that were never seen has many shapes that fit as well, and each start ends in its own."""
+    """This is the standard deviation of the second difference of control points, as a share of their spacing.
+    It is smaller than online, since a curve between cones that were never detected has many shapes that fit
+    equally well, and each start would end in its own."""
     sigma_slide: float = 0.2
-    """How far (m) a control point slides along its curve from beside the pose that it began beside."""
+    """A control point slides along its curve by this standard deviation (m) from its place beside the pose
+    that it began beside."""
     gate: float = 4.0
-    """Width of Tukey's loss: a reading farther than so many sigmas from its curve says nothing."""
+    """Tukey's loss has this width: a detection farther from its curve than this number of standard deviations
+    has no weight."""
     pose_steps: int = 3
-    """Gauss-Newton steps of the poses alone, beside the map that the start has found."""
+    """The poses alone take this number of Gauss-Newton steps at first, while the map of the start is held."""
     rough_rounds: int = 24
-    """Most rounds of a first optimization, on knots that the start decides."""
+    """The first optimization, on knots that follow the start, has at most this number of rounds."""
     rough_tolerance: float = 8.0
-    """Multiplies the tolerances below in the first optimization."""
+    """The tolerances are multiplied by this in the first optimization."""
     dense_share: float = 1.0
-    """Control points by cones of the curves that are solved for: they meet the cones. The map's own, fewer,
-    are fitted to them in the end."""
+    """The curves that are solved for have this number of control points for each cone, so that they meet the
+    cones. The map's own curves have fewer, and are fitted to them in the end."""
     knot_passes: int = 2
-    """Most times that they are solved for: once, unless the cones' number has changed then."""
+    """The dense curves are solved for at most this number of times; more than once only if the number of
+    cones has changed."""
     max_rounds: int = 80
-    """Steps, each with new foot points, gates and weights; the last of them is told as not converged."""
+    """The optimization has at most this number of rounds, each with new foot points, gates and weights; one
+    that uses them all is reported as not converged."""
     loose_gate: float = 8.0
-    """The first round uses readings within so many sigmas of a curve."""
+    """The first round uses detections within this number of standard deviations from a curve."""
     gate_factor: float = 0.7
-    """Multiplies the gate from each round to the next, down to `gate`."""
+    """The gate is multiplied by this from each round to the next, down to `gate`."""
     damping: float = 1e-2
-    """First hold on control points (1/m^2)."""
+    """This is the first damping of control points (1/m^2)."""
     damping_up: float = 5.0
-    """Multiplies the damping after a step that made the cost larger."""
+    """The damping is multiplied by this after a step that increased the cost."""
     damping_down: float = 0.1
-    """Multiplies the damping after a step that made the cost smaller."""
+    """The damping is multiplied by this after a step that decreased the cost."""
     damping_least: float = 1e-6
-    """Least damping (1/m^2)."""
+    """The damping is at least this (1/m^2)."""
     damping_most: float = 1e6
-    """Damping (1/m^2) at which no step is left that makes it better."""
+    """A round ends without a step if the cost still increases at this damping (1/m^2)."""
     share_least: float = 0.3
-    """Least share of the step before at which a step is tried as far as those that would follow lead."""
+    """A step is extended to the sum of those that would follow it if its ratio to the step before is larger
+    than this."""
     share_most: float = 0.97
-    """Largest such share."""
+    """A step is not extended if its ratio to the step before is larger than this."""
     tolerance_cost: float = 1e-5
-    """Converged where |cost_before - cost_after| <= tolerance * cost_before, and both below hold."""
+    """The optimization has converged when |cost_before - cost_after| <= tolerance_cost * cost_before, and the
+    other two tolerances hold."""
     tolerance_curve: float = 2e-3
-    """No point of a curve moved farther than this across it (m)."""
+    """At convergence, no point of a curve moved farther than this across it in a round (m)."""
     tolerance_pose: float = 2e-3
-    """No pose moved farther than this (m, and rad)."""
+    """At convergence, no pose moved farther than this in a round (m, and rad)."""
     min_size_share: float = 0.6
     """The fewest control points that the map's curves are tried with, as a share of the most."""
     curve_samples: int = 2

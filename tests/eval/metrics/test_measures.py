@@ -7,12 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.metrics.consistency import (
-    Nees,
-    curve_errors,
-    landmark_errors,
-    map_nees,
-)
+from pathspace_graph.eval.metrics.consistency import Nees, curve_errors, landmark_errors, map_nees
 from pathspace_graph.eval.metrics.cost import WHOLE, covariance_bytes, map_bytes, stage_times
 from pathspace_graph.eval.metrics.curve_distance import curve_distance
 from pathspace_graph.eval.metrics.ghosts import GhostSettings, ghosts
