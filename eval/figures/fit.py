@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from pathspace_graph.ckf.fit import SplineMeasurement, fit_detections
 from pathspace_graph.mapping.cubature import cubature_points, square_root
@@ -121,11 +122,8 @@ def _ray_covariances(rays: Array, sigmas: tuple[float, float]) -> Array:
 
 def _sigma_points(detections: Array, covariances: Array) -> Array:
     """Returns the cubature points (4 m, m, 2) of all detections (m, 2), (m, 2, 2) together."""
-    m = len(detections)
-    joint = np.zeros((m, 2, m, 2))
-    joint[np.arange(m), :, np.arange(m), :] = covariances
-    root = square_root(joint.reshape(2 * m, 2 * m))
-    return cubature_points(detections.ravel(), root).reshape(-1, m, 2)
+    root = square_root(block_diag(*covariances))
+    return cubature_points(detections.ravel(), root).reshape(-1, *detections.shape)
 
 
 # --- figure ----------------------------------------------------------------------------------------------
