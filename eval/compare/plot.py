@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pathspace_graph.eval.figures.map_plot import PlotStyle, draw_boundary, draw_start, draw_truth
 from pathspace_graph.eval.figures.style import RED, fit_height, grouped_legend
 from pathspace_graph.eval.metrics.blind_spot import BlindSpot
+from pathspace_graph.eval.metrics.curves import mapped_points
 from pathspace_graph.eval.metrics.measures import PAPER
-from pathspace_graph.eval.metrics.true_curve import mapped_points
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 

@@ -12,7 +12,7 @@ from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.settings.checked import Positive
 
-from .true_curve import mapped_points, true_curve
+from .curves import mapped_points, true_curve
 
 Array = NDArray[np.float64]
 

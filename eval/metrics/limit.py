@@ -6,23 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.landmark.oracle import LandmarkSolution, solve_landmarks
-from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.settings.knots import FitSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import fit_spline
 
+from .curves import driving_order
 from .table1 import closest_points, root_mean_square
 
 Array = NDArray[np.float64]
-
-PATH_STEP = 0.1
-"""Distance (m) between the points of the true path that cones are ordered along."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,35 +80,6 @@ def fit_distances(cones: Array, size: int, like: BSpline) -> Array:
     """
     fitted = fit_spline(cones, size, like.periodic, FitSettings(degree=like.degree))
     return np.asarray(np.linalg.norm(cones - closest_points(fitted, cones).position, axis=1))
-
-
-def driving_order(truth: Truth, label: int) -> Array:
-    """The true cones (k, 2) of one boundary in driving order.
-
-    By their station on the first lap of the true path, or as the file lists them where that makes the shorter
-    way (stations tie on the inside of a hairpin) or where there is no true path.
-    """
-    cones: Array = truth.cones[truth.cone_labels == label]
-    if len(truth.poses) < 2 or len(cones) == 0:
-        return cones
-    station: NDArray[np.intp] = np.asarray(KDTree(_first_lap(truth)).query(cones)[1])
-    by_station: Array = cones[np.argsort(station, kind="stable")]
-    return by_station if _way_around(by_station) < _way_around(cones) else cones
-
-
-def _first_lap(truth: Truth) -> Array:
-    """Points (n, 2) of the true path up to the end of lap 1, PATH_STEP apart at most."""
-    ends = lap_end_indices(truth.poses)
-    path = truth.poses[: ends[0] + 1 if len(ends) else None, :2]
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    driven = np.concatenate([[0.0], np.cumsum(steps)])
-    stations = np.linspace(0.0, driven[-1], int(np.ceil(driven[-1] / PATH_STEP)) + 1)
-    return np.stack([np.interp(stations, driven, coordinate) for coordinate in path.T], axis=1)
-
-
-def _way_around(points: Array) -> float:
-    """Length (m) of the closed polygon through the points."""
-    return float(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
 
 
 def _truth(log: Log) -> Truth:

@@ -18,13 +18,12 @@ from pathspace_graph.labels import BOUNDARIES, NAMES
 from .consistency import normal_errors
 from .table1 import (
     LapMetrics,
-    ate,
     lap_end_times,
     lap_metrics,
     laps_metrics,
     root_mean_square,
-    trajectory_errors,
 )
+from .trajectory import ate, trajectory_errors
 
 Array = NDArray[np.float64]
 

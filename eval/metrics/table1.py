@@ -1,4 +1,4 @@
-"""The metrics of the paper's Table 1, and the error of a trajectory."""
+"""The metrics of the paper's Table 1."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
-from pathspace_graph.factors.odometry import wrap_angle
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
@@ -108,44 +107,6 @@ def root_mean_square(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
-# --- trajectory ------------------------------------------------------------------------------------------
-
-
-def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
-    """(n, 3) [x, y, theta] at t (n,), linear between poses (N, 3) at pose_t (N,), turning the shorter way."""
-    columns = (poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2]))
-    x, y, theta = (np.interp(t, pose_t, column) for column in columns)
-    return np.stack([x, y, wrap_angle(theta)], axis=1)
-
-
-def trajectory_errors(t: Array, poses: Array, truth: Truth) -> Array:
-    """(k, 3): [along, across, heading] error of each pose in the true vehicle frame (m, m, rad), unaligned.
-
-    t (n,), poses (n, 3); stamps outside the truth's own are left out, so k <= n.
-    """
-    inside = (t >= truth.pose_t[0]) & (t <= truth.pose_t[-1])
-    true = interpolate_poses(truth.pose_t, truth.poses, t[inside])
-    dx, dy, turn = (poses[inside] - true).T
-    c, s = np.cos(true[:, 2]), np.sin(true[:, 2])
-    return np.stack([c * dx + s * dy, c * dy - s * dx, wrap_angle(turn)], axis=1)
-
-
-def ate(t: Array, poses: Array, truth: Truth) -> float:
-    """Absolute trajectory error: sqrt(mean |p - p_true|^2) in m, no alignment."""
-    errors = trajectory_errors(t, poses, truth)
-    return root_mean_square(np.linalg.norm(errors[:, :2], axis=1))
-
-
 def lap_end_times(truth: Truth, settings: LapSettings | None = None) -> Array:
     """(laps,) s: when each complete lap of the true path ends."""
     return truth.pose_t[lap_end_indices(truth.poses, settings)]
-
-
-# --- curves ----------------------------------------------------------------------------------------------
-
-
-def two_way_distance(points_a: Array, points_b: Array) -> float:
-    """Mean of the mean distances a -> b and b -> a (m) of two curves given as dense points (., 2)."""
-    forth = KDTree(points_b).query(points_a)[0]
-    back = KDTree(points_a).query(points_b)[0]
-    return float(0.5 * (np.mean(forth) + np.mean(back)))

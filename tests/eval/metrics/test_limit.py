@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.eval.metrics.curves import driving_order
 from pathspace_graph.eval.metrics.limit import (
     Limit,
-    driving_order,
     fit_rmse,
     landmark_rmse,
     limit,
     solve_oracle_landmarks,
 )
-from pathspace_graph.eval.metrics.table1 import ate, root_mean_square
+from pathspace_graph.eval.metrics.table1 import root_mean_square
+from pathspace_graph.eval.metrics.trajectory import ate
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
