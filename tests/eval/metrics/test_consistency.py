@@ -11,6 +11,7 @@ from pathspace_graph.eval.metrics.consistency import (
     landmark_errors,
     map_nees,
     normal_errors,
+    with_marginals,
 )
 from pathspace_graph.eval.metrics.curves import (
     true_curve,

@@ -1,0 +1,124 @@
+"""What is measured of a run: rows of laps and of the whole, and values of a run known by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pathspace_graph.eval.metrics.measures import METRICS, PAPER, Metric, measure
+from pathspace_graph.io.log import Detections, Log, Odometry, Truth
+from pathspace_graph.io.map import Map
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
+from pathspace_graph.labels import LEFT, RIGHT
+
+from ...scenes.straight_maps import landmarks, line, row, truth
+
+STAMPS = np.arange(0.5, 40.0, 1.0)
+"""The cycles are one second apart."""
+ANGULAR_SPEED = 0.25
+"""A lap of 2 pi / 0.25 s = 25.1 s, at which cycles 0 to 24 are over."""
+
+
+def circle_truth() -> Truth:
+    """One and a half laps of radius 20 m, between straight rows of cones."""
+    angle = ANGULAR_SPEED * np.arange(0.0, 40.0, 0.05)
+    heading = (angle + np.pi) % (2 * np.pi) - np.pi
+    poses = np.stack([20.0 * np.sin(angle), 20.0 * (1.0 - np.cos(angle)), heading], axis=1)
+    rows = truth(row(2.0), row(-2.0))
+    return Truth(angle / ANGULAR_SPEED, poses, rows.cones, rows.cone_labels)
+
+
+def log(true: Truth | None) -> Log:
+    nothing = np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, dtype=int)
+    odometry = Odometry(np.array([0.0, 40.0]), np.zeros((2, 3)))
+    return Log(odometry, tuple(Detections(t, *nothing) for t in STAMPS), np.full(3, 0.1), truth=true)
+
+
+def run(true: Truth) -> RunResult:
+    """The first lap's map 0.4 m off, the last one 0.3 m; poses 1 m to the left in lap 1, then 2 m."""
+    before, after = (Map(closed, {LEFT: line(2.0 + by)}) for closed, by in ((False, 0.4), (True, 0.3)))
+    cycles = tuple(CycleRecord(k, t, 0.001 * (k + 1), 4, 0, 0, 1) for k, t in enumerate(STAMPS))
+    at = [np.searchsorted(true.pose_t, t) for t in STAMPS]
+    poses = true.poses[at].copy()
+    left = np.stack([-np.sin(poses[:, 2]), np.cos(poses[:, 2])], axis=1)
+    poses[:, :2] += left * np.where(2 * np.pi / ANGULAR_SPEED > STAMPS, 1.0, 2.0)[:, None]
+    return RunResult("made", {}, after, STAMPS, poses, cycles, 1, ((1, before),), (before,))
+
+
+def test_every_lap_has_a_row_and_the_whole_run_is_the_last() -> None:
+    true = circle_truth()
+    lap, whole = measure(run(true), log(true), 7.0)
+    assert (lap.lap, whole.lap) == (1, None)
+    assert (lap.values["closed"], whole.values["closed"]) == (False, True)
+    assert [r.values["rmse"] for r in (lap, whole)] == [pytest.approx(0.4), pytest.approx(0.3)]
+    assert [r.values["missed"] for r in (lap, whole)] == [0.5, 0.5]  # the right boundary isn't mapped
+    assert (whole.values["size"], whole.values["cones"], whole.values["size_share"]) == (4, 6, 4 / 6)
+    assert whole.values["rmse_capped"] == pytest.approx(np.sqrt((0.3**2 + 3.0**2) / 2))
+    assert whole.values["mapped_to_truth"] == pytest.approx(0.3, abs=1e-3)
+    assert whole.values["truth_to_mapped"] == np.inf
+    assert (whole.values["inside"], whole.values["ghost_metres"]) == (0.0, 0.0)
+    assert whole.values["seconds"] == 7.0 and "seconds" not in lap.values
+    assert set(whole.values) | set(lap.values) <= set(METRICS)
+
+
+def test_poses_and_updates_are_those_of_the_lap() -> None:
+    true = circle_truth()
+    lap, whole = measure(run(true), log(true))
+    assert lap.values["ate"] == pytest.approx(1.0, abs=0.01) == lap.values["across"]
+    assert lap.values["along"] == pytest.approx(0.0, abs=0.01)
+    assert whole.values["ate"] == pytest.approx(np.sqrt((25 * 1.0 + 15 * 4.0) / 40), abs=0.01)
+    assert lap.values["ms_mean"] == pytest.approx(13.0) and whole.values["ms_mean"] == pytest.approx(20.5)
+    assert whole.values["ms_median"] == pytest.approx(20.5)
+
+
+def test_a_batch_has_a_row_of_its_last_lap_and_no_update_times() -> None:
+    true = circle_truth()
+    made = run(true)
+    batch = BatchRun("made", {}, made.map, STAMPS, made.trajectory, made.cycles, 3, converged=False)
+    lap, whole = measure(batch, log(true))
+    assert (lap.lap, lap.values["rmse"]) == (1, pytest.approx(0.3))
+    assert whole.values["converged"] is False and "ms_mean" not in whole.values
+    (own, _) = measure(batch, log(None))
+    assert own.lap == 3  # without a true path laps are the estimator's own
+
+
+def test_without_truth_only_what_needs_none_is_measured() -> None:
+    true = circle_truth()
+    lap, whole = measure(run(true), log(None))
+    keys = {"size", "closed", "bytes", "bytes_covariance", "ms_mean", "ms_median", "ms_p99"}
+    assert set(lap.values) == set(whole.values) == keys
+    bare = log(Truth(true.pose_t, true.poses, np.zeros((0, 2)), np.zeros(0, dtype=int)))
+    assert set(measure(run(true), bare)[0].values) == keys | {"ate", "along", "across"}
+
+
+def test_marginals_and_yardsticks_are_measured_where_they_are_asked_for() -> None:
+    true = circle_truth()
+    (*_, whole) = measure(run(true), log(true), marginals=True)
+    for key in ("nees", "inside", "normalized_error"):  # the map's covariance has no cross terms
+        assert whole.values[f"{key}_marginals"] == pytest.approx(whole.values[key])
+    # 0.3 m by 0.1 m at both ends, and by 0.1 sqrt(20 / 64) m in the middle
+    assert whole.values["normalized_error"] == pytest.approx((9.0 + 9.0 + 28.8) / 3)
+    assert whole.values["nees_inside"] is False
+    with pytest.raises(ValueError, match="associations"):
+        measure(run(true), log(true), yardsticks=True)
+
+
+def test_landmarks_have_no_band() -> None:
+    true = circle_truth()
+    points = Map(False, {LEFT: landmarks((0, 2.1), (5, 2)), RIGHT: landmarks((0, -2))})
+    (*_, whole) = measure(replace(run(true), map=points), log(true))
+    assert np.isnan(whole.values["inside"]) and np.isnan(whole.values["normalized_error"])
+    assert whole.values["nees"] == pytest.approx(1 / 6)
+    assert whole.values["nees_low"] < 0.25 and whole.values["nees_inside"] is False
+
+
+def test_a_metric_is_shown_in_its_unit() -> None:
+    assert [metric.key for metric in PAPER] == ["rmse", "missed", "size"]
+    assert METRICS["missed"].heading == "missed [%]" and METRICS["size"].heading == "size"
+    assert METRICS["missed"].text(0.125) == "12.5" and METRICS["bytes"].text(1640.0) == "1.64"
+    assert Metric("k", "t").text(float("nan")) == "–"
+    assert {key for key, metric in METRICS.items() if metric.time} == {
+        *("ms_mean", "ms_median", "ms_p99", "seconds")
+    }
