@@ -19,7 +19,7 @@ MOST_FILES = 15
 EXTRAS = {"distributed"}
 """Optional packages, which are imported only where they are needed."""
 
-LEAVES = {"errors", "labels", "progress", "stopwatch"}
+LEAVES = {"errors", "labels", "progress"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "ckf", "landmark"}
 BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "run"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import wrap_angle
+from pathspace_graph.factors.se2 import wrap_angle
 from pathspace_graph.io.log import Truth
 
 from .table1 import root_mean_square

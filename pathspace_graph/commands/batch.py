@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.estimators import DEFAULT_BATCH, check_batch, check_settings, make_batch
+from pathspace_graph.estimators import DEFAULT_BATCH, check_batch, make_batch
 from pathspace_graph.eval.metrics.gap import gap
 from pathspace_graph.eval.metrics.summary import summarize
 from pathspace_graph.io.files import check_target
@@ -48,7 +48,6 @@ class Batch:
         check_batch(self.estimator)
         if self.start == "odometry" and self.estimator != DEFAULT_BATCH:
             raise SettingsError(f"--start: expected online for {self.estimator}, found {self.start}")
-        check_settings(self.settings)
         check_target(self.out, MAP_FILE)
         log = read_log(self.log)
         with progress("optimizing") as advance:

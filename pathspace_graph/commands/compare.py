@@ -9,7 +9,6 @@ from typing import Annotated, Final
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from pathspace_graph.estimators import check_settings
 from pathspace_graph.eval.compare.comparison import Comparison, choose, choose_reference, compare, read_logs
 from pathspace_graph.eval.compare.gap import with_gaps
 from pathspace_graph.eval.compare.output import MARKER, tables, write_comparison
@@ -54,7 +53,6 @@ class Compare:
         estimators = choose(self.estimators)
         reference = choose_reference(self.reference, estimators)
         check_jobs(self.jobs)
-        check_settings(self.settings)
         check_target(self.out, MARKER)
         logs = read_logs(self.log)
         with progress("comparing", len(logs) * len(estimators)) as advance:
