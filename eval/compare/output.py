@@ -19,7 +19,7 @@ from pathspace_graph.io.results import write_result
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .comparison import Comparison, NamedLog, Outcome
-from .paired import paired_frame, paired_table
+from .differences import paired_frame, paired_table
 from .plot import plot_blind_spot, plot_maps
 from .table import final_table, paper_frame, paper_table
 
