@@ -31,7 +31,7 @@ ROUND_OFF: Final = 1e-9
 _OVERLAP: Final = 3
 """Akima's tangents of a closed curve need this many cones beyond the seam."""
 _CACHED: Final = 16
-"""So many true curves are kept, since every map of a log is compared with the same ones several times."""
+"""This many true curves are cached, since every map of a log is compared with the same ones several times."""
 _MIN_CONES: Final = 2
 """A curve needs at least this many cones."""
 

@@ -19,31 +19,31 @@ from pathspace_graph.spline.bspline import BSpline
 Array = NDArray[np.float64]
 
 MISSED_DISTANCE = 3.0
-"""A true cone farther (m) than this from its boundary is missed (paper, Table 1)."""
+"""A true cone farther than this (m) from its mapped boundary is missed (paper, Table 1)."""
 
 GRID_PER_SPAN = 64
-"""Grid points on each span that a closest point is searched from: about every 0.1 m of a track."""
+"""Closest points are searched from this many grid points on each span, about every 0.1 m of a track."""
 
 
 @dataclass(frozen=True, slots=True)
 class LapMetrics:
-    """One row of the paper's Table 1."""
+    """Holds one row of the paper's Table 1."""
 
     lap: int
-    """Counted from 1; the map is taken as it stood at this lap's end."""
+    """Laps count from 1; the map is taken as it stood at the end of this lap."""
 
     rmse: float
-    """m, over the cones not missed; NaN where all are."""
+    """This is the rmse (m) over the cones that aren't missed; it is NaN where all are missed."""
 
     missed: float
-    """Missed share of all true cones, 0 to 1; NaN where there are none."""
+    """This share (0 to 1) of all true cones is missed; it is NaN without true cones."""
 
     size: int
-    """Control points or landmarks on both boundaries together."""
+    """Both boundaries together have this many control points or landmarks."""
 
 
 def lap_metrics(track: Map, truth: Truth, lap: int) -> LapMetrics:
-    """rmse = sqrt(mean d^2) over the true cones with d <= 3 m, and the share of those with d > 3 m."""
+    """Returns rmse = sqrt(mean d^2) over true cones with d <= 3 m, and the share of those with d > 3 m."""
     distances = cone_distances(track, truth)
     return LapMetrics(
         lap=lap,
@@ -54,24 +54,25 @@ def lap_metrics(track: Map, truth: Truth, lap: int) -> LapMetrics:
 
 
 def missed_share(distances: Array, threshold: float = MISSED_DISTANCE) -> float:
-    """The share of the true cones (K,) with d > threshold (m); NaN where there are none."""
+    """Returns the share of the distances (K,) with d > threshold (m); NaN without any."""
     return float(np.mean(distances > threshold)) if len(distances) else float("nan")
 
 
 def capped_rmse(distances: Array, cap: float = MISSED_DISTANCE) -> float:
-    """sqrt(mean min(d, cap)^2), m: every missed cone counts as `cap`, so that missing one never pays."""
+    """Returns sqrt(mean min(d, cap)^2) in m: a missed cone counts as `cap`, so that missing it never pays."""
     return root_mean_square(np.minimum(distances, cap))
 
 
 def laps_metrics(lap_maps: Sequence[tuple[int, Map]], truth: Truth) -> list[LapMetrics]:
-    """The whole table: `lap_metrics` of the map as it stood at the end of each lap."""
+    """Returns the rows of (lap, map as it stood at its end)."""
     return [lap_metrics(track, truth, lap) for lap, track in lap_maps]
 
 
 def cone_distances(track: Map, truth: Truth) -> Array:
-    """(K,) m: from each true cone of a boundary to the nearest mapped point of its own, in the truth's order.
+    """Returns the distance (K,) in m of each true cone from its own mapped boundary, in the truth's order.
 
-    Infinite where that boundary isn't mapped. Cones labelled `unknown` belong to none and aren't counted.
+    It is infinite where that boundary isn't mapped. Cones labelled `unknown` belong to no boundary and are
+    left out.
     """
     distances = np.full(len(truth.cones), np.inf)
     for label in BOUNDARIES:
@@ -82,7 +83,7 @@ def cone_distances(track: Map, truth: Truth) -> Array:
 
 
 def boundary_distances(boundary: MapBoundary, points_map: Array) -> Array:
-    """(k,) m: from each point (k, 2) to the closest point of the spline, or to the nearest landmark."""
+    """Returns the distance (k,) in m of each point (k, 2) from the spline, or from the nearest landmark."""
     if isinstance(boundary, SplineBoundary):
         feet = closest_points(boundary.spline, points_map)
         return np.asarray(np.linalg.norm(points_map - feet.position, axis=1))
@@ -92,9 +93,10 @@ def boundary_distances(boundary: MapBoundary, points_map: Array) -> Array:
 
 
 def closest_points(spline: BSpline, points_map: Array) -> FootPoints:
-    """The closest point of the whole curve to each point (k, 2), searched so finely that it counts as exact.
+    """Returns the closest point of the whole curve to each point (k, 2).
 
-    Only where two stretches are equally near, to about the grid's sagitta, may the other one be taken.
+    The search is so fine that the result is exact, except where two stretches are equally near to about the
+    sagitta of the grid: then either may be found.
     """
     low, high = spline.domain
     step = (high - low) / (GRID_PER_SPAN * (len(spline.breaks) - 1))
@@ -103,10 +105,10 @@ def closest_points(spline: BSpline, points_map: Array) -> FootPoints:
 
 
 def root_mean_square(values: Array) -> float:
-    """sqrt(mean v^2); NaN of nothing."""
+    """Returns sqrt(mean v^2); NaN without values."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
 def lap_end_times(truth: Truth, settings: LapSettings | None = None) -> Array:
-    """(laps,) s: when each complete lap of the true path ends."""
+    """Returns the stamp (laps,) in s at which each complete lap of the true path ends."""
     return truth.pose_t[lap_end_indices(truth.poses, settings)]
