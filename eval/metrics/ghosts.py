@@ -22,8 +22,8 @@ class GhostSettings(Positive):
     """Holds what counts as a ghost."""
 
     distance: float = 2.0
-    """A mapped point farther than this (m) from the true boundary of its own colour is a ghost. The default is
-    more than the drift of a map whose loop is closed, and less than the width of the narrowest lane (3 m)."""
+    """A mapped point farther than this (m) from the true boundary of its own colour is a ghost. The default
+    exceeds the drift of a map whose loop is closed, but not the width of the narrowest lane (3 m)."""
 
 
 @dataclass(frozen=True, slots=True)
