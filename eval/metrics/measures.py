@@ -15,7 +15,7 @@ from pathspace_graph.labels import BOUNDARIES
 
 from .consistency import map_nees, normal_errors, with_marginals
 from .cost import covariance_bytes, map_bytes, stage_times
-from .curve_distance import curve_distance
+from .curves import curve_distance
 from .ghosts import GhostSettings, ghosts
 from .limit import limit
 from .summary import has_cones, lap_times
@@ -25,8 +25,8 @@ from .table1 import (
     lap_metrics,
     missed_share,
     root_mean_square,
-    trajectory_errors,
 )
+from .trajectory import position_rms, trajectory_errors
 
 FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3}
 """Columns hold shares and bytes, which these factors turn into the units of the tables."""
@@ -251,7 +251,7 @@ def _drive_values(run: RunResult, truth: Truth | None, begin: float, end: float)
     if truth is not None and len(truth.poses):
         inside = (run.trajectory_t > begin) & (run.trajectory_t <= end)
         errors = trajectory_errors(run.trajectory_t[inside], run.trajectory[inside], truth)
-        values["ate"] = root_mean_square(np.linalg.norm(errors[:, :2], axis=1))
+        values["ate"] = position_rms(errors)
         values["along"], values["across"] = (root_mean_square(column) for column in errors[:, :2].T)
     cycles = online_cycles(run, begin, end)
     if cycles:
