@@ -1,4 +1,4 @@
-"""The few exceptions this library raises; the command line turns each into one line and exit code 2."""
+"""The few exceptions of this library; the command line turns each into one line and exit code 2."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from pathlib import Path
 
 
 class PathspaceError(Exception):
-    """Base of all errors that a user can mend; its text is one line that says expected and found."""
+    """This is the base of all errors that a user can mend; its text is one line with what was expected and
+    found."""
 
 
 class InputError(PathspaceError):
-    """A user's file is missing or wrong: names the file, the row (1 is the first line), what was expected."""
+    """A user's file is missing or wrong; the text names the file, the row (1 is the first line) and what was
+    expected."""
 
     def __init__(self, file: Path | str, message: str, row: int | None = None) -> None:
         self.file = Path(file)
@@ -20,7 +22,7 @@ class InputError(PathspaceError):
 
 
 class OutputError(PathspaceError):
-    """An output path can't be written without losing something that is there already."""
+    """An output path cannot be written without losing something that is there already."""
 
 
 class SettingsError(PathspaceError):
@@ -28,4 +30,4 @@ class SettingsError(PathspaceError):
 
 
 class SingularSystemError(PathspaceError):
-    """The normal equations are not positive definite: nothing holds some variable."""
+    """The normal equations are not positive definite, since nothing determines some variable."""

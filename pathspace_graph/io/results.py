@@ -9,49 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .files import atomic_folder
 from .json_file import write_json
 from .map import MAP_FILE, Map, map_to_json
-
-_CYCLE_COLUMNS = ("cycle", "t", "seconds", "size_left", "size_right", "readings", "lap")
-
-
-def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, Any]) -> None:
-    """Writes map.json, trajectory.tum, cycles.csv and summary.json: all of them, or on failure nothing.
-
-    An earlier result in `folder` is kept as a numbered backup; OutputError where anything else stands there.
-    """
-    with atomic_folder(Path(folder), marker=MAP_FILE) as temporary:
-        write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
-        write_trajectory(temporary / "trajectory.tum", result.trajectory_t, result.trajectory)
-        _write_cycles(temporary / "cycles.csv", result.cycles)
-        write_json(temporary / "summary.json", summary)
-
-
-def write_trajectory(file: Path, t: ArrayLike, poses: ArrayLike) -> None:
-    """TUM trajectory format, `t tx ty tz qx qy qz qw`; t: (n,) s, poses: (n, 3) [x, y, theta] map frame."""
-    rows = np.column_stack([np.asarray(t, dtype=float), np.asarray(poses, dtype=float).reshape(-1, 3)])
-    with file.open("w", encoding="utf-8", newline="\n") as out:
-        for stamp, x, y, theta in rows.tolist():
-            qz, qw = float(np.sin(theta / 2)), float(np.cos(theta / 2))
-            out.write(f"{stamp!r} {x!r} {y!r} 0.0 0.0 0.0 {qz!r} {qw!r}\n")
-
-
-def _write_cycles(file: Path, cycles: Iterable[CycleRecord]) -> None:
-    with file.open("w", encoding="utf-8", newline="") as out:
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(_CYCLE_COLUMNS)
-        writer.writerows(_cycle_row(record) for record in cycles)
-
-
-def _cycle_row(record: CycleRecord) -> list[float | int]:
-    values = (getattr(record, column) for column in _CYCLE_COLUMNS)
-    return [value.item() if isinstance(value, np.generic) else value for value in values]
-
+from .trajectory import TRAJECTORY_FILE, write_trajectory
 
 Array = NDArray[np.float64]
+
+_CYCLE_COLUMNS = ("cycle", "t", "seconds", "size_left", "size_right", "readings", "lap")
 
 
 @dataclass(frozen=True)
@@ -106,3 +73,27 @@ class BatchRun(RunResult):
 
     converged: bool = True
     """Whether it ended at an optimum."""
+
+
+def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, Any]) -> None:
+    """Writes map.json, trajectory.tum, cycles.csv and summary.json: all of them, or on failure nothing.
+
+    An earlier result in `folder` is kept as a numbered backup; OutputError where anything else stands there.
+    """
+    with atomic_folder(Path(folder), marker=MAP_FILE) as temporary:
+        write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
+        write_trajectory(temporary / TRAJECTORY_FILE, result.trajectory_t, result.trajectory)
+        _write_cycles(temporary / "cycles.csv", result.cycles)
+        write_json(temporary / "summary.json", summary)
+
+
+def _write_cycles(file: Path, cycles: Iterable[CycleRecord]) -> None:
+    with file.open("w", encoding="utf-8", newline="") as out:
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(_CYCLE_COLUMNS)
+        writer.writerows(_cycle_row(record) for record in cycles)
+
+
+def _cycle_row(record: CycleRecord) -> list[float | int]:
+    values = (getattr(record, column) for column in _CYCLE_COLUMNS)
+    return [value.item() if isinstance(value, np.generic) else value for value in values]
