@@ -19,8 +19,10 @@ INTERRUPTED: Final = 130
 
 @dataclass(frozen=True)
 class Command:
-    """Holds a command, which is imported only when it is called: `--help` need not wait for GTSAM and
-    matplotlib."""
+    """Names a command, which is imported only when it is called.
+
+    `--help` need not wait for GTSAM and matplotlib.
+    """
 
     module: str
     """This module of `commands` holds the command."""
@@ -38,14 +40,13 @@ COMMANDS: Final = {
     "compare": Command("compare", "Compare", "every estimator on one log or many: the paper's table"),
     "ablate": Command("ablate", "Ablate", "run a study: estimators and settings over many drives"),
     "figures": Command("figures", "Figures", "the paper's isolated tests as figures"),
-    "scale": Command("scale", "Scale", "time per update against map size, readings and laps"),
+    "scale": Command("scale", "Scale", "time per update against map size, detections and laps"),
     "plot": Command("plot", "Plot", "draw a map with its uncertainty band"),
 }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a command; returns 0 on success, and 2 with one line on standard error on bad usage or bad
-    input."""
+    """Runs a command; returns 0 on success, and 2 with one line on standard error on bad usage or input."""
     try:
         return _run(list(sys.argv[1:] if arguments is None else arguments))
     except PathspaceError as error:

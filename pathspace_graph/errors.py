@@ -6,13 +6,17 @@ from pathlib import Path
 
 
 class PathspaceError(Exception):
-    """This is the base of all errors that a user can mend; its text is one line with what was expected and
-    found."""
+    """This is the base of all errors that a user can mend.
+
+    Its text is one line that says what was expected and what was found.
+    """
 
 
 class InputError(PathspaceError):
-    """A user's file is missing or wrong; the text names the file, the row (1 is the first line) and what was
-    expected."""
+    """A user's file is missing or wrong.
+
+    The text names the file, the row (1 is the first line) and what was expected.
+    """
 
     def __init__(self, file: Path | str, message: str, row: int | None = None) -> None:
         self.file = Path(file)

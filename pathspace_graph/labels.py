@@ -18,6 +18,6 @@ _CODES: Final = {"left": LEFT, "blue": LEFT, "right": RIGHT, "yellow": RIGHT}
 
 
 def label_from_name(name: str) -> int:
-    """Returns LEFT for `left` or `blue`, RIGHT for `right` or `yellow`, and UNKNOWN for any other word
-    (FORMATS: a log)."""
+    """Returns LEFT for `left` or `blue`, RIGHT for `right` or `yellow`, UNKNOWN for any other word
+    (FORMATS)."""
     return _CODES.get(name.strip().lower(), UNKNOWN)

@@ -12,8 +12,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class LapSettings:
-    """Describes what counts as passing the start line, which is the y axis of the map frame at the first
-    pose."""
+    """Describes what counts as passing the start line, the y axis of the map frame at the first pose."""
 
     min_path: float = 40.0
     """A lap is at least this long (m along the path); jitter or an overlap may cross the line sooner."""

@@ -45,8 +45,7 @@ class Ablate:
     """This number of laps replaces the study's own."""
 
     def run(self) -> None:
-        """Checks everything, runs and writes the study, and reports; the exit code is 3 where cells
-        failed."""
+        """Checks, runs, writes and reports the study; the exit code is 3 where cells failed."""
         check_jobs(self.jobs)
         study = self._study()
         plan = make_plan(study)

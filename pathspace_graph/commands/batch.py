@@ -43,8 +43,7 @@ class Batch:
     """These settings describe the estimator."""
 
     def run(self) -> None:
-        """Reads, optimizes, writes and reports; the exit code is 3 where the optimization did not
-        converge."""
+        """Reads, optimizes, writes and reports; the exit code is 3 if it did not converge."""
         check_batch(self.estimator)
         if self.start != "online" and self.estimator != DEFAULT_BATCH:
             raise SettingsError(f"--start: expected online for {self.estimator}, found {self.start}")
@@ -69,8 +68,7 @@ class Batch:
 
 
 def summarize_batch(result: BatchRun, log: Log, start: Start) -> dict[str, Any]:
-    """Returns the summary of a run, how its optimization ended, and its gap from the online run that it began
-    at."""
+    """Returns the summary of a run, how its optimization ended, and its gap from its online start."""
     summary = summarize(result, log) | {"start": start, "converged": result.converged}
     if not isinstance(result, BatchResult):
         return summary

@@ -63,8 +63,7 @@ class Demo:
 
 
 def map_with_both(log: Log) -> tuple[RunResult, RunResult]:
-    """Returns the results of our estimator, run with progress, and of the landmark graph, run in another
-    process."""
+    """Returns the spline graph's result and the landmark graph's, which runs in another process."""
     settings = MapperSettings()
     with parallel_config(backend="loky", inner_max_num_threads=1):
         # with one job it would be run here, and first

@@ -60,8 +60,8 @@ def map_online(log: Log, settings: MapperSettings, estimator: str = DEFAULT) -> 
 
 
 def report(result: RunResult, log: Log) -> None:
-    """Prints the paper's table where there is truth and the run in one line, and on standard error what was
-    not mapped."""
+    """Prints the run in a line, the paper's table where there is truth, and what was not mapped as an
+    error."""
     console = Console()
     laps = laps_of(result, log)
     if laps:

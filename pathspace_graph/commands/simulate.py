@@ -62,6 +62,6 @@ def generated_track(seed: int, settings: TrackGeneratorSettings | None = None) -
 
 def describe(log: Log) -> str:
     """Returns the length of the log in words."""
-    readings = sum(len(cycle.labels) for cycle in log.cycles)
+    detections = sum(len(cycle.labels) for cycle in log.cycles)
     seconds = log.odometry.t[-1] - log.odometry.t[0]
-    return f"{seconds:.1f} s, {len(log.cycles)} perception cycles, {readings} readings"
+    return f"{seconds:.1f} s, {len(log.cycles)} perception cycles, {detections} detections"

@@ -23,62 +23,64 @@ _CYCLE_COLUMNS = ("cycle", "t", "seconds", "size_left", "size_right", "readings"
 
 @dataclass(frozen=True)
 class CycleRecord:
-    """One row of `cycles.csv` (FORMATS)."""
+    """Holds one row of `cycles.csv` (FORMATS)."""
 
     cycle: int
-    """Number of the perception cycle, from 0."""
+    """This is the number of the perception cycle, from 0."""
     t: float
-    """Stamp, s."""
+    """This is the stamp of the cycle (s)."""
     seconds: float
-    """Wall time of the whole update, s."""
+    """The whole update took this wall time (s)."""
     size_left: int
-    """Control points or landmarks of the left boundary."""
+    """The left boundary has this number of control points or landmarks."""
     size_right: int
-    """The same of the right boundary."""
+    """The right boundary has this number of control points or landmarks."""
     readings: int
-    """How many of the cycle's readings were used."""
+    """This is the number of the cycle's detections that were used."""
     lap: int
-    """The lap being driven, from 1, by the estimated trajectory."""
+    """The estimated trajectory is in this lap, counted from 1."""
     stages: Mapping[str, float] = field(default_factory=dict)
-    """Time (s) that each stage of the update took, by its name."""
+    """Each stage of the update took this time (s), by the stage's name."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """What a run of an estimator over a log gives."""
+    """Holds what a run of an estimator over a log gives."""
 
     estimator: str
-    """Name of the estimator (FORMATS)."""
+    """This is the name of the estimator (FORMATS)."""
     settings: dict[str, Any]
-    """Its settings in full, as plain values."""
+    """These are all settings of the estimator, as plain values."""
     map: Map
-    """The map at the end of the log."""
+    """This is the map at the end of the log."""
     trajectory_t: Array
-    """Stamps of the perception cycles (n,), s."""
+    """These are the stamps of the perception cycles (n,) in s."""
     trajectory: Array
-    """Poses [x, y, theta] (n, 3), map frame; of an online estimator as they stood at that cycle."""
+    """Each row is a pose [x, y, theta] (n, 3), map frame; an online estimator gives it as it stood at that
+    cycle."""
     cycles: tuple[CycleRecord, ...]
-    """A record of each perception cycle."""
+    """Each perception cycle has a record."""
     laps: int
-    """Complete laps by the estimated trajectory, one that ends just short of the line included."""
+    """The estimated trajectory has this number of complete laps, with a last one that ends just before the
+    line."""
     lap_maps: tuple[tuple[int, Map], ...] = ()
-    """(lap, map as it stood at its end) of each complete lap by the estimated trajectory."""
+    """Each complete lap of the estimated trajectory has its number and the map as it stood at its end."""
     snapshots: tuple[Map, ...] = ()
-    """The map as it stood at each of the times that were asked for."""
+    """The map is kept as it stood at each of the times that were asked for."""
 
 
 @dataclass(frozen=True, eq=False)
 class BatchRun(RunResult):
-    """What a batch estimator gives; its maps of the laps are all the same one, that of the whole log."""
+    """Holds what a batch estimator gives; its maps of the laps are all the one of the whole log."""
 
     converged: bool = True
-    """Whether it ended at an optimum."""
+    """The optimization ended at an optimum where this is true."""
 
 
 def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, Any]) -> None:
     """Writes map.json, trajectory.tum, cycles.csv and summary.json: all of them, or on failure nothing.
 
-    An earlier result in `folder` is kept as a numbered backup; OutputError where anything else stands there.
+    An earlier result in `folder` is kept as a numbered backup; anything else there is an OutputError.
     """
     with atomic_folder(Path(folder), marker=MAP_FILE) as temporary:
         write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
