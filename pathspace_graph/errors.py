@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 
 class PathspaceError(Exception):
@@ -35,3 +38,13 @@ class SettingsError(PathspaceError):
 
 class SingularSystemError(PathspaceError):
     """The normal equations are not positive definite, since nothing determines some variable."""
+
+
+def check_name(name: Any, known: Iterable[str], expected: str) -> None:
+    """Raises a SettingsError that names the nearest known name, unless `name` is known."""
+    known = list(known)
+    if name in known:
+        return
+    near = get_close_matches(str(name), known, n=1, cutoff=0.0)
+    hint = f", the nearest is '{near[0]}'" if near else ""
+    raise SettingsError(f"{expected}, found '{name}'{hint}")

@@ -91,6 +91,15 @@ def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
         since = detections.t
 
 
+def timed_update(
+    estimator: OnlineEstimator, odometry: Odometry, detections: Detections
+) -> tuple[CycleResult, float]:
+    """Does one update, and returns the estimate and the wall time (s) that the update took."""
+    begin = time.perf_counter()
+    estimate = estimator.update(odometry, detections)
+    return estimate, time.perf_counter() - begin
+
+
 def run_online(
     log: Log,
     estimator: OnlineEstimator,
@@ -129,9 +138,7 @@ class _Run:
     def cycle(self, odometry: Odometry, detections: Detections) -> CycleRecord:
         """Runs and times one update, and records it."""
         self._take_snapshots(before=detections.t)
-        begin = time.perf_counter()
-        result = self._estimator.update(odometry, detections)
-        seconds = time.perf_counter() - begin
+        result, seconds = timed_update(self._estimator, odometry, detections)
         lap_before = self._laps.lap
         lap = self._laps.update(result.pose)
         if lap > lap_before:

@@ -39,12 +39,16 @@ ARROWS: dict[str, set[str]] = {
     "eval.metrics": BELOW_EVAL,
     "eval.tables": BELOW_EVAL | {"eval.metrics"},
     "eval.figures": BELOW_EVAL | {"eval.metrics"},
-    "eval.study": BELOW_EVAL | {"eval.metrics", "eval.tables", "eval.figures"},
-    "eval.compare": BELOW_EVAL | {"eval.metrics", "eval.tables", "eval.figures", "eval.study"},
-    "eval.scaling": BELOW_EVAL | {"eval.metrics", "eval.tables", "eval.figures", "eval.study"},
-    "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.tables", "eval.figures", "eval.study"},
+    "eval.harness": BELOW_EVAL | {"eval.metrics"},
+    "eval.study": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures"},
+    "eval.compare": BELOW_EVAL
+    | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures", "eval.study"},
+    "eval.scaling": BELOW_EVAL
+    | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures", "eval.study"},
+    "eval.benchmark": BELOW_EVAL
+    | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures", "eval.study"},
     "commands": BELOW_EVAL
-    | {f"eval.{room}" for room in ("metrics", "tables", "figures", "study", "compare", "scaling")},
+    | {f"eval.{room}" for room in ("metrics", "harness", "tables", "figures", "study", "compare", "scaling")},
     "cli": {"commands"},
     "__main__": {"cli"},
 }

@@ -8,10 +8,10 @@ from typing import Any, Final
 
 from matplotlib.figure import Figure
 
-from pathspace_graph.eval.figures.map_plot import save_plot
+from pathspace_graph.eval.figures.files import save_figures
 from pathspace_graph.eval.metrics.blind_spot import find_blind_spot
 from pathspace_graph.eval.metrics.summary import summarize, versions
-from pathspace_graph.eval.tables.text_table import TextTable
+from pathspace_graph.eval.metrics.text_table import TextTable
 from pathspace_graph.io.files import atomic_folder
 from pathspace_graph.io.json_file import write_json
 from pathspace_graph.io.map import PointBoundary
@@ -26,8 +26,6 @@ from .table import final_table, paper_frame, paper_table
 FORMAT: Final = "pathspace-comparison/1"
 MARKER: Final = "comparison.json"
 """The file that a comparison's folder is known by."""
-_SUFFIXES: Final = (".png", ".pdf")
-"""Each figure is written as."""
 
 
 def tables(comparison: Comparison) -> dict[str, TextTable]:
@@ -72,10 +70,10 @@ def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
         if outcome.result is not None:
             write_result(folder / outcome.estimator, outcome.result, summarize(outcome.result, named.log))
     if any(outcome.result is not None for outcome in outcomes):
-        _save(plot_maps(outcomes, named.log), folder / "maps")
+        save_figures(folder, {"maps": plot_maps(outcomes, named.log)})
     figure = blind_spot_figure(outcomes, named, comparison.reference)
     if figure is not None:
-        _save(figure, folder / "blind_spot")
+        save_figures(folder, {"blind_spot": figure})
 
 
 def blind_spot_figure(outcomes: list[Outcome], named: NamedLog, reference: str) -> Figure | None:
@@ -94,11 +92,6 @@ def blind_spot_figure(outcomes: list[Outcome], named: NamedLog, reference: str) 
         if spot is not None:
             return plot_blind_spot(spot, [(reference, maps[reference]), (name, maps[name])], truth)
     return None
-
-
-def _save(figure: Figure, file: Path) -> None:
-    for suffix in _SUFFIXES:
-        save_plot(figure, file.with_suffix(suffix))
 
 
 def _content(comparison: Comparison, settings: MapperSettings, jobs: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a measurement of scaling leaves: a table to print, points, slopes and figures on disk."""
+"""The results of a scaling measurement: a table to print, and points, slopes and figures on disk."""
 
 from __future__ import annotations
 
@@ -9,36 +9,33 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
-from pathspace_graph.eval.figures.map_plot import save_plot
+from pathspace_graph.eval.figures.files import save_figures
 from pathspace_graph.eval.metrics.summary import versions
-from pathspace_graph.eval.tables.text_table import TextTable
+from pathspace_graph.eval.metrics.text_table import TextTable
 from pathspace_graph.io.files import atomic_folder
 from pathspace_graph.io.json_file import write_json
 
 from .plot import plot_laps, plot_scaling
-from .points import CONES, LAPS, READINGS, Slope
-from .scaling import Scaling
+from .points import CONES, LAPS, READINGS, Scaling, Slope
 
 FORMAT: Final = "pathspace-scaling/1"
 MARKER: Final = "scaling.json"
-"""The file that the folder of a measurement is known by."""
-SUFFIXES: Final = (".png", ".pdf")
-"""Each figure is written as."""
+"""A folder of results is known by this file."""
 COMPARED_AT: Final = 200.0
-"""Cones at which estimators are held against each other, an ordinary track's."""
+"""Estimators are compared at this number of cones, that of an ordinary track."""
 
 
 def scaling_table(scaling: Scaling) -> TextTable:
-    """A row per estimator: its slopes, times, ratio to the first, what the laps cost, memory."""
-    road = scaling.settings
+    """Returns a row for each estimator: slopes, times, the ratio to the first, laps and memory."""
+    settings = scaling.settings
     header = (
         "estimator",
-        f"slope, cones ({road.fit_from:g} to {road.cones_max:g})",
+        f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})",
         "slope, readings",
         f"ms at {COMPARED_AT:g} cones",
         f"{scaling.estimators[0]} / this",
         "most cones",
-        f"ms, lap 2 and {road.laps}",
+        f"ms, lap 2 and {settings.laps}",
         "peak MB",
     )
     rows = tuple(_row(scaling, name) for name in scaling.estimators)
@@ -73,7 +70,7 @@ def _number(value: float, form: str) -> str:
 
 
 def stops(scaling: Scaling) -> list[str]:
-    """A line for each estimator and sweep that did not come to the end."""
+    """Returns a line for each estimator and sweep that did not reach the end."""
     return [
         f"{s.estimator}, {s.sweep}: stopped, {s.stopped}" + (f" (slope to {s.high:.0f})" if s.points else "")
         for s in scaling.slopes
@@ -82,14 +79,12 @@ def stops(scaling: Scaling) -> list[str]:
 
 
 def write_scaling(out: Path, scaling: Scaling) -> None:
-    """`points.csv`, `scaling.json` (slopes, settings, versions), `table.md`, two figures; all or nothing."""
+    """Writes `points.csv`, `scaling.json` (with slopes and settings), `table.md` and two figures."""
     with atomic_folder(out, MARKER) as folder:
         scaling.frame().to_csv(folder / "points.csv", index=False, lineterminator="\n")
         (folder / "table.md").write_text(scaling_table(scaling).markdown(), encoding="utf-8")
         write_json(folder / MARKER, _content(scaling))
-        for name, figure in {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)}.items():
-            for suffix in SUFFIXES:
-                save_plot(figure, folder / f"{name}{suffix}")
+        save_figures(folder, {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)})
 
 
 def _content(scaling: Scaling) -> dict[str, Any]:
@@ -109,6 +104,6 @@ def _content(scaling: Scaling) -> dict[str, Any]:
 
 
 def _process_megabytes() -> float:
-    """The most that the process, with everything loaded and all estimators at once, ever had in memory."""
+    """Returns the most memory (MB) that the process had, with all estimators loaded at once."""
     unit = 1e-6 if platform.system() == "Darwin" else 1.024e-3
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -11,16 +11,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from pathspace_graph.errors import OutputError
+from pathspace_graph.eval.harness.drives import Drive, NamedTrack, load_tracks, try_drive
+from pathspace_graph.eval.harness.workers import check_jobs, outcomes, workers
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.json_file import to_plain, write_json
 from pathspace_graph.io.log import Log
 
-from .cells import Cell, Drive, NamedTrack, Record, failed, load_tracks, run_cell, try_drive
+from .cells import Cell, Record, failed, run_cell
 from .frame import frame_of
 from .overrides import flatten
 from .store import Store
 from .study import Study
-from .workers import check_jobs, outcomes, workers
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,11 +7,12 @@ import pickle
 from dataclasses import dataclass
 from pathlib import Path
 
+from pathspace_graph.eval.harness.drives import Drive
 from pathspace_graph.io.files import replacing
 from pathspace_graph.io.json_file import write_json
 from pathspace_graph.io.log import Log
 
-from .cells import FORMAT, Cell, Drive, Record
+from .cells import FORMAT, Cell, Record
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Closing and simplification in the paper's filter: an early segment is met, then curves are periodic."""
+"""Closes the loop of the paper's filter, and simplifies its curves (paper: Results, Simplification)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from pathspace_graph.graph.keys import POSE, pose_keys
+from pathspace_graph.graph.keys import POINT, POSE, pose_keys
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.registration import Motion, register
@@ -23,13 +23,13 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
-def associate_early(
+def associate_early_segment(
     state: CurveState, cycles: list[tuple[Array, Detections]], beginning: Array
 ) -> Motion | None:
-    """The motion that lays the newest readings on the beginning of the curves; None where they disagree.
+    """Returns the motion that moves the newest detections onto the beginning of the curves, or None.
 
-    cycles: pose (3,) and readings of the last few seconds, oldest first; beginning: poses (k, 3) of the
-    drive's first stretch.
+    cycles holds the poses (3,) and detections of the last few seconds, oldest first. beginning holds the
+    poses (k, 3) of the first stretch of the drive. The result is None if the registration fails.
     """
     ckf = state.settings.ckf
     closing = replace(
@@ -45,7 +45,7 @@ def associate_early(
 
 
 def _recent(state: CurveState, cycles: list[tuple[Array, Detections]]) -> CurveMap:
-    """The curves, the newest poses and their readings, as the registration takes them."""
+    """Returns the curves, the newest poses and their detections as the registration takes them."""
     track = CurveMap(state.settings)
     for label in state.curves:
         track.state.add_boundary(label, state.boundary(label), state.control_points(label))
@@ -56,12 +56,13 @@ def _recent(state: CurveState, cycles: list[tuple[Array, Detections]]) -> CurveM
 
 
 def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
-    """One Kalman update: the end of each curve, where the motion lays it on its beginning, is the beginning.
+    """Makes one Kalman update: the end of each curve lies on its beginning, at the correspondences.
 
-    `n . (S(u) - S(w)) = 0`, with u along the end, w its association on the early segment, and n the normal
-    there. Along the curve the same, but that is one fact however many points say it, the registration's; so
-    each of k points says it with sqrt(k) times that sigma. False, and nothing done, where the end of a curve
-    hasn't reached its beginning yet.
+    `n . (S(u) - S(w)) = 0` with sigma `ckf.sigma_tie`, where u is a parameter near the end, w that of the
+    point of the early segment on which the motion moves S(u), and n the normal there. Along the tangent the
+    residual is the same, but all k correspondences there are one result of the registration. So each of them
+    has sqrt(k) times its sigma. Returns False, and does nothing, if the end of a curve has not reached its
+    beginning yet.
     """
     overlaps = {label: _overlap(state, label, motion) for label in state.curves}
     if not all(len(u) for u, _ in overlaps.values()):
@@ -72,8 +73,8 @@ def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
         basis = spline.basis_matrix(u) - spline.basis_matrix(w)
         tangents = spline.tangent_unit(w)
         normals = np.column_stack([-tangents[:, 1], tangents[:, 0]])
-        own = [(basis[:, :, None] * axes[:, None, :]).reshape(len(u), -1) for axes in (normals, tangents)]
-        rows.append(np.concatenate(own))
+        by_axis = [(basis[:, :, None] * axis[:, None, :]).reshape(len(u), -1) for axis in (normals, tangents)]
+        rows.append(np.concatenate(by_axis))
         columns.append(state.columns(label, np.arange(spline.size)))
     matrix = block_diag(*rows)
     across, along = state.settings.ckf.sigma_tie, state.settings.closing.sigma_max
@@ -86,42 +87,44 @@ def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
 
 
 def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Array]:
-    """Parameters (k,) on the end of a curve that the motion lays on its beginning, and theirs (k,) there."""
+    """Returns parameters (k,) near the end of a curve, and those (k,) of the points they are moved on."""
     closing, spline = state.settings.closing, state.spline(label)
     high = spline.domain[1]
     low = max(high - closing.beginning - closing.join_margin, closing.join_share * high)
     u = np.arange(low, high, closing.overlap_step)
     moved = motion.apply(spline.evaluate(u))
     zero = np.zeros(len(u))
-    foot = state.find(label, moved, zero, zero + min(closing.beginning, closing.beginning_share * high))
+    beginning = min(closing.beginning, closing.beginning_share * high)
+    foot = state.foot_points(label, moved, zero, zero + beginning)
     on = foot.interior & (np.abs(foot.distance) < state.settings.ckf.tie_reach)
     return u[on], foot.u[on]
 
 
 def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
-    """Both curves become periodic, on curvature-weighted knots (paper: Simplification).
+    """Makes both curves periodic, on curvature-weighted knots (paper: Simplification).
 
-    Sampling the curve and fitting it by least squares is linear in its control points once the knots are
-    determined, so that the cubature transform's mean and covariance are those of the matrix itself.
+    observed holds the confirmed cones by label. With given knots, sampling the curve and fitting it by least
+    squares is linear in the control points. So the matrix gives the mean and covariance of the cubature
+    transform.
     """
     for label in state.curves:
         boundary = state.boundary(label)
-        points, zero = np.array(observed[label]).reshape(-1, 2), np.zeros(len(observed[label]))
+        points, zero = np.array(observed[label]).reshape(-1, POINT), np.zeros(len(observed[label]))
         foot = boundary.find(state.control_points(label), points, zero, zero + boundary.confirmed_end)
         boundary.cone_parameters = np.sort(foot.u).tolist()
-        periodic_curve = make_periodic(
+        periodic = make_periodic(
             boundary, state.control_points(label), state.settings, state.settings.ckf.knots
         )
-        curve, matrix = periodic_refit(state.spline(label), periodic_curve, state.settings)
+        curve, matrix = periodic_refit(state.spline(label), periodic, state.settings)
         state.replace(label, curve, matrix, state.settings.spline.sigma_simplify)
-        state.pose_u[label] = float(periodic_curve.overlap.new_parameter(np.array([state.pose_u[label]]))[0])
+        state.pose_u[label] = float(periodic.overlap.new_parameter(np.array([state.pose_u[label]]))[0])
 
 
 def periodic_refit(
-    spline: BSpline, periodic_curve: PeriodicCurve, settings: MapperSettings
+    spline: BSpline, periodic: PeriodicCurve, settings: MapperSettings
 ) -> tuple[BSpline, Array]:
-    """The closed curve's knots, and the matrix (m, n) from the open curve's control points to its own."""
+    """Returns the closed curve, and the matrix (m, n) from the open curve's control points to its own."""
     degree = settings.spline.degree
-    points = np.concatenate([periodic_curve.points, periodic_curve.points[:degree]])
-    curve = BSpline(periodic_curve.knots, points, degree, periodic=True)
-    return curve, refit(spline, curve, periodic_curve.overlap.new_parameter).new_from_old
+    points = np.concatenate([periodic.points, periodic.points[:degree]])
+    curve = BSpline(periodic.knots, points, degree, periodic=True)
+    return curve, refit(spline, curve, periodic.overlap.new_parameter).new_from_old

@@ -1,32 +1,35 @@
-"""S_z: the readings of one cycle as one reading of a spline's control points (paper: Update).
+"""Fits S_z: the detections of one cycle become one measurement of a spline's control points (paper: Update).
 
-Where the paper leaves something open or contradicts itself, this is what was chosen for the whole filter; the
-other choice is a setting.
+The paper leaves some points open, and contradicts itself in one. This list holds the choices of the whole
+filter. For most of them, a setting selects the other choice.
 
-- Its cost squares L, its solution doesn't. The solution is taken (`ckf.penalty`).
-- The prediction of S_z isn't given. Held against the control points as they are, what the fit keeps of the
-  prior would count as evidence for the prior, and a control point out of the readings' reach, whose spread is
-  zero, would be known exactly. So the prediction goes through the same fit: it is the S_z of readings that
-  lie on the curve (`ckf.prediction`; direct: against the control points, with `ckf.sigma_kept`). Then both
-  sides of the innovation have the same full-rank gain, which cancels: the update is that of a filter on the
-  readings themselves, and neither lambda nor the power of L makes a difference.
-- B holds the basis at the foot points of the readings themselves, and the sigma points are fitted with it, as
-  the solution is written; foot points of their own would give S_z no spread along the curve at all.
-- A reading says nothing of where along the curve its cone stands; the foot point is only the nearest one. So
-  the reading's covariance is widened along the tangent (`ckf.sigma_along`; tiny: as written).
-- It is held against the control points as the vehicle sees them, like the landmarks of its baseline:
-  otherwise the map would never correct the pose.
-- The odometry's constant errors are in the state, of the baseline too, as they are in that of every other
-  estimator (`odometry.sigma_scale` and `sigma_bias`; tiny: as written). Taken for white noise, they make the
-  filter drift several times farther than it believes.
-- Its front end has no false detections. Here a reading is gated, and what was seen only once doesn't expand a
-  curve (`ckf_expand`). An extension leaves the end's bending open, and multiplies what is open of it, so that
-  end gets a prior of little bending (`ckf.sigma_bend`; large: as written).
+- The cost of the fit squares L, and its solution does not. We take the solution (`ckf.penalty`).
+- The paper does not give the prediction of S_z. If S_z were compared with the control points themselves, what
+  the fit keeps of the prior would count as evidence for the prior. A control point out of the detections'
+  reach has no spread in S_z, so it would be known exactly. Hence the prediction goes through the same fit: it
+  is the S_z of detections that lie on the curve (`ckf.prediction`; with `direct` it is the control points,
+  and `ckf.sigma_kept` is added). Then both sides of the innovation have the same full-rank gain, which
+  cancels. The update is that of a filter on the detections themselves, so neither lambda nor the power of L
+  makes a difference.
+- B holds the basis at the foot points of the detections, and all sigma points are fitted with this B, as in
+  the paper's solution. Foot points of their own would give S_z no spread along the curve at all.
+- A detection does not tell where along the curve its cone stands, since the foot point is only the nearest
+  point. So its covariance is widened along the tangent (`ckf.sigma_along`; a tiny value gives the paper's
+  version).
+- S_z is compared with the control points in the vehicle frame, as the landmarks are in the paper's baseline.
+  Otherwise the map would never correct the pose.
+- The calibration of the odometry is in the state, as in every other estimator, the baseline included
+  (`odometry.sigma_scale` and `odometry.sigma_bias`; tiny values give the paper's version). If these constant
+  errors were taken for white noise, the filter would drift several times farther than it believes.
+- The paper's front end has no false detections. Here a detection must pass a gate, and a curve is expanded
+  only by confirmed tracks (`expansion.py`).
+- An extension leaves the bending of the end undetermined, and multiplies that uncertainty each time. So the
+  end gets a prior of little bending (`ckf.sigma_bend`; a large value gives the paper's version).
 
-What the other choices do at the end of lap 2, one simulated drive on each of seven tracks (rmse, missed,
-loops closed):
+This table shows the effect of the other choices at the end of lap 2, in one simulated drive on each of seven
+tracks (rmse, missed, loops closed):
 
-    as it is                                    0.33 m    0.0 %   7 of 7
+    default settings                            0.33 m    0.0 %   7 of 7
     prediction direct                           0.89 m    3.5 %   5 of 7
     prediction direct, penalty cost             0.96 m   12.0 %   5 of 7
     sigma_along 0.05 m                          0.36 m    0.0 %   7 of 7
@@ -45,45 +48,44 @@ from pathspace_graph.mapping.cubature import transform
 from pathspace_graph.settings.comparison import CkfSettings
 
 Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 _RANK: Final = 1e-9
-"""What the fit takes from the readings below this share of the most is nothing."""
+"""Singular values of the gain below this share of the largest one count as zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class SplineMeasurement:
-    """S_z, in the frame of the readings, on the control points that it is of."""
+    """Holds S_z on r control points, in the frame of the detections."""
 
     points: Array
-    """(r, 2) control points of S_z, m."""
+    """(r, 2) These are the control points of S_z, in m."""
     covariance: Array
-    """(2 r, 2 r) their covariance over x0, y0, x1, y1 ..., m^2."""
+    """(2 r, 2 r) This is their covariance over x0, y0, x1, y1 and so on, in m^2."""
     gain: Array
-    """(r, m) G: what the fit takes from the readings."""
+    """(r, m) This is G, the derivative of S_z by the detections."""
     taken: Array
-    """(r, r) G B: what it takes from control points whose curve the readings lie on."""
+    """(r, r) This is G B, the derivative of S_z by control points whose curve the detections lie on."""
     known: Array
-    """(r, 2) C_mu, where the control points were."""
+    """(r, 2) These are the control points C_mu before the fit."""
 
     def refitted(self, points: Array) -> Array:
-        """`C_mu + G B (C - C_mu)`: S_z of readings on the curves of control points (k, r, 2)."""
+        """Returns `C_mu + G B (C - C_mu)`: the S_z of detections on curves with control points (k, r, 2)."""
         return np.asarray(self.known + np.einsum("ij,kjd->kid", self.taken, points - self.known))
 
-    def basis(self) -> Array:
-        """(r, q) orthonormal columns that span what the fit can take from the readings."""
-        left, values, _ = np.linalg.svd(self.gain, full_matrices=False)
-        return np.asarray(left[:, values > _RANK * values[0]])
+    def range_basis(self) -> Array:
+        """Returns an orthonormal basis (r, q) of the range of G: all that the detections can change."""
+        vectors, values, _ = np.linalg.svd(self.gain, full_matrices=False)
+        return np.asarray(vectors[:, values > _RANK * values[0]])
 
 
 def regularization(basis: Array, settings: CkfSettings) -> Array:
-    """`L = lambda diag(1 - B' 1 / m)` (r, r) of the basis B (m, r), squared where the cost is taken."""
+    """Returns `L = lambda diag(1 - B' 1 / m)` (r, r) of the basis B (m, r); the penalty `cost` squares it."""
     diagonal = settings.ridge * (1.0 - basis.mean(axis=0))
     return np.diag(diagonal if settings.penalty == "solution" else diagonal**2)
 
 
 def ridge_gain(basis: Array, settings: CkfSettings) -> Array:
-    """`G = (B' B + L)^-1 B'` (r, m), so that the ridge regression is `C = C_mu + G (y - B C_mu)`."""
+    """Returns `G = (B' B + L)^-1 B'` (r, m): the ridge regression is `C = C_mu + G (y - B C_mu)`."""
     gram = basis.T @ basis + regularization(basis, settings)
     return np.asarray(np.linalg.lstsq(gram, basis.T, rcond=None)[0])
 
@@ -91,9 +93,10 @@ def ridge_gain(basis: Array, settings: CkfSettings) -> Array:
 def fit_detections(
     basis: Array, detections: Array, covariances: Array, known: Array, settings: CkfSettings
 ) -> SplineMeasurement:
-    """S_z of readings (m, 2) with covariances (m, 2, 2): a cubature transform through the ridge regression.
+    """Fits S_z to detections (m, 2) with covariances (m, 2, 2): a cubature transform of the ridge regression.
 
-    basis (m, r) at their foot points; known (r, 2): the control points, in the frame of the readings.
+    basis (m, r) is evaluated at their foot points. known (r, 2) holds the control points in the frame of the
+    detections.
     """
     m, r = basis.shape
     gain = ridge_gain(basis, settings)

@@ -1,25 +1,24 @@
-"""The paper's spline filter, PathSpace as written: predict, classify, expand, update, close, simplify."""
+"""The paper's spline filter: predict, classify, expand, update, close, simplify."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
+from pathspace_graph.mapping.measurements import integrate_odometry
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
-from .association import OnCurve, classify
-from .closing import associate_early, simplify, update_by_correspondences
+from .closing import associate_early_segment, simplify, update_by_correspondences
 from .expansion import Expansion
 from .state import CurveState
-from .update import update
+from .update import OnCurve, classify, update
 
 Array = NDArray[np.float64]
 
@@ -27,7 +26,7 @@ Array = NDArray[np.float64]
 class CkfMapper:
     """Maps a track's two boundaries by a cubature Kalman filter over the pose and all control points.
 
-    What the paper leaves open, and what was chosen, is told in `ckf_fit`. `odometry_sigma` (3,): standard
+    `fit.py` lists what the paper leaves open, and what was chosen. `odometry_sigma` (3,) is the standard
     deviation of a twist reading (m/s, m/s, rad/s).
     """
 
@@ -35,18 +34,18 @@ class CkfMapper:
         self.settings = settings or MapperSettings()
         self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
         self.state = CurveState(Belief.at_start(self.settings.odometry), self.settings)
-        """What is estimated."""
+        """This holds the pose, the curves and their joint covariance."""
         self.path = DrivenPath(self.settings.path)
-        """The way driven."""
+        """This is the path driven."""
         self.expansion = Expansion(self.settings)
-        """What isn't on a curve yet."""
+        """This holds what is not on a curve yet."""
         self.closed = False
-        """Whether the loop has closed, and the map its final size."""
+        """This tells whether the loop has closed, so that the map has its final size."""
         self._recent: list[tuple[Array, Detections]] = []
-        self._closing_tried = 0.0
+        self._last_check = 0.0
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """One perception cycle: the twists since the last one, and what was detected now."""
+        """Processes one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
         self._predict(odometry, detections.t)
         watch.lap("predict")
@@ -62,15 +61,14 @@ class CkfMapper:
         return self._result(detections.t, used, watch.laps)
 
     def _predict(self, odometry: Odometry, t: float) -> None:
-        """The pose by the odometry integrated since the last cycle."""
-        durations = np.diff(np.append(odometry.t, t))
-        self.state.belief.predict(integrate_twists(durations, odometry.twist, self.odometry_sigma))
+        """Predicts the pose by the odometry since the last cycle, and locates it on the curves."""
+        self.state.belief.predict(integrate_odometry(odometry, t, self.odometry_sigma))
         self.state.locate_vehicle()
         self.path.update(self.state.pose.copy())
         self.path.steer(odometry.twist)
 
     def _expand(self, detections: Detections, found: dict[int, OnCurve]) -> dict[int, OnCurve]:
-        """Lead the ends on; then the readings that lie on the new stretch update it with the rest."""
+        """Expands the curves; then detections on the new stretch update it with the rest."""
         if self.closed:
             return found
         self.expansion.observe(self.state, detections)
@@ -78,11 +76,11 @@ class CkfMapper:
         for on in found.values():
             free[on.rows] = False
         path_ahead = self.path.ahead(self.state.pose, self.settings.ckf.reach)
-        grown = self.expansion.expand(self.state, detections, path_ahead, free)
-        return classify(self.state, detections) if grown else found
+        extended = self.expansion.expand(self.state, detections, path_ahead, free)
+        return classify(self.state, detections) if extended else found
 
     def _close(self, detections: Detections) -> None:
-        """Past the shortest lap, look for an early segment; where it is met, both curves become periodic."""
+        """Looks for the early segment after the shortest lap, and closes and simplifies both curves there."""
         settings, state = self.settings.closing, self.state
         if self.closed:
             return
@@ -90,21 +88,21 @@ class CkfMapper:
         self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - settings.window]
         if len(state.curves) == 0 or not near_start(self.path, state.pose, settings):
             return
-        if self.path.length - self._closing_tried < settings.check_interval:
+        if self.path.length - self._last_check < settings.check_interval:
             return
-        self._closing_tried = self.path.length
-        motion = associate_early(state, self._recent, self.path.beginning)
+        self._last_check = self.path.length
+        motion = associate_early_segment(state, self._recent, self.path.beginning)
         if motion is not None and update_by_correspondences(state, motion):
             simplify(state, self.expansion.observed)
             self.closed = True
 
-    def _result(self, t: float, readings: int, stages: dict[str, float]) -> CycleResult:
+    def _result(self, t: float, used: int, stages: dict[str, float]) -> CycleResult:
         curves = self.state.curves
         left, right = (curves[label].size if label in curves else 0 for label in (LEFT, RIGHT))
-        return CycleResult(t, self.state.pose.copy(), (left, right), readings, self.closed, stages)
+        return CycleResult(t, self.state.pose.copy(), (left, right), used, self.closed, stages)
 
     def map(self) -> Map:
-        """The map as it stands, with the joint covariance of each boundary's control points."""
+        """Returns the map as it stands, with the joint covariance of each boundary's control points."""
         state = self.state
         curves = {b: SplineBoundary(state.spline(b), state.covariance(b)) for b in state.curves}
         return Map(self.closed, curves)

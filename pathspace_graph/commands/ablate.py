@@ -10,11 +10,11 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.harness.workers import check_jobs
 from pathspace_graph.eval.study.file import find_study, read_study
 from pathspace_graph.eval.study.output import write_figures, write_tables
 from pathspace_graph.eval.study.run import make_plan, run_plan
 from pathspace_graph.eval.study.study import Study
-from pathspace_graph.eval.study.workers import check_jobs
 from pathspace_graph.progress import progress
 
 CELLS_FAILED: Final = 3

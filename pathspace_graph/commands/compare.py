@@ -12,8 +12,8 @@ from tyro.conf import Positional, arg
 from pathspace_graph.eval.compare.comparison import Comparison, choose, choose_reference, compare, read_logs
 from pathspace_graph.eval.compare.gap import with_gaps
 from pathspace_graph.eval.compare.output import MARKER, tables, write_comparison
+from pathspace_graph.eval.harness.workers import check_jobs
 from pathspace_graph.eval.metrics.ghosts import GhostSettings
-from pathspace_graph.eval.study.workers import check_jobs
 from pathspace_graph.io.files import check_target
 from pathspace_graph.progress import progress
 from pathspace_graph.settings.mapper import MapperSettings

@@ -18,8 +18,9 @@ from .files import write_text
 def to_plain(value: Any) -> Any:
     """Returns the value in the types of strict JSON.
 
-    Arrays and tuples become lists, numpy's scalars become numbers, and paths become texts. NaN and infinity
-    become null, since JSON has no numbers for them.
+    Arrays and tuples become lists, numpy's scalars become numbers, and paths become texts. JSON has no
+    numbers for what is not finite: NaN becomes null, since it is no value, and infinity becomes the text
+    "inf".
     """
     if isinstance(value, Mapping):
         return {str(key): to_plain(item) for key, item in value.items()}
@@ -28,7 +29,7 @@ def to_plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [to_plain(item) for item in value]
     if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        return value if math.isfinite(value) else None if math.isnan(value) else str(value)
     return str(value) if isinstance(value, Path) else value
 
 

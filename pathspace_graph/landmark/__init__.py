@@ -1,1 +1,1 @@
-"""The Hungarian landmark estimators that the curves are compared with: online, batch and filter."""
+"""The landmark estimators with Hungarian association, which the curves are compared with."""

@@ -1,4 +1,4 @@
-"""Which reading saw which landmark: the Hungarian assignment on Mahalanobis distances, between two gates."""
+"""Associates detections with landmarks: the Hungarian assignment on Mahalanobis distances, with two gates."""
 
 from __future__ import annotations
 
@@ -10,54 +10,73 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
+from pathspace_graph.factors.landmark import landmark_residuals
+from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.graph.keys import POINT
 from pathspace_graph.labels import UNKNOWN
+from pathspace_graph.settings.comparison import LandmarkSettings
+from pathspace_graph.settings.mapper import GrowthSettings
+
+from .landmark_map import LandmarkSmoother, two_rows
+from .state import AMBIGUOUS, UNASSOCIATED
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-NONE = -1
-"""The landmark of a reading that has none."""
-INSIDE = 1e-9
-"""How far inside the gate (share of it) a pair that is held is put: at its very edge, round-off in the sums
-of an assignment would decide whether it is kept."""
-PLANE = 2
-"""Degrees of freedom of a reading."""
-
-
-@dataclass(frozen=True)
-class Gates:
-    """Squared Mahalanobis distances of a reading in the plane (chi-square with 2 degrees of freedom)."""
-
-    match: float
-    """Below it, a reading may be of the landmark."""
-    create: float
-    """Above it from every landmark, a reading is of none of them; between the two nothing is said."""
-
-    @staticmethod
-    @cache
-    def of_probabilities(match: float, create: float) -> Gates:
-        """The gates that hold a reading of the landmark with these probabilities, as 0.95 and 0.99."""
-        return Gates(float(chi2.ppf(match, PLANE)), float(chi2.ppf(create, PLANE)))
+HELD_MARGIN = 1e-9
+"""The cost of a held pair is reduced to this share below the match gate. Exactly at the gate, round-off in
+the sums of an assignment would decide whether the pair is kept."""
 
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """What the readings of one perception cycle are of."""
+    """Holds the landmark of each detection of one perception cycle."""
 
     landmark: IntArray
-    """(m,) column of the landmark that each reading saw, NONE where none."""
+    """(m,) Each entry is the column of the landmark of a detection, or UNASSOCIATED."""
     new: BoolArray
-    """(m,) whether a reading is beyond the create gate of every landmark that it may be of."""
+    """(m,) Each entry tells whether a detection lies beyond the create gate of every compatible landmark."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Holds what the newest pose should detect, in the vehicle frame."""
+
+    landmarks: IntArray
+    """(k,) These are the positions of the landmarks in the state."""
+    points_vehicle: Array
+    """(k, 2) Each row is the place where a landmark should be detected, in m."""
+    covariances: Array
+    """(k, 2, 2) Each block is the covariance `H Sigma H'` of such a place, in m^2."""
+
+
+@dataclass(frozen=True)
+class Gates:
+    """Holds two gates on squared Mahalanobis distances with two degrees of freedom."""
+
+    match: float
+    """A detection may be associated with a landmark below this distance."""
+    create: float
+    """A detection may create a landmark if it is above this distance from every compatible landmark."""
+
+    @staticmethod
+    @cache
+    def of(settings: LandmarkSettings) -> Gates:
+        """Returns the chi-square quantiles of the two probabilities in the settings."""
+        return Gates(float(chi2.ppf(settings.match, POINT)), float(chi2.ppf(settings.create, POINT)))
+
+
+# --- the assignment --------------------------------------------------------------------------------------
 
 
 def associate(cost: Array, gates: Gates) -> Association:
-    """`min sum_ij cost_ij` over one-to-one assignments, a reading left alone costing the match gate.
+    """Minimizes `sum_ij cost_ij` over one-to-one assignments; an unassigned detection costs the match gate.
 
-    cost (m, n): squared Mahalanobis distance of m readings, all of one cycle, to n landmarks; infinite where
-    a pair can't be (`compatible` says which colours can). Any m and n, zero too.
+    cost (m, n) holds the squared Mahalanobis distances of all m detections of a cycle to n landmarks. It is
+    infinite where the labels are not compatible. Both m and n may be zero.
     """
-    landmark = np.full(len(cost), NONE, np.intp)
+    landmark = np.full(len(cost), UNASSOCIATED, np.intp)
     rows, columns = linear_sum_assignment(np.minimum(cost, gates.match))
     chosen = cost[rows, columns] < gates.match
     landmark[rows[chosen]] = columns[chosen]
@@ -65,32 +84,111 @@ def associate(cost: Array, gates: Gates) -> Association:
 
 
 def squared_mahalanobis(innovations: Array, covariances: Array) -> Array:
-    """`r' S^-1 r` (...,) of innovations (..., 2) with covariances (..., 2, 2), by the closed inverse."""
+    """Returns `r' S^-1 r` (...,) of innovations (..., 2) with covariances (..., 2, 2), in closed form."""
     x, y = innovations[..., 0], innovations[..., 1]
     xx, xy, yy = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
     return np.asarray((yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy))
 
 
 def pair_costs(points: Array, covariances: Array, predicted: Array, predicted_covariances: Array) -> Array:
-    """`(m, n)` squared Mahalanobis distances with `S_ij = H_j Sigma H_j' + K_i`, in the vehicle frame.
+    """Returns the squared Mahalanobis distances (m, n) with `S_ij = H_j Sigma H_j' + K_i`, vehicle frame.
 
-    points (m, 2) and K (m, 2, 2): the readings; predicted (n, 2) and `H Sigma H'` (n, 2, 2): where each
-    landmark should be seen, with the *joint* covariance of pose and landmark, cross terms included.
+    points (m, 2) and covariances K (m, 2, 2) are those of the detections. predicted (n, 2) and
+    predicted_covariances `H Sigma H'` (n, 2, 2) are those of the landmarks. Sigma is the joint covariance of
+    pose and landmark, so it contains the cross terms.
     """
     innovations = predicted[None] - points[:, None]
     return squared_mahalanobis(innovations, predicted_covariances[None] + covariances[:, None])
 
 
-def kept_costs(cost: Array, held: BoolArray, gates: Gates) -> Array:
-    """The costs, with pairs that are `held` already inside the match gate as long as they pass the other one.
+def hysteresis_costs(cost: Array, held: BoolArray, gates: Gates) -> Array:
+    """Returns the costs, where pairs that are `held` already stay in the match gate up to the create gate.
 
-    Held to the strict gate anew in every round, readings would come and go at its edge; and since a reading's
-    covariance grows with its range, cutting often at both sides would favour those that are too far.
+    With the strict gate in every round, detections at the edge would change their association forever. The
+    covariance of a detection grows with its range. So a repeated cut on both sides of the gate would also
+    favour detections that are measured too far away.
     """
-    inside = (1.0 - INSIDE) * gates.match
+    inside = (1.0 - HELD_MARGIN) * gates.match
     return np.where(held & (cost < gates.create), np.minimum(cost, inside), cost)
 
 
 def compatible(labels: IntArray, landmark_labels: IntArray) -> BoolArray:
-    """(m, n) whether a reading's colour may be that of the landmark: the same one, or unknown."""
+    """Returns for each pair (m, n) whether the detection has the landmark's label or an unknown one."""
     return np.asarray((labels[:, None] == landmark_labels[None]) | (labels == UNKNOWN)[:, None])
+
+
+# --- online ----------------------------------------------------------------------------------------------
+
+
+def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray) -> None:
+    """Associates the rows `new` of the newest pose with landmarks, and puts the associated ones to use.
+
+    Only landmarks whose entry in `eligible` (n,) is set take part. A detection between the gates becomes
+    AMBIGUOUS. So does one in the match gate of a landmark with another label, since it must not create a
+    second landmark for the same cone. It is a vote for its own label.
+    """
+    detections, state, settings = smoother.map.detections, smoother.map.state, smoother.map.settings.landmark
+    rows = np.arange(new.start, new.stop)
+    candidates = nearby(smoother, rows, settings.rough)
+    prediction = predict(smoother, candidates[eligible[candidates]])
+    gates, numbers = Gates.of(settings), state.numbers[prediction.landmarks]
+    any_label = pair_costs(
+        detections.point[rows], detections.covariance[rows], prediction.points_vehicle, prediction.covariances
+    )
+    same_label = compatible(detections.label[rows], state.labels[prediction.landmarks])
+    found = associate(np.where(same_label, any_label, np.inf), gates)
+    matched = found.landmark != UNASSOCIATED
+    detections.take(rows[matched], numbers[found.landmark[matched]])
+    explained = (any_label < gates.match).any(axis=1)
+    detections.landmark[rows[~matched & (~found.new | explained)]] = AMBIGUOUS
+    if explained.any():
+        state.vote(detections.label[rows[explained]], numbers[any_label[explained].argmin(axis=1)])
+
+
+def nearby(smoother: LandmarkSmoother, rows: IntArray, radius: float) -> IntArray:
+    """Returns the positions of the landmarks within `radius` (m) of any of these detections."""
+    detections = smoother.map.detections
+    points = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
+    offset = points[:, None] - smoother.map.state.landmarks[None]
+    return np.flatnonzero((np.hypot(offset[..., 0], offset[..., 1]) < radius).any(axis=0))
+
+
+def predict(smoother: LandmarkSmoother, landmarks: IntArray) -> Prediction:
+    """Predicts the detections of landmarks (k,), given by position, from the newest pose.
+
+    The covariance is `H_j Sigma H_j'`, where Sigma is the joint covariance of pose and landmark in the last
+    step. It is zero before the first step.
+    """
+    state, k = smoother.map.state, len(landmarks)
+    poses, zero = np.tile(smoother.variables.poses[-1], (k, 1)), np.zeros((k, POINT))
+    expected = landmark_residuals(poses, state.landmarks[landmarks], zero)
+    if smoother.last_step is None or k == 0:
+        return Prediction(landmarks, expected.residual, np.zeros((k, POINT, POINT)))
+    jacobian = np.concatenate([expected.by_pose, expected.by_landmark], axis=2)
+    rows = two_rows(np.full(k, smoother.next_cycle - 1), state.numbers[landmarks], jacobian, zero)
+    return Prediction(landmarks, expected.residual, smoother.predicted_covariance(rows, together=POINT))
+
+
+# --- new landmarks ---------------------------------------------------------------------------------------
+
+
+def associate_created(
+    points: Array, cycles: IntArray, landmarks: Array, settings: GrowthSettings
+) -> tuple[IntArray, IntArray]:
+    """Returns the rows of the detections that belong to new landmarks (k, 2), and the landmark of each.
+
+    points (m, 2) are the detections in the map frame, and cycles (m,) are their perception cycles. A
+    detection belongs to the nearest landmark if that is within the merge radius. Only the nearest detection
+    of each cycle belongs to a landmark.
+    """
+    if len(points) == 0 or len(landmarks) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    offset = points[:, None] - landmarks[None]
+    distances = np.hypot(offset[..., 0], offset[..., 1])
+    nearest = distances.argmin(axis=1)
+    distance = distances[np.arange(len(points)), nearest]
+    rows = np.argsort(distance, kind="stable")
+    rows = rows[distance[rows] < settings.merge_radius]
+    _, first = np.unique(np.column_stack([cycles[rows], nearest[rows]]), axis=0, return_index=True)
+    chosen = rows[first]
+    return chosen, nearest[chosen]

@@ -1,8 +1,7 @@
-"""The Hungarian landmark graph over a whole log: every pose and landmark at once, associations refreshed."""
+"""The Hungarian landmark graph over a whole log: all poses and landmarks at once, associations refreshed."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -13,92 +12,93 @@ from pathspace_graph.graph.keys import POSE
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import BatchRun
 from pathspace_graph.laps import LapCounter
-from pathspace_graph.mapping.measurements import integrate_log
-from pathspace_graph.run import settings_dict
+from pathspace_graph.run import settings_dict, split_odometry
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
-from .fixed_lag import point_map
-from .reassociation import Reassociation, drop_rare
-from .start import as_landmark_detections, start_online, start_oracle
-from .state import LandmarkState
-from .system import LandmarkSystem
-from .tentative import duplicates
+from .fixed_lag import LandmarkFixedLag
+from .merging import find_duplicates
+from .reassociation import Reassociation, remove_rare
+from .state import UNASSOCIATED, LandmarkState, point_map
+from .system import LandmarkSystem, insert_drive
 
 Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 NAME: Final = "landmark-batch"
-"""What the command line knows it by."""
-
-
-@dataclass(frozen=True, eq=False)
-class LandmarkResult(BatchRun):
-    """What the landmark batch gives; it has converged where the last round changed hardly any association."""
-
-    rounds: int = 0
-    """Times that the log was associated anew; 0 where the associations were told."""
-    pose_covariances: Array = field(default_factory=lambda: np.zeros((0, POSE, POSE)))
-    """(n, 3, 3) marginal covariance of each pose (x, y, theta), map frame."""
+"""This is the estimator's name on the command line."""
 
 
 class LandmarkBatch:
-    """Cones as points, poses of the whole log; begun at the online run of `LandmarkFixedLag`."""
+    """Maps cones as points with all poses of a log; the start is the online run of `LandmarkFixedLag`."""
 
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
         self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
 
-    def solve(self, log: Log, associations: Ints | None = None) -> LandmarkResult:
-        """The optimum over a log: associate, solve, merge, drop, until no association changes.
+    def solve(self, log: Log) -> BatchRun:
+        """Solves a log: associate, optimize, merge and remove landmarks, until the associations stay.
 
-        associations (R,): landmark of each detection in file order, negative for none: told, they are kept;
-        for evaluation only.
+        The result has converged if the last round changed hardly any association.
         """
         with threadpool_limits(limits=1):
-            return self._solve(log, associations)
+            return self._solve(log)
 
-    def _solve(self, log: Log, associations: Ints | None) -> LandmarkResult:
+    def _solve(self, log: Log) -> BatchRun:
         settings = self.settings.landmark
-        chain = integrate_log(log, self.odometry_sigma, self.settings.odometry)
-        detections = as_landmark_detections(log)
-        if associations is None:
-            state = start_online(log, detections, self.settings, self.odometry_sigma)
-        else:
-            state = start_oracle(detections, chain, associations)
-        system = LandmarkSystem(detections, chain, self.settings)
-        system.settle(state)
-        rounds, converged = 0, associations is not None
+        system = LandmarkSystem.of_log(log, self.settings, self.odometry_sigma)
+        state = start_online(log, system, self.odometry_sigma)
+        system.optimize(state)
+        rounds, converged = 0, False
         while not converged and rounds < settings.max_rounds:
             rounds += 1
-            converged = self._refresh(system, state) <= settings.settled * len(detections)
-            system.settle(state)
-        return self._result(system, state, rounds, converged)
+            converged = self._refresh(system, state) <= settings.settled * len(system.detections)
+            system.optimize(state)
+        return self._result(system, state, converged)
 
     def _refresh(self, system: LandmarkSystem, state: LandmarkState) -> int:
-        """Associate anew, merge, drop; how many readings are of another landmark now."""
+        """Associates anew, merges and removes landmarks; returns how many associations have changed."""
         detections, problem = system.detections, system.eliminated(state)
         before, known = detections.landmark.copy(), len(state)
         Reassociation(state, detections, problem, self.settings, system.chain.stamps).run()
-        first, second = duplicates(state, known, problem.joint, self.settings)
-        detections.merge(state.numbers[first], state.numbers[second])
-        drop_rare(state, detections, self.settings.growth.sightings)
+        gone, kept = find_duplicates(state, known, problem.joint, self.settings)
+        detections.merge(state.numbers[gone], state.numbers[kept])
+        remove_rare(state, detections, self.settings.growth.sightings)
         return int((before != detections.landmark).sum())
 
-    def _result(
-        self, system: LandmarkSystem, state: LandmarkState, rounds: int, converged: bool
-    ) -> LandmarkResult:
+    def _result(self, system: LandmarkSystem, state: LandmarkState, converged: bool) -> BatchRun:
         laps, problem, poses = LapCounter(), system.eliminated(state), state.variables.poses.copy()
         for pose in poses:
             laps.update(pose)
-        return LandmarkResult(
+        return BatchRun(
             estimator=NAME,
             settings=settings_dict(self.settings),
-            map=point_map(state, problem.joint(state.keys), laps.completed > 0),
+            map=point_map(state.landmarks, state.labels, problem.joint(state.keys), laps.completed > 0),
             trajectory_t=system.chain.stamps,
             trajectory=poses,
             cycles=(),
             laps=laps.completed,
-            rounds=rounds,
             converged=converged,
-            pose_covariances=problem.pose_marginals,
         )
+
+
+def start_online(log: Log, system: LandmarkSystem, odometry_sigma: Array) -> LandmarkState:
+    """Returns the last map of the online run, with each pose and association as it left the window."""
+    online, detections = LandmarkFixedLag(system.settings, odometry_sigma), system.detections
+    smoother, track = online.smoother, online.smoother.map
+    poses = np.zeros((len(log.cycles), POSE))
+    landmark = np.full(len(detections), UNASSOCIATED, np.intp)
+    begins = np.searchsorted(detections.cycle, np.arange(len(log.cycles)))
+    for odometry, cycle in split_odometry(log):
+        online.update(odometry, cycle)
+        first = smoother.first_cycle
+        poses[first : smoother.next_cycle] = smoother.variables.poses
+        landmark[begins[first] : begins[first] + len(track.detections)] = track.detections.landmark
+    final = np.arange(track.state.next_number)
+    for gone, kept in sorted(track.merged_into.items()):  # ascending, so that `kept` is final already
+        final[gone] = final[kept]
+    rows = np.flatnonzero(landmark >= 0)
+    detections.take(rows, final[landmark[rows]])
+    state = LandmarkState()
+    state.add(track.state.landmarks, track.state.labels, track.state.numbers)
+    state.votes, state.next_number = track.state.votes, track.state.next_number
+    insert_drive(state, smoother.variables.calibration, poses)
+    return state

@@ -1,7 +1,7 @@
-"""Closing the loop of a landmark map: which landmarks of the newest row are those of the beginning.
+"""Closes the loop of a landmark map: detects which of the landmarks seen now are those of the beginning.
 
-The landmarks seen now and those not seen for long are one Gaussian, with one joint covariance, so a set of
-pairs can be tested as a whole: each pair taken moves all others (joint compatibility, Neira and Tardos).
+The landmarks seen now and those not seen for long have one joint covariance. So a set of pairs can be tested
+as a whole, since each accepted pair moves all others (joint compatibility, Neira and Tardos 2001).
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from pathspace_graph.graph.keys import POINT
 from pathspace_graph.labels import BOUNDARIES
 
-from .association import PLANE, Gates, squared_mahalanobis
+from .association import Gates, squared_mahalanobis
 from .landmark_map import LandmarkSmoother
 
 Array = NDArray[np.float64]
@@ -22,63 +23,64 @@ IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
-    """Landmarks that may be the same."""
+class LoopPairs:
+    """Holds a hypothesis: pairs of landmarks that are the same cone."""
 
-    first: IntArray
-    """(k,) positions of those seen lately."""
-    second: IntArray
-    """(k,) positions of those that each may be, seen long ago."""
+    recent: IntArray
+    """(k,) These are the positions of landmarks that were seen lately."""
+    old: IntArray
+    """(k,) These are the positions of the landmarks of the beginning that they are."""
     distance: float
-    """Squared Mahalanobis distance of all of them together, 2 k degrees of freedom."""
+    """This is the squared Mahalanobis distance of all pairs together, with 2 k degrees of freedom."""
 
     def score(self, gate: float) -> float:
-        """How much better they explain what is seen than new landmarks do: `k gate - d^2`."""
-        return len(self.first) * gate - self.distance
+        """Returns `k gate - d^2`: how much better the pairs explain the detections than new landmarks do."""
+        return len(self.recent) * gate - self.distance
 
-    def shares(self, other: Pairs) -> bool:
-        """Whether any pair is the same."""
-        own = set(zip(self.first.tolist(), self.second.tolist(), strict=True))
-        return not own.isdisjoint(zip(other.first.tolist(), other.second.tolist(), strict=True))
+    def overlaps(self, other: LoopPairs) -> bool:
+        """Returns whether both hypotheses have a pair in common."""
+        own = set(zip(self.recent.tolist(), self.old.tolist(), strict=True))
+        return not own.isdisjoint(zip(other.recent.tolist(), other.old.tolist(), strict=True))
 
 
-class Belief:
-    """Joint Gaussian of some landmarks seen lately and some seen long ago."""
+class JointCompatibility:
+    """Tests sets of pairs against the joint Gaussian of some recent and some old landmarks."""
 
     def __init__(
         self, smoother: LandmarkSmoother, recent: IntArray, old: IntArray, scale: float, sigma: float
     ) -> None:
-        """`scale` multiplies all sigmas; a pair may be apart by `sigma` (m) anyway."""
+        """`scale` multiplies all standard deviations, and `sigma` (m) is the one of a pair's true offset."""
         state = smoother.map.state
         self.recent, self.old, self.variance = recent, old, sigma**2
         both = np.concatenate([recent, old])
         self.mean = state.landmarks[both].copy()
         self.covariance = scale**2 * smoother.last_covariance(state.keys[both])
-        self.same_colour = state.labels[recent][:, None] == state.labels[old][None]
+        self.same_label = state.labels[recent][:, None] == state.labels[old][None]
 
     def distances(self, mean: Array, covariance: Array) -> Array:
-        """(k, n) squared Mahalanobis distances of all pairs, infinite where the colours differ."""
+        """Returns the squared Mahalanobis distances (k, n) of all pairs; other labels give infinity."""
         k, points = len(self.recent), len(mean)
-        blocks = covariance.reshape(points, PLANE, points, PLANE).transpose(0, 2, 1, 3)
+        blocks = covariance.reshape(points, POINT, points, POINT).transpose(0, 2, 1, 3)
         own = blocks[np.arange(points), np.arange(points)]
         cross = blocks[:k, k:]
         spread = own[:k, None] + own[None, k:] - cross - np.swapaxes(cross, 2, 3)
-        spread = spread + self.variance * np.eye(PLANE)
-        return np.where(
-            self.same_colour, squared_mahalanobis(mean[:k, None] - mean[None, k:], spread), np.inf
-        )
+        spread = spread + self.variance * np.eye(POINT)
+        return np.where(self.same_label, squared_mahalanobis(mean[:k, None] - mean[None, k:], spread), np.inf)
 
-    def joined(self, mean: Array, covariance: Array, i: int, j: int) -> tuple[Array, Array]:
-        """The Gaussian given that landmark i of the recent ones is landmark j of the old ones."""
-        a, b = PLANE * i, PLANE * (len(self.recent) + j)
-        gradient = covariance[:, a : a + PLANE] - covariance[:, b : b + PLANE]
-        spread = gradient[a : a + PLANE] - gradient[b : b + PLANE] + self.variance * np.eye(PLANE)
-        gain = np.linalg.solve(spread, gradient.T).T
+    def conditioned(self, mean: Array, covariance: Array, i: int, j: int) -> tuple[Array, Array]:
+        """Returns the Gaussian given that recent landmark i is old landmark j: one Kalman update."""
+        a, b = POINT * i, POINT * (len(self.recent) + j)
+        cross = covariance[:, a : a + POINT] - covariance[:, b : b + POINT]
+        spread = cross[a : a + POINT] - cross[b : b + POINT] + self.variance * np.eye(POINT)
+        gain = np.linalg.solve(spread, cross.T).T
         innovation = mean[i] - mean[len(self.recent) + j]
-        return mean - (gain @ innovation).reshape(-1, PLANE), covariance - gain @ gradient.T
+        return mean - (gain @ innovation).reshape(-1, POINT), covariance - gain @ cross.T
 
-    def grown_from(self, i: int, j: int, gate: float) -> Pairs:
-        """One pair, then always the one that fits best given those before, as long as it is in the gate."""
+    def grow(self, i: int, j: int, gate: float) -> LoopPairs:
+        """Returns a hypothesis that begins with one pair and adds the best pair while that is in the gate.
+
+        Each pair is tested given those before it.
+        """
         mean, covariance, total = self.mean, self.covariance, 0.0
         distances = self.distances(mean, covariance)
         free = np.ones(distances.shape, bool)
@@ -87,59 +89,49 @@ class Belief:
             chosen.append((i, j))
             total += float(distances[i, j])
             free[i], free[:, j] = False, False
-            mean, covariance = self.joined(mean, covariance, i, j)
+            mean, covariance = self.conditioned(mean, covariance, i, j)
             distances = np.where(free, self.distances(mean, covariance), np.inf)
             i, j = divmod(int(distances.argmin()), distances.shape[1])
         index = np.array(chosen, np.intp).reshape(-1, 2)
-        return Pairs(self.recent[index[:, 0]], self.old[index[:, 1]], total)
+        return LoopPairs(self.recent[index[:, 0]], self.old[index[:, 1]], total)
 
 
-def recognize(smoother: LandmarkSmoother, recent: IntArray, old: IntArray, reach: float) -> Pairs | None:
-    """The landmarks seen lately that are surely old ones; None where they may be others, or too few are.
+def detect_loop(
+    smoother: LandmarkSmoother, recent: IntArray, old: IntArray, reach: float
+) -> LoopPairs | None:
+    """Returns the pairs of the best hypothesis, or None if it is not clear or has too few pairs.
 
-    Old ones farther than `reach` (m) from all of them aren't looked at.
+    Old landmarks farther than `reach` (m) from all recent ones are not tested.
     """
     settings, points = smoother.map.settings.landmark, smoother.map.state.landmarks
     offset = points[recent][:, None] - points[old][None]
     old = old[(np.hypot(offset[..., 0], offset[..., 1]) < reach).any(axis=0)]
     if len(recent) < settings.min_pairs or len(old) < settings.min_pairs:
         return None
-    gate = Gates.of_probabilities(settings.match, settings.create).match
-    belief = Belief(smoother, recent, old, smoother.map.settings.closing.prior_scale, settings.sigma_merge)
-    distances = belief.distances(belief.mean, belief.covariance)
-    seeds = np.argwhere(distances < gate)
+    gate, scale = Gates.of(settings).match, smoother.map.settings.closing.prior_scale
+    test = JointCompatibility(smoother, recent, old, scale, settings.sigma_merge)
+    seeds = np.argwhere(test.distances(test.mean, test.covariance) < gate)
     if len(seeds) == 0:
         return None
-    hypotheses = [belief.grown_from(int(i), int(j), gate) for i, j in seeds]
+    hypotheses = [test.grow(int(i), int(j), gate) for i, j in seeds]
     best = max(hypotheses, key=lambda pairs: pairs.score(gate))
-    others = [pairs.score(gate) for pairs in hypotheses if not pairs.shares(best)]
+    others = [pairs.score(gate) for pairs in hypotheses if not pairs.overlaps(best)]
     clear = best.score(gate) - max(others, default=0.0) >= settings.min_lead * gate
-    return best if clear and _believed(smoother, best) else None
+    return best if clear and _is_acceptable(smoother, best) else None
 
 
-def _believed(smoother: LandmarkSmoother, pairs: Pairs) -> bool:
-    """Enough pairs of either colour, compatible as a whole."""
-    settings, labels = smoother.map.settings.landmark, smoother.map.state.labels[pairs.first]
+def _is_acceptable(smoother: LandmarkSmoother, pairs: LoopPairs) -> bool:
+    """Returns whether there are enough pairs of either label, which are compatible as a whole."""
+    settings, labels = smoother.map.settings.landmark, smoother.map.state.labels[pairs.recent]
     enough = all((labels == label).sum() >= settings.min_pairs // 3 for label in BOUNDARIES)
-    joint = chi2.ppf(settings.create, PLANE * len(labels)) if len(labels) else 0.0
+    joint = chi2.ppf(settings.create, POINT * len(labels)) if len(labels) else 0.0
     return bool(enough and len(labels) >= settings.min_pairs and pairs.distance < joint)
 
 
-def optimize_loop(smoother: LandmarkSmoother, pairs: Pairs) -> None:
-    """Solve the whole loop with the pairs tied, each submap relinearized in its own frame.
+def optimize_loop(smoother: LandmarkSmoother, pairs: LoopPairs) -> None:
+    """Solves the whole loop with the pairs held together, each submap relinearized in its own frame.
 
-    The pairs are to be merged next.
+    The caller merges the pairs next.
     """
-    smoother.map.ties = smoother.map.state.numbers[np.column_stack([pairs.first, pairs.second])]
+    smoother.map.loop_pairs = smoother.map.state.numbers[np.column_stack([pairs.recent, pairs.old])]
     smoother.solve_loop(smoother.map.settings.closing.iterations, None)
-
-
-def merge(smoother: LandmarkSmoother, first: IntArray, second: IntArray) -> None:
-    """Landmarks `first` (k,) become `second` (k,), by position; exact, nothing is forgotten.
-
-    A step follows, since the last one's columns are gone.
-    """
-    keys = smoother.map.state.keys
-    smoother.merge(keys[first], keys[second])
-    smoother.map.merge(first, second)
-    smoother.step()

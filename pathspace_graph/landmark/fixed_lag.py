@@ -1,16 +1,16 @@
-"""The Hungarian landmark graph online: cones as points in the mapper's own smoother."""
+"""The Hungarian landmark graph online: cones are points in the same fixed-lag smoother as the curves."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import integrate_twists
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.io.map import Map, PointBoundary
-from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.io.map import Map
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.measurements import integrate_odometry
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import smoother_settings
 from pathspace_graph.mapping.registration import near_start
@@ -18,12 +18,11 @@ from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
-from .association import NONE, PLANE
-from .closing import merge, optimize_loop, recognize
+from .association import associate_created, associate_newest
+from .closing import detect_loop, optimize_loop
 from .landmark_map import LandmarkMap
-from .prediction import assign
-from .state import LandmarkState
-from .tentative import detected_by, duplicates
+from .merging import find_duplicates, merge
+from .state import UNASSOCIATED, landmark_counts, point_map
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -32,138 +31,134 @@ IntArray = NDArray[np.intp]
 class LandmarkFixedLag:
     """Maps cones as points: predict, associate, create, update, close, marginalize.
 
-    Window, odometry and robust weights are those of `FixedLagMapper`; a reading is held against the one
-    landmark that it is of. `odometry_sigma` (3,): standard deviation of a twist reading (m/s, m/s,
-    rad/s).
+    Window, odometry and robust weights are those of `FixedLagMapper`, but each detection has one landmark in
+    place of a curve. `odometry_sigma` (3,) is the standard deviation of a twist reading (m/s, m/s, rad/s).
     """
 
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
         self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), LandmarkMap(self.settings))
-        """What is estimated, and from what."""
+        """This holds the variables, the window and its prior."""
         self.smoother.window.exact = True
         self.path = DrivenPath(self.settings.path)
-        """The way driven."""
+        """This is the path driven."""
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
-        """What isn't a landmark yet."""
+        """These tracks by label are not landmarks yet."""
         self.closed = False
-        """Whether the loop has closed."""
-        self._last_seen: Array = np.zeros(0)  # by number, path driven (m) when each landmark was seen last
-        self._tried = 0.0
+        """This tells whether the loop has closed."""
+        self._last_detected: Array = np.zeros(
+            0
+        )  # path driven (m) when each landmark was last seen, by number
+        self._last_check = 0.0
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """One perception cycle: the twists since the last one, and what was detected now."""
+        """Processes one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
-        durations = np.diff(np.append(odometry.t, detections.t))
-        driven = integrate_twists(durations, odometry.twist, self.odometry_sigma)
-        self.path.update(self.smoother.drive(detections.t, driven, self.settings.odometry.sigmas_start))
+        motion = integrate_odometry(odometry, detections.t, self.odometry_sigma)
+        self.path.update(self.smoother.predict(detections.t, motion, self.settings.odometry.sigmas_start))
         watch.lap("predict")
         new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
-        assign(self.smoother, new, self._open_to_detections())
+        associate_newest(self.smoother, new, self._eligible())
         watch.lap("associate")
         created = self._create(new, detections.t)
         watch.lap("create")
         for _ in range(self.settings.steps_grown if created else self.settings.steps):
             self.smoother.step()
         watch.lap("update")
-        self._look_back()
+        self._close()
         watch.lap("close")
         self.smoother.marginalize()
         watch.lap("marginalize")
         return self._result(detections.t, watch.laps)
 
     def _create(self, new: slice, t: float) -> bool:
-        """Readings of no landmark are sightings; those seen often enough become landmarks. True if any."""
+        """Adds detections without a landmark to the tentative tracks, and makes confirmed ones landmarks.
+
+        Returns whether there are new landmarks.
+        """
         detections, created = self.smoother.map.detections, False
-        rows = new.start + np.flatnonzero(detections.landmark[new] == NONE)
+        rows = new.start + np.flatnonzero(detections.landmark[new] == UNASSOCIATED)
         for label, tentative in self.tentative.items():
-            of = rows[detections.label[rows] == label]
-            points = to_map(detections.point[of], self.smoother.variables.poses_at(detections.cycle[of]))
-            tentative.add(points, np.trace(detections.covariance[of], axis1=1, axis2=2), t)
+            own = rows[detections.label[rows] == label]
+            points = to_map(detections.point[own], self.smoother.variables.poses_at(detections.cycle[own]))
+            tentative.add(points, np.trace(detections.covariance[own], axis1=1, axis2=2), t)
             confirmed = tentative.confirmed()
             if len(confirmed):
-                self._found(label, tentative.points[confirmed].copy())
+                self._add_landmarks(label, tentative.points[confirmed].copy())
                 tentative.remove(confirmed)
                 created = True
         return created
 
-    def _found(self, label: int, points: Array) -> None:
-        """New landmarks at points (k, 2) that readings in the window saw; those readings are of them."""
+    def _add_landmarks(self, label: int, points: Array) -> None:
+        """Adds landmarks at points (k, 2), and associates the detections in the window that created them.
+
+        A point without any such detection is left out, since nothing would hold the landmark.
+        """
         detections, state = self.smoother.map.detections, self.smoother.map.state
-        rows = np.flatnonzero((detections.label == label) & (detections.landmark == NONE))
+        rows = np.flatnonzero((detections.label == label) & (detections.landmark == UNASSOCIATED))
         cycles = detections.cycle[rows]
-        seen = to_map(detections.point[rows], self.smoother.variables.poses_at(cycles))
-        chosen, which = detected_by(seen, cycles, points, self.settings.growth)
-        held, which = np.unique(which, return_inverse=True)  # nothing would hold the others
-        numbers = state.add(points[held], np.full(len(held), label, np.intp))[which]
+        points_map = to_map(detections.point[rows], self.smoother.variables.poses_at(cycles))
+        chosen, landmark = associate_created(points_map, cycles, points, self.settings.growth)
+        held, landmark = np.unique(landmark, return_inverse=True)
+        numbers = state.add(points[held], np.full(len(held), label, np.intp))[landmark]
         detections.take(rows[chosen], numbers)
         state.vote(detections.label[rows[chosen]], numbers)
 
-    def _open_to_detections(self) -> NDArray[np.bool_]:
-        """(n,) landmarks that readings may be of: until the loop has closed, near the start not the old ones.
+    def _eligible(self) -> NDArray[np.bool_]:
+        """Returns which landmarks (n,) may be associated. Near the start they exclude the old ones.
 
-        Drift is common to all that is seen: there one reading alone can't tell which old landmark it is of.
+        Until the loop has closed, all detections there share the drift of the lap. So one detection alone
+        can't tell which of the old landmarks it shows.
         """
-        everything = np.ones(len(self.smoother.map.state), bool)
-        return everything if self.closed or not self._near_start() else ~self._old()
+        every = np.ones(len(self.smoother.map.state), bool)
+        return every if self.closed or not self._near_start() else ~self._old()
 
     def _near_start(self) -> bool:
         return near_start(self.path, self.smoother.variables.poses[-1], self.settings.closing)
 
     def _old(self) -> NDArray[np.bool_]:
-        last_seen = self._last_seen[self.smoother.map.state.numbers]
-        return np.asarray(last_seen < self.path.length - self.settings.landmark.unseen)
+        last_detected = self._last_detected[self.smoother.map.state.numbers]
+        return np.asarray(last_detected < self.path.length - self.settings.landmark.unseen)
 
-    def _look_back(self) -> None:
-        """Every few metres: close the loop where old landmarks are seen, then merge what is one cone."""
+    def _close(self) -> None:
+        """Every few metres, closes the loop if old landmarks are detected; then merges duplicates."""
         detections, state, length = self.smoother.map.detections, self.smoother.map.state, self.path.length
-        seen = np.unique(detections.landmark[detections.used])
-        self._last_seen = np.append(self._last_seen, np.zeros(state.born - len(self._last_seen)))
-        self._last_seen[seen] = length
-        if length - self._tried < self.settings.closing.check_interval:
+        detected = np.unique(detections.landmark[detections.used])
+        self._last_detected = np.append(
+            self._last_detected, np.zeros(state.next_number - len(self._last_detected))
+        )
+        self._last_detected[detected] = length
+        if length - self._last_check < self.settings.closing.check_interval:
             return
-        self._tried = length
+        self._last_check = length
         if self.closed:
-            covariance = self.smoother.last_covariance
-            self._merge(*duplicates(state, len(state), covariance, self.settings))
+            self._merge(*find_duplicates(state, len(state), self.smoother.last_covariance, self.settings))
         elif self._near_start():
-            settings = self.settings.closing
-            reach = settings.radius + settings.drift * length
-            pairs = recognize(self.smoother, state.positions(seen), np.flatnonzero(self._old()), reach)
+            reach = self.settings.closing.radius + self.settings.closing.drift * length
+            recent, old = state.positions(detected), np.flatnonzero(self._old())
+            pairs = detect_loop(self.smoother, recent, old, reach)
             if pairs is not None:
                 optimize_loop(self.smoother, pairs)
-                self._merge(pairs.first, pairs.second)
+                self._merge(pairs.recent, pairs.old)
                 self.closed, self.smoother.window.exact = True, False
 
-    def _merge(self, first: IntArray, second: IntArray) -> None:
-        if len(first) == 0:
+    def _merge(self, gone: IntArray, kept: IntArray) -> None:
+        if len(gone) == 0:
             return
         numbers = self.smoother.map.state.numbers
-        np.maximum.at(self._last_seen, numbers[second], self._last_seen[numbers[first]])
-        merge(self.smoother, first, second)
+        np.maximum.at(self._last_detected, numbers[kept], self._last_detected[numbers[gone]])
+        merge(self.smoother, gone, kept)
 
     def _result(self, t: float, stages: dict[str, float]) -> CycleResult:
-        detections, state = self.smoother.map.detections, self.smoother.map.state
+        detections, sizes = self.smoother.map.detections, landmark_counts(self.smoother.map.state.labels)
         used = int((detections.used & (detections.cycle == self.smoother.next_cycle - 1)).sum())
-        left, right = (int((state.labels == label).sum()) for label in (LEFT, RIGHT))
-        pose = self.smoother.variables.poses[-1].copy()
-        return CycleResult(t, pose, (left, right), used, self.closed, stages)
+        return CycleResult(t, self.smoother.variables.poses[-1].copy(), sizes, used, self.closed, stages)
 
     def map(self) -> Map:
-        """The map as it stands, with the joint covariance of each boundary's landmarks."""
+        """Returns the map as it stands, with the joint covariance of each boundary's landmarks."""
         state = self.smoother.map.state
         if len(state) == 0:
             return Map(self.closed, {})
-        return point_map(state, self.smoother.last_covariance(state.keys), self.closed)
-
-
-def point_map(state: LandmarkState, joint: Array, closed: bool) -> Map:
-    """The landmarks by colour, each boundary's with its block of their joint covariance (2 n, 2 n)."""
-    boundaries = {}
-    for label in BOUNDARIES:
-        of = np.flatnonzero(state.labels == label)
-        if len(of):
-            columns = (PLANE * of[:, None] + np.arange(PLANE)).ravel()
-            boundaries[label] = PointBoundary(state.landmarks[of].copy(), joint[np.ix_(columns, columns)])
-    return Map(closed, boundaries)
+        joint = self.smoother.last_covariance(state.keys)
+        return point_map(state.landmarks, state.labels, joint, self.closed)

@@ -1,8 +1,7 @@
-"""The yardstick: the landmark batch over a whole log, *told* which reading saw which landmark.
+"""The landmark batch with oracle associations: the true landmark of every detection is given.
 
-An estimator can't know that. It is what the limit of a run is made of: the batch's own system, with the
-calibration of the odometry that every estimator estimates, and without robust weights, for what it is told
-has no outliers.
+No estimator can know them. The limit of a run is computed from this solution. It is the batch's own system
+with the same calibration of the odometry, but without robust weights, since there are no outliers.
 """
 
 from __future__ import annotations
@@ -12,12 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Log
-from pathspace_graph.mapping.measurements import integrate_log
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .start import as_landmark_detections, start_oracle
-from .system import LandmarkSystem
+from .state import LandmarkState
+from .system import LandmarkSystem, insert_drive
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -25,46 +26,67 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class LandmarkSolution:
-    """The optimum of a landmark batch that was told its associations."""
+    """Holds the optimum of a landmark batch with oracle associations."""
 
     trajectory_t: Array
-    """(n,) s, one per perception cycle."""
+    """(n,) These are the stamps of the perception cycles, in s."""
 
     trajectory: Array
-    """(n, 3) [x, y, theta], map frame, smoothed, theta not wrapped."""
+    """(n, 3) Each row is a smoothed pose (x, y, theta) in m and rad, map frame; theta is not wrapped."""
 
     landmark_ids: Ints
-    """(m,) what the associations call each landmark that was seen, ascending."""
+    """(m,) These are the associations' numbers of all landmarks that were detected, ascending."""
 
     landmarks: Array
-    """(m, 2) m, map frame."""
+    """(m, 2) Each row is the position of a landmark in m, map frame."""
 
     covariance: Array | None
-    """(2m, 2m) m^2, joint covariance of the landmarks, or None where it wasn't asked for."""
+    """(2m, 2m) This is the joint covariance of the landmarks in m^2, or None if it was not requested."""
 
     error: float
-    """Half the squared whitened residuals that are left."""
+    """This is half the sum of the squared whitened residuals."""
 
 
 def solve_landmarks(
     log: Log, associations: Ints, *, with_covariance: bool = False, settings: MapperSettings | None = None
 ) -> LandmarkSolution:
-    """argmin over poses, calibration and landmarks of all squared Mahalanobis distances, none of them robust.
+    """Minimizes all squared Mahalanobis distances over poses, calibration and landmarks; no loss is robust.
 
-    associations: (R,) landmark of each detection row in file order, negative for none (left out). The pose at
-    the first odometry stamp is (0, 0, 0). Started at the integrated odometry and first sightings.
+    associations (R,) holds the landmark of each detection in file order; negative ones are left out. The pose
+    at the first odometry stamp is (0, 0, 0). The start is `start_oracle`.
     """
     settings = settings or MapperSettings()
     settings = replace(settings, gate=replace(settings.gate, huber=np.inf))
-    chain, detections = integrate_log(log, log.odometry_sigma, settings.odometry), as_landmark_detections(log)
-    system = LandmarkSystem(detections, chain, settings)
-    state = start_oracle(detections, chain, associations)
-    system.settle(state)
+    system = LandmarkSystem.of_log(log, settings, log.odometry_sigma)
+    state = start_oracle(system, associations)
+    system.optimize(state)
     return LandmarkSolution(
-        trajectory_t=chain.stamps,
+        trajectory_t=system.chain.stamps,
         trajectory=state.variables.poses.copy(),
         landmark_ids=state.numbers.astype(np.int64),
         landmarks=state.landmarks.copy(),
         covariance=system.eliminated(state).joint(state.keys) if with_covariance else None,
         error=system.cost(state),
     )
+
+
+def start_oracle(system: LandmarkSystem, associations: Ints) -> LandmarkState:
+    """Associates the system's detections with landmarks (R,), and returns the state by dead reckoning.
+
+    Each landmark is placed at its first detection, and has the label of most of them.
+    """
+    detections, rows = system.detections, np.flatnonzero(associations >= 0)
+    numbers, first, landmark = np.unique(associations[rows], return_index=True, return_inverse=True)
+    detections.take(rows, numbers[landmark])
+    calibration = np.zeros(CALIBRATION_SIZE)
+    poses = system.chain.dead_reckoned(calibration)
+    points = to_map(detections.point[rows[first]], poses[detections.cycle[rows[first]]])
+    labels = detections.label[rows]
+    votes = np.stack(
+        [np.bincount(landmark[labels == label], minlength=len(numbers)) for label in (LEFT, RIGHT, UNKNOWN)]
+    )
+    state = LandmarkState()
+    state.add(points, votes.argmax(axis=0).astype(np.intp), numbers.astype(np.intp))
+    state.votes = votes[: len(BOUNDARIES)].T
+    insert_drive(state, calibration, poses)
+    return state

@@ -1,4 +1,4 @@
-"""The landmarks beside their variables, and the readings that see them."""
+"""The state of the landmark graphs: landmarks with their variables, and detections with associations."""
 
 from __future__ import annotations
 
@@ -10,76 +10,76 @@ from numpy.typing import NDArray
 from pathspace_graph.graph.keys import LANDMARK_LETTER, POINT, landmark_keys
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.io.log import Detections
-from pathspace_graph.labels import BOUNDARIES
-
-from .association import NONE
+from pathspace_graph.io.map import Map, PointBoundary
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-LEFT_OUT = -2
-"""The landmark of a reading between the gates, or of a known landmark in another colour: it is of none, and
-makes none."""
+UNASSOCIATED = -1
+"""This stands for the landmark of a detection that has none, and that may create one."""
+AMBIGUOUS = -2
+"""This stands for the landmark of a detection that has none, and that must not create one."""
 
 
 class LandmarkState:
-    """The landmarks by position, oldest first, each with a number that is its key's and never changes."""
+    """Holds the landmarks, oldest first. A landmark's number is that of its key and never changes."""
 
     def __init__(self, variables: Variables | None = None) -> None:
         self.variables = variables or Variables()
-        """Landmarks, calibration and poses by key."""
+        """These are the landmarks, the calibration and the poses by key."""
         self.numbers: IntArray = np.zeros(0, np.intp)
-        """(n,) ascending."""
+        """(n,) These are the numbers of the landmarks, ascending."""
         self.labels: IntArray = np.zeros(0, np.intp)
-        """(n,) colour of each landmark."""
+        """(n,) These are the labels of the landmarks."""
         self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)
-        """(n, 2) readings of either colour that each landmark explained."""
-        self.born = 0
-        """Landmarks made so far, and the next one's number."""
+        """(n, 2) Each row counts the detections with the left and the right label on a landmark."""
+        self.next_number = 0
+        """This is the number of the next landmark."""
 
     def __len__(self) -> int:
         return len(self.numbers)
 
     @property
     def keys(self) -> IntArray:
-        """(n,) key of each."""
+        """These are the keys (n,) of the landmarks."""
         return landmark_keys(self.numbers)
 
     @property
     def landmarks(self) -> Array:
-        """Landmarks (n, 2), map frame, m: a view."""
+        """These are the landmarks (n, 2) in the map frame, in m: a view."""
         return self.variables.block(LANDMARK_LETTER).reshape(-1, POINT)
 
     def positions(self, numbers: IntArray) -> IntArray:
-        """Position of each of these numbers, of any shape, all of which are known."""
+        """Returns the position of each of these numbers, of any shape, all of which must be known."""
         return self.numbers.searchsorted(numbers)
 
     def add(self, points: Array, labels: IntArray, numbers: IntArray | None = None) -> IntArray:
-        """New landmarks (k, 2) with colours (k,), after those that there are; gives their numbers (k,).
+        """Adds landmarks (k, 2) with labels (k,) behind the others, and returns their numbers (k,).
 
-        `numbers`: ascending, none less than `born`; else the next ones.
+        `numbers` must be ascending, and none may be less than `next_number`; by default they follow it.
         """
-        new = self.born + np.arange(len(labels)) if numbers is None else numbers
+        new = self.next_number + np.arange(len(labels)) if numbers is None else numbers
         self.variables.insert(landmark_keys(new), points.ravel())
         self.numbers = np.concatenate([self.numbers, new])
         self.labels = np.concatenate([self.labels, labels])
         self.votes = np.concatenate([self.votes, np.zeros((len(labels), len(BOUNDARIES)), np.intp)])
-        self.born = int(new[-1]) + 1 if len(new) else self.born
+        self.next_number = int(new[-1]) + 1 if len(new) else self.next_number
         return new
 
     def vote(self, labels: IntArray, numbers: IntArray) -> None:
-        """Readings (k,) with these colours lie on landmarks (k,), each of which has the colour of the most.
+        """Counts detections with labels (k,) on landmarks (k,), which take the label of their majority.
 
-        A landmark that was made of a few readings in the wrong colour would have the wrong one for good.
+        Otherwise a landmark that was created by a few detections with the wrong label would keep it forever.
         """
-        coloured = np.isin(labels, BOUNDARIES)
-        np.add.at(self.votes, (self.positions(numbers[coloured]), labels[coloured]), 1)
+        known = np.isin(labels, BOUNDARIES)
+        np.add.at(self.votes, (self.positions(numbers[known]), labels[known]), 1)
         most = self.votes.argmax(axis=1)
         outvoted = self.votes[np.arange(len(most)), most] > self.votes[np.arange(len(most)), self.labels]
         self.labels = np.where(outvoted, most, self.labels)
 
     def keep(self, stays: NDArray[np.bool_]) -> None:
-        """Only these landmarks (n,) are there from now on; the variables are left as they are."""
+        """Removes the landmarks whose entry in `stays` (n,) is not set; the variables stay as they are."""
         self.numbers, self.labels, self.votes = self.numbers[stays], self.labels[stays], self.votes[stays]
 
 
@@ -96,7 +96,7 @@ class LandmarkDetections:
     label: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
     """What the sensor says: LEFT, RIGHT or UNKNOWN."""
     landmark: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Number of the landmark that it is of; else NONE or LEFT_OUT."""
+    """Number of the landmark that it is of; else UNASSOCIATED or AMBIGUOUS."""
     changed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
     """Whether it came into use since its cycle was linearized last."""
 
@@ -116,7 +116,7 @@ class LandmarkDetections:
             np.asarray(detections.points_vehicle, float),
             np.asarray(detections.covariances, float),
             np.asarray(detections.labels, np.intp),
-            np.full(m, NONE, np.intp),
+            np.full(m, UNASSOCIATED, np.intp),
             np.zeros(m, bool),
         )
         for column in fields(self):
@@ -138,3 +138,19 @@ class LandmarkDetections:
     def take(self, rows: IntArray, numbers: IntArray) -> None:
         """These readings (k,) are of landmarks (k,)."""
         self.landmark[rows], self.changed[rows] = numbers, True
+
+
+def landmark_counts(labels: IntArray) -> tuple[int, int]:
+    """Returns the number of landmarks with the left and with the right label."""
+    return int((labels == LEFT).sum()), int((labels == RIGHT).sum())
+
+
+def point_map(points: Array, labels: IntArray, joint: Array, closed: bool) -> Map:
+    """Returns landmarks (n, 2) by label, each boundary with its block of the joint covariance (2 n, 2 n)."""
+    boundaries = {}
+    for label in BOUNDARIES:
+        own = np.flatnonzero(labels == label)
+        if len(own):
+            columns = (POINT * own[:, None] + np.arange(POINT)).ravel()
+            boundaries[label] = PointBoundary(points[own].copy(), joint[np.ix_(columns, columns)])
+    return Map(closed, boundaries)

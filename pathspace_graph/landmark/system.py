@@ -7,35 +7,42 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.projection import huber_loss
+from pathspace_graph.factors.noise import huber_loss
 from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
-from pathspace_graph.graph.keys import indices
+from pathspace_graph.graph.keys import CALIBRATION_KEY, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
+from pathspace_graph.io.log import Log
 from pathspace_graph.labels import RIGHT
-from pathspace_graph.mapping.measurements import Chain
+from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .landmark_map import landmark_rows
-from .state import LandmarkDetections, LandmarkState
+from .state import UNASSOCIATED, LandmarkDetections, LandmarkState
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkSystem:
-    """`min 1/2 |odometry|^2 + sum rho(readings of landmarks) + 1/2 |calibration, first pose|^2`.
+    """Minimizes `1/2 |odometry|^2 + sum rho(associated detections) + 1/2 |calibration, first pose|^2`.
 
-    The associations are held: a reading of no landmark costs nothing.
+    The associations are constant, and a detection without a landmark costs nothing.
     """
 
     detections: LandmarkDetections
-    """Of the whole log."""
+    """These are the detections of the whole log."""
     chain: Chain
-    """Its odometry."""
+    """This is the odometry of the whole log."""
     settings: MapperSettings
 
+    @classmethod
+    def of_log(cls, log: Log, settings: MapperSettings, odometry_sigma: Array) -> LandmarkSystem:
+        """Returns the problem of a log without any association; `odometry_sigma` (3,) is that of a twist."""
+        chain = integrate_log(log, odometry_sigma, settings.odometry)
+        return cls(collect_landmark_detections(log), chain, settings)
+
     def cost(self, state: LandmarkState) -> float:
-        """Half the sum of squares at a state, Huber's loss in place of the readings' own."""
+        """Returns half the sum of squares at a state, with Huber's loss of the detections."""
         poses, calibration = state.variables.poses, state.variables.calibration
         residual, _ = self.chain.terms(poses, calibration)
         losses = huber_loss(self._detection_rows(state, np.inf).residual, self.settings.gate.huber)
@@ -43,23 +50,23 @@ class LandmarkSystem:
         return float(cost)
 
     def rows(self, state: LandmarkState) -> list[Rows]:
-        """Gauss-Newton's rows at a state, each of a reading's rows weighted as Huber's loss has it."""
+        """Returns the Gauss-Newton rows at a state, where each row of a detection has its Huber weight."""
         poses, calibration = state.variables.poses, state.variables.calibration
         rows = self.chain.rows(self.chain.terms(poses, calibration), poses[0], calibration)
         return [*rows, self._detection_rows(state, self.settings.gate.huber)]
 
     def eliminated(self, state: LandmarkState) -> Elimination:
-        """The system that they make, with the poses eliminated."""
+        """Returns the linear problem at a state, with the poses eliminated."""
         return Elimination(linear_graph(self.rows(state), state.variables), state.variables.layout)
 
     def _detection_rows(self, state: LandmarkState, huber: float) -> Rows:
-        """The readings in use, whitened; a factor takes those of some poses on one side of the track."""
+        """Returns the whitened rows; a factor owns those of a few poses on one side of the track."""
         rows = landmark_rows(state, self.detections, np.flatnonzero(self.detections.used), huber)
         labels = state.labels[state.positions(indices(rows.keys[:, 1]))]
         return replace(rows, owner=owners(rows.owner, labels == RIGHT))
 
-    def settle(self, state: LandmarkState) -> None:
-        """Move a state to the optimum, the associations held: Levenberg-Marquardt that damps the map."""
+    def optimize(self, state: LandmarkState) -> None:
+        """Moves a state to the optimum by Levenberg-Marquardt; the associations stay, the map is damped."""
         settings, variables, cost = self.settings.batch, state.variables, self.cost(state)
         damping = settings.damping
         for _ in range(settings.max_rounds):
@@ -74,3 +81,18 @@ class LandmarkSystem:
             cost, damping = cost - gain, max(settings.damping_down * damping, settings.damping_least)
             if gain <= self.settings.landmark.tolerance * cost:
                 break
+
+
+def collect_landmark_detections(log: Log) -> LandmarkDetections:
+    """Returns every detection of a log without any association."""
+    plain = collect_detections(log)
+    landmark = np.full(len(plain), UNASSOCIATED, np.intp)
+    return LandmarkDetections(
+        plain.cycle, plain.point, plain.covariance, plain.label, landmark, plain.changed
+    )
+
+
+def insert_drive(state: LandmarkState, calibration: Array, poses: Array) -> None:
+    """Makes the calibration (2,) and the poses (P, 3) of the whole log variables of a state."""
+    state.variables.insert(np.array([CALIBRATION_KEY]), calibration)
+    state.variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())

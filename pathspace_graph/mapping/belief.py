@@ -1,4 +1,4 @@
-"""The state of the paper's filters: the vehicle's pose and points of the map, with one covariance."""
+"""The state of the paper's filters: the vehicle's pose and points of the map, with a joint covariance."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, lapack
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
-from pathspace_graph.graph.keys import POSE
+from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.settings.mapper import OdometrySettings
 
 from .cubature import Transformed, square_root, transform
@@ -18,46 +18,46 @@ from .cubature import Transformed, square_root, transform
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-PLANE: Final = 2
-"""Entries of a point."""
 HEAD: Final = POSE + CALIBRATION_SIZE
-"""Entries before the points."""
+"""The state has this many entries before its points."""
 
 
 class Belief:
-    """`x = [pose | calibration | points]`, Gaussian: pose (x, y, theta) and points (x, y) in the map frame, m
-    and rad; the odometry's calibration (scale error of the speeds, bias of the yaw rate, rad/s).
+    """A belief is a Gaussian over `x = [pose | calibration | points]`.
 
-    A step's function depends on few entries. Cubature points are laid through those only; all others follow
-    by the joint covariance, which is what the full rule would give for them, without its cubic cost.
+    The pose (x, y, theta) and the points (x, y) are in the map frame, in m and rad. The calibration of the
+    odometry is the scale error of the speeds and the bias of the yaw rate (rad/s).
+
+    A model depends on few entries of x, so only those get cubature points. All others follow by the joint
+    covariance, which is what the full rule would give for them, without its cubic cost.
     """
 
     def __init__(self, pose: Array, covariance: Array, calibration_sigma: Array | None = None) -> None:
         sigma = np.zeros(CALIBRATION_SIZE) if calibration_sigma is None else calibration_sigma
         self.mean: Array = np.concatenate([pose, np.zeros(CALIBRATION_SIZE)])
-        """(n,) x."""
+        """(n,) This is the mean of x."""
         self.covariance: Array = block_diag(covariance, np.diag(sigma**2))
-        """(n, n)."""
+        """(n, n) This is the covariance of x."""
 
     @classmethod
     def at_start(cls, settings: OdometrySettings) -> Belief:
-        """The vehicle at the first odometry stamp, no map."""
+        """Returns the belief at the first odometry stamp, with an empty map."""
         sigmas = np.array([settings.sigma_start, settings.sigma_start, settings.sigma_start_heading])
         calibration = np.array([settings.sigma_scale, settings.sigma_bias])
         return cls(np.zeros(POSE), np.diag(sigmas**2), calibration)
 
     @property
     def pose(self) -> Array:
-        """(3,) a view of x."""
+        """This is the mean pose (3,), a view of the mean; theta is not wrapped."""
         return self.mean[:POSE]
 
     @property
     def points(self) -> Array:
-        """(m, 2) a view of x."""
-        return self.mean[HEAD:].reshape(-1, PLANE)
+        """These are the mean points (m, 2), a view of the mean."""
+        return self.mean[HEAD:].reshape(-1, POINT)
 
     def predict(self, odometry: IntegratedOdometry) -> None:
-        """`pose <- pose * delta * (error - J calibration)`, with the covariance of the odometry's error."""
+        """Predicts `pose <- pose * delta * (error - J calibration)`; the error is that of the odometry."""
         drift, size = odometry.calibration_jacobian, HEAD + POSE
         augmented = np.zeros((size, size))
         augmented[:HEAD, :HEAD] = self.covariance[:HEAD, :HEAD]
@@ -77,76 +77,68 @@ class Belief:
     def update(
         self, columns: IntArray, function: Callable[[Array], Array], measured: Array, noise: Array
     ) -> None:
-        """One Kalman update: `measured` (q,) is a function of the entries `columns` (d,), plus noise (q, q).
+        """Makes one Kalman update: `measured` (q,) is `function(x[columns])` plus noise of covariance (q, q).
 
-        The function takes points (k, d) to (k, q).
+        The function maps points (k, d) to (k, q), row by row.
         """
-        seen = transform(function, self.mean[columns], self.covariance[np.ix_(columns, columns)])
-        root = square_root(seen.covariance + noise)
-        cross = seen.slope @ self.covariance[columns]
-        half, _ = lapack.dtrtrs(root, np.column_stack([cross, measured - seen.mean]), lower=1)
+        predicted = transform(function, self.mean[columns], self.covariance[np.ix_(columns, columns)])
+        root = square_root(predicted.covariance + noise)
+        cross = predicted.slope @ self.covariance[columns]
+        half, _ = lapack.dtrtrs(root, np.column_stack([cross, measured - predicted.mean]), lower=1)
         self.mean += half[:, :-1].T @ half[:, -1]
         self.covariance -= half[:, :-1].T @ half[:, :-1]
-        self._symmetrize()
+        self.covariance = 0.5 * (self.covariance + self.covariance.T)
 
-    def seen(self, points: IntArray) -> Transformed:
-        """Where the vehicle should see points (k,): mean (2 k,) and covariance (2 k, 2 k), vehicle frame."""
+    def predict_detections(self, points: IntArray) -> Transformed:
+        """Predicts the detections of points (k,): mean (2 k,), covariance (2 k, 2 k), vehicle frame."""
         columns = np.concatenate([np.arange(POSE), point_columns(points)])
         covariance = self.covariance[np.ix_(columns, columns)]
         return transform(lambda x: to_vehicle_rows(x[:, :POSE], x[:, POSE:]), self.mean[columns], covariance)
 
-    def observe(self, detections: Array, covariances: Array) -> None:
-        """New points, the last of x from now on: readings (k, 2) of the vehicle frame with (k, 2, 2)."""
-        k = len(detections)
-        columns = np.arange(POSE)
-        own = np.zeros((POSE + PLANE * k, POSE + PLANE * k))
-        own[:POSE, :POSE] = self.covariance[:POSE, :POSE]
-        for i, covariance in enumerate(covariances):
-            block = slice(POSE + PLANE * i, POSE + PLANE * (i + 1))
-            own[block, block] = covariance
+    def add_points(self, detections: Array, covariances: Array) -> None:
+        """Adds points at the end of x, at detections (k, 2) with covariances (k, 2, 2), vehicle frame."""
+        own = block_diag(self.covariance[:POSE, :POSE], *covariances)
         mean = np.concatenate([self.pose, detections.ravel()])
         placed = transform(lambda x: to_map_rows(x[:, :POSE], x[:, POSE:]), mean, own)
-        cross = placed.slope[:, :POSE] @ self.covariance[columns]
+        cross = placed.slope[:, :POSE] @ self.covariance[:POSE]
         self.mean = np.concatenate([self.mean, placed.mean])
         self.covariance = np.block([[self.covariance, cross.T], [cross, placed.covariance]])
 
-    def change(self, start: int, stop: int, matrix: Array, sigma: Array) -> None:
-        """The points [start, stop) become `matrix` (k, stop - start) times them, each coordinate alike.
+    def transform_points(self, start: int, stop: int, matrix: Array, sigma: Array) -> None:
+        """Replaces the points [start, stop) by `matrix` (k, stop - start) times them, for both coordinates.
 
-        sigma (k,): what is added to each of them, m. The rule's own result, since the change is linear.
+        Independent noise with standard deviations sigma (k,) in m is added to them. The change is linear, so
+        this is what the cubature rule gives.
         """
-        low, high = HEAD + PLANE * start, HEAD + PLANE * stop
-        full = np.kron(matrix, np.eye(PLANE))
+        low, high = HEAD + POINT * start, HEAD + POINT * stop
+        full = np.kron(matrix, np.eye(POINT))
         mean, covariance = self.mean, self.covariance
         cross = full @ covariance[low:high]
-        block = cross[:, low:high] @ full.T + np.diag(np.repeat(sigma, PLANE) ** 2)
-        left, right = slice(0, low), slice(high, len(mean))
-        self.mean = np.concatenate([mean[left], full @ mean[low:high], mean[right]])
+        block = cross[:, low:high] @ full.T + np.diag(np.repeat(sigma, POINT) ** 2)
+        before, after = slice(0, low), slice(high, len(mean))
+        self.mean = np.concatenate([mean[before], full @ mean[low:high], mean[after]])
         self.covariance = np.block(
             [
-                [covariance[left, left], cross[:, left].T, covariance[left, right]],
-                [cross[:, left], block, cross[:, right]],
-                [covariance[right, left], cross[:, right].T, covariance[right, right]],
+                [covariance[before, before], cross[:, before].T, covariance[before, after]],
+                [cross[:, before], block, cross[:, after]],
+                [covariance[after, before], cross[:, after].T, covariance[after, after]],
             ]
         )
 
     def reorder(self, points: IntArray) -> None:
-        """The points in another order, or some of them."""
+        """Puts the points into another order, or keeps some of them, by their indices (k,)."""
         columns = np.concatenate([np.arange(HEAD), point_columns(points)])
         self.mean = self.mean[columns]
         self.covariance = self.covariance[np.ix_(columns, columns)]
 
-    def _symmetrize(self) -> None:
-        self.covariance = 0.5 * (self.covariance + self.covariance.T)
-
 
 def point_columns(points: IntArray) -> IntArray:
-    """(2 k,) entries of x of points (k,)."""
-    return (HEAD + PLANE * points[:, None] + np.arange(PLANE)).ravel()
+    """Returns the entries (2 k,) of points (k,) in x."""
+    return (HEAD + POINT * points[:, None] + np.arange(POINT)).ravel()
 
 
 def compose_rows(poses: Array, deltas: Array) -> Array:
-    """`pose * delta` on SE(2), row by row: (k, 3), deltas (k, 3) or (3,); theta is not wrapped."""
+    """Returns `pose * delta` on SE(2), row by row: (k, 3), deltas (k, 3) or (3,); theta is not wrapped."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     dx, dy = deltas[..., 0], deltas[..., 1]
     return np.column_stack(
@@ -155,7 +147,7 @@ def compose_rows(poses: Array, deltas: Array) -> Array:
 
 
 def to_map_rows(poses: Array, detections: Array) -> Array:
-    """`R z + t`: for each of k poses (k, 3) its r readings (k, 2 r) of the vehicle frame -> map (k, 2 r)."""
+    """Returns `R z + t` (k, 2 r), map frame, of r detections (k, 2 r) from each of k poses (k, 3)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x, y = detections[:, 0::2], detections[:, 1::2]
     placed = np.stack([c * x - s * y + poses[:, :1], s * x + c * y + poses[:, 1:2]], axis=2)
@@ -163,7 +155,7 @@ def to_map_rows(poses: Array, detections: Array) -> Array:
 
 
 def to_vehicle_rows(poses: Array, points: Array) -> Array:
-    """`R' (p - t)`: for each of k poses (k, 3) its r points (k, 2 r) of the map -> vehicle frame (k, 2 r)."""
+    """Returns `R' (p - t)` (k, 2 r), vehicle frame, of r map points (k, 2 r) from each of k poses (k, 3)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x, y = points[:, 0::2] - poses[:, :1], points[:, 1::2] - poses[:, 1:2]
     return np.stack([c * x + s * y, c * y - s * x], axis=2).reshape(len(poses), -1)

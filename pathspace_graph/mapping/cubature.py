@@ -1,4 +1,4 @@
-"""The third-degree spherical-radial cubature rule (Arasaratnam and Haykin 2009)."""
+"""The third-degree spherical-radial cubature rule (Arasaratnam and Haykin 2009), the paper's transform."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from scipy.linalg import lapack
 Array = NDArray[np.float64]
 
 _LEAST_VARIANCE: Final = 1e-12
-"""Variances below this share of the largest are lifted to it, where a covariance has no Cholesky factor."""
+"""Eigenvalues are raised to this share of the largest one where a covariance has no Cholesky factor."""
 
 
 @dataclass(frozen=True, eq=False)
 class Transformed:
-    """A Gaussian after a function, as the cubature rule sees it."""
+    """Holds the moments of a function of a Gaussian, by the cubature rule."""
 
     mean: Array
-    """(q,) mean of the function."""
+    """(q,) This is the mean of the function."""
     covariance: Array
-    """(q, q) covariance of the function."""
+    """(q, q) This is the covariance of the function."""
     slope: Array
-    """(q, d) statistical linearization `C_yx C_xx^-1`: so the covariance of the function with anything that
-    it doesn't depend on directly is `slope @ C_x.`, which is exact for Gaussians."""
+    """(q, d) This is the statistical linearization `C_yx C_xx^-1`. The covariance of the function with a
+    variable z that it does not depend on is `slope @ C_xz`, which is exact for Gaussians."""
 
 
 def square_root(covariance: Array) -> Array:
-    """Lower L with `L L' = covariance` (d, d); one that is only semidefinite is lifted by round-off."""
+    """Returns the lower L with `L L' = covariance` (d, d). Small eigenvalues are raised if it is singular."""
     factor, info = lapack.dpotrf(covariance, lower=1, clean=1)
     if info == 0:
         return np.asarray(factor)
@@ -40,15 +40,15 @@ def square_root(covariance: Array) -> Array:
 
 
 def cubature_points(mean: Array, root: Array) -> Array:
-    """`mean +- sqrt(d) L e_i` (2 d, d), the positive ones first; each weighs 1 / (2 d)."""
+    """Returns `mean +- sqrt(d) L e_i` (2 d, d), the positive ones first; each has the weight 1 / (2 d)."""
     offsets = np.sqrt(len(mean)) * root.T
     return np.concatenate([mean + offsets, mean - offsets])
 
 
 def transform(function: Callable[[Array], Array], mean: Array, covariance: Array) -> Transformed:
-    """Mean, covariance and slope of `function`, which takes points (k, d) row by row to (k, q).
+    """Returns mean, covariance and slope of `function`, which maps points (k, d) row by row to (k, q).
 
-    Exact where the function is linear, and its mean where it is a polynomial of the third degree.
+    All are exact for a linear function, and the mean is exact for a polynomial of the third degree.
     """
     root = square_root(covariance)
     d = len(mean)

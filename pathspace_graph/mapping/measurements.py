@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import IntegratedOdometry, compose, integrate_twists
+from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
+from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.elimination import owners
 from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_key
 from pathspace_graph.graph.odometry import OdometryChain, calibrated_delta, odometry_rows
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.io.log import Log
+from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import OdometrySettings
 
@@ -73,9 +74,7 @@ def _prior(key: int, root: Array, off: Array) -> Rows:
 
 def integrate_log(log: Log, sigma: Array, settings: OdometrySettings) -> Chain:
     """Every interval between two cycles of a log; sigma (3,) of a twist reading (m/s, m/s, rad/s)."""
-    steps = [
-        _integrate(odometry.t, odometry.twist, cycle.t, sigma) for odometry, cycle in split_odometry(log)
-    ]
+    steps = [integrate_odometry(odometry, cycle.t, sigma) for odometry, cycle in split_odometry(log)]
     return Chain(
         stamps=np.array([cycle.t for cycle in log.cycles]),
         first=compose(np.zeros(3), steps[0].delta),
@@ -85,8 +84,9 @@ def integrate_log(log: Log, sigma: Array, settings: OdometrySettings) -> Chain:
     )
 
 
-def _integrate(t: Array, twist: Array, end: float, sigma: Array) -> IntegratedOdometry:
-    return integrate_twists(np.diff(np.append(t, end)), twist, sigma)
+def integrate_odometry(odometry: Odometry, end: float, sigma: Array) -> IntegratedOdometry:
+    """Integrates twists, the last of which is held until `end` (s); sigma (3,) is that of a twist reading."""
+    return integrate_twists(np.diff(np.append(odometry.t, end)), odometry.twist, sigma)
 
 
 def collect_detections(log: Log) -> DetectionTable:

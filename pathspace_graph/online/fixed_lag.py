@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.graph.keys import POINT, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
@@ -18,6 +17,7 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
+from pathspace_graph.mapping.measurements import integrate_odometry
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import smoother_settings
 from pathspace_graph.mapping.registration import near_start, register
@@ -119,9 +119,8 @@ class FixedLagMapper:
 
     def _predict(self, odometry: Odometry, t: float) -> None:
         """The newest pose, by the calibrated odometry; and how the way goes on from there."""
-        durations = np.diff(np.append(odometry.t, t))
-        integrated = integrate_twists(durations, odometry.twist, self.odometry_sigma)
-        self.path.update(self.smoother.drive(t, integrated, self.settings.odometry.sigmas_start))
+        integrated = integrate_odometry(odometry, t, self.odometry_sigma)
+        self.path.update(self.smoother.predict(t, integrated, self.settings.odometry.sigmas_start))
         if self.solver is not None:
             self.smoother.submaps = None  # nothing of another solver is relinearized when the loop closes
         self.path.steer(odometry.twist)

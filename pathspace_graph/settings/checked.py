@@ -15,15 +15,21 @@ class Positive:
     UNLIMITED: ClassVar[tuple[str, ...]] = ()
     """These numbers may be infinite, which means that there is no limit."""
 
+    prefix: ClassVar[str]
+    """This stands before the names of the settings on the command line."""
+
+    def __init_subclass__(cls, group: str | None = None) -> None:
+        """Sets the prefix from the name of the group, which is by default that of the class."""
+        group = cls.__name__.removesuffix("Settings").lower() if group is None else group
+        cls.prefix = "" if group == "mapper" else f"{group}."
+
     def __post_init__(self) -> None:
         """Raises a SettingsError that names the first wrong setting, as the command line knows it."""
-        group = type(self).__name__.removesuffix("Settings").lower()
-        prefix = "" if group == "mapper" else f"{group}."
         for entry in fields(self):  # type: ignore[arg-type]  # every heir is a dataclass
             value = getattr(self, entry.name)
             if not isinstance(value, int | float):
                 continue
             if not value > 0:
-                raise SettingsError(f"{prefix}{entry.name}: expected a positive number, found {value}")
+                raise SettingsError(f"{self.prefix}{entry.name}: expected a positive number, found {value}")
             if value == inf and entry.name not in self.UNLIMITED:
-                raise SettingsError(f"{prefix}{entry.name}: expected a finite number, found {value}")
+                raise SettingsError(f"{self.prefix}{entry.name}: expected a finite number, found {value}")

@@ -95,6 +95,6 @@ def test_readings_on_the_curve_fit_the_curve() -> None:
     other = spline.with_points(spline.control_points + rng.normal(size=spline.control_points.shape))
     fitted = fit_detections(basis, other.evaluate(u), covariances, spline.control_points, settings)
     np.testing.assert_allclose(fitted.refitted(other.control_points[None])[0], fitted.points, atol=1e-9)
-    combine = fitted.basis()
+    combine = fitted.range_basis()
     assert combine.shape == (13, 3)
     np.testing.assert_allclose(combine @ combine.T @ fitted.gain, fitted.gain, atol=1e-9)

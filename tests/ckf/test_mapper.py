@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.ckf.association import classify
 from pathspace_graph.ckf.closing import update_by_correspondences
 from pathspace_graph.ckf.expansion import proximity_chain
 from pathspace_graph.ckf.mapper import CkfMapper
 from pathspace_graph.ckf.state import CurveState
-from pathspace_graph.ckf.update import update
+from pathspace_graph.ckf.update import classify, update
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.table1 import cone_distances, lap_metrics
 from pathspace_graph.io.log import Detections
@@ -112,10 +111,10 @@ def test_an_update_moves_the_curve_to_the_readings_and_makes_it_surer(prediction
     found = classify(state, readings)
     assert len(found[LEFT].rows) == 3
     u = found[LEFT].basis @ np.linspace(0.0, 8.0, 4)
-    before = state.find(LEFT, readings.points_vehicle, 0.0 * u, 0.0 * u + 12.0).distance
+    before = state.foot_points(LEFT, readings.points_vehicle, 0.0 * u, 0.0 * u + 12.0).distance
     spread = np.trace(state.belief.covariance)
     update(state, readings, found)
-    after = state.find(LEFT, readings.points_vehicle, 0.0 * u, 0.0 * u + 12.0).distance
+    after = state.foot_points(LEFT, readings.points_vehicle, 0.0 * u, 0.0 * u + 12.0).distance
     assert np.linalg.norm(after) < np.linalg.norm(before)
     assert np.trace(state.belief.covariance) < spread
     assert np.linalg.eigvalsh(state.belief.covariance)[0] > -1e-12

@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.landmark.association import (
-    NONE,
+    UNASSOCIATED,
     Gates,
     associate,
     compatible,
-    kept_costs,
+    hysteresis_costs,
     pair_costs,
     squared_mahalanobis,
 )
 
 Array = NDArray[np.float64]
 
-GATES = Gates.of_probabilities(0.95, 0.99)
+GATES = Gates.of(LandmarkSettings())
 
 
 def test_gates_are_those_of_two_degrees_of_freedom() -> None:
@@ -39,27 +39,27 @@ def test_the_assignment_is_the_best_of_all_not_each_readings_own() -> None:
 def test_a_bad_pair_is_not_taken_to_save_another() -> None:
     cost = np.array([[0.5, 50.0], [0.1, 50.0]])
     found = associate(cost, GATES)
-    np.testing.assert_array_equal(found.landmark, [NONE, 0])
+    np.testing.assert_array_equal(found.landmark, [UNASSOCIATED, 0])
 
 
 def test_between_the_gates_nothing_is_said() -> None:
     between = 0.5 * (GATES.match + GATES.create)
     found = associate(np.array([[between, 99.0], [99.0, 99.0], [99.0, 1.0]]), GATES)
-    np.testing.assert_array_equal(found.landmark, [NONE, NONE, 1])
+    np.testing.assert_array_equal(found.landmark, [UNASSOCIATED, UNASSOCIATED, 1])
     np.testing.assert_array_equal(found.new, [False, True, False])
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (0, 3), (3, 0)])
 def test_nothing_to_associate(shape: tuple[int, int]) -> None:
     found = associate(np.zeros(shape), GATES)
-    np.testing.assert_array_equal(found.landmark, np.full(shape[0], NONE))
+    np.testing.assert_array_equal(found.landmark, np.full(shape[0], UNASSOCIATED))
     assert found.new.all()
 
 
 @given(arrays(float, (4, 5), elements=st.floats(0.0, 20.0) | st.just(np.inf)))
 def test_it_is_one_to_one_and_inside_the_gate(cost: Array) -> None:
     found = associate(cost, GATES)
-    matched = np.flatnonzero(found.landmark != NONE)
+    matched = np.flatnonzero(found.landmark != UNASSOCIATED)
     assert len(np.unique(found.landmark[matched])) == len(matched)
     assert (cost[matched, found.landmark[matched]] < GATES.match).all()
     assert not found.new[matched].any()
@@ -74,7 +74,7 @@ def test_a_held_pair_stays_as_long_as_it_passes_the_wide_gate() -> None:
     between = 0.5 * (GATES.match + GATES.create)
     cost = np.array([between, between, GATES.create + 1.0, 1.0])
     held = np.array([True, False, True, True])
-    kept = kept_costs(cost, held, GATES)
+    kept = hysteresis_costs(cost, held, GATES)
     np.testing.assert_array_equal(kept < GATES.match, [True, False, False, True])
     np.testing.assert_array_equal(kept[1:], cost[1:])
 
@@ -97,6 +97,10 @@ def test_a_held_pair_is_kept_however_its_assignment_is_summed() -> None:
     """At the very edge of the gate, alone or beside a reading of nothing, in any order."""
     gates = Gates(6.0, 9.0)
     cost = np.array([[np.inf, np.inf], [7.0, np.inf]])
-    for own, expected in ((cost, [NONE, 0]), (cost[::-1], [0, NONE]), (cost[:, ::-1], [NONE, 1])):
+    for own, expected in (
+        (cost, [UNASSOCIATED, 0]),
+        (cost[::-1], [0, UNASSOCIATED]),
+        (cost[:, ::-1], [UNASSOCIATED, 1]),
+    ):
         held = np.isfinite(own)
-        assert associate(kept_costs(own, held, gates), gates).landmark.tolist() == expected
+        assert associate(hysteresis_costs(own, held, gates), gates).landmark.tolist() == expected

@@ -20,11 +20,10 @@ from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.landmark.batch import LandmarkBatch
 from pathspace_graph.landmark.oracle import solve_landmarks
-from pathspace_graph.landmark.reassociation import drop_rare, predicted
+from pathspace_graph.landmark.reassociation import remove_rare
 from pathspace_graph.landmark.start import as_landmark_detections, start_oracle
 from pathspace_graph.landmark.state import LandmarkState
 from pathspace_graph.landmark.system import LandmarkSystem
-from pathspace_graph.landmark.tentative import duplicates
 from pathspace_graph.mapping.measurements import integrate_log
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -119,12 +118,12 @@ def whole_system(system: LandmarkSystem, state: LandmarkState) -> tuple[Array, A
 
 def test_what_it_predicts_is_of_the_whole_inverse(log: Log) -> None:
     system, state = told_system(log, 25)
-    system.settle(state)
+    system.optimize(state)
     whole = np.linalg.inv(whole_system(system, state)[0])
     cycles, landmarks = np.array([3, 20, 24]), np.array([0, 5, 2])
     r = landmark_residuals(state.variables.poses[cycles], state.landmarks[landmarks], np.zeros((3, 2)))
     jacobian, keys = np.concatenate([r.by_pose, r.by_landmark], axis=2), state.keys[landmarks]
-    found = predicted(system.eliminated(state), cycles, keys, jacobian)
+    found = predicted_covariances(system.eliminated(state), cycles, keys, jacobian)
     for k, h in enumerate(jacobian):
         entries = state.variables.layout.entries(np.array([pose_key(cycles[k]), keys[k]]))
         np.testing.assert_allclose(found[k], h @ whole[np.ix_(entries, entries)] @ h.T, rtol=1e-6)
@@ -133,7 +132,7 @@ def test_what_it_predicts_is_of_the_whole_inverse(log: Log) -> None:
 def test_the_optimum_has_no_gradient(log: Log) -> None:
     system, state = told_system(log, 60)
     before = system.cost(state)
-    system.settle(state)
+    system.optimize(state)
     hessian, vector = whole_system(system, state)
     assert system.cost(state) < before
     assert np.abs(vector / np.sqrt(np.diagonal(hessian))).max() < 0.05
@@ -161,10 +160,10 @@ def test_two_of_one_cone_are_merged_and_two_cones_are_not(log: Log) -> None:
     twin = state.add(state.landmarks[own] + 0.05, state.labels[own])
     mine = np.flatnonzero(detections.landmark == often)
     detections.take(mine[::2], np.repeat(twin, len(mine[::2])))
-    system.settle(state)
-    first, second = duplicates(state, len(state), system.eliminated(state).joint, settings)
+    system.optimize(state)
+    first, second = find_duplicates(state, len(state), system.eliminated(state).joint, settings)
     detections.merge(state.numbers[first], state.numbers[second])
-    drop_rare(state, detections, 1)
+    remove_rare(state, detections, 1)
     assert len(state) == len(state.landmarks) == count
     assert (detections.landmark[mine] == often).all()
 
@@ -175,7 +174,7 @@ def test_rare_ones_are_dropped_and_the_others_keep_their_readings(log: Log) -> N
     numbers, counts = np.unique(detections.landmark[detections.used], return_counts=True)
     fewest = int(np.sort(counts)[len(counts) // 3]) + 1
     before, points = detections.landmark.copy(), state.landmarks.copy()
-    drop_rare(state, detections, fewest)
+    remove_rare(state, detections, fewest)
     np.testing.assert_array_equal(state.numbers, numbers[counts >= fewest])
     np.testing.assert_array_equal(state.landmarks, points[counts >= fewest])
     kept = np.isin(before, state.numbers)

@@ -15,7 +15,6 @@ from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
-from pathspace_graph.landmark.closing import recognize
 from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.run import run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -156,8 +155,8 @@ def recognizing(gap: Array, sigma: float) -> tuple[Array, Array] | None:
     smoother.last_covariance = lambda keys: covariance[  # type: ignore[method-assign]
         np.ix_(entries(keys), entries(keys))
     ]
-    found = recognize(smoother, np.arange(2 * n, 4 * n), np.arange(2 * n), reach=8.0)
-    return None if found is None else (found.first, found.second)
+    found = detect_loop(smoother, np.arange(2 * n, 4 * n), np.arange(2 * n), reach=8.0)
+    return None if found is None else (found.recent, found.old)
 
 
 def test_rows_are_recognized_as_a_whole() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.landmark import landmark_residuals
 from pathspace_graph.factors.odometry import integrate_twists
-from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, merged, normal_equations
+from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, merge_variables, normal_equations
 from pathspace_graph.graph.keys import landmark_keys, pose_key, sizes
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.labels import LEFT, RIGHT
@@ -39,7 +39,7 @@ def drive_on(smoother: LandmarkSmoother, cycle: int, twist: tuple[float, float, 
     """The pose of one more cycle, reached with a twist (m/s, m/s, rad/s)."""
     steps = 1 if cycle else 0
     odometry = integrate_twists(np.full(steps, PERIOD), np.tile(twist, (steps, 1)), ODOMETRY_SIGMA)
-    smoother.drive(PERIOD * cycle, odometry, smoother.map.settings.odometry.sigmas_start)
+    smoother.predict(PERIOD * cycle, odometry, smoother.map.settings.odometry.sigmas_start)
 
 
 def see_all(smoother: LandmarkSmoother, cycle: int, noise: float) -> None:
@@ -67,7 +67,7 @@ def driven(cycles: int, settings: MapperSettings = QUADRATIC, noise: float = 1.0
 def test_rows_are_the_derivatives_of_their_residuals() -> None:
     smoother = driven(4)
     variables, track = smoother.variables, smoother.map
-    track.ties = np.array([[4, 0], [3, 2]])
+    track.loop_pairs = np.array([[4, 0], [3, 2]])
 
     def whitened(x: Array) -> tuple[Array, Array]:
         variables.values = x
@@ -84,10 +84,10 @@ def test_rows_are_the_derivatives_of_their_residuals() -> None:
 def test_a_tie_pulls_two_landmarks_together_as_far_as_it_is_sure() -> None:
     smoother = driven(3)
     apart = np.diff(smoother.map.state.landmarks[[0, 4]], axis=0)
-    smoother.map.ties = np.array([[4, 0]])
+    smoother.map.loop_pairs = np.array([[4, 0]])
     smoother.step()
     tied = np.diff(smoother.map.state.landmarks[[0, 4]], axis=0)
-    smoother.map.ties = np.zeros((0, 2), np.intp)
+    smoother.map.loop_pairs = np.zeros((0, 2), np.intp)
     smoother.step()
     free = np.diff(smoother.map.state.landmarks[[0, 4]], axis=0)
     assert np.hypot(*tied.T) < 0.9 * np.hypot(*apart.T)
@@ -102,7 +102,7 @@ def test_what_it_predicts_is_what_a_step_with_the_new_pose_would_say() -> None:
     found = predict(smoother, landmarks)
     pose, points = smoother.variables.poses[-1].copy(), state.landmarks[landmarks]
     rows = landmark_residuals(np.tile(pose, (2, 1)), points, np.zeros((2, 2)))
-    np.testing.assert_allclose(found.points, rows.residual)
+    np.testing.assert_allclose(found.points_vehicle, rows.residual)
     before = smoother.variables.values.copy()
     smoother.step()
     np.testing.assert_allclose(smoother.variables.values, before, atol=0.1)
@@ -150,7 +150,7 @@ def test_merging_is_the_constraint_that_both_are_one(tolerance: float) -> None:
     before = state.landmarks[0].copy()
     merge(smoother, np.array([4]), np.array([0]))
     np.testing.assert_array_equal(state.numbers, np.arange(4))
-    assert smoother.map.became == {4: 0}
+    assert smoother.map.merged_into == {4: 0}
     assert set(smoother.map.detections.landmark.tolist()) == {0, 1, 2, 3}
     np.testing.assert_allclose(state.landmarks, expected.reshape(-1, 2), atol=1e-3)
     assert np.abs(expected[:2] - before).max() > 0.01
@@ -160,7 +160,7 @@ def test_a_merged_graph_has_the_error_of_the_old_one_where_both_are_one() -> Non
     rng, keys = np.random.default_rng(2), landmark_keys(np.arange(4))
     gone, kept, offset = keys[[3, 1]], keys[[0, 2]], rng.normal(0.0, 1.0, 4)
     factors = [_random(rng, of) for of in (keys[[0, 3]], keys[[1, 2, 3]], keys[[0, 1, 2]])]
-    old, new = graph_of(*factors), merged(graph_of(*factors), gone, kept, offset)
+    old, new = graph_of(*factors), merge_variables(graph_of(*factors), gone, kept, offset)
     raised = []
     for _ in range(5):
         known = {int(key): rng.normal(0.0, 3.0, 2) for key in kept}
@@ -176,7 +176,7 @@ def test_a_key_that_the_graph_does_not_hold_merges_into_nothing() -> None:
     keys = landmark_keys(np.arange(3))
     graph = graph_of(_random(np.random.default_rng(3), keys[:2]))
     hessian, vector = graph.hessian(gtsam.Ordering(keys[:2].tolist()))
-    found = merged(graph, keys[2:], keys[:1], np.ones(2)).hessian(gtsam.Ordering(keys[:2].tolist()))
+    found = merge_variables(graph, keys[2:], keys[:1], np.ones(2)).hessian(gtsam.Ordering(keys[:2].tolist()))
     np.testing.assert_allclose(found[0], hessian, atol=1e-9)
     np.testing.assert_allclose(found[1], vector, atol=1e-9)
 
@@ -184,7 +184,7 @@ def test_a_key_that_the_graph_does_not_hold_merges_into_nothing() -> None:
 @pytest.mark.parametrize("observed", [2, 0])
 def test_a_landmark_has_the_colour_of_most_of_its_readings(observed: int) -> None:
     state = LandmarkState()
-    state.born = 10 * observed  # numbers, not positions
+    state.next_number = 10 * observed  # numbers, not positions
     n = state.add(CONES, LABELS)
     state.vote(np.array([RIGHT, RIGHT, RIGHT]), n[[0, 0, 1]])
     np.testing.assert_array_equal(state.labels, [RIGHT, RIGHT, LEFT, RIGHT, LEFT])

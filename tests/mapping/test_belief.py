@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
-from pathspace_graph.mapping.belief import Belief, compose_rows, point_columns, to_map_rows, to_vehicle_rows
+from pathspace_graph.factors.se2 import compose
+from pathspace_graph.mapping.belief import Belief, point_columns, to_map_rows, to_vehicle_rows
 
 Array = NDArray[np.float64]
 
@@ -17,7 +18,7 @@ def belief_with_points(seed: int = 0) -> Belief:
     rng = np.random.default_rng(seed)
     calibration = np.array([0.05, 0.04])
     belief = Belief(np.array([1.0, -2.0, 0.4]), np.diag([0.2, 0.1, 0.03]) ** 2, calibration)
-    belief.observe(rng.normal(scale=5.0, size=(3, 2)), np.tile(0.04 * np.eye(2), (3, 1, 1)))
+    belief.add_points(rng.normal(scale=5.0, size=(3, 2)), np.tile(0.04 * np.eye(2), (3, 1, 1)))
     return belief
 
 
@@ -31,7 +32,7 @@ def test_prediction_has_the_moments_of_a_sample() -> None:
     noise = rng.multivariate_normal(np.zeros(3), odometry.covariance, 200_000)
     moved = sample.copy()
     error = noise - sample[:, 3:5] @ odometry.calibration_jacobian.T
-    moved[:, :3] = compose_rows(compose_rows(sample[:, :3], odometry.delta), error)
+    moved[:, :3] = compose(compose(sample[:, :3], odometry.delta), error)
     belief.predict(odometry)
     np.testing.assert_allclose(belief.mean, moved.mean(axis=0), atol=3e-3)
     np.testing.assert_allclose(belief.covariance, np.cov(moved.T), atol=1e-3)
@@ -40,7 +41,7 @@ def test_prediction_has_the_moments_of_a_sample() -> None:
 def test_new_points_are_where_the_vehicle_sees_them_with_its_uncertainty() -> None:
     pose, covariance = np.array([1.0, -2.0, 0.4]), np.diag([0.2, 0.1, 0.03]) ** 2
     belief, reading = Belief(pose, covariance), np.array([[8.0, 1.0]])
-    belief.observe(reading, 0.04 * np.eye(2)[None])
+    belief.add_points(reading, 0.04 * np.eye(2)[None])
     rng = np.random.default_rng(2)
     poses = rng.multivariate_normal(pose, covariance, 200_000)
     placed = to_map_rows(poses, rng.multivariate_normal(reading[0], 0.04 * np.eye(2), 200_000))
@@ -71,7 +72,7 @@ def test_a_change_of_points_is_exact_and_leaves_the_rest() -> None:
     belief = belief_with_points()
     before, covariance = belief.mean.copy(), belief.covariance.copy()
     matrix = np.array([[0.5, 0.5], [0.0, 1.0], [1.5, -0.5]])
-    belief.change(0, 2, matrix, np.zeros(3))
+    belief.transform_points(0, 2, matrix, np.zeros(3))
     full = np.zeros((13, 11))
     full[:5, :5], full[11:, 9:], full[5:11, 5:9] = np.eye(5), np.eye(2), np.kron(matrix, np.eye(2))
     np.testing.assert_allclose(belief.mean, full @ before, atol=1e-12)

@@ -23,17 +23,9 @@ from pathspace_graph.eval.benchmark.baseline import (
     read_baseline,
     write_baseline,
 )
-from pathspace_graph.eval.benchmark.benchmark import (
-    Gtsam,
-    Measurement,
-    linear_window,
-    marginal_keys,
-    measure,
-    metrics,
-    orderings,
-    rich_table,
-    time_gtsam,
-)
+from pathspace_graph.eval.benchmark.benchmark import rich_table
+from pathspace_graph.eval.benchmark.gtsam_window import linear_window, marginal_keys, orderings, time_gtsam
+from pathspace_graph.eval.benchmark.measurement import Gtsam, Measurement, measure, metrics
 from pathspace_graph.eval.benchmark.metric import Metric
 from pathspace_graph.io.json_file import write_json
 from pathspace_graph.io.results import CycleRecord
