@@ -19,13 +19,7 @@ from .curves import curve_distance
 from .ghosts import GhostSettings, ghosts
 from .limit import limit
 from .summary import has_cones, lap_times
-from .table1 import (
-    capped_rmse,
-    cone_distances,
-    lap_metrics,
-    missed_share,
-    root_mean_square,
-)
+from .table1 import capped_rmse, cone_distances, lap_metrics, missed_share, root_mean_square
 from .trajectory import position_rms, trajectory_errors
 
 FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3}

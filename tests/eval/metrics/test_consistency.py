@@ -13,9 +13,7 @@ from pathspace_graph.eval.metrics.consistency import (
     normal_errors,
     with_marginals,
 )
-from pathspace_graph.eval.metrics.curves import (
-    true_curve,
-)
+from pathspace_graph.eval.metrics.curves import true_curve
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT
 from pathspace_graph.spline.bspline import BSpline
