@@ -89,18 +89,19 @@ def test_taking_back_leaves_the_first_cones() -> None:
     np.testing.assert_array_equal(np.array(boundary.observed)[:, 0], [0.0, 4.0, 8.0, 12.0])
 
 
-@pytest.mark.parametrize("confirmed", [0.0, 2.9, 3.0, 3.1, 12.0])
-def test_settled_control_points_act_before_the_confirmed_end(confirmed: float) -> None:
-    """All bases but theirs vanish there to two orders: the rest of the curve may be placed anew."""
-    boundary, _ = line(24.0)
+@pytest.mark.parametrize("confirmed", [0.5, 2.9, 3.1, 12.0, 20.0])
+def test_settled_control_points_alone_hold_the_curve_before_the_confirmed_end(confirmed: float) -> None:
+    """All others may be placed anew; they act from less than two knot intervals before the end on."""
+    boundary, points = line(24.0)
     boundary.confirmed_end = confirmed
     settled = boundary.settled(boundary.size)
-    u = np.array([max(confirmed - 1e-9, 0.0)])
-    values, span = boundary.tables.evaluate(u)
-    free = boundary.columns(span)[0] >= settled
-    assert values[0][0][free].sum() <= 1.0 + 1e-12
-    assert (boundary.knots[:settled] < confirmed + 1e-9).all()
-    assert settled == 0 or boundary.knots[settled + 1] >= confirmed - 1e-9
+    u = np.linspace(0.0, max(confirmed - 2.0 * SPLINE.spacing, 0.0), 20)
+    before = boundary.evaluate(points, u)
+    points[settled:] += 1.0
+    kept = u <= boundary.knots[settled]
+    np.testing.assert_array_equal(boundary.evaluate(points, u)[kept], before[kept])
+    assert kept[u > 0.0].all()
+    assert (boundary.knots[:settled] < confirmed).all()
 
 
 # --- what it believes ----------------------------------------------------------------------------------
