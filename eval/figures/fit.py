@@ -17,14 +17,7 @@ from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.sim.geometry import left_normals, unit
 from pathspace_graph.spline.bspline import BSpline
 
-from .marks import (
-    draw_control_points,
-    draw_curve,
-    draw_ellipses,
-    draw_points,
-    normals,
-    point_blocks,
-)
+from .marks import draw_control_points, draw_curve, draw_ellipses, draw_points, normals, point_blocks
 from .style import (
     BLUE,
     DARK,

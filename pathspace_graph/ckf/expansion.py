@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.candidates import SIDES, Candidates, End, chain
@@ -151,8 +151,7 @@ class Expansion:
         point = path_ahead.beside(path_ahead.driven - settings.stranded_left * settings.stranded, side)
         if np.hypot(*(point - end.position)) < settings.min_carry:
             return False
-        c, s = np.cos(state.pose[2]), np.sin(state.pose[2])
-        point_vehicle = (point - state.pose[:2]) @ np.array([[c, -s], [s, c]])
+        point_vehicle = (point - state.pose[:2]) @ rotation(state.pose[2])
         state.extend(label, point_vehicle, self.settings.ckf.sigma_carry**2 * np.eye(2))
         return True
 
