@@ -34,7 +34,7 @@ BAD_INPUT: Final = 2
 
 @dataclass(frozen=True, kw_only=True)
 class Benchmark:
-    """Time the online mapper on a generated track of 200 cones, and GTSAM's linear algebra on its windows."""
+    """Times the online mapper on a generated track of 200 cones, and GTSAM's own solver on its windows."""
 
     laps: int = 5
     """The track is driven for this many laps."""
@@ -43,9 +43,9 @@ class Benchmark:
     json: Path | None = None
     """The figures are written to this file."""
     compare: bool = False
-    """Say what is worse than the baseline by more than its tolerance; the exit code is 1 then."""
+    """The table says what is worse than the baseline by more than its tolerance; the exit code is 1 then."""
     write_baseline: bool = False
-    """Make the ratios of this run the baseline."""
+    """The ratios of this run become the baseline."""
     baseline: Path = BASELINE
     """The baseline is in this file; by default it is the one that comes with the package."""
 
