@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.projection import ProjectionRows, project
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.graph.elimination import Elimination, linear_graph, map_held, owners
+from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
 from pathspace_graph.graph.keys import are_poses, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
@@ -184,8 +184,8 @@ class BatchSystem:
     def poses_alone(self, at: Evaluation) -> Array:
         """Returns the step (3 P,) of the poses while the map and the calibration are held."""
         keys = at.state.variables.keys
-        graph = linear_graph(map_held(self.rows(at)), at.state.variables)
-        return Elimination(graph, Layout(keys[are_poses(keys)])).beside(np.zeros(0))
+        graph = linear_graph(fix_map(self.rows(at)), at.state.variables)
+        return Elimination(graph, Layout(keys[are_poses(keys)])).poses_given(np.zeros(0))
 
 
 def moved(state: State, step: Array) -> State:
