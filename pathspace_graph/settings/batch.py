@@ -12,7 +12,7 @@ Start = Literal["online", "odometry"]
 
 @dataclass(frozen=True)
 class RecurrenceSettings(Positive, group="batch.recurrence"):
-    """How a start from odometry finds the length of a lap."""
+    """Describes how a start from odometry finds the length of a lap."""
 
     profile_step: float = 0.5
     """The curvature of the path driven is sampled at this step (m)."""
@@ -26,7 +26,7 @@ class RecurrenceSettings(Positive, group="batch.recurrence"):
 
 @dataclass(frozen=True)
 class LapCorrespondenceSettings(Positive, group="batch.laps"):
-    """How a start from odometry makes every lap pass the same places."""
+    """Describes how a start from odometry makes every lap pass the same places."""
 
     reference_step: float = 8.0
     """The reference poses that every lap passes are this distance (m) apart."""
@@ -47,7 +47,7 @@ class LapCorrespondenceSettings(Positive, group="batch.laps"):
 
 @dataclass(frozen=True)
 class ConeSettings(Positive, group="batch.cones"):
-    """How the detections along a curve are clustered to cones."""
+    """Describes how the detections along a curve are clustered to cones."""
 
     density_step: float = 0.1
     """The density of the detections along a curve is sampled at this step (m)."""
@@ -70,7 +70,7 @@ class ConeSettings(Positive, group="batch.cones"):
 
 @dataclass(frozen=True)
 class AssociationSettings(Positive, group="batch.association"):
-    """How poses and detections are placed along the curves."""
+    """Describes how poses and detections are placed along the curves."""
 
     step: float = 1.0
     """Nearest points of a curve are first searched for at this step (m along the curve)."""
@@ -80,7 +80,7 @@ class AssociationSettings(Positive, group="batch.association"):
 
 @dataclass(frozen=True)
 class FootPointSettings(Positive, group="batch.foot_points"):
-    """How foot points are computed: more exactly than online, as an optimum needs it."""
+    """Describes how foot points are computed: more exactly than online, as an optimum needs it."""
 
     refine_room: float = 8.0
     """A foot point is followed this far (m along the curve) in a step, instead of `spline.refine_room`."""
@@ -92,7 +92,7 @@ class FootPointSettings(Positive, group="batch.foot_points"):
 
 @dataclass(frozen=True)
 class ScatterSettings(Positive, group="batch.scatter"):
-    """How the distance of cones from the map's curves is measured."""
+    """Describes how the distance of cones from the map's curves is measured."""
 
     folds: int = 4
     """The cross-validation deals the cones in turn into this number of groups, and leaves out one group at a
