@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.ckf.update import classify, update
 from pathspace_graph.ckf.closing import update_by_correspondences
 from pathspace_graph.ckf.expansion import proximity_chain
 from pathspace_graph.ckf.mapper import CkfMapper
 from pathspace_graph.ckf.state import CurveState
+from pathspace_graph.ckf.update import classify, update
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.table1 import cone_distances, lap_metrics
 from pathspace_graph.io.log import Detections
