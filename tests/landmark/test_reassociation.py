@@ -1,4 +1,4 @@
-"""A round of the landmark batch: its predictions, its associations, and the landmarks it creates or removes."""
+"""A round of the landmark batch: its predictions, its associations, and which landmarks it creates."""
 
 from __future__ import annotations
 
