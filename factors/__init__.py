@@ -1,1 +1,1 @@
-"""Measurement mathematics: splines on plain arrays, and the factors built on them."""
+"""Measurement mathematics on plain arrays: B-splines, residuals and their Jacobians, and GTSAM adapters."""

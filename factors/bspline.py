@@ -1,7 +1,7 @@
-"""B-spline basis functions on plain arrays: Cox-de Boor values and derivatives.
+"""B-spline basis functions on plain arrays: their values and derivatives by the Cox-de Boor recurrence.
 
 A spline of degree p over n control points has n + p + 1 non-decreasing knots and the domain
-[knots[p], knots[n]]. On the span knots[i] <= u < knots[i + 1] only the control points i - p .. i matter.
+[knots[p], knots[n]]. On the span knots[i] <= u < knots[i + 1] only the control points i - p to i matter.
 A periodic spline of m distinct control points is stored unwrapped: n = m + p control points, of which the
 last p repeat the first, over one period of knots and p more on either side.
 """
@@ -16,12 +16,15 @@ Ints = NDArray[np.intp]
 
 
 def domain(knots: Floats, degree: int) -> tuple[float, float]:
-    """[knots[p], knots[n]]: where all p + 1 basis functions of a span exist."""
+    """Returns the limits knots[p] and knots[n] of the domain, where all p + 1 basis functions exist."""
     return float(knots[degree]), float(knots[len(knots) - degree - 1])
 
 
 def wrap(knots: Floats, degree: int, u: Floats) -> Floats:
-    """u modulo the period, into the domain of a periodic spline (its right end by round-off only)."""
+    """Returns u modulo the period, inside the domain of a periodic spline.
+
+    The right end of the domain is reached by round-off only.
+    """
     low, high = domain(knots, degree)
     period = high - low
     wrapped = u - period * np.floor((u - low) / period)
@@ -29,9 +32,10 @@ def wrap(knots: Floats, degree: int, u: Floats) -> Floats:
 
 
 def find_span(knots: Floats, degree: int, u: Floats) -> Ints:
-    """i with knots[i] <= u < knots[i + 1]; the right end of the domain belongs to the last non-empty span.
+    """Returns the span i (m,), in [p, n - 1], of each u (m,), so that knots[i] <= u < knots[i + 1].
 
-    knots (n + p + 1,), u (m,), as if clipped to the domain -> (m,) in [p, n - 1].
+    Values of u outside the domain are treated as if they were clipped to it. The right end of the domain
+    belongs to the last non-empty span. knots has shape (n + p + 1,).
     """
     end = len(knots) - degree - 1
     last = int(np.searchsorted(knots[degree:end], knots[end], side="left")) - 1
@@ -40,12 +44,13 @@ def find_span(knots: Floats, degree: int, u: Floats) -> Ints:
 
 
 def basis(knots: Floats, degree: int, u: Floats, derivatives: int = 0) -> tuple[Floats, Ints]:
-    """N_i^p = (u - t_i) / (t_{i+p} - t_i) N_i^{p-1} + (t_{i+p+1} - u) / (t_{i+p+1} - t_{i+1}) N_{i+1}^{p-1}.
+    """Returns basis values and derivatives (derivatives + 1, m, p + 1) at u (m,), and the spans (m,) of u.
 
-    knots (n + p + 1,) of a domain that is not empty, u (m,) clipped to it -> values
-    (derivatives + 1, m, p + 1), spans (m,); column j belongs to the control point span - p + j. At a knot the
-    derivative from the right is given, at the right end of the domain the one from the left. A span found is
-    never empty, so no divisor is zero: functions of empty support (0/0 := 0) are not met. De Boor (1972).
+        N_i^p = (u - t_i) / (t_{i+p} - t_i) N_i^{p-1} + (t_{i+p+1} - u) / (t_{i+p+1} - t_{i+1}) N_{i+1}^{p-1}
+
+    knots (n + p + 1,) must have a non-empty domain, and u is clipped to it. Column j belongs to the control
+    point span - p + j. A derivative at a knot is the one from the right, and at the right end of the domain
+    the one from the left. The span of a parameter is never empty, so no divisor is zero. See de Boor (1972).
     """
     low, high = domain(knots, degree)
     u = np.minimum(np.maximum(u, low), high)
@@ -64,7 +69,7 @@ def basis(knots: Floats, degree: int, u: Floats, derivatives: int = 0) -> tuple[
 
 
 def _levels(window: Floats, degree: int, u: Floats) -> list[Floats]:
-    """Basis values of every degree q <= p, (q + 1, m) each, from the knots `window` (2 p, m) around u."""
+    """Returns the basis values (q + 1, m) of each degree q <= p, from the knots (2 p, m) around each u."""
     levels = [np.ones((1, len(u)))]
     for q in range(1, degree + 1):
         lower, upper = window[degree - q : degree], window[degree : degree + q]
@@ -78,7 +83,10 @@ def _levels(window: Floats, degree: int, u: Floats) -> list[Floats]:
 
 
 def _differentiate(window: Floats, degree: int, q: int, level: Floats) -> Floats:
-    """q (N_i^{q-1} / (t_{i+q} - t_i) - N_{i+1}^{q-1} / (t_{i+q+1} - t_{i+1})): (q, m) -> (q + 1, m)."""
+    """Returns q (N_i^{q-1} / (t_{i+q} - t_i) - N_{i+1}^{q-1} / (t_{i+q+1} - t_{i+1})) (q + 1, m).
+
+    level (q, m) holds the functions, or derivatives, of degree q - 1.
+    """
     ratio = q * level / (window[degree : degree + q] - window[degree - q : degree])
     raised = np.zeros((q + 1, ratio.shape[1]))
     raised[1:] = ratio
@@ -86,15 +94,15 @@ def _differentiate(window: Floats, degree: int, q: int, level: Floats) -> Floats
     return raised
 
 
-def positive(width: Floats) -> Floats:
-    """The width, or infinity where it is zero, so that 0 / 0 := 0."""
+def divisors(width: Floats) -> Floats:
+    """Returns each width, or infinity where it is zero, so that 0 / 0 is taken as 0."""
     return np.where(width > 0.0, width, np.inf)
 
 
 def scatter(values: Floats, first: Ints, size: int, periodic: bool = False) -> Floats:
-    """Dense rows (m, size) of the local values (m, p + 1) whose first column is the control point `first`.
+    """Returns dense rows (m, size) of local values (m, p + 1), whose first columns belong to `first` (m,).
 
-    Where periodic, columns are folded modulo `size` (and summed where a short period folds them together).
+    Columns of a periodic spline are taken modulo `size`, and values that fall on the same column are added.
     """
     matrix = np.zeros((len(values), size))
     columns = first[:, None] + np.arange(values.shape[1])
@@ -105,29 +113,35 @@ def scatter(values: Floats, first: Ints, size: int, periodic: bool = False) -> F
 
 
 def basis_matrix(knots: Floats, degree: int, u: Floats, n: int, derivative: int = 0) -> Floats:
-    """B with B[k, i] = d^r/du^r N_i^p(u_k): (m, n), so that S(u) = B c for n control points."""
+    """Returns B (m, n) with B[k, i] = d^r/du^r N_i^p(u_k), so that d^r S/du^r = B c for n control points."""
     values, span = basis(knots, degree, u, derivative)
     return scatter(values[derivative], span - degree, n)
 
 
 def periodic_basis_matrix(knots: Floats, degree: int, u: Floats, m: int, derivative: int = 0) -> Floats:
-    """B onto the m distinct control points of a periodic spline, u taken modulo the period: (rows, m)."""
+    """Returns B (k, m) as `basis_matrix`, for the m distinct control points of a periodic spline.
+
+    Parameters u (k,) are taken modulo the period.
+    """
     values, span = basis(knots, degree, wrap(knots, degree, u), derivative)
     return scatter(values[derivative], span - degree, m, periodic=True)
 
 
 def uniform_knots(count: int, degree: int, interval: float = 1.0, start: float = 0.0) -> Floats:
-    """Unclamped equally spaced knots of `count` control points, the domain beginning at `start`."""
+    """Returns unclamped, equally spaced knots of `count` control points; the domain begins at `start`."""
     return start + interval * np.arange(-degree, count + 1, dtype=np.float64)
 
 
 def clamped_knots(breaks: Floats, degree: int) -> Floats:
-    """The breaks (k + 1,) with both ends repeated p times more: knots of k + p control points."""
+    """Returns the breaks (k + 1,) with both ends repeated p times more, as knots of k + p control points."""
     return np.concatenate([np.full(degree, breaks[0]), breaks, np.full(degree, breaks[-1])])
 
 
 def periodic_knots(breaks: Floats, degree: int) -> Floats:
-    """One period of m + 1 > p breaks and p knots more on either side, for m + p unwrapped control points."""
+    """Returns one period of m + 1 > p breaks with p more knots on either side.
+
+    They are the knots of m + p unwrapped control points.
+    """
     period = breaks[-1] - breaks[0]
     before = breaks[-1 - degree : -1] - period
     after = breaks[1 : degree + 1] + period
@@ -135,11 +149,11 @@ def periodic_knots(breaks: Floats, degree: int) -> Floats:
 
 
 def end_change_matrix(knots: Floats, degree: int, new_knots: Floats) -> Floats:
-    """M (n, n) with C_new = M C: the same curve on the same domain where only knots outside of it changed.
+    """Returns M (n, n) with C_new = M C, which keeps the curve where only knots outside the domain change.
 
-    c_j is the blossom of the polynomial of a span that it acts on, at the knots t_{j+1} .. t_{j+p}
-    (Ramshaw 1989): so clamping, unclamping and the extension of Hu et al. (2002) are one formula. The first
-    and the last span of the domain must not be empty; knots beyond index n + p - 1 are not read.
+    The control point c_j is the blossom, at the knots t_{j+1} to t_{j+p}, of the polynomial of any span that
+    it acts on (Ramshaw 1989). So clamping, unclamping and the extension of Hu et al. (2002) are one formula.
+    The first and the last span of the domain must not be empty. Knots beyond index n + p - 1 are not read.
     """
     count = len(knots) - degree - 1
     matrix = np.eye(count)
@@ -153,7 +167,10 @@ def end_change_matrix(knots: Floats, degree: int, new_knots: Floats) -> Floats:
 
 
 def _blossom(knots: Floats, degree: int, span: int, arguments: Floats) -> Floats:
-    """Weights (p + 1,) on the span's control points of its polynomial's blossom, by de Boor's recurrence."""
+    """Returns the weights (p + 1,) of a span's control points in the blossom of its polynomial.
+
+    They follow from de Boor's recurrence, with another argument at each level.
+    """
     weights = np.eye(degree + 1)
     for r, x in enumerate(arguments, start=1):
         lower = knots[span - degree + r : span + 1]

@@ -9,106 +9,100 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .bspline import Floats, Ints
-from .spans import SpanPolynomials, Spans
+from .spans import SpanPolynomials, Spans, horner
 from .stretch import Stretch, stretch_of
 
 Bools = NDArray[np.bool_]
 
 _STEP_TOLERANCE: Final = 1e-9
-"""A row takes its last step where |step| <= tolerance * length of the domain: the error is its square."""
+"""A row takes its last step where |step| <= tolerance * length of the domain; the error is its square."""
 _FLAT: Final = 1e-12
-"""f' is positive where f' > tolerance * |S'|^2."""
+"""The derivative f' counts as positive where f' > tolerance * |S'|^2."""
 _EQUAL_SQUARE: Final = 1e-12
-"""Squared distances d, e (m^2) are told apart where e > d + tolerance * (1 + d): below lies round-off."""
+"""Squared distances d, e (m^2) differ by more than round-off where e > d + tolerance * (1 + d)."""
 _END_TOLERANCE: Final = 1e-9
-"""A foot point is at an end where it lies within tolerance * length of the domain of it."""
+"""A foot point is at an end that is no farther away than tolerance * length of the domain."""
 _NO_TANGENT: Final = 1e-12
 """The tangent vanishes where |S'| <= tolerance * largest coordinate / length of the domain."""
 _SAFEGUARDED_STEPS: Final = 4
-"""Bracketed steps in place of a Newton step that led farther away."""
+"""A Newton step that leads farther away is replaced by this number of bracketed steps."""
 _TINY: Final = 1e-300
-"""Smallest divisor of a step; the numerator vanishes before it does."""
+"""This is the smallest divisor of a step; the numerator vanishes before it does."""
 _CHUNK: Final = 1 << 20
-"""Most point-to-grid distances held at once (entries)."""
+"""At most this number of point-to-grid distances are held in memory at once."""
+SEARCH_ITERATIONS: Final = 50
+"""A search takes at most this number of steps; it ends earlier once all rows have converged."""
+REFINE_ITERATIONS: Final = 2
+"""A refinement from a known parameter takes this number of Newton steps."""
 
 
 @dataclass(frozen=True, eq=False)
 class FootPoints:
-    """The nearest curve point to each of m points, within each one's own stretch."""
+    """Holds the curve point that is nearest to each of m points, within each point's own stretch."""
 
     u: Floats
-    """Parameter (m,), inside the domain (wrapped where periodic)."""
+    """The parameters (m,) are inside the domain; those of a periodic curve are wrapped."""
     position: Floats
-    """S(u) (m, 2), metres."""
+    """These are the curve points S(u) (m, 2), in m."""
     tangent_unit: Floats
-    """Unit tangent in the direction of travel (m, 2)."""
+    """The unit tangents (m, 2) are in the direction of travel."""
     normal_unit: Floats
-    """Unit normal (m, 2), left of the direction of travel."""
+    """The unit normals (m, 2) point to the left of the direction of travel."""
     distance: Floats
-    """normal_unit . (point - S(u)) (m,), metres: positive left of the curve."""
+    """The signed distances normal_unit . (point - S(u)) (m,), in m, are positive left of the curve."""
     interior: Bools
-    """False (m,) at an end of an open curve, and at a limit of the stretch beyond which it comes nearer."""
+    """This is false (m,) at an end of an open curve, and at a limit beyond which the curve comes nearer."""
     basis: Floats
-    """Basis values (m, p + 1) at u; column j is of control point span - p + j (modulo m where periodic)."""
+    """In these basis values (m, p + 1) at u, column j belongs to the control point span - p + j."""
     span: Ints
-    """Knot span (m,) of u; those of several curves are counted through."""
+    """These are the knot spans (m,) of u; the spans of several curves are numbered consecutively."""
     columns: Ints
-    """Control points (m, p + 1) that the basis values belong to."""
+    """These are the indices (m, p + 1) of the control points that the basis values belong to."""
 
     def where(self, rows: Ints | Bools | slice) -> FootPoints:
-        """Of some rows."""
+        """Returns the foot points of some rows."""
         return FootPoints(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Curves:
-    """Curves as polynomials on each span, evaluated component-first."""
+    """Holds curves as polynomials on each span; arrays have the component x, y first."""
 
     spans: Spans
-    """The basis."""
+    """These are the spans of all curves."""
     coefficients: Floats
-    """(p + 1, 3, 2, n) of `Spans.curve_coefficients`: S, S', S''."""
+    """This is the result (p + 1, 3, 2, n) of `Spans.curve_coefficients`."""
 
     def position(self, v: Floats) -> Floats:
-        """S (2, m) at places on the axis."""
+        """Returns S (2, m) at places v (m,) on the axis."""
         number, s = self.spans.locate(v)
-        return _horner(self.coefficients[:, 0].take(number, axis=-1), s)
+        return horner(self.coefficients[:, 0].take(number, axis=-1), s)
 
     def derivatives(self, number: Ints, s: Floats) -> Floats:
-        """S, S', S'' (3, 2, m) at the local coordinate s on span `number`."""
-        return _horner(self.coefficients.take(number, axis=-1), s)
-
-
-def _horner(terms: Floats, s: Floats) -> Floats:
-    """sum_k terms[k] s^k (..., m) of terms (p + 1, ..., m)."""
-    total: Floats = terms[-1] * s
-    total += terms[-2]
-    for term in terms[-3::-1]:
-        total *= s
-        total += term
-    return total
+        """Returns S, S', S'' (3, 2, m) at the local coordinates s (m,) on the spans `number` (m,)."""
+        return horner(self.coefficients.take(number, axis=-1), s)
 
 
 @dataclass(frozen=True, eq=False)
 class _Probe:
-    """The curve and the distances to it at one parameter for each row."""
+    """Holds the curve and the distance to it at one parameter for each row."""
 
     v: Floats
-    """Places (m,) on the axis."""
+    """These are the places (m,) on the axis."""
     number: Ints
-    """Span numbers (m,) of `Spans.locate`."""
+    """These are the span numbers (m,) from `Spans.locate`."""
     s: Floats
-    """Local coordinates (m,)."""
+    """These are the local coordinates (m,) on the spans."""
     offset: Floats
-    """S(u) - p (2, m), metres."""
+    """These are the offsets S(u) - p (2, m), in m."""
     first: Floats
-    """S'(u) (2, m)."""
+    """These are the derivatives S'(u) (2, m)."""
     square: Floats
-    """Squared distance (m,)."""
+    """These are the squared distances |S(u) - p|^2 (m,), in m^2."""
     slope: Floats
-    """f = (S - p) . S' (m,): half the derivative of the squared distance."""
+    """The slope f = (S - p) . S' (m,) is half the derivative of the squared distance."""
     step: Floats
-    """Newton's -f / f' (m,), or Gauss-Newton's -f / |S'|^2 where f' is not positive: downhill."""
+    """The downhill step (m,) is Newton's -f / f', or Gauss-Newton's -f / |S'|^2 where f' is not positive."""
 
 
 def foot_points(
@@ -118,14 +112,15 @@ def foot_points(
     u_low: Floats,
     u_high: Floats,
     coarse_step: float,
-    iterations: int = 50,
+    iterations: int = SEARCH_ITERATIONS,
 ) -> FootPoints:
-    """u_i = argmin |S(u) - p_i| over u in [u_low_i, u_high_i], globally as far as the coarse grid resolves.
+    """Returns `u_i = argmin |S(u) - p_i|` over u in [u_low_i, u_high_i], and what the curve is there.
 
-    control_points (n, 2) unwrapped where periodic, points (m, 2), stretch limits (m,) in parameter units:
-    clipped to the domain of an open curve; of a periodic one they may run past the seam, and a stretch as
-    long as the period has no limits. `coarse_step` is the grid's step in u. It stops once all rows converged.
-    Finite input gives finite output, also where the tangent vanishes, at centres of curvature and at kinks.
+    The minimum is global as far as a coarse grid of step `coarse_step` in u resolves it. control_points
+    (n, 2) are unwrapped where the curve is periodic, points (m, 2) are in the same frame, in m, and the
+    limits (m,) are parameters. They are clipped to the domain of an open curve. On a periodic curve they may
+    run past the seam, and a stretch as long as the period has no limits. Finite input gives finite output,
+    also where the tangent vanishes, at centres of curvature and at kinks.
     """
     curve = np.zeros(len(points), np.intp)
     search = (coarse_step, iterations)
@@ -140,9 +135,9 @@ def joint_foot_points(
     u_low: Floats,
     u_high: Floats,
     coarse_step: float,
-    iterations: int = 50,
+    iterations: int = SEARCH_ITERATIONS,
 ) -> FootPoints:
-    """`foot_points` on several curves at once, `curve` (m,) each row's own, of those that are laid out."""
+    """Returns `foot_points` on several curves; `curve` (m,) is the number of each row's own."""
     curves = _Curves(spans, spans.curve_coefficients(control_points))
     points_t = np.ascontiguousarray(points.T)
     stretch = stretch_of(spans, curve, u_low, u_high)
@@ -158,12 +153,12 @@ def refine_foot_points(
     u_start: Floats,
     u_low: Floats,
     u_high: Floats,
-    iterations: int = 2,
+    iterations: int = REFINE_ITERATIONS,
 ) -> FootPoints:
-    """The local minimum of |S(u) - p_i| downhill from u_start, by a few safeguarded Newton steps.
+    """Returns the local minimum of |S(u) - p_i| downhill from u_start, by a few safeguarded Newton steps.
 
-    As `foot_points`, but from a known parameter (m,), moved into the stretch where it lies outside; a step
-    never goes farther than one mean knot interval, and no row ends farther from the curve than it began.
+    The arguments are those of `foot_points`. A start (m,) outside its stretch is moved into it first. A step
+    is never longer than one mean knot interval, and no row ends farther from the curve than it began.
     """
     curve = np.zeros(len(points), np.intp)
     return refine_joint_foot_points(
@@ -179,9 +174,9 @@ def refine_joint_foot_points(
     u_start: Floats,
     u_low: Floats,
     u_high: Floats,
-    iterations: int = 2,
+    iterations: int = REFINE_ITERATIONS,
 ) -> FootPoints:
-    """`refine_foot_points` on several curves at once, `curve` (m,) each row's own."""
+    """Returns `refine_foot_points` on several curves; `curve` (m,) is the number of each row's own."""
     curves = _Curves(spans, spans.curve_coefficients(control_points))
     points_t = np.ascontiguousarray(points.T)
     stretch = stretch_of(spans, curve, u_low, u_high)
@@ -191,11 +186,12 @@ def refine_joint_foot_points(
 
 
 def _nearest_on_grid(curves: _Curves, points: Floats, curve: Ints, stretch: Stretch, step: float) -> Floats:
-    """The nearest to each point (m,) among the places of a shared grid in its stretch, and its limits."""
+    """Returns the nearest place (m,) to each point, of a grid in its stretch and the stretch's limits."""
     if len(points) == 0:
         return np.zeros(0)
     low, high = stretch.low, stretch.high
-    grid = np.concatenate([_grid(low[of], high[of], step) for of in _by_curve(curve, len(curves.spans.low))])
+    own_rows = _rows_of_curves(curve, len(curves.spans.low))
+    grid = np.concatenate([_grid(low[rows], high[rows], step) for rows in own_rows])
     count = len(grid)
     on_curve = curves.position(np.concatenate([grid, low, high]))
     on_grid, ends = on_curve[:, :count], on_curve[:, count:].reshape(2, 2, -1)
@@ -206,14 +202,14 @@ def _nearest_on_grid(curves: _Curves, points: Floats, curve: Ints, stretch: Stre
     return np.asarray(np.choose(choice, [grid[index], low, high]))
 
 
-def _by_curve(curve: Ints, count: int) -> list[Bools]:
-    """The rows (m,) of each curve that has any."""
-    of_each = (curve == k for k in range(count))
-    return [rows for rows in of_each if rows.any()]
+def _rows_of_curves(curve: Ints, count: int) -> list[Bools]:
+    """Returns a mask (m,) of the rows of each curve that has any."""
+    masks = (curve == k for k in range(count))
+    return [rows for rows in masks if rows.any()]
 
 
 def _grid(low: Floats, high: Floats, step: float) -> Floats:
-    """Evenly spaced places from the lowest to the highest of stretches (m,) on a curve."""
+    """Returns evenly spaced places from the lowest to the highest limit of stretches (m,) on a curve."""
     first = float(low.min())
     count = max(int(np.ceil((float(high.max()) - first) / step)), 1) + 1
     return np.asarray(first + step * np.arange(count, dtype=np.float64))
@@ -222,21 +218,24 @@ def _grid(low: Floats, high: Floats, step: float) -> Floats:
 def _nearest_of(
     points: Floats, grid: Floats, on_grid: Floats, low: Floats, high: Floats
 ) -> tuple[Ints, Floats]:
-    """Nearest grid point (m,) of each stretch, and its squared distance (m,); so many rows at once as fit."""
+    """Returns the index (m,) of the nearest grid point in each stretch, and its squared distance (m,).
+
+    Rows are taken in chunks, so that the distances fit into memory.
+    """
     index, least = np.empty(len(points), np.intp), np.empty(len(points))
     rows = max(_CHUNK // len(grid), 1)
     for begin in range(0, len(points), rows):
-        part = slice(begin, begin + rows)
-        squares = (points[part, :1] - on_grid[0]) ** 2
-        squares += (points[part, 1:] - on_grid[1]) ** 2
-        squares[(grid < low[part, None]) | (grid > high[part, None])] = np.inf
-        index[part] = squares.argmin(axis=1)
-        least[part] = squares.min(axis=1)
+        chunk = slice(begin, begin + rows)
+        squares = (points[chunk, :1] - on_grid[0]) ** 2
+        squares += (points[chunk, 1:] - on_grid[1]) ** 2
+        squares[(grid < low[chunk, None]) | (grid > high[chunk, None])] = np.inf
+        index[chunk] = squares.argmin(axis=1)
+        least[chunk] = squares.min(axis=1)
     return index, least
 
 
 def _newton(curves: _Curves, points_t: Floats, start: Floats, stretch: Stretch, iterations: int) -> _Probe:
-    """Newton steps no longer than a knot interval; a row that would get farther away is safeguarded."""
+    """Takes Newton steps no longer than a knot interval; a row that would get farther away is bracketed."""
     reach = stretch.interval
     last = _probe(curves, points_t, start)
     for _ in range(iterations):
@@ -262,10 +261,10 @@ def _descend(
     reach: Floats,
     iterations: int,
 ) -> _Probe:
-    """Newton where its step stays inside the bracket, else its middle; it begins as `reach` (m,) downhill.
+    """Takes Newton steps that stay inside a bracket, and otherwise goes to the middle of the bracket.
 
-    The bracket is from the nearest so far to where the distance surely rises again, so that no row ever gets
-    farther away.
+    The bracket reaches from the nearest place so far to one where the distance surely rises again, so that no
+    row ever gets farther away. At first it is `reach` (m,) long, downhill.
     """
     tolerance = _STEP_TOLERANCE * stretch.length
     best = _probe(curves, points_t, start)
@@ -285,17 +284,17 @@ def _descend(
 
 
 def _either(first: Bools, a: _Probe, b: _Probe) -> _Probe:
-    """Row by row the one or the other."""
+    """Returns a where `first` (m,) is true, and b elsewhere."""
     return _Probe(*(np.where(first, getattr(a, f.name), getattr(b, f.name)) for f in fields(a)))
 
 
 def _no_farther(square: Floats, than: Floats) -> Bools:
-    """Squared distances (m,) compared, round-off aside."""
+    """Returns where a squared distance (m,) is no larger than another one, apart from round-off."""
     return square <= than + _EQUAL_SQUARE * (1.0 + than)
 
 
 def _probe(curves: _Curves, points_t: Floats, v: Floats) -> _Probe:
-    """The curve and the distances of points (2, m) at v."""
+    """Returns the curve at the places v (m,), and its distance from points (2, m)."""
     number, s = curves.spans.locate(v)
     orders = curves.derivatives(number, s)
     offset, first = orders[0], orders[1]
@@ -303,14 +302,14 @@ def _probe(curves: _Curves, points_t: Floats, v: Floats) -> _Probe:
     products = orders * offset
     square, slope, centripetal = products[:, 0] + products[:, 1]
     speed = _dot(first, first)
-    bend = speed + centripetal
-    divisor = np.where(bend > _FLAT * speed, bend, speed)
+    curvature = speed + centripetal
+    divisor = np.where(curvature > _FLAT * speed, curvature, speed)
     step = -slope / np.maximum(divisor, _TINY)
     return _Probe(v, number, s, offset, first, square, slope, step)
 
 
 def _dot(a: Floats, b: Floats) -> Floats:
-    """Inner products (m,) of columns (2, m)."""
+    """Returns the inner products (m,) of columns (2, m)."""
     products = a * b
     return np.asarray(products[0] + products[1])
 
@@ -318,7 +317,7 @@ def _dot(a: Floats, b: Floats) -> Floats:
 def _finish(
     spans: Spans, control_points: Floats, points_t: Floats, curve: Ints, probe: _Probe, stretch: Stretch
 ) -> FootPoints:
-    """All outputs at the places found."""
+    """Returns all outputs at the places that were found."""
     columns = spans.columns.take(probe.number, axis=0)
     tangent = _unit_tangent(control_points, probe.first, columns, stretch.length)
     normal = np.empty_like(tangent)
@@ -338,7 +337,11 @@ def _finish(
 
 
 def _unit_tangent(control_points: Floats, first: Floats, columns: Ints, length: Floats) -> Floats:
-    """S' / |S'| (2, m); where S' vanishes the direction of the control polygon, or else of the x axis."""
+    """Returns S' / |S'| (2, m).
+
+    Where S' vanishes, it returns the direction of the control polygon, or of the x axis where that vanishes
+    too.
+    """
     norm = np.sqrt(_dot(first, first))
     vanishing = ~(norm * length > _NO_TANGENT * np.abs(control_points).max(initial=0.0))
     if not vanishing.any():
@@ -353,7 +356,7 @@ def _unit_tangent(control_points: Floats, first: Floats, columns: Ints, length: 
 
 
 def _interior(probe: _Probe, stretch: Stretch) -> Bools:
-    """False at an end of an open domain, and at a limit of the stretch where the distance falls outward."""
+    """Returns false (m,) at an end of an open domain, and at a limit beyond which the distance falls."""
     tolerance = _END_TOLERANCE * stretch.length
     at_low = probe.v - stretch.floor <= tolerance
     at_high = stretch.ceiling - probe.v <= tolerance

@@ -1,6 +1,6 @@
-"""The kernels as GTSAM factors, for anyone's nonlinear graph: projection, spacing, smoothness, odometry.
+"""Residuals as GTSAM factors for any nonlinear graph: projection, spacing, smoothness and odometry.
 
-A factor holds its measurement and keys, never a graph; it is a pure function of the values that it is given.
+A factor holds its measurement and its keys, but no graph. It is a pure function of the values.
 """
 
 from __future__ import annotations
@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .footpoint import FootPoints, foot_points
+from .noise import huber_roots, huber_weights
 from .odometry import IntegratedOdometry, odometry_residuals
-from .projection import huber_weights, project, to_map
+from .projection import project
+from .se2 import rotation, to_map
 from .spans import SpanPolynomials
 
 Array = NDArray[np.float64]
@@ -22,7 +24,7 @@ IntArray = NDArray[np.intp]
 JacobianList = MutableSequence[Array]
 
 GRID_SHARE = 0.25
-"""Coarse step of the foot-point search, as a share of the mean knot interval."""
+"""The coarse step of the foot-point search is this share of the mean knot interval."""
 
 
 def spline_projection_factor(
@@ -37,29 +39,64 @@ def spline_projection_factor(
     sigma_model: float,
     huber: float,
 ) -> gtsam.CustomFactor:
-    """`z_i = n_i . (R z_i + t - S(u_i)) / sigma_i`, the rows of one cycle on one boundary (see `project`).
+    """Returns the factor `e_i = n_i . (R z_i + t - S(u_i)) / sigma_i` of one cycle on one boundary.
 
-    control_keys (k,) of all the boundary's distinct control points, of which the factor takes those that
-    matter in the stretches [low, high] (m,) of the curve where each foot point is searched for: a few metres
-    about where it is expected. points_vehicle (m, 2) and covariances (m, 2, 2) in the vehicle frame;
-    sigma_model in m; huber is the whitened residual beyond which a row's weight falls (infinite: never).
+    The rows are those of `project`. control_keys (k,) are the keys of all distinct control points; the factor
+    holds those that matter in the stretches [low, high] (m,), where foot points are searched for. A stretch
+    is a few metres about the expected foot point. points_vehicle z (m, 2) and covariances (m, 2, 2) are in
+    the vehicle frame, and sigma_model is in m. A row's weight falls beyond the whitened residual `huber`,
+    which may be infinite.
 
-    Foot points, standard deviations and weights are found anew at every evaluation. A linearization gives
-    rows scaled by the square root of their Huber weight; an error without Jacobians is the Huber loss itself,
-    so that an optimizer that judges its steps by the error judges them rightly. That sigma turns with the
-    normal is in no derivative: the optimum is where Gauss-Newton stands still, and an optimizer that looks at
-    the error may stop beside it, by as much as sigma depends on the direction. A row whose foot point is not
-    interior, so that it would leave its stretch or the curve, contributes zero: create the factor anew.
+    Foot points, standard deviations and weights are recomputed at every evaluation. With Jacobians, rows are
+    scaled by the square root of their Huber weight. Without, half their squares are the Huber loss, so that
+    an optimizer judges its steps by the true cost. No derivative contains the turning of sigma with the
+    normal, so an optimizer that judges by the error may stop beside the fixed point of Gauss-Newton, by as
+    much as sigma depends on the direction. A row whose foot point is not interior contributes zero; where
+    foot points leave their stretches, the factor is to be created anew.
     """
     if not len(points_vehicle) == len(covariances) == len(low) == len(high) > 0:
         raise ValueError(
-            f"expected as many readings, covariances and stretches, at least one, found "
+            f"expected as many detections, covariances and stretches, at least one, found "
             f"{len(points_vehicle)}, {len(covariances)} and {len(low)}, {len(high)}"
         )
     curve = _Curve.of(control_keys, tables, low, high)
     function = _Projection(int(pose_key), curve, points_vehicle, covariances, sigma_model, huber)
     keys = [int(pose_key), *curve.keys]
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(low)), keys, function)
+
+
+def spline_projection_factors(
+    pose_keys: IntArray,
+    control_keys: Sequence[int],
+    tables: SpanPolynomials,
+    *,
+    points_vehicle: Array,
+    covariances: Array,
+    low: Array,
+    high: Array,
+    sigma_model: float,
+    huber: float,
+) -> list[gtsam.CustomFactor]:
+    """Returns a `spline_projection_factor` for each pose in pose_keys (m,), the key of each row's own pose.
+
+    The rows of one pose are neighbours. All other arguments are those of `spline_projection_factor`.
+    """
+    changes = np.flatnonzero(np.diff(pose_keys)) + 1
+    return [
+        spline_projection_factor(
+            int(pose_keys[own[0]]),
+            control_keys,
+            tables,
+            points_vehicle=points_vehicle[own],
+            covariances=covariances[own],
+            low=low[own],
+            high=high[own],
+            sigma_model=sigma_model,
+            huber=huber,
+        )
+        for own in np.split(np.arange(len(pose_keys)), changes)
+        if len(own)
+    ]
 
 
 def boundary_point_factor(
@@ -71,12 +108,11 @@ def boundary_point_factor(
     low: Array,
     high: Array,
 ) -> gtsam.CustomFactor:
-    """`z_i = n_i . (p_i - S(u_i)) / sigma_i`: a boundary passes through surveyed points, such as a wall's
-    corner.
+    """Returns the factor `e_i = n_i . (p_i - S(u_i)) / sigma_i`: a boundary passes through surveyed points.
 
-    points_map (m, 2) in the map frame with standard deviations sigma (m,), m; u_i is the foot point of p_i in
-    the stretch [low_i, high_i] (m,) of the curve. Keys and stretches as in `spline_projection_factor`; a row
-    whose foot point is not interior contributes zero.
+    A surveyed point is, for example, the corner of a wall. points_map p (m, 2) are in the map frame and sigma
+    (m,) in m; u_i is the foot point of p_i in the stretch [low_i, high_i] of the curve. Keys and stretches
+    are as in `spline_projection_factor`. A row whose foot point is not interior contributes zero.
     """
     if not len(points_map) == len(sigma) == len(low) == len(high) > 0:
         raise ValueError(
@@ -90,22 +126,22 @@ def boundary_point_factor(
 
 @dataclass(frozen=True, eq=False)
 class _Curve:
-    """The stretches of a curve that a factor looks at, and the keys that matter there."""
+    """Holds the stretches of a curve that a factor depends on, and the keys that matter there."""
 
     keys: tuple[int, ...]
-    """Keys of the control points `touched`."""
+    """These are the keys of the control points `touched`."""
     touched: IntArray
-    """Indices of the control points whose keys are held."""
+    """These are the indices of the control points whose keys are held."""
     tables: SpanPolynomials
-    """The basis."""
+    """These are the basis functions."""
     low: Array
-    """(m,) beginning of the stretch where each foot point is searched for."""
+    """The stretch where each foot point is searched for begins here (m,)."""
     high: Array
-    """(m,) its end."""
+    """The stretch where each foot point is searched for ends here (m,)."""
 
     @staticmethod
     def of(control_keys: Sequence[int], tables: SpanPolynomials, low: Array, high: Array) -> _Curve:
-        """Of the keys of all distinct control points those that matter in the stretches [low, high] (m,)."""
+        """Selects, from the keys of all distinct control points, those that matter in the stretches (m,)."""
         size = _distinct(tables)
         if len(control_keys) != size:
             raise ValueError(f"expected a key for each of {size} control points, found {len(control_keys)}")
@@ -113,7 +149,7 @@ class _Curve:
         return _Curve(tuple(int(control_keys[j]) for j in touched), touched, tables, low, high)
 
     def find(self, values: gtsam.Values, points: Array) -> FootPoints:
-        """Foot points within the stretch; control points that can't matter there are left at zero."""
+        """Returns foot points within the stretches; control points that do not matter there stay zero."""
         distinct = np.zeros((_distinct(self.tables), 2))
         distinct[self.touched] = [values.atPoint2(key) for key in self.keys]
         unwrapped = distinct[np.arange(_unwrapped(self.tables)) % len(distinct)]
@@ -121,7 +157,7 @@ class _Curve:
         return foot_points(self.tables, unwrapped, points, self.low, self.high, step)
 
     def usable(self, foot: FootPoints) -> tuple[NDArray[np.bool_], IntArray]:
-        """Rows (m,) that may contribute, and the key numbers (m, degree + 1) of their control points."""
+        """Returns which rows (m,) may contribute, and the slots (m, p + 1) of their control points' keys."""
         size = _distinct(self.tables)
         slot_of = np.full(size, -1, dtype=np.intp)
         slot_of[self.touched] = np.arange(len(self.touched))
@@ -129,7 +165,7 @@ class _Curve:
         return foot.interior & (slots >= 0).all(axis=1), slots
 
     def by_key(self, by_control: Array, slots: IntArray) -> Array:
-        """Derivatives (m, degree + 1, 2) by the control points of each row's span -> (keys, m, 2)."""
+        """Returns derivatives by key (keys, m, 2) from those by the points of each span (m, p + 1, 2)."""
         blocks = np.zeros((len(self.touched), len(by_control), 2))
         np.add.at(blocks, (slots, np.arange(len(by_control))[:, None]), by_control)
         return blocks
@@ -137,23 +173,23 @@ class _Curve:
 
 @dataclass(frozen=True, eq=False)
 class _Projection:
-    """Error function of a spline-projection factor."""
+    """Evaluates a spline-projection factor."""
 
     pose_key: int
-    """Of the pose that the readings were made from."""
+    """This is the key of the pose that the detections were made from."""
     curve: _Curve
-    """What they are held against."""
+    """The detections are projected on this curve."""
     points_vehicle: Array
-    """(m, 2) readings, m."""
+    """These are the detections (m, 2) in the vehicle frame, in m."""
     covariances: Array
-    """(m, 2, 2) their covariances, vehicle frame, m^2."""
+    """These are their covariances (m, 2, 2) in the vehicle frame, in m^2."""
     sigma_model: float
-    """Standard deviation of cones about a smooth curve, m."""
+    """Cones lie about a smooth curve with this standard deviation (m)."""
     huber: float
-    """Whitened residual beyond which a row's weight falls."""
+    """The weight of a row falls beyond this whitened residual."""
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
-        """Robust whitened rows (m,), and their Jacobians in H where it is given."""
+        """Returns robust whitened rows (m,), and writes their Jacobians to H where it is given."""
         pose = values.atPose2(self.pose_key)
         poses = np.tile(pose_array(pose), (len(self.points_vehicle), 1))
         points = to_map(self.points_vehicle, poses)
@@ -173,17 +209,17 @@ class _Projection:
 
 @dataclass(frozen=True, eq=False)
 class _BoundaryPoint:
-    """Error function of a boundary-point factor."""
+    """Evaluates a boundary-point factor."""
 
     curve: _Curve
-    """What passes through the points."""
+    """This curve passes through the points."""
     points: Array
-    """(m, 2) map frame, m."""
+    """These are the points (m, 2) in the map frame, in m."""
     sigma: Array
-    """(m,) standard deviation across the curve, m."""
+    """These are the standard deviations (m,) across the curve, in m."""
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
-        """Whitened rows (m,), and their Jacobians in H where it is given."""
+        """Returns whitened rows (m,), and writes their Jacobians to H where it is given."""
         foot = self.curve.find(values, self.points)
         usable, slots = self.curve.usable(foot)
         scale = usable / self.sigma
@@ -193,36 +229,23 @@ class _BoundaryPoint:
         return np.asarray(foot.distance * scale)
 
 
-def rotation(theta: float) -> Array:
-    """R(theta) (2, 2): vehicle to map frame."""
-    c, s = np.cos(theta), np.sin(theta)
-    return np.array([[c, -s], [s, c]])
-
-
 def pose_array(pose: gtsam.Pose2) -> Array:
-    """(3,) x (m), y (m), theta (rad) in (-pi, pi]."""
+    """Returns (x, y, theta) in m, m and rad, with theta in (-pi, pi]."""
     return np.array([pose.x(), pose.y(), pose.theta()])
 
 
-def huber_roots(whitened: Array, threshold: float) -> Array:
-    """`sign(z) sqrt(2 rho(z))` with Huber's loss `rho = z^2 / 2`, beyond the threshold k `k (|z| - k/2)`."""
-    size = np.abs(whitened)
-    inner = np.minimum(size, threshold)
-    return np.sign(whitened) * np.sqrt(inner * (2.0 * size - inner))
-
-
 def _unwrapped(tables: SpanPolynomials) -> int:
-    """Control points as the kernels take them."""
+    """Returns the number of control points, with those that a periodic spline repeats."""
     return len(tables.knots) - tables.degree - 1
 
 
 def _distinct(tables: SpanPolynomials) -> int:
-    """Control points, without those that a periodic spline repeats."""
+    """Returns the number of control points, without those that a periodic spline repeats."""
     return _unwrapped(tables) - (tables.degree if tables.periodic else 0)
 
 
 def _touched(tables: SpanPolynomials, low: Array, high: Array) -> IntArray:
-    """Indices of the control points that matter anywhere in the stretches [low, high] (m,)."""
+    """Returns the indices of the control points that matter anywhere in the stretches [low, high] (m,)."""
     period, spans = tables.high - tables.low, len(tables.starts)
     first, last = tables.locate(low)[0], tables.locate(high)[0]
     if tables.periodic:
@@ -233,7 +256,7 @@ def _touched(tables: SpanPolynomials, low: Array, high: Array) -> IntArray:
 
 
 def _fill(H: JacobianList, blocks: Sequence[Array]) -> None:
-    """Hand every Jacobian over; GTSAM takes whatever it is given, so the shapes are checked here."""
+    """Writes every Jacobian to H; GTSAM does not check shapes, so they are checked here."""
     if len(H) != len(blocks):
         raise ValueError(f"expected {len(H)} Jacobians, one a key, found {len(blocks)}")
     for i, block in enumerate(blocks):
@@ -245,9 +268,9 @@ def _fill(H: JacobianList, blocks: Sequence[Array]) -> None:
 def spacing_factors(
     control_keys: Sequence[int], nominal: Array, sigma: Array, periodic: bool
 ) -> list[gtsam.RangeFactor2]:
-    """`|c_{j+1} - c_j| - nominal_j` between neighbours, GTSAM's own range factor (see `spacing_residuals`).
+    """Returns GTSAM's range factors `|c_{j+1} - c_j| - nominal_j` between neighbours.
 
-    nominal and sigma (k - 1,), or (k,) where periodic, m.
+    nominal and sigma are in m and have k - 1 entries, or k where periodic. See `gauge.spacing_residuals`.
     """
     expected = len(control_keys) - (0 if periodic else 1)
     if not len(nominal) == len(sigma) == expected:
@@ -262,17 +285,17 @@ def spacing_factors(
 def smoothness_factors(
     control_keys: Sequence[int], matrix: Array, sigma: float
 ) -> list[gtsam.LinearContainerFactor]:
-    """`D c ~ N(0, sigma^2)`, one linear factor for each row of D (`gauge.smoothness_matrix`); sigma in m."""
+    """Returns linear factors `D c ~ N(0, sigma^2)`, one for each row of D (`gauge.smoothness_matrix`)."""
     if matrix.shape[1] != len(control_keys):
         raise ValueError(f"expected a key for each of {matrix.shape[1]} columns, found {len(control_keys)}")
     return [_smoothness_factor(control_keys, row, sigma) for row in matrix]
 
 
 def linear_factor(keys: Sequence[int], dims: Sequence[int], A: Array, b: Array) -> gtsam.GaussianConditional:
-    """`1/2 |A x - b|^2` over any number of keys, A (m, sum of dims) whitened, b (m,).
+    """Returns the factor `1/2 |A x - b|^2` on any number of keys; A (m, sum of dims) and b (m,) are whitened.
 
-    The binding's own constructors stop at three keys; a Gaussian conditional has no such limit and is a
-    Jacobian factor. Shapes are checked here, since the binding doesn't.
+    The binding's constructors take at most three keys. A Gaussian conditional has no such limit, and it is a
+    Jacobian factor. The binding does not check shapes: ValueError where they do not fit.
     """
     if len(keys) != len(dims) or len(set(keys)) != len(keys):
         raise ValueError(f"expected one size for each of {len(keys)} different keys, found {len(dims)}")
@@ -284,7 +307,7 @@ def linear_factor(keys: Sequence[int], dims: Sequence[int], A: Array, b: Array) 
 
 
 def _smoothness_factor(control_keys: Sequence[int], row: Array, sigma: float) -> gtsam.LinearContainerFactor:
-    """Linearized about zero: without a point, GTSAM's error of a linear factor is zero everywhere."""
+    """Returns a linear factor about zero; without a linearization point GTSAM takes its error as zero."""
     columns = np.flatnonzero(row)
     keys = [control_keys[int(j)] for j in columns]
     zero = gtsam.Values()
@@ -298,34 +321,34 @@ def _smoothness_factor(control_keys: Sequence[int], row: Array, sigma: float) ->
 def odometry_factor(
     first_key: int, second_key: int, odometry: IntegratedOdometry
 ) -> gtsam.BetweenFactorPose2:
-    """`Log(delta^-1 x_i^-1 x_j)`, GTSAM's own factor between two poses, with the odometry's covariance."""
+    """Returns GTSAM's factor `Log(delta^-1 x_i^-1 x_j)` between two poses, with the odometry's covariance."""
     return gtsam.BetweenFactorPose2(first_key, second_key, gtsam.Pose2(*odometry.delta), _noise(odometry))
 
 
 def calibrated_odometry_factor(
     first_key: int, second_key: int, calibration_key: int, odometry: IntegratedOdometry
 ) -> gtsam.CustomFactor:
-    """`Log(delta^-1 x_i^-1 x_j) + G b`, with b (2,) the odometry's scale error and yaw-rate bias."""
+    """Returns the factor `Log(delta^-1 x_i^-1 x_j) + G b`, b (2,) the scale error and the yaw-rate bias."""
     keys = (int(first_key), int(second_key), int(calibration_key))
     return gtsam.CustomFactor(_noise(odometry), list(keys), _CalibratedOdometry(keys, odometry))
 
 
 def _noise(odometry: IntegratedOdometry) -> gtsam.noiseModel.Gaussian:
-    """From the information: GTSAM silently drops the lower triangle of a square root that it is given."""
+    """Returns the noise model from the information; GTSAM ignores the lower triangle of a square root."""
     return gtsam.noiseModel.Gaussian.Information(odometry.whitener.T @ odometry.whitener)
 
 
 @dataclass(frozen=True, eq=False)
 class _CalibratedOdometry:
-    """Error function of a calibrated odometry factor."""
+    """Evaluates a calibrated odometry factor."""
 
     keys: tuple[int, int, int]
-    """Of the start, the end, and the calibration."""
+    """These are the keys of the start, the end and the calibration."""
     odometry: IntegratedOdometry
-    """The measurement."""
+    """This is the measurement."""
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
-        """Residual (3,), and its Jacobians in H where it is given; the noise model whitens both."""
+        """Returns the residual (3,), and writes its Jacobians to H; the noise model whitens both."""
         start, end = values.atPose2(self.keys[0]), values.atPose2(self.keys[1])
         residual, by_start, by_end = odometry_residuals(
             pose_array(start)[None], pose_array(end)[None], self.odometry.delta[None]

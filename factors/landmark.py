@@ -1,4 +1,4 @@
-"""The landmark factor: a reading against the one point that it saw, with its full covariance."""
+"""The landmark factor: a detection against the landmark that it saw, with its full covariance."""
 
 from __future__ import annotations
 
@@ -12,35 +12,27 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LandmarkResiduals:
-    """Two rows a reading, in the vehicle frame, not whitened."""
+    """Holds two rows for each detection, in the vehicle frame, not whitened."""
 
     residual: Array
-    """(m, 2) where the landmark should be seen, minus where it was, m."""
+    """Each row (m, 2) is the expected minus the measured position of the landmark, in m."""
     by_pose: Array
-    """(m, 2, 3) derivative by the pose (x, y, theta) in the map frame."""
+    """These are the derivatives (m, 2, 3) by the pose (x, y, theta) in the map frame."""
     by_landmark: Array
-    """(m, 2, 2) derivative by the landmark in the map frame: the transposed rotation."""
+    """These are the derivatives (m, 2, 2) by the landmark in the map frame, the transposed rotations."""
 
 
-def landmark_residuals(poses: Array, landmarks: Array, readings: Array) -> LandmarkResiduals:
-    """`r = R^T (l - t) - z`: poses (m, 3), landmarks (m, 2) in the map frame, readings (m, 2).
+def landmark_residuals(poses: Array, landmarks: Array, points_vehicle: Array) -> LandmarkResiduals:
+    """Returns `r = R^T (l - t) - z`, with poses (m, 3) and landmarks l (m, 2) in the map frame.
 
-    dr/dt = -R^T,   dr/dtheta = (a_y, -a_x) with a = R^T (l - t),   dr/dl = R^T.
+    The detections z are points_vehicle (m, 2) in the vehicle frame, in m. The derivatives are
+
+        dr/dt = -R^T,   dr/dtheta = (a_y, -a_x) with a = R^T (l - t),   dr/dl = R^T
     """
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     dx, dy = landmarks[:, 0] - poses[:, 0], landmarks[:, 1] - poses[:, 1]
-    seen = np.column_stack([c * dx + s * dy, -s * dx + c * dy])
+    expected = np.column_stack([c * dx + s * dy, -s * dx + c * dy])
     by_landmark = np.stack([np.column_stack([c, s]), np.column_stack([-s, c])], axis=1)
-    by_theta = np.column_stack([seen[:, 1], -seen[:, 0]])
+    by_theta = np.column_stack([expected[:, 1], -expected[:, 0]])
     by_pose = np.concatenate([-by_landmark, by_theta[:, :, None]], axis=2)
-    return LandmarkResiduals(seen - readings, by_pose, by_landmark)
-
-
-def whiteners(covariances: Array) -> Array:
-    """(m, 2, 2) lower W with `W' W = K^-1` of covariances K (m, 2, 2): a reading's two independent rows."""
-    xx, xy, yy = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
-    out = np.zeros(covariances.shape)
-    out[:, 0, 0] = 1.0 / np.sqrt(xx)
-    out[:, 1, 1] = 1.0 / np.sqrt(yy - xy * xy / xx)
-    out[:, 1, 0] = -xy / xx * out[:, 1, 1]
-    return out
+    return LandmarkResiduals(expected - points_vehicle, by_pose, by_landmark)

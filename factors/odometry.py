@@ -8,60 +8,39 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from .se2 import se2_exp, wrap_angle
+
 Array = NDArray[np.float64]
 
 MIN_SIGMA = 1e-6
-"""Least sigma of an integrated odometry (m, rad): keeps the factor of an empty interval finite."""
+"""This smallest sigma of integrated odometry (m, rad) keeps the factor of an empty interval finite."""
 
 CALIBRATION_SIZE = 2
-"""Calibration of the odometry: (scale error of the speeds [-], bias of the yaw rate [rad/s])."""
+"""The calibration has two entries: the scale error of the speeds (-) and the bias of the yaw rate (rad/s)."""
+
+_SERIES_BELOW = 1e-3
+"""Below this angle (rad) a series replaces `(phi/2) cot(phi/2)`; its next terms are below 1e-15 there."""
 
 
 @dataclass(frozen=True)
 class IntegratedOdometry:
-    """Relative pose over an interval, as a factor between its two poses needs it."""
+    """Holds the relative pose over an interval, as a factor between its two poses needs it."""
 
     delta: Array
-    """(3,) pose of the end in the frame of the start: x (m), y (m), theta (rad)."""
+    """This is the end pose (x, y, theta) in the frame of the start, in m, m and rad."""
     covariance: Array
-    """(3, 3) covariance of the end pose's error, in the frame of the end (GTSAM's right tangent of Pose2)."""
+    """This is the covariance (3, 3) of the end pose, in the frame of the end (GTSAM's tangent of Pose2)."""
     calibration_jacobian: Array
-    """(3, 2) derivative of the end pose by (scale error, yaw-rate bias), in the frame of the end."""
+    """This is the derivative (3, 2) of the end pose, in its own frame, by (scale error, yaw-rate bias)."""
     whitener: Array
-    """(3, 3) W with `W' W = covariance^-1`: whitens a residual."""
-
-
-def wrap_angle(angle: Array) -> Array:
-    """Angle in (-pi, pi], elementwise (rad)."""
-    return -((np.pi - angle) % (2.0 * np.pi) - np.pi)
-
-
-def se2_exp(tangents: Array) -> Array:
-    """Exponential of SE(2), row by row: (k, 3) tangents (vx, vy, wz) times time -> (k, 3) relative poses."""
-    x, y, theta = tangents.T
-    half = np.where(theta == 0.0, np.finfo(float).tiny, 0.5 * theta)  # so that sin(half) / half is 1
-    sine, cosine = np.sin(half), np.cos(half)
-    sinc, cosc = sine * cosine / half, sine * sine / half
-    return np.array([sinc * x - cosc * y, cosc * x + sinc * y, theta]).T
-
-
-def compose(pose: Array, delta: Array) -> Array:
-    """`pose * delta` on SE(2): both (3,) [x, y, theta]; theta is not wrapped, so that turns accumulate."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return np.array(
-        [pose[0] + c * delta[0] - s * delta[1], pose[1] + s * delta[0] + c * delta[1], pose[2] + delta[2]]
-    )
-
-
-def between(first: Array, second: Array) -> Array:
-    """`first^-1 * second` on SE(2): (3,) [x, y, theta] in the frame of `first`."""
-    c, s = np.cos(first[2]), np.sin(first[2])
-    dx, dy = second[0] - first[0], second[1] - first[1]
-    return np.array([c * dx + s * dy, -s * dx + c * dy, second[2] - first[2]])
+    """This matrix W (3, 3) with `W' W = covariance^-1` whitens a residual."""
 
 
 def integrate_poses(durations: Array, twists: Array) -> Array:
-    """Poses after each of k constant twists: (k,) s, (k, 3) -> (k, 3) in the frame of the start."""
+    """Returns the poses (k, 3), in the frame of the start, after each of k constant twists.
+
+    durations (k,) are in s, twists (k, 3) in m/s, m/s and rad/s.
+    """
     steps = se2_exp(twists * durations[:, None])
     heading = np.cumsum(steps[:, 2])
     before = heading - steps[:, 2]
@@ -72,14 +51,14 @@ def integrate_poses(durations: Array, twists: Array) -> Array:
 
 
 def integrate_twists(durations: Array, twists: Array, sigma: Array) -> IntegratedOdometry:
-    """`prod_k exp(dt_k xi_k)` with first-order covariance and calibration derivative.
+    """Returns `prod_k exp(dt_k xi_k)` with its first-order covariance and its calibration derivative.
 
-    durations (k,) s; twists (k, 3) body (vx m/s, vy m/s, wz rad/s), each held over its duration; sigma (3,)
-    standard deviation of each reading, white from sample to sample. An error `e` of sample k (its frame)
-    reaches the end as `Ad(T_end^-1 T_k) e`, with T_k the middle of its step; samples are independent, so the
-    covariances add. A speed reads `(1 + scale) v` and a yaw rate `w + bias`, so the calibrated end pose is
-    the end pose minus `calibration_jacobian @ (scale, bias)`. No samples, or no time: the identity, with zero
-    covariance.
+    durations (k,) are in s. twists (k, 3) are body twists (vx m/s, vy m/s, wz rad/s), each held over its
+    duration, and sigma (3,) is the standard deviation of each sample. An error e of sample k, in its own
+    frame, reaches the end as `Ad(T_end^-1 T_k) e` with T_k the middle of its step. Samples are independent,
+    so their covariances add. The odometry measures `(1 + scale) v` and `w + bias`, so the calibrated end pose
+    is the end pose minus `calibration_jacobian @ (scale, bias)`. Without samples, or in no time, the result
+    is the identity with zero covariance.
     """
     if len(durations) == 0:
         return _integrated(np.zeros(3), np.zeros((3, 3)), np.zeros((3, CALIBRATION_SIZE)))
@@ -93,7 +72,7 @@ def integrate_twists(durations: Array, twists: Array, sigma: Array) -> Integrate
 
 
 def _integrated(delta: Array, covariance: Array, calibration_jacobian: Array) -> IntegratedOdometry:
-    """With the whitener; a covariance of zero (no time has passed) is lifted to the floor."""
+    """Returns the odometry with its whitener; `MIN_SIGMA` lifts a covariance of zero."""
     floored = covariance + np.eye(3) * MIN_SIGMA**2
     root, _ = lapack.dpotrf(floored, lower=1)
     whitener, _ = lapack.dtrtri(root, lower=1)
@@ -101,7 +80,10 @@ def _integrated(delta: Array, covariance: Array, calibration_jacobian: Array) ->
 
 
 def _midpoints(poses: Array, durations: Array, twists: Array) -> Array:
-    """Poses (k, 3) in the middle of each step: exp's right Jacobian is the adjoint there, to second order."""
+    """Returns the poses (k, 3) in the middle of each step.
+
+    The adjoint there equals the right Jacobian of the exponential to second order.
+    """
     back = se2_exp(-0.5 * twists * durations[:, None])
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = poses[:, 0] + c * back[:, 0] - s * back[:, 1], poses[:, 1] + s * back[:, 0] + c * back[:, 1]
@@ -109,7 +91,7 @@ def _midpoints(poses: Array, durations: Array, twists: Array) -> Array:
 
 
 def _adjoints_to_end(poses: Array, end: Array) -> Array:
-    """Adjoint maps (k, 3, 3) that carry a tangent at each pose to the tangent at the end pose."""
+    """Returns the adjoint maps (k, 3, 3) that carry a tangent at each pose to one at the end pose."""
     theta = poses[:, 2] - end[2]
     c, s = np.cos(theta), np.sin(theta)
     ce, se = np.cos(end[2]), np.sin(end[2])
@@ -122,10 +104,11 @@ def _adjoints_to_end(poses: Array, end: Array) -> Array:
 
 
 def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> tuple[Array, Array, Array]:
-    """`r = Log(delta^-1 start^-1 end)`, the residual of GTSAM's BetweenFactorPose2, for m factors at once.
+    """Returns `r = Log(delta^-1 start^-1 end)` (m, 3), and its Jacobians (m, 3, 3) by start and end.
 
-    poses (m, 3) in the map frame, deltas (m, 3). Gives residuals (m, 3), a tangent in the frame of the end,
-    and the Jacobians (m, 3, 3) by the start's and the end's (x, y, theta) in the map frame.
+    It is the residual of GTSAM's BetweenFactorPose2, a tangent in the frame of the end (m, m, rad). Poses
+    (m, 3) are in the map frame, deltas (m, 3) in the frame of the start. The Jacobians are by (x, y, theta)
+    in the map frame.
     """
     angle = poses_start[:, 2] + deltas[:, 2]
     c, s = np.cos(angle), np.sin(angle)
@@ -149,8 +132,8 @@ def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> t
 
 
 def _inverse_left_terms(phi: Array) -> tuple[Array, Array]:
-    """`a = (phi/2) cot(phi/2)` of SE(2)'s inverse left Jacobian, and da/dphi; by series below 1e-3 rad."""
-    small = np.abs(phi) < 1e-3  # the series' next terms are below 1e-15 there
+    """Returns `a = (phi/2) cot(phi/2)` of SE(2)'s inverse left Jacobian, and da/dphi."""
+    small = np.abs(phi) < _SERIES_BELOW
     half = np.where(small, 0.5, 0.5 * phi)
     cot = 1.0 / np.tan(half)
     a = np.where(small, 1.0 - phi**2 / 12.0, half * cot)

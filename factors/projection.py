@@ -1,4 +1,4 @@
-"""The spline-projection factor: a reading's signed distance across the curve, without any association."""
+"""The spline-projection factor: a detection's signed distance across the curve, without any association."""
 
 from __future__ import annotations
 
@@ -8,33 +8,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .footpoint import FootPoints
+from .noise import whiteners
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class ProjectionRows:
-    """One row a reading: residual, its standard deviation, and its Jacobian blocks, not whitened."""
+    """Holds one row for each detection: residual, standard deviation and Jacobian blocks, not whitened."""
 
     residual: Array
-    """(m,) signed distance of the reading from the curve, left of travel positive, m."""
+    """This is the signed distance (m,) of the detection from the curve, in m, positive left of travel."""
     sigma: Array
-    """(m,) standard deviation of the reading across the curve, m."""
+    """This is the standard deviation (m,) of the detection across the curve, in m."""
     by_pose: Array
-    """(m, 3) derivative by the pose (x, y, theta) in the map frame."""
+    """These are the derivatives (m, 3) by the pose (x, y, theta) in the map frame."""
     by_control: Array
-    """(m, degree + 1, 2) derivative by the control points of the foot point's span."""
-
-
-def to_map(points_vehicle: Array, poses: Array) -> Array:
-    """`p = R z + t`: points (m, 2) in the vehicle frame of each row's own pose (m, 3) -> map frame (m, 2)."""
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    x, y = points_vehicle[:, 0], points_vehicle[:, 1]
-    return np.array([c * x - s * y + poses[:, 0], s * x + c * y + poses[:, 1]]).T
+    """These are the derivatives (m, degree + 1, 2) by the control points of the foot point's span."""
 
 
 def sigma_across(normals: Array, covariances: Array, poses: Array, sigma_model: float) -> Array:
-    """`sqrt(n^T R K R^T n + sigma_model^2)` (m,): a reading's sigma along the map-frame normals (m, 2)."""
+    """Returns `sqrt(n^T R K R^T n + sigma_model^2)` (m,), the sigma of each detection across the curve, in m.
+
+    normals n (m, 2) are in the map frame, covariances K (m, 2, 2) in the vehicle frame of each row's pose
+    (m, 3).
+    """
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     nx, ny = c * normals[:, 0] + s * normals[:, 1], -s * normals[:, 0] + c * normals[:, 1]
     variance = (
@@ -46,16 +44,16 @@ def sigma_across(normals: Array, covariances: Array, poses: Array, sigma_model: 
 def project(
     points_map: Array, covariances: Array, poses: Array, foot: FootPoints, sigma_model: float
 ) -> ProjectionRows:
-    """`r = n . (p - S(u))` with `u` the foot point of `p = R z + t` (paper: Update).
+    """Returns `r = n . (p - S(u))` with u the foot point of `p = R z + t` (paper: Update).
 
-    points_map (m, 2), covariances (m, 2, 2) in the vehicle frame, poses (m, 3) of each row. At an interior
-    foot point `p - S` is along `n` while `S'` and `dn/du` are along the tangent, so every term through `u`
-    vanishes and
+    points_map p (m, 2) are in m, covariances (m, 2, 2) in the vehicle frame of each row's pose (m, 3). At an
+    interior foot point `p - S` is along n while `S'` and `dn/du` are along the tangent. So every term through
+    u vanishes, and with J the quarter turn
 
-        dr/dt = n,   dr/dtheta = n . (J R z),   dr/dc_j = -beta_j(u) n      (J: the quarter turn)
+        dr/dt = n,   dr/dtheta = n . (J R z),   dr/dc_j = -beta_j(u) n
 
-    are exact at any distance from the curve. At an end of the curve, or of a stretch, they are not: leave
-    such rows out (`foot.interior`).
+    are exact at any distance from the curve. They are not exact at an end of the curve or of a stretch: such
+    rows are to be left out (`foot.interior`).
     """
     n = foot.normal_unit
     arm = points_map - poses[:, :2]
@@ -69,54 +67,40 @@ def project(
 
 
 @dataclass(frozen=True)
-class PointRows:
-    """Two rows a reading, whitened: how far it is from its foot point, and their Jacobian blocks."""
+class OffsetRows:
+    """Holds two whitened rows for each detection: its offset from the foot point, and Jacobian blocks."""
 
     residual: Array
-    """(m, 2) whitened offset from the foot point."""
+    """These are the whitened offsets (m, 2) from the foot points."""
     by_pose: Array
-    """(m, 2, 3) derivative by the pose (x, y, theta) in the map frame."""
+    """These are the derivatives (m, 2, 3) by the pose (x, y, theta) in the map frame."""
     by_control: Array
-    """(m, 2, degree + 1, 2) derivative by the control points of the foot point's span."""
+    """These are the derivatives (m, 2, degree + 1, 2) by the control points of the foot point's span."""
 
 
-def project_to_point(
+def offset_from_foot_point(
     points_map: Array, covariances: Array, poses: Array, foot: FootPoints, sigma_model: float
-) -> PointRows:
-    """`r = W (p - S(u))`, `W^T W = (R K R^T + sigma_model^2 I)^-1`, with `u` held where the foot point is.
+) -> OffsetRows:
+    """Returns `r = W (p - S(u))` with u held, and `W^T W = (R K R^T + sigma_model^2 I)^-1`.
 
-    For comparison with `project`, whose arguments it has: at the foot point both see the same distance, but
-    this one also holds the curve and the pose along the curve, of which the reading says nothing:
+    This is the point-to-point variant of `project`, for an ablation, with the same arguments. Both see the
+    same distance at the foot point, but this one also constrains the pose and the curve along the curve,
+    where a detection has no information. With J the quarter turn
 
-        dr/dt = W,   dr/dtheta = W J R z,   dr/dc_j = -beta_j(u) W      (J: the quarter turn)
+        dr/dt = W,   dr/dtheta = W J R z,   dr/dc_j = -beta_j(u) W
     """
-    W = _whiteners(covariances, poses, sigma_model)
+    W = whiteners(_widened(covariances, poses, sigma_model))
     offset, arm = points_map - foot.position, points_map - poses[:, :2]
     turned = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
-    return PointRows(
+    return OffsetRows(
         residual=np.einsum("mij,mj->mi", W, offset),
         by_pose=np.concatenate([W, np.einsum("mij,mj->mi", W, turned)[:, :, None]], axis=2),
         by_control=-foot.basis[:, None, :, None] * W[:, :, None, :],
     )
 
 
-def _whiteners(covariances: Array, poses: Array, sigma_model: float) -> Array:
-    """`L^-1` (m, 2, 2) of `L L^T = R K R^T + sigma_model^2 I`, L lower triangular."""
+def _widened(covariances: Array, poses: Array, sigma_model: float) -> Array:
+    """Returns `R K R^T + sigma_model^2 I` (m, 2, 2) in the map frame, K (m, 2, 2) in the vehicle frame."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    rotation = np.moveaxis(np.array([[c, -s], [s, c]]), -1, 0)
-    turned = rotation @ covariances @ rotation.transpose(0, 2, 1)
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(turned + sigma_model**2 * np.eye(2))))
-
-
-def huber_weights(whitened: Array, threshold: float) -> Array:
-    """`w = min(1, threshold / |z|)` per row: the weight of a whitened residual in a Gauss-Newton step.
-
-    An infinite threshold gives least squares: every weight is 1.
-    """
-    return 1.0 / np.maximum(np.abs(whitened) / threshold, 1.0)
-
-
-def huber_loss(whitened: Array, threshold: float) -> Array:
-    """`rho(z) = z^2 / 2`, beyond the threshold `threshold (|z| - threshold / 2)`, per row."""
-    inner = np.minimum(np.abs(whitened), threshold)
-    return np.asarray(inner * (np.abs(whitened) - 0.5 * inner))
+    turns = np.moveaxis(np.array([[c, -s], [s, c]]), -1, 0)
+    return np.asarray(turns @ covariances @ turns.transpose(0, 2, 1) + sigma_model**2 * np.eye(2))

@@ -1,42 +1,51 @@
-"""B-splines as polynomials on each span: faster than the recurrence, of one curve or of several at once."""
+"""B-splines as polynomials on each span, of one curve or several: faster than the recurrence."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import factorial
+from typing import Final
 
 import numpy as np
 
-from .bspline import Floats, Ints, domain, positive, wrap
+from .bspline import Floats, Ints, divisors, domain, wrap
+
+_PERIODS_LAID_OUT: Final = (-1.0, 0.0, 1.0)
+"""A periodic curve lies on the axis of `Spans` once for each of these shifts, in periods."""
+_GAP_OF_CURVES: Final = 1.0
+"""Curves on the axis of `Spans` are at least this far apart, in units of the parameter."""
 
 
 @dataclass(frozen=True, eq=False)
 class SpanPolynomials:
-    """Basis functions as polynomials of s = (u - t_i) / (t_{i+1} - t_i) on each span: `basis`, but faster."""
+    """Holds the basis functions on each span as polynomials of s = (u - t_i) / (t_{i+1} - t_i).
+
+    It gives the same values as `basis`, but faster.
+    """
 
     knots: Floats
-    """Non-decreasing knots (n + p + 1,), unwrapped if periodic."""
+    """The knots (n + p + 1,) do not decrease; they are unwrapped where the curve is periodic."""
     degree: int
-    """Degree p >= 1."""
+    """The degree p is at least 1."""
     periodic: bool = False
-    """Parameters are taken modulo the domain's length instead of clipped to it."""
+    """If true, parameters are taken modulo the length of the domain instead of being clipped to it."""
     low: float = field(init=False)
-    """Left end of the domain."""
+    """This is the left end of the domain."""
     high: float = field(init=False)
-    """Right end of the domain."""
+    """This is the right end of the domain."""
     coefficients: Floats = field(init=False, repr=False)
-    """(p + 1 powers, n - p spans, p + 1 columns): N_{i-p+j}(u) = sum_k coefficients[k, i - p, j] s^k."""
+    """N_{i-p+j}(u) is sum_k coefficients[k, i - p, j] s^k; the shape is (p + 1, n - p spans, p + 1)."""
     starts: Floats = field(init=False, repr=False)
-    """Left knot of each span (n - p,)."""
+    """These are the left knots of the spans (n - p,)."""
     inverse_widths: Floats = field(init=False, repr=False)
-    """1 / (t_{i+1} - t_i) of each span (n - p,), zero for an empty span."""
+    """Each entry (n - p,) is 1 / (t_{i+1} - t_i) of a span, and zero for an empty span."""
     known: Floats | None = field(default=None, repr=False)
-    """The coefficients of the first spans, where they have been worked out already."""
+    """These coefficients of the first spans are taken over instead of being computed again."""
     _breaks: Floats = field(init=False, repr=False)
     _by_span: dict[int, Floats] = field(init=False, repr=False, default_factory=dict)
     windows: Ints = field(init=False, repr=False)
-    """(n - p, p + 1) control points that matter on each span."""
+    """Each row (n - p, p + 1) holds the control points that matter on a span."""
     _stacks: dict[int, Floats] = field(init=False, repr=False, default_factory=dict)
     _laid: dict[str, Spans] = field(init=False, repr=False, default_factory=dict)
 
@@ -51,7 +60,7 @@ class SpanPolynomials:
         set_field(self, "high", high)
         set_field(self, "starts", knots[self.degree : end])
         widths = np.diff(knots[self.degree : end + 1])
-        set_field(self, "inverse_widths", np.where(widths > 0.0, 1.0 / positive(widths), 0.0))
+        set_field(self, "inverse_widths", np.where(widths > 0.0, 1.0 / divisors(widths), 0.0))
         set_field(self, "coefficients", self._all_coefficients())
         set_field(self, "windows", np.arange(len(widths))[:, None] + np.arange(self.degree + 1))
         set_field(self, "_breaks", knots[self.degree + 1 : self.degree + 1 + max(last, 0)])
@@ -65,75 +74,68 @@ class SpanPolynomials:
         return np.concatenate([self.known, _span_coefficients(self.knots[count:], self.degree)], axis=1)
 
     def extended(self, knots: Floats) -> SpanPolynomials:
-        """An open curve's on knots that begin with the own ones: only what is new is worked out."""
+        """Returns an open curve's polynomials on knots that begin with these; only new spans are computed."""
         return SpanPolynomials(knots, self.degree, False, self.coefficients)
 
     def tail(self, first: int) -> SpanPolynomials:
-        """An open curve's without its first control points, which changes nothing on the spans that stay."""
+        """Returns an open curve's polynomials without its first control points; other spans stay the same."""
         return SpanPolynomials(self.knots[first:], self.degree, False, self.coefficients[:, first:])
 
     @property
     def alone(self) -> Spans:
-        """The spans of this curve only, on its unwrapped control points; kept for next time."""
+        """Returns the spans of this curve alone, on its unwrapped control points; they are computed once."""
         if "alone" not in self._laid:
             self._laid["alone"] = lay_out([self], [0])
         return self._laid["alone"]
 
     @property
     def length(self) -> float:
-        """Length of the domain."""
+        """Returns the length of the domain."""
         return self.high - self.low
 
     @property
     def occupied(self) -> int:
-        """Spans up to the last that is not empty."""
+        """Returns the number of spans up to the last one that is not empty."""
         return len(self._breaks) + 1
 
     def inside(self, u: Floats) -> Floats:
-        """u wrapped into the domain where periodic, else clipped to it."""
+        """Returns u wrapped into the domain of a periodic curve, or clipped to the domain of an open one."""
         if self.periodic:
             return wrap(self.knots, self.degree, u)
         return np.minimum(np.maximum(u, self.low), self.high)
 
     def locate(self, u: Floats) -> tuple[Ints, Floats]:
-        """Span number span - p in [0, n - p) and s in [0, 1] of each u (m,), wrapped or clipped."""
+        """Returns the span number span - p (m,), in [0, n - p), and s (m,), in [0, 1], of each u (m,).
+
+        u is wrapped or clipped first.
+        """
         inside = self.inside(u)
         number = self._breaks.searchsorted(inside, side="right")
         return number, (inside - self.starts.take(number)) * self.inverse_widths.take(number)
 
     def evaluate(self, u: Floats, derivatives: int = 0) -> tuple[Floats, Ints]:
-        """As `basis`: values (derivatives + 1, m, p + 1) and spans (m,), with u wrapped or clipped."""
-        number, s = self.locate(u)
-        return self.evaluate_located(number, s, derivatives), number + self.degree
+        """Returns values (derivatives + 1, m, p + 1) and spans (m,) as `basis` does, by Horner's rule.
 
-    def evaluate_located(self, number: Ints, s: Floats, derivatives: int = 0) -> Floats:
-        """Basis values (derivatives + 1, m, p + 1) at what `locate` gave, by Horner's rule."""
-        stack = self._stack(derivatives)
-        column = s[:, None]
+        u is wrapped or clipped first.
+        """
+        number, s = self.locate(u)
+        stack, column = self._stack(derivatives), s[:, None]
         values: Floats = stack[-1].take(number, axis=0)
         for power in range(self.degree - 1, -1, -1):
             values *= column
             values += stack[power].take(number, axis=0)
-        return values.reshape(len(s), derivatives + 1, self.degree + 1).transpose(1, 0, 2)
-
-    def curve_coefficients(self, control_points: Floats, derivatives: int = 0) -> Floats:
-        """(p + 1, derivatives + 1, 2, n - p): d^r S / du^r = sum_k coefficients[k, r, :, i - p] s^k.
-
-        control_points (n, 2), unwrapped where periodic.
-        """
-        by_span = np.matmul(self.polynomials(derivatives), control_points[self.windows])
-        shape = (len(by_span), self.degree + 1, derivatives + 1, 2)
-        return np.ascontiguousarray(by_span.reshape(shape).transpose(1, 2, 3, 0))
+        shaped = values.reshape(len(s), derivatives + 1, self.degree + 1)
+        return shaped.transpose(1, 0, 2), number + self.degree
 
     def polynomials(self, derivatives: int) -> Floats:
-        """(n - p spans, (p + 1) (derivatives + 1), p + 1 columns): the polynomials of `_stack` by span."""
+        """Returns the polynomials of all orders by span: (n - p, (p + 1) (derivatives + 1), p + 1)."""
         if derivatives not in self._by_span:
             by_span = self._stack(derivatives).transpose(1, 0, 2)
             self._by_span[derivatives] = by_span.reshape(by_span.shape[0], -1, self.degree + 1)
         return self._by_span[derivatives]
 
     def _stack(self, derivatives: int) -> Floats:
-        """(p + 1 powers, n - p spans, (derivatives + 1) (p + 1)): polynomials of all orders side by side."""
+        """Returns the polynomials of all orders side by side: (p + 1, n - p, (derivatives + 1) (p + 1))."""
         if derivatives == 0:
             return self.coefficients
         if derivatives not in self._stacks:
@@ -144,71 +146,78 @@ class SpanPolynomials:
 
 @dataclass(frozen=True, eq=False)
 class Spans:
-    """The spans of some curves of one degree, laid one curve after the other on an axis v.
+    """Holds the spans of several curves of one degree, laid out one curve after the other on an axis v.
 
-    So rows on any of the curves are looked up and evaluated at once. Parameter u of curve k is at
-    `v = u + shift[k]`. Periodic curves lie there for three periods: what runs past the seam is not wrapped.
+    Rows on any of the curves are then located and evaluated in one call. Parameter u of curve k lies at
+    `v = u + shift[k]`. A periodic curve is laid out for three periods, so that a stretch across the seam need
+    not be wrapped.
     """
 
     degree: int
-    """Degree p of all."""
+    """All curves have this degree p."""
     periodic: bool
-    """Whether all are closed; else none is."""
+    """If true, all curves are closed; otherwise none is."""
     low: Floats
-    """Left end (k,) of each curve's domain on the axis."""
+    """These are the left ends (k,) of the curves' domains on the axis."""
     high: Floats
-    """Right end (k,)."""
+    """These are the right ends (k,) of the curves' domains on the axis."""
     shift: Floats
-    """(k,) from each curve's own parameter to the axis; none for the first."""
+    """Each shift (k,) leads from a curve's own parameter to the axis; it is zero for the first curve."""
     interval: Floats
-    """Mean knot interval (k,) of each."""
+    """These are the mean knot intervals (k,) of the curves."""
     first: int
-    """Spans of the first curve that are left out before it."""
+    """The control points of the first curve begin at this place of the common array."""
     columns: Ints
-    """(n, p + 1) control points that matter on each span."""
+    """Each row (n, p + 1) holds the control points that matter on a span."""
     starts: Floats
-    """Left end of each span (l,) on the axis, in order: n, or three times as many."""
+    """These are the left ends (l,) of the spans, in order: l is n, or 3 n for periodic curves."""
     inverse_widths: Floats
-    """1 / width (l,) of each."""
+    """Each entry (l,) is one over the width of a span."""
     number: Ints
-    """Which of the n spans (l,) each is."""
+    """Each entry (l,) is the number of the span, in [0, n)."""
     by_span: Floats
-    """(n, 3 (p + 1), p + 1): the polynomials of the basis and two derivatives, power after power."""
+    """The array (n, 3 (p + 1), p + 1) holds the polynomials of the basis and of two derivatives."""
     values: Floats
-    """(p + 1, n, p + 1): those of the basis."""
+    """The array (p + 1, n, p + 1) holds the polynomials of the basis, power after power."""
 
     def locate(self, v: Floats) -> tuple[Ints, Floats]:
-        """Span number in [0, n) and s in [0, 1] of each v (m,) on the axis."""
+        """Returns the span number in [0, n), and s in [0, 1], of each place v (m,) on the axis."""
         laid = self.starts[1:].searchsorted(v, side="right")
         s = (v - self.starts.take(laid)) * self.inverse_widths.take(laid)
         return self.number.take(laid) if self.periodic else laid, s
 
     def basis(self, number: Ints, s: Floats) -> Floats:
-        """Basis values (m, p + 1) at what `locate` gave, by Horner's rule."""
-        terms, column = self.values.take(number, axis=1), s[:, None]
-        total: Floats = terms[-1] * column
-        total += terms[-2]
-        for term in terms[-3::-1]:
-            total *= column
-            total += term
-        return total
+        """Returns basis values (m, p + 1) at the result of `locate`, by Horner's rule."""
+        return horner(self.values.take(number, axis=1), s[:, None])
 
     def curve_coefficients(self, control_points: Floats) -> Floats:
-        """(p + 1, 3, 2, n): S, S', S'' of span i are sum_k coefficients[k, r, :, i] s^k."""
+        """Returns C (p + 1, 3, 2, n): on span i, d^r S / du^r = sum_k C[k, r, :, i] s^k, r <= 2."""
         by_span = np.matmul(self.by_span, control_points.take(self.columns, axis=0))
         shape = (len(by_span), self.degree + 1, 3, 2)
         return np.ascontiguousarray(by_span.reshape(shape).transpose(1, 2, 3, 0))
 
 
+def horner(terms: Floats, s: Floats) -> Floats:
+    """Returns sum_k terms[k] s^k for terms (p + 1, m, ...) and s, which broadcasts to the shape of a term."""
+    total: Floats = terms[-1] * s
+    total += terms[-2]
+    for term in terms[-3::-1]:
+        total *= s
+        total += term
+    return total
+
+
 def lay_out(
     curves: Sequence[SpanPolynomials], offsets: Sequence[int], sizes: Sequence[int] | None = None
 ) -> Spans:
-    """Curves, all periodic or none, whose control points begin at these places of a common array.
+    """Returns the spans of curves, all periodic or none, laid out on one axis.
 
-    `sizes`: so many control points of periodic curves are distinct, the others not there; else unwrapped.
+    The control points of each curve begin at its entry of `offsets` in a common array. Where `sizes` is
+    given, the array holds this many distinct control points of each periodic curve; otherwise it holds
+    unwrapped ones.
     """
     periodic, counts = curves[0].periodic, [curve.occupied for curve in curves]
-    periods = np.arange(-1.0, 2.0) if periodic else np.zeros(1)
+    periods = np.array(_PERIODS_LAID_OUT) if periodic else np.zeros(1)
     shift = np.array(_shifts(curves, periods))
     columns = [curve.windows[:n] for curve, n in zip(curves, counts, strict=True)]
     if periodic and sizes is not None:
@@ -239,16 +248,19 @@ def lay_out(
 
 
 def _shifts(curves: Sequence[SpanPolynomials], periods: Floats) -> list[float]:
-    """How far each curve is moved, the first not at all, so that none overlaps; whole, which rounds least."""
+    """Returns the shift of each curve at which no two overlap; the first curve is not shifted.
+
+    Shifts are whole numbers, which add the least round-off.
+    """
     shifts, end = [0.0], curves[0].high + curves[0].length * periods[-1]
     for curve in curves[1:]:
-        shifts.append(float(np.ceil(end - (curve.low + curve.length * periods[0]) + 1.0)))
+        shifts.append(float(np.ceil(end - (curve.low + curve.length * periods[0]) + _GAP_OF_CURVES)))
         end = curve.high + curve.length * periods[-1] + shifts[-1]
     return shifts
 
 
 def _span_coefficients(knots: Floats, degree: int) -> Floats:
-    """The Cox-de Boor recurrence on polynomials of s: (p + 1 powers, n - p spans, p + 1 columns)."""
+    """Returns the coefficients (p + 1 powers, n - p spans, p + 1) by Cox-de Boor on polynomials of s."""
     spans = np.arange(degree, len(knots) - degree - 1)
     start = knots[spans]
     width = knots[spans + 1] - start
@@ -257,7 +269,7 @@ def _span_coefficients(knots: Floats, degree: int) -> Floats:
     level[0] = 1.0
     for q in range(1, degree + 1):
         lower, upper = window[degree - q : degree], window[degree : degree + q]
-        ratio = level / positive(upper - lower)
+        ratio = level / divisors(upper - lower)
         raised = np.zeros((degree + 1, q + 1, len(spans)))
         raised[:, :-1] = (upper - start) * ratio
         raised[:, 1:] += (start - lower) * ratio
@@ -268,7 +280,7 @@ def _span_coefficients(knots: Floats, degree: int) -> Floats:
 
 
 def _derivative(coefficients: Floats, order: int, inverse_widths: Floats) -> Floats:
-    """d^r/du^r of the polynomials of s = (u - start) / width: same shape, high powers zero."""
+    """Returns d^r/du^r of polynomials of s = (u - start) / width, in the same shape."""
     derived = np.zeros_like(coefficients)
     for power in range(order, len(coefficients)):
         derived[power - order] = coefficients[power] * (factorial(power) // factorial(power - order))

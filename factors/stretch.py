@@ -1,4 +1,4 @@
-"""Where a foot point is looked for: a stretch of each row's own curve."""
+"""Stretches: the part of its own curve where each row's foot point is searched for."""
 
 from __future__ import annotations
 
@@ -15,36 +15,36 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Each row's stretch on the axis of `Spans`."""
+    """Holds each row's stretch, on the axis of `Spans`."""
 
     periodic: bool
-    """Whether the curves are closed."""
+    """If true, the curves are closed."""
     begin: Floats
-    """Domain (m,) of the row's curve, from ..."""
+    """The domain of each row's curve begins here (m,)."""
     end: Floats
-    """... to."""
+    """The domain of each row's curve ends here (m,)."""
     low: Floats
-    """Stretch (m,), from ..."""
+    """Each stretch begins here (m,)."""
     high: Floats
-    """... to."""
+    """Each stretch ends here (m,)."""
     floor: Floats
-    """Limits (m,) that the iteration must keep, from ..."""
+    """The iteration does not go below this limit (m,), which is -inf where a stretch is a whole period."""
     ceiling: Floats
-    """... to: none for a stretch that is a whole period."""
+    """The iteration does not go above this limit (m,), which is inf where a stretch is a whole period."""
     interval: Floats
-    """Mean knot interval (m,) of the row's curve."""
+    """This is the mean knot interval (m,) of each row's curve."""
 
     @property
     def length(self) -> Floats:
-        """Length (m,) of the row's curve."""
+        """Returns the length (m,) of the domain of each row's curve."""
         return self.end - self.begin
 
     def within(self, v: Floats) -> Floats:
-        """v (m,) clipped to the limits that the iteration must keep."""
+        """Returns v (m,) clipped to the limits of the iteration."""
         return np.minimum(np.maximum(v, self.floor), self.ceiling)
 
     def moved_into(self, v: Floats) -> Floats:
-        """v (m,) moved into the stretch: by whole periods where periodic, else to the nearest limit."""
+        """Returns v (m,) moved into its stretch by whole periods, or to the nearest limit."""
         low, high = self.low, self.high
         if not self.periodic:
             return np.minimum(np.maximum(v, low), high)
@@ -54,19 +54,23 @@ class Stretch:
         return np.where(inside <= high, inside, nearest)
 
     def in_domain(self, v: Floats) -> Floats:
-        """v (m,) wrapped into the curve's domain where periodic, else clipped to it."""
+        """Returns v (m,) wrapped into the domain of a periodic curve, or clipped to that of an open one."""
         if self.periodic:
             v = v - self.length * np.floor((v - self.begin) / self.length)
         return np.minimum(np.maximum(v, self.begin), self.end)
 
     def where(self, rows: Bools) -> Stretch:
-        """Of some rows."""
+        """Returns the stretches of some rows."""
         names = ("begin", "end", "low", "high", "floor", "ceiling", "interval")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
 
 def stretch_of(spans: Spans, curve: Ints, u_low: Floats, u_high: Floats) -> Stretch:
-    """Stretches (m,) inside an open domain, or begun in a periodic one; never reversed."""
+    """Returns the stretches of rows on curves `curve` (m,) between the parameters u_low and u_high (m,).
+
+    A stretch lies inside the domain of an open curve and begins inside that of a periodic one. Reversed
+    limits give a stretch of length zero.
+    """
     begin, end, shift = spans.low.take(curve), spans.high.take(curve), spans.shift.take(curve)
     interval = spans.interval.take(curve)
     low, high = u_low + shift, u_high + shift

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 
 class PathspaceError(Exception):
@@ -29,3 +32,13 @@ class SettingsError(PathspaceError):
 
 class SingularSystemError(PathspaceError):
     """The normal equations are not positive definite: nothing holds some variable."""
+
+
+def check_name(name: Any, known: Iterable[str], expected: str) -> None:
+    """SettingsError, naming the nearest known one, unless `name` is among the known."""
+    known = list(known)
+    if name in known:
+        return
+    near = get_close_matches(str(name), known, n=1, cutoff=0.0)
+    hint = f", the nearest is '{near[0]}'" if near else ""
+    raise SettingsError(f"{expected}, found '{name}'{hint}")

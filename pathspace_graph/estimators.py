@@ -7,7 +7,6 @@ An installed package adds an estimator by an entry point in the group `pathspace
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final
 
@@ -101,13 +100,3 @@ def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:
     """The batch estimator of that name for a log, of which it is told the noise of the odometry only."""
     check_batch(name)
     return BATCH[name](settings, log.odometry_sigma)
-
-
-def check_settings(settings: Any, where: str = "") -> None:
-    """SettingsError unless every number of a settings dataclass, nested ones too, is finite and positive."""
-    for entry in fields(settings):
-        name, value = f"{where}{entry.name}", getattr(settings, entry.name)
-        if is_dataclass(value):
-            check_settings(value, f"{name}.")
-        elif isinstance(value, int | float) and not isinstance(value, bool) and not 0 < value < float("inf"):
-            raise SettingsError(f"{name}: expected a finite, positive number, found {value}")

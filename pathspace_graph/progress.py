@@ -1,29 +1,60 @@
-"""Progress of long work, on standard error and only where that is a terminal."""
+"""Progress of long work, on standard error."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
 
 
 @contextmanager
-def progress(description: str, total: int | None = None) -> Iterator[Callable[[], None]]:
-    """Show a bar (a spinner where the total isn't known) and yield what is to be called after each step."""
-    console = Console(stderr=True)
-    columns = [SpinnerColumn(), TextColumn("{task.description}")]
-    known = [BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()] if total is not None else []
-    with Progress(
-        *columns, *known, console=console, transient=True, disable=not console.is_terminal
-    ) as display:
-        task = display.add_task(description, total=total)
-        yield lambda: display.advance(task)
+def progress(description: str, total: int | None = None, lines: int = 0) -> Iterator[Steps]:
+    """Shows a bar on a terminal, or a spinner where the total isn't known, and yields what counts the steps.
+
+    Without a terminal nothing is shown, unless `lines` asks for about that many lines over the whole work.
+    """
+    console = Console(stderr=True, highlight=False)
+    text, remaining = TextColumn("{task.description}"), TextColumn("{task.fields[remaining]}")
+    columns = (SpinnerColumn(), text, BarColumn(), MofNCompleteColumn(), remaining)
+    shown = columns if total is not None or lines else columns[:2]
+    with Progress(*shown, console=console, transient=True, disable=not console.is_terminal) as display:
+        yield Steps(display, description, total, lines)
+
+
+class Steps:
+    """Counts the steps of long work, and estimates the time that remains by the mean of those done so far."""
+
+    def __init__(self, display: Progress, description: str, total: int | None, lines: int) -> None:
+        self._display, self._description = display, description
+        self._done, self._total, self._lines = 0, total, lines
+        self._begin = time.monotonic()
+        self._task = display.add_task(description, total=total, remaining="")
+
+    def __call__(self, done: int | None = None, total: int | None = None) -> None:
+        """Counts one more step, or sets how many steps of how many are done."""
+        self._done = self._done + 1 if done is None else done
+        self._total = self._total if total is None else total
+        remaining = ""
+        if self._total is not None:
+            remaining = time_remaining(time.monotonic() - self._begin, self._done, self._total)
+        self._display.update(self._task, completed=self._done, total=self._total, remaining=remaining)
+        if self._is_a_line_due():
+            text = f"{self._description}: {self._done} of {self._total}, {remaining}"
+            self._display.console.print(text)
+
+    def _is_a_line_due(self) -> bool:
+        if not self._lines or not self._total or self._display.console.is_terminal:
+            return False
+        interval = -(-self._total // self._lines)
+        return self._done % interval == 0 or self._done == self._total
+
+
+def time_remaining(elapsed: float, done: int, total: int) -> str:
+    """Returns `elapsed * (total - done) / done` (s) in words."""
+    if not done:
+        return "time left unknown"
+    return f"{timedelta(seconds=round(elapsed * (total - done) / done))} left"

@@ -1,4 +1,4 @@
-"""One loop for every online estimator: a log goes in cycle by cycle, a map and a trajectory come out."""
+"""The interface of estimators, and the loop that feeds a log to an online one cycle by cycle."""
 
 from __future__ import annotations
 
@@ -21,61 +21,83 @@ from .laps import LapCounter
 Array = NDArray[np.float64]
 
 
-class OnlineEstimate(Protocol):
-    """What an online estimator says after one perception cycle."""
+@dataclass(frozen=True, eq=False)
+class CycleResult:
+    """Holds what an online estimator found in one perception cycle."""
 
-    @property
-    def pose(self) -> Array:
-        """The vehicle's pose [x, y, theta] (3,), map frame, at the cycle's stamp."""
-
-    @property
-    def sizes(self) -> tuple[int, int]:
-        """Control points or landmarks of the left and the right boundary."""
-
-    @property
-    def readings(self) -> int:
-        """How many of the cycle's readings were used."""
-
-    @property
-    def stages(self) -> Mapping[str, float]:
-        """Time (s) that each stage of the update took, by its name."""
+    t: float
+    """This is the stamp of the cycle (s)."""
+    pose: Array
+    """The vehicle has this pose [x, y, theta] (3,), m and rad, map frame; theta isn't wrapped."""
+    sizes: tuple[int, int]
+    """These are the numbers of control points, or of landmarks, of the left and of the right boundary."""
+    readings: int
+    """This is the number of the cycle's detections that were used."""
+    closed: bool
+    """This says whether the loop has closed."""
+    stages: Mapping[str, float] = field(default_factory=dict)
+    """Each stage of the update took this time (s), by the stage's name."""
 
 
 class OnlineEstimator(Protocol):
-    """The one face of every online estimator."""
+    """Describes what every online estimator has."""
 
     @property
     def settings(self) -> Any:
-        """A frozen dataclass of everything that it was told."""
+        """A frozen dataclass holds all settings of the estimator."""
 
-    def update(self, odometry: Odometry, detections: Detections) -> OnlineEstimate:
-        """One perception cycle: the twists since the last one, and what was detected now."""
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        """Processes one perception cycle: the twists since the last one, and the detections of this one."""
 
     def map(self) -> Map:
-        """The map as it stands, a copy."""
+        """Returns a copy of the map as it stands."""
 
 
 class BatchEstimator(Protocol):
-    """The one face of every batch estimator."""
+    """Describes what every batch estimator has."""
 
     @property
     def settings(self) -> Any:
-        """A frozen dataclass of everything that it was told."""
+        """A frozen dataclass holds all settings of the estimator."""
 
     def solve(self, log: Log) -> BatchRun:
-        """The optimum over a whole log, whose truth isn't read."""
+        """Returns the optimum over a whole log, whose truth is not read."""
+
+
+class Stopwatch:
+    """Measures how long each stage of an update takes, from the moment that it is made."""
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        """Each stage took this time (s)."""
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        """Assigns the time since the last call to the stage `name`."""
+        now = time.perf_counter()
+        self.laps[name] = now - self._last
+        self._last = now
 
 
 def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
-    """Each perception cycle with the twists in force since the one before, nothing later than its own stamp.
+    """Yields each perception cycle with the twists since the cycle before it, none later than its stamp.
 
-    Rows [t_i, t_(i+1)) tile the time from the first odometry stamp to the cycle: the first row begins at the
-    last cycle's stamp with the twist that was held there, the last one is held until the cycle.
+    The rows tile the time without a gap, row i being in force during [t_i, t_(i+1)). The first row begins at
+    the stamp of the cycle before with the twist that was held then. The last row is held until the cycle.
     """
     since = float(log.odometry.t[0])
     for detections in log.cycles:
         yield log.odometry.between(since, detections.t), detections
         since = detections.t
+
+
+def timed_update(
+    estimator: OnlineEstimator, odometry: Odometry, detections: Detections
+) -> tuple[CycleResult, float]:
+    """Does one update, and returns the estimate and the wall time (s) that the update took."""
+    begin = time.perf_counter()
+    estimate = estimator.update(odometry, detections)
+    return estimate, time.perf_counter() - begin
 
 
 def run_online(
@@ -88,8 +110,9 @@ def run_online(
 ) -> RunResult:
     """Feeds a log's odometry and cycles to an online estimator, in order of time and never ahead of it.
 
-    The truth of the log is not read. `snapshot_times` (s, ascending): a map is kept as it stood then, after
-    the last cycle that isn't later. `on_cycle` is told of each cycle when it is done. BLAS has one thread.
+    The truth of the log is not read. For each of the `snapshot_times` (s, ascending) the map is kept as it
+    stood then, after the last cycle that isn't later. `on_cycle` is called after each cycle. BLAS has one
+    thread, since its threads stall small solves.
     """
     run = _Run(estimator, [float(t) for t in snapshot_times])
     with threadpool_limits(limits=1):
@@ -101,7 +124,7 @@ def run_online(
 
 
 class _Run:
-    """A run in progress."""
+    """Collects the results of a run in progress."""
 
     def __init__(self, estimator: OnlineEstimator, snapshot_times: list[float]) -> None:
         self._estimator = estimator
@@ -113,32 +136,30 @@ class _Run:
         self._records: list[CycleRecord] = []
 
     def cycle(self, odometry: Odometry, detections: Detections) -> CycleRecord:
-        """One update, timed, and what it did to the map and the lap."""
+        """Runs and times one update, and records it."""
         self._take_snapshots(before=detections.t)
-        begin = time.perf_counter()
-        estimate = self._estimator.update(odometry, detections)
-        seconds = time.perf_counter() - begin
+        result, seconds = timed_update(self._estimator, odometry, detections)
         lap_before = self._laps.lap
-        lap = self._laps.update(estimate.pose)
+        lap = self._laps.update(result.pose)
         if lap > lap_before:
             self._lap_maps.append((lap_before, self._estimator.map()))
-        self._poses.append(np.array(estimate.pose, dtype=float))
+        self._poses.append(np.array(result.pose, dtype=float))
         self._records.append(
             CycleRecord(
                 cycle=len(self._records),
                 t=detections.t,
                 seconds=seconds,
-                size_left=estimate.sizes[LEFT],
-                size_right=estimate.sizes[RIGHT],
-                readings=estimate.readings,
+                size_left=result.sizes[LEFT],
+                size_right=result.sizes[RIGHT],
+                readings=result.readings,
                 lap=lap,
-                stages=dict(estimate.stages),
+                stages=dict(result.stages),
             )
         )
         return self._records[-1]
 
     def result(self, name: str) -> RunResult:
-        """All of it, after the last cycle."""
+        """Returns the results after the last cycle."""
         self._take_snapshots(before=float("inf"))
         track = self._estimator.map()
         if self._laps.last_lap_is_complete:
@@ -163,23 +184,5 @@ class _Run:
 
 
 def settings_dict(settings: Any) -> dict[str, Any]:
-    """A settings dataclass, nested ones included, as plain dicts."""
+    """Returns a settings dataclass with all nested ones as dictionaries; it is empty for anything else."""
     return asdict(settings) if is_dataclass(settings) and not isinstance(settings, type) else {}
-
-
-@dataclass(frozen=True, eq=False)
-class CycleResult:
-    """The estimate after one perception cycle."""
-
-    t: float
-    """Stamp, s."""
-    pose: Array
-    """(3,) x (m), y (m), theta (rad, not wrapped), map frame."""
-    sizes: tuple[int, int]
-    """Control points, or landmarks, of the left and the right boundary."""
-    readings: int
-    """How many of the cycle's readings were used."""
-    closed: bool
-    """Whether the loop has closed."""
-    stages: dict[str, float] = field(default_factory=dict)
-    """Time (s) that each stage of the update took, by its name."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,12 +22,6 @@ from .track import Track
 
 FloatArray = NDArray[np.float64]
 
-KNOWN_KINDS: Final = (
-    "PacSim YAML (track: left, right, start), "
-    "fssim YAML (cones_left, cones_right, starting_pose_front_wing), "
-    "EUFS CSV (tag,x,y,direction), TUM CSV (# x_m,y_m,w_tr_right_m,w_tr_left_m)"
-)
-"""What `read_track` reads, for messages."""
 MIN_CONES: Final = 3
 """A boundary has at least so many cones."""
 DUPLICATE_DISTANCE: Final = 0.3
@@ -47,25 +42,38 @@ EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
 """The EUFS tags of cones that belong to no boundary; further tags, such as midpoint, aren't cones."""
 
 
-def read_track(path: Path | str) -> Track:
-    """The track in a file of a known kind, its cones in driving order, in the file's own frame.
+@dataclass(frozen=True)
+class TrackFormat:
+    """A kind of track file: how it is recognized, and what reads it."""
 
-    A file that is missing, of no known kind or malformed is an InputError that names the row or the key.
+    description: str
+    """This names the format in messages."""
+    suffixes: tuple[str, ...]
+    """File names of this format end in one of these (lower case, with the dot)."""
+    parse: Callable[[Path], Any]
+    """This turns a file into the content that the next two take; it raises an InputError where it can't."""
+    recognizes: Callable[[Any], bool]
+    """This tells whether the parsed content of a file is of this format."""
+    read: Callable[[Path, Any], Track]
+    """This makes the track from the path, which its errors name, and from the parsed content."""
+
+
+def read_track(path: Path | str) -> Track:
+    """Returns the track in a file of a known format: its cones in driving order, in the file's own frame.
+
+    Raises an InputError that names the row or the key where the file is missing, of no known format or
+    malformed.
     """
     path = Path(path)
-    if path.suffix.lower() in (".yaml", ".yml"):
-        track = _read_yaml(path)
-    elif path.suffix.lower() == ".csv":
-        track = _read_csv(path)
-    else:
-        _check_exists(path)
-        raise _unknown_kind(path)
-    _check(path, track)
-    return track
-
-
-def _unknown_kind(path: Path) -> InputError:
-    return InputError(path, f"expected a track file of a known kind: {KNOWN_KINDS}")
+    suffix = path.suffix.lower()
+    _check_exists(path)
+    for known in FORMATS:
+        if suffix in known.suffixes and known.recognizes(content := known.parse(path)):
+            track = known.read(path, content)
+            _check(path, track)
+            return track
+    kinds = ", ".join(known.description for known in FORMATS)
+    raise InputError(path, f"expected a track file of a known kind: {kinds}")
 
 
 def _check_exists(path: Path) -> None:
@@ -96,10 +104,9 @@ def _check(path: Path, track: Track) -> None:
 # YAML: PacSim and fssim
 
 
-def _read_yaml(path: Path) -> Track:
-    _check_exists(path)
+def _parse_yaml(path: Path) -> Any:
     try:
-        data = yaml.load(
+        return yaml.load(
             path.read_text(encoding="utf-8-sig"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)
         )
     except yaml.MarkedYAMLError as error:
@@ -107,14 +114,18 @@ def _read_yaml(path: Path) -> Track:
         raise InputError(path, f"expected YAML: {error.problem}", row) from error
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(path, f"expected YAML: {' '.join(str(error).split())}") from error
-    if isinstance(data, dict) and isinstance(data.get("track"), dict):
-        return _pacsim(path, data["track"])
-    if isinstance(data, dict) and {"cones_left", "cones_right"} & set(data):
-        return _fssim(path, data)
-    raise _unknown_kind(path)
 
 
-def _pacsim(path: Path, data: Mapping[str, Any]) -> Track:
+def _is_pacsim(data: Any) -> bool:
+    return isinstance(data, dict) and isinstance(data.get("track"), dict)
+
+
+def _is_fssim(data: Any) -> bool:
+    return isinstance(data, dict) and not {"cones_left", "cones_right"}.isdisjoint(data)
+
+
+def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
+    data = content["track"]
     closed = _get(path, data, "lanesFirstWithLastConnected", "track.")
     if not isinstance(closed, bool):
         raise InputError(
@@ -200,17 +211,19 @@ def _without_repeats(row: FloatArray, closed: bool) -> FloatArray:
 # CSV: EUFS and TUM
 
 
-def _read_csv(path: Path) -> Track:
-    _check_exists(path)
-    table = read_table(path, (), comment="#")
-    if {"x_m", "y_m"} & set(table.columns):
-        return _tum(path)
-    if "tag" in table.columns:
-        return _eufs(path)
-    raise _unknown_kind(path)
+def _parse_csv(path: Path) -> Table:
+    return read_table(path, (), comment="#")
 
 
-def _eufs(path: Path) -> Track:
+def _is_tum(table: Table) -> bool:
+    return not {"x_m", "y_m"}.isdisjoint(table.columns)
+
+
+def _is_eufs(table: Table) -> bool:
+    return "tag" in table.columns and not _is_tum(table)
+
+
+def _eufs(path: Path, _: Table) -> Track:
     table = read_table(path, ("tag", "x", "y"))
     tags = np.array([tag.strip().lower() for tag in table.columns["tag"]])
     points = table.stack(("x", "y"))
@@ -262,7 +275,7 @@ def _without_duplicates(cones: FloatArray) -> FloatArray:
     return np.array(kept).reshape(-1, 2)
 
 
-def _tum(path: Path) -> Track:
+def _tum(path: Path, _: Table) -> Track:
     circuit = _tum_circuit(path)
     knots = arc_lengths(circuit[:, :2])
     spline = CubicSpline(knots, circuit[:, :2], bc_type="periodic")
@@ -295,3 +308,15 @@ def _spaced(boundary: FloatArray) -> FloatArray:
     s = arc_lengths(polyline)
     at = np.linspace(0.0, s[-1], math.ceil(s[-1] / CONE_SPACING), endpoint=False)
     return along_polyline(at, s, polyline)
+
+
+YAML: Final = (".yaml", ".yml")
+FORMATS: Final = (
+    TrackFormat("PacSim YAML (track: left, right, start)", YAML, _parse_yaml, _is_pacsim, _pacsim),
+    TrackFormat(
+        "fssim YAML (cones_left, cones_right, starting_pose_front_wing)", YAML, _parse_yaml, _is_fssim, _fssim
+    ),
+    TrackFormat("EUFS CSV (tag,x,y,direction)", (".csv",), _parse_csv, _is_eufs, _eufs),
+    TrackFormat("TUM CSV (# x_m,y_m,w_tr_right_m,w_tr_left_m)", (".csv",), _parse_csv, _is_tum, _tum),
+)
+"""The first format that recognizes a file reads it; docs/extending.md shows how a format is added."""

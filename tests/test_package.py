@@ -35,8 +35,8 @@ FOLDERS = {package: folder_of(package) for package in PACKAGES}
 
 
 def python_folders() -> set[Path]:
-    """Every folder with Python code below the root, but for tests, examples, and what is hidden or built."""
-    skipped = {"tests", "examples", "build", "dist"}
+    """Every folder with Python code below the root, but for tests, examples and pages, and what is built."""
+    skipped = {"tests", "examples", "docs", "build", "dist"}
     files = (file.relative_to(ROOT) for file in ROOT.rglob("*.py"))
     return {
         file.parent

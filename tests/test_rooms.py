@@ -19,7 +19,7 @@ MOST_FILES = 15
 EXTRAS = {"distributed"}
 """Optional packages, which are imported only where they are needed."""
 
-LEAVES = {"errors", "labels", "progress", "stopwatch"}
+LEAVES = {"errors", "labels", "progress"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "ckf", "landmark"}
 BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "run"}
@@ -42,12 +42,16 @@ ARROWS: dict[str, set[str]] = {
     "eval.metrics": BELOW_EVAL,
     "eval.tables": BELOW_EVAL | {"eval.metrics"},
     "eval.figures": BELOW_EVAL | {"eval.metrics"},
-    "eval.study": BELOW_EVAL | {"eval.metrics", "eval.tables", "eval.figures"},
-    "eval.compare": BELOW_EVAL | {"eval.metrics", "eval.tables", "eval.figures", "eval.study"},
-    "eval.scaling": BELOW_EVAL | {"eval.metrics", "eval.tables", "eval.figures", "eval.study"},
-    "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.tables", "eval.figures", "eval.study"},
+    "eval.harness": BELOW_EVAL | {"eval.metrics"},
+    "eval.study": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures"},
+    "eval.compare": BELOW_EVAL
+    | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures", "eval.study"},
+    "eval.scaling": BELOW_EVAL
+    | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures", "eval.study"},
+    "eval.benchmark": BELOW_EVAL
+    | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures", "eval.study"},
     "commands": BELOW_EVAL
-    | {f"eval.{room}" for room in ("metrics", "tables", "figures", "study", "compare", "scaling")},
+    | {f"eval.{room}" for room in ("metrics", "harness", "tables", "figures", "study", "compare", "scaling")},
     "cli": {"commands"},
     "__main__": {"cli"},
 }

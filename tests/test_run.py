@@ -16,7 +16,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.labels import LEFT
-from pathspace_graph.run import run_online, split_odometry
+from pathspace_graph.run import CycleResult, run_online, split_odometry
 
 
 def detections(t: float) -> Detections:
@@ -35,14 +35,6 @@ class Told:
     inner: dict[str, float] = field(default_factory=lambda: {"a": 1.0})
 
 
-@dataclass(frozen=True)
-class Estimate:
-    pose: np.ndarray
-    sizes: tuple[int, int]
-    readings: int = 5
-    stages: dict[str, float] = field(default_factory=dict)
-
-
 class Counting:
     """An estimator whose map has as many points as there were cycles, and that drives given poses."""
 
@@ -52,12 +44,12 @@ class Counting:
         self.count = 0
         self.threads: set[int] = set()
 
-    def update(self, odometry: Odometry, detections: Detections) -> Estimate:
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         assert (odometry.t < detections.t).all()
         self.threads |= {pool["num_threads"] for pool in threadpool_info()}
         self.count += 1
         pose = np.zeros(3) if self.poses is None else self.poses[self.count - 1]
-        return Estimate(pose, (self.count, 0))
+        return CycleResult(detections.t, pose, (self.count, 0), 5, False)
 
     def map(self) -> Map:
         size = self.count

@@ -1,4 +1,4 @@
-"""The benchmark's committed baseline: ratios only, as times are the machine's; and what got worse than it."""
+"""The benchmark's committed baseline of ratios (times depend on the machine), and what is worse than it."""
 
 from __future__ import annotations
 
@@ -14,37 +14,38 @@ from rich.table import Table
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.files import atomic_file
+from pathspace_graph.io.json_file import write_json
 
 from .metric import Metric
 
 FORMAT: Final = "pathspace-benchmark-baseline/1"
 BASELINE: Final = Path(__file__).with_name("baseline.json")
-"""The one that comes with the package."""
+"""This baseline comes with the package."""
 
 
 @dataclass(frozen=True)
 class BaselineComparison:
-    """A figure of this run and of the baseline; either may be missing."""
+    """Holds a figure of this run beside that of the baseline; either may be missing."""
 
     key: str
-    """The figure's name."""
+    """The figure has this name."""
     value: float
-    """Of this run; NaN where it has none."""
+    """This is the value of this run; it is NaN where the run has none."""
     baseline: float | None
-    """None where it isn't in the baseline."""
+    """This is the value of the baseline; it is None where the baseline has none."""
     tolerance: float
-    """Share of the baseline by which it may be worse."""
+    """The figure may be worse than the baseline by this share."""
     worse: bool
-    """Whether it is by more than that, or is missing in this run."""
+    """This says whether the figure is worse by more than that, or missing in this run."""
 
 
 def ratios(figures: Iterable[Metric]) -> list[Metric]:
-    """Those that have a baseline: a ratio, with a tolerance."""
+    """Returns the figures that have a baseline: ratios with a tolerance."""
     return [metric for metric in figures if not metric.unit and metric.tolerance is not None]
 
 
 def compare(figures: Iterable[Metric], baseline: Mapping[str, float]) -> tuple[BaselineComparison, ...]:
-    """Every figure that has a baseline or should; one that is in the baseline and not in the run is worse."""
+    """Compares every figure that has a baseline or should; one that the run lacks is worse."""
     known = {metric.key: metric for metric in ratios(figures)}
     found = []
     for key in dict.fromkeys([*known, *baseline]):
@@ -56,7 +57,7 @@ def compare(figures: Iterable[Metric], baseline: Mapping[str, float]) -> tuple[B
 
 
 def write_baseline(file: Path, figures: Iterable[Metric]) -> None:
-    """This run's ratios as the baseline; SettingsError where one isn't known, as of a run too short."""
+    """Writes this run's ratios; raises SettingsError where one isn't known because the run is too short."""
     chosen = ratios(figures)
     for metric in chosen:
         if not math.isfinite(metric.value):
@@ -67,11 +68,11 @@ def write_baseline(file: Path, figures: Iterable[Metric]) -> None:
         "ratios": {metric.key: round(metric.value, 4) for metric in chosen},
     }
     with atomic_file(file) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_json(temporary, content)
 
 
 def read_baseline(file: Path) -> dict[str, float]:
-    """The ratios by name; InputError where the file isn't a baseline."""
+    """Returns the ratios by name; raises InputError where the file isn't a baseline."""
     try:
         content: Any = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -91,7 +92,7 @@ def _is_number(value: object) -> bool:
 
 
 def baseline_table(comparisons: Sequence[BaselineComparison]) -> Table:
-    """For a terminal: what is worse is said in words and in red."""
+    """Returns a table for a terminal, where figures that are worse are marked in words and in red."""
     table = Table("ratio", title="against the baseline", title_justify="left")
     for name in ("baseline", "now", "change", "tolerance", ""):
         table.add_column(name, justify="right")

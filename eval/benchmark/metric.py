@@ -1,4 +1,4 @@
-"""A figure of a benchmark as data: its value, which way is better, and what it is held to."""
+"""A figure of a benchmark as data: its value, which way is better, its bound and its tolerance."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Metric:
-    """One figure, and what it is held to."""
+    """Holds one figure of a run."""
 
     key: str
-    """Name, for a baseline to be compared with."""
+    """The figure has this name, also in a baseline."""
     value: float
-    """NaN where the run was too short for it."""
+    """This is NaN where the run was too short for the figure."""
     unit: str
-    """Empty for a ratio."""
+    """The value has this unit; it is empty for a ratio."""
     direction: Literal["lower", "higher"] = "lower"
-    """Which way is better."""
+    """The figure is better in this direction."""
     bound: float | None = None
-    """Worst value allowed; None where nothing is asked."""
+    """This is the worst value allowed; it is None where any value is."""
     tolerance: float | None = None
-    """How much worse than its baseline it may be, as a share of that; None where it has no baseline."""
+    """The figure may be worse than its baseline by this share; it is None where there is no baseline."""
 
     @property
     def holds(self) -> bool:
-        """Whether the bound is kept; a value that isn't known keeps none."""
+        """Returns whether the bound is kept; an unknown value keeps none."""
         if self.bound is None:
             return True
         return self.value <= self.bound if self.direction == "lower" else self.value >= self.bound
 
     def worse_than(self, baseline: float) -> bool:
-        """Whether it is worse than the baseline by more than its tolerance; one that isn't known is."""
+        """Returns whether the figure is worse than the baseline by more than its tolerance, or unknown."""
         spare = (self.tolerance or 0.0) * abs(baseline)
         if self.direction == "lower":
             return not self.value <= baseline + spare

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 import pandas as pd
-from threadpoolctl import threadpool_limits
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.eval.harness.attempts import Attempt, attempt, known_estimators
+from pathspace_graph.eval.harness.workers import check_jobs, outcomes, workers
 from pathspace_graph.eval.metrics.cost import StageTime, stage_times
 from pathspace_graph.eval.metrics.ghosts import GhostSettings
-from pathspace_graph.eval.metrics.summary import lap_times
-from pathspace_graph.eval.study.workers import check_jobs, outcomes, workers
+from pathspace_graph.eval.metrics.measures import measure, online_cycles
 from pathspace_graph.io.log import LOG_FILE, Log, read_log
 from pathspace_graph.io.results import BatchRun, RunResult
-from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .metrics import Row, online_cycles, rows
+Row = dict[str, float | int | str | bool]
 
 RUN: Final = ("log", "estimator")
 """Columns that name a run."""
@@ -126,7 +125,7 @@ def read_logs(folder: Path) -> tuple[NamedLog, ...]:
 
 def choose(names: Sequence[str]) -> tuple[str, ...]:
     """Estimators by name, all that are known where none is named; SettingsError where one isn't."""
-    known = [*registry.ONLINE, *registry.BATCH]
+    known = known_estimators()
     for name in names:
         if name not in known:
             raise SettingsError(f"--estimators: expected known ones ({', '.join(known)}), found '{name}'")
@@ -161,7 +160,11 @@ def compare(
     done: dict[Task, Outcome] = {}
     with workers(jobs, None):
         for task, outcome in outcomes(run_task, tasks, lambda task: (logs[task.log], settings, ghosts)):
-            done[task] = outcome if isinstance(outcome, Outcome) else _failed(task, logs, outcome)
+            done[task] = (
+                outcome
+                if isinstance(outcome, Outcome)
+                else _outcome(task, logs[task.log], Attempt.failed(outcome))
+            )
             if on_run is not None:
                 on_run()
     chosen = choose_reference(reference, estimators)
@@ -169,31 +172,24 @@ def compare(
 
 
 def run_task(task: Task, named: NamedLog, settings: MapperSettings, ghosts: GhostSettings) -> Outcome:
-    """Run and measure; a failure is an outcome as well."""
-    try:
-        with threadpool_limits(limits=1):
-            begin = time.perf_counter()
-            result = run_estimator(task.estimator, settings, named.log)
-            seconds = time.perf_counter() - begin
-            measured = tuple(rows(result, named.log, seconds, ghosts))
-        cycles = online_cycles(result)
-        times = tuple(stage_times(cycles)) if cycles else ()
-        return Outcome(named.name, task.estimator, result, rows=measured, times=times)
-    except Exception as error:  # whatever ends a run belongs into the table
-        return Outcome(named.name, task.estimator, failure=_told(error))
+    """Runs and measures; a failure is an outcome as well."""
+    what = attempt(task.estimator, settings, named.log, partial(_measure, ghosts=ghosts))
+    return _outcome(task, named, what)
 
 
-def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
-    """An online estimator cycle by cycle, with its map at each true lap's end, or a batch one at once."""
-    if name in registry.ONLINE:
-        estimator = registry.make_online(name, settings, log)
-        return run_online(log, estimator, name=name, snapshot_times=lap_times(log))
-    return registry.make_batch(name, settings, log).solve(log)
+def _measure(
+    result: RunResult, log: Log, seconds: float, ghosts: GhostSettings
+) -> tuple[tuple[Row, ...], tuple[StageTime, ...]]:
+    rows: tuple[Row, ...] = tuple(
+        {"scope": "lap" if row.lap else "log", "lap": row.lap or result.laps, **row.values}
+        for row in measure(result, log, seconds, ghosts)
+    )
+    cycles = online_cycles(result)
+    return rows, tuple(stage_times(cycles)) if cycles else ()
 
 
-def _failed(task: Task, logs: Sequence[NamedLog], error: BaseException) -> Outcome:
-    return Outcome(logs[task.log].name, task.estimator, failure=_told(error))
-
-
-def _told(error: BaseException) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())
+def _outcome(
+    task: Task, named: NamedLog, what: Attempt[tuple[tuple[Row, ...], tuple[StageTime, ...]]]
+) -> Outcome:
+    measured, times = what.measured or ((), ())
+    return Outcome(named.name, task.estimator, what.result, what.failure, measured, times)

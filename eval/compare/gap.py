@@ -11,8 +11,7 @@ from pathspace_graph.eval.metrics.gap import gap
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import RunResult
 
-from .comparison import Comparison, Outcome
-from .metrics import Row
+from .comparison import Comparison, Outcome, Row
 
 
 def with_gaps(comparison: Comparison) -> Comparison:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from matplotlib.figure import Figure
 
-from pathspace_graph.eval.figures.map_plot import save_plot
+from pathspace_graph.eval.figures.files import save_figures
 from pathspace_graph.eval.metrics.blind_spot import find_blind_spot
 from pathspace_graph.eval.metrics.summary import summarize, versions
-from pathspace_graph.eval.tables.text_table import TextTable
+from pathspace_graph.eval.metrics.text_table import TextTable
 from pathspace_graph.io.files import atomic_folder
+from pathspace_graph.io.json_file import write_json
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.io.results import write_result
 from pathspace_graph.settings.mapper import MapperSettings
@@ -26,8 +26,6 @@ from .table import final_table, paper_frame, paper_table
 FORMAT: Final = "pathspace-comparison/1"
 MARKER: Final = "comparison.json"
 """The file that a comparison's folder is known by."""
-_SUFFIXES: Final = (".png", ".pdf")
-"""Each figure is written as."""
 
 
 def tables(comparison: Comparison) -> dict[str, TextTable]:
@@ -62,7 +60,7 @@ def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings
             own = folder if len(comparison.logs) == 1 else folder / named.name
             own.mkdir(exist_ok=True)
             _write_log(own, named, comparison)
-        _write_json(folder / MARKER, comparison, settings, jobs)
+        write_json(folder / MARKER, _content(comparison, settings, jobs))
 
 
 def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
@@ -72,10 +70,10 @@ def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
         if outcome.result is not None:
             write_result(folder / outcome.estimator, outcome.result, summarize(outcome.result, named.log))
     if any(outcome.result is not None for outcome in outcomes):
-        _save(plot_maps(outcomes, named.log), folder / "maps")
+        save_figures(folder, {"maps": plot_maps(outcomes, named.log)})
     figure = blind_spot_figure(outcomes, named, comparison.reference)
     if figure is not None:
-        _save(figure, folder / "blind_spot")
+        save_figures(folder, {"blind_spot": figure})
 
 
 def blind_spot_figure(outcomes: list[Outcome], named: NamedLog, reference: str) -> Figure | None:
@@ -96,13 +94,8 @@ def blind_spot_figure(outcomes: list[Outcome], named: NamedLog, reference: str) 
     return None
 
 
-def _save(figure: Figure, file: Path) -> None:
-    for suffix in _SUFFIXES:
-        save_plot(figure, file.with_suffix(suffix))
-
-
-def _write_json(file: Path, comparison: Comparison, settings: MapperSettings, jobs: int) -> None:
-    content = {
+def _content(comparison: Comparison, settings: MapperSettings, jobs: int) -> dict[str, Any]:
+    return {
         "format": FORMAT,
         "logs": [named.name for named in comparison.logs],
         "estimators": comparison.estimators,
@@ -114,4 +107,3 @@ def _write_json(file: Path, comparison: Comparison, settings: MapperSettings, jo
         "settings": asdict(settings),
         "versions": versions(),
     }
-    file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

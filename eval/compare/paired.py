@@ -7,11 +7,11 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
+from pathspace_graph.eval.metrics.measures import MEAN_DIGITS, METRICS, UNKNOWN, Metric
 from pathspace_graph.eval.metrics.paired import difference
-from pathspace_graph.eval.tables.text_table import TextTable
+from pathspace_graph.eval.metrics.text_table import TextTable
 
 from .comparison import Comparison
-from .metrics import METRIC, METRICS, Metric
 
 _COMPARED: Final = (
     "rmse",
@@ -34,7 +34,7 @@ def paired_frame(comparison: Comparison) -> pd.DataFrame:
     """A tidy row per estimator and metric of the whole logs: the difference from the reference."""
     frame = comparison.frame()
     final = frame[frame["scope"] == "log"].set_index(["log", "estimator"])
-    names = [m.name for m in METRICS if m.name in frame and m.name not in _NOT_PAIRED]
+    names = [key for key in METRICS if key in frame and key not in _NOT_PAIRED]
     logs = [named.name for named in comparison.logs]
     found = []
     for estimator in comparison.estimators:
@@ -54,10 +54,10 @@ def paired_table(comparison: Comparison, paired: pd.DataFrame) -> TextTable:
     """Differences from the reference with their intervals: a row per metric, a column per other estimator."""
     others = [name for name in comparison.estimators if name != comparison.reference]
     rows = []
-    for metric in (METRIC[name] for name in _COMPARED):
-        of = paired[paired["metric"] == metric.name].set_index("estimator")
+    for metric in (METRICS[key] for key in _COMPARED):
+        of = paired[paired["metric"] == metric.key].set_index("estimator")
         if len(of) and of["mean"].notna().any():
-            rows.append((metric.title, *(_interval(metric, of.loc[name]) for name in others)))
+            rows.append((metric.heading, *(_interval(metric, of.loc[name]) for name in others)))
     title = (
         f"Difference from {comparison.reference}, mean [95 % interval] over {len(comparison.logs)} logs, "
         "paired; * where 0 is outside of it. Positive: the reference has less."
@@ -69,7 +69,7 @@ def _interval(metric: Metric, row: Any) -> str:
     """mean [low, high], in the metric's own unit."""
     mean, low, high = (metric.factor * float(row[name]) for name in ("mean", "low", "high"))
     if np.isnan(mean):
-        return "–"
-    digits = max(metric.digits, 2)
+        return UNKNOWN
+    digits = max(metric.digits, MEAN_DIGITS)
     mark = "*" if low > 0.0 or high < 0.0 else ""
     return f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]{mark}"

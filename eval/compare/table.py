@@ -8,12 +8,12 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
+from pathspace_graph.eval.metrics.measures import METRICS, PAPER, Metric
 from pathspace_graph.eval.metrics.summary import has_cones
 from pathspace_graph.eval.metrics.table1 import LapMetrics
-from pathspace_graph.eval.tables.text_table import TextTable
+from pathspace_graph.eval.metrics.text_table import TextTable
 
 from .comparison import Comparison
-from .metrics import METRICS, PAPER, Metric
 
 NO_TRUTH: Final = "the log has no true cones: only what needs none is told"
 """What a table says that lacks the paper's columns."""
@@ -29,7 +29,7 @@ def paper_frame(comparison: Comparison) -> pd.DataFrame:
 
     An estimator that completed no lap on any log has its maps at the end of the logs, without a lap.
     """
-    names = [metric.name for metric in PAPER]
+    names = [metric.key for metric in PAPER]
     frame = comparison.frame().reindex(columns=["log", "estimator", "scope", "lap", *names])
     found = []
     for estimator in comparison.estimators:
@@ -46,7 +46,7 @@ def paper_frame(comparison: Comparison) -> pd.DataFrame:
 def paper_table(comparison: Comparison) -> TextTable:
     """The paper's Table 1, lap by lap; without truth its sizes alone."""
     frame = paper_frame(comparison)
-    known = [metric for metric in PAPER if not metric.truth or has_truth(comparison)]
+    known = PAPER if has_truth(comparison) else (METRICS["size"],)
     several = len(comparison.logs) > 1
     rows = [
         (
@@ -59,7 +59,7 @@ def paper_table(comparison: Comparison) -> TextTable:
     ]
     names = frame["estimator"].tolist()
     groups = tuple(i for i in range(1, len(names)) if names[i] != names[i - 1])
-    header = ("estimator", "lap", *(["logs"] if several else []), *(metric.title for metric in known))
+    header = ("estimator", "lap", *(["logs"] if several else []), *(metric.heading for metric in known))
     return TextTable(_title(comparison, "at the end of each lap"), header, tuple(rows), groups)
 
 
@@ -67,13 +67,13 @@ def final_table(comparison: Comparison) -> TextTable:
     """Every metric of the whole logs: a row per metric, a column per estimator, means over the logs."""
     frame = comparison.frame()
     final = frame[frame["scope"] == "log"]
-    known = [m for m in METRICS if m.name in frame and not final[m.name].astype(float).isna().all()]
+    known = [m for m in METRICS.values() if m.key in frame and not final[m.key].astype(float).isna().all()]
     means = {
-        name: final[final["estimator"] == name][[m.name for m in known]].astype(float).mean()
+        name: final[final["estimator"] == name][[m.key for m in known]].astype(float).mean()
         for name in comparison.estimators
     }
     rows = tuple(
-        (metric.title, *(metric.text(float(means[name][metric.name])) for name in comparison.estimators))
+        (metric.heading, *(metric.text(float(means[name][metric.key])) for name in comparison.estimators))
         for metric in known
     )
     title = _title(comparison, "at the end of the log")
@@ -85,7 +85,7 @@ def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
 
     rmse, missed and size of an estimator are one column, so that its name stands over all three.
     """
-    titles = _SPACE.join(metric.title for metric in PAPER)
+    titles = _SPACE.join(metric.heading for metric in PAPER)
     header = ("lap", *(f"{name}\n{titles}" for name in laps))
     count = max((len(rows) for rows in laps.values()), default=0)
     rows = (
@@ -97,7 +97,7 @@ def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
 
 def _three(row: LapMetrics | None) -> str:
     """The paper's three figures of a lap, each as wide as its title."""
-    return _SPACE.join(_cell(metric, row).rjust(len(metric.title)) for metric in PAPER)
+    return _SPACE.join(_cell(metric, row).rjust(len(metric.heading)) for metric in PAPER)
 
 
 def has_truth(comparison: Comparison) -> bool:
@@ -122,5 +122,5 @@ def _cell(metric: Metric, row: Any) -> str:
     """Of a row of a frame, of a lap's metrics, or of nothing."""
     if row is None:
         return metric.text(float("nan"))
-    value = getattr(row, metric.name) if isinstance(row, LapMetrics) else row[metric.name]
+    value = getattr(row, metric.key) if isinstance(row, LapMetrics) else row[metric.key]
     return metric.text(float(value))

@@ -1,4 +1,4 @@
-"""The paper's isolated tests as figures, each with what it shows in a sentence."""
+"""The paper's isolated tests as figures, each with a caption that says what it shows."""
 
 from __future__ import annotations
 
@@ -13,27 +13,25 @@ from matplotlib.figure import Figure
 from pathspace_graph.io.files import atomic_folder
 
 from .expansion import expansion, plot_expansion
+from .files import save_figures
 from .fit import fit, plot_fit
-from .map_plot import save_plot
 from .simplification import plot_simplification, simplification
 from .uncertainty import plot_uncertainty, uncertainty
 
 MARKER: Final = "captions.md"
-"""The file that a folder of figures is known by."""
-SUFFIXES: Final = (".png", ".pdf")
-"""Each figure is written as."""
+"""A folder of these figures is known by this file."""
 _SEED: Final = 0
-"""Of the splines that are drawn at random."""
+"""The splines that are drawn at random have this seed."""
 
 
 @dataclass(frozen=True)
 class IsolatedFigure:
-    """A figure and its caption."""
+    """A figure has a name and a caption."""
 
     name: str
-    """Of its files."""
+    """The figure's files have this name."""
     make: Callable[[], tuple[Figure, str]]
-    """Computes and draws it; gives the caption too, with its figures."""
+    """This computes and draws the figure, and gives the caption with its numbers."""
 
 
 def _uncertainty() -> tuple[Figure, str]:
@@ -50,19 +48,19 @@ def _uncertainty() -> tuple[Figure, str]:
 def _expansion() -> tuple[Figure, str]:
     data = expansion()
     return plot_expansion(data), (
-        "Expansion in its three steps. (a) Readings whose closest point is the end of the curve, beyond a "
-        "threshold from the last two control points, mark an expansion. (b) The curve is led on to the last "
-        "of their proximity chain, exactly as it was up to its old end; the others are readings of it now. "
-        "(c) One update with all of those."
+        "Expansion in its three steps. (a) Detections whose closest point is the end of the curve, beyond a "
+        "threshold from the last two control points, mark an expansion. (b) The curve is extended to the "
+        "last of their proximity chain, and is exactly as it was up to its old end; the others are "
+        "detections of it now. (c) One update uses all of those."
     )
 
 
 def _fit() -> tuple[Figure, str]:
     return plot_fit(fit()), (
-        "The fit of S_z. (a) The closest points on the state's curve to the readings. (b) Sigma points of "
-        "the readings, and the curve fitted to each by ridge regression. (c) Mean and covariance of their "
-        "control points: one reading of the curve. (d) The basis functions at the closest points: a control "
-        "point whose function is nothing there (grey) stays where it was."
+        "The fit of S_z. (a) The closest points on the state's curve to the detections. (b) Sigma points of "
+        "the detections, and the curve fitted to each by ridge regression. (c) Mean and covariance of their "
+        "control points make one measurement of the curve. (d) The basis functions at the closest points: a "
+        "control point whose function is zero there (grey) stays where it was."
     )
 
 
@@ -83,18 +81,16 @@ FIGURES: Final = (
     IsolatedFigure("fit", _fit),
     IsolatedFigure("simplification", _simplification),
 )
-"""All of them, in the paper's order."""
+"""These are all figures, in the paper's order."""
 
 
-def write_figures(out: Path, on_figure: Callable[[], None] | None = None) -> None:
-    """Every figure as PNG and PDF, and their captions, or nothing; `on_figure` after each."""
+def write_figures(out: Path, on_figure: Callable[[], None] = lambda: None) -> None:
+    """Writes every figure and the captions, or nothing; `on_figure` is called after each figure."""
     captions = []
     with atomic_folder(out, MARKER) as folder:
         for isolated in FIGURES:
             figure, caption = isolated.make()
-            for suffix in SUFFIXES:
-                save_plot(figure, folder / f"{isolated.name}{suffix}")
+            save_figures(folder, {isolated.name: figure})
             captions.append(f"![{isolated.name}]({isolated.name}.png)\n\n{caption}\n")
-            if on_figure is not None:
-                on_figure()
+            on_figure()
         (folder / MARKER).write_text("\n".join(captions), encoding="utf-8")

@@ -3,93 +3,66 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any, Final
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.files import atomic_file
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
-from pathspace_graph.spline.bspline import BSpline
 
-from .style import BLUE, DARK, GREEN, ORANGE
+from .marks import (
+    SIGMAS,
+    draw_band,
+    draw_control_points,
+    draw_curve,
+    draw_ellipses,
+    draw_points,
+    point_blocks,
+)
+from .style import BLUE, DARK, GREEN, ORANGE, WIDTH, figure_context, grouped_legend, set_frame
 
 Array = NDArray[np.float64]
 
-FORMATS = (".png", ".pdf", ".svg")
-"""Suffixes that a plot can be saved under."""
+MARGIN: Final = 3.0
+"""There is this much free space around what is drawn (m)."""
+TRUTH_COLOR: Final = DARK
+"""Everything that is true rather than estimated has this colour."""
 
-BAND_SIGMAS = 2.0
-"""Half width of the uncertainty band in standard deviations across the curve."""
-
-_REPRODUCIBLE = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
-"""Metadata that would differ from one run to the next is left out."""
+_MAX_HEIGHT: Final = 7.5
+"""A figure is at most this high (in); a track that is narrower than it is long is drawn smaller."""
+_LABELS_HEIGHT: Final = 0.85
+"""The tick labels and the legend take this height (in)."""
+_COLORS: Final = {LEFT: BLUE, RIGHT: ORANGE}
+"""Boundaries have their cones' colours; yellow is amber, which can be seen on white paper."""
+_TRAJECTORY_COLOR: Final = GREEN
+"""The estimated trajectory has this colour."""
+_BAND_ALPHA: Final = 0.35
+"""The uncertainty band has this opacity."""
 
 
 @dataclass(frozen=True, slots=True)
-class PlotStyle:
-    """How a map is drawn; lengths in inches, line widths and markers in points."""
-
-    width: float = 7.0
-    """Width of the figure: two columns of a paper."""
-
-    max_height: float = 7.5
-    """Tallest figure; a track narrower than it is long is drawn smaller."""
-
-    furniture: float = 0.85
-    """Height that tick labels and the legend take."""
-
-    margin: float = 3.0
-    """Free space around what is drawn (m)."""
-
-    dpi: float = 200.0
-    """Resolution of a png."""
-
-    font_size: float = 8.0
-    """Of all text (pt)."""
-
-    left_color: str = BLUE
-    """Blue, as the cones; told from amber by every kind of colour vision, and by lightness in print."""
-
-    right_color: str = ORANGE
-    """Amber, for yellow cones on white paper."""
-
-    truth_color: str = DARK
-    """Of everything that is true rather than estimated."""
-
-    trajectory_color: str = GREEN
-    """Of the estimated trajectory."""
-
-    band_alpha: float = 0.35
-    """Opacity of the uncertainty band."""
+class MapStyle:
+    """Line widths and marker sizes (pt), which depend on how much of a track a panel shows."""
 
     curve_width: float = 0.7
-    """Of a boundary."""
-
+    """A boundary has this width."""
     path_width: float = 0.6
-    """Of trajectories."""
-
+    """The trajectory has this width; the true path is thinner."""
     marker_size: float = 2.6
-    """Of cones and control points."""
-
+    """Cones and control points have this size."""
     landmark_size: float = 1.4
-    """Of landmarks, small enough for their ellipses to be seen."""
+    """Landmarks have this size, small enough for their ellipses to be seen."""
 
-    samples_per_span: int = 24
-    """Points drawn on each span of a spline."""
 
-    def color(self, label: int) -> str:
-        """The colour of a boundary."""
-        return {LEFT: self.left_color, RIGHT: self.right_color}[label]
+WHOLE_TRACK: Final = MapStyle()
+"""This is the style of a panel that shows a whole track."""
 
 
 def plot_map(
@@ -99,242 +72,103 @@ def plot_map(
     trajectory: Array | None = None,
     band_scale: float = 1.0,
     title: str | None = None,
-    style: PlotStyle | None = None,
 ) -> Figure:
-    """The map in metres, equal aspect, with the band S(u) +- 2 band_scale sigma(u) n(u) around each boundary.
+    """Draws the map in metres, with equal scales and the band S(u) +- 2 band_scale sigma(u) n(u).
 
     `log` adds the true cones and the true path where it has truth; trajectory (n, 3) or (n, 2), map frame.
-    A `band_scale` other than 1 draws the band wider than it is, and the legend says so.
+    The legend says so where a `band_scale` other than 1 draws the band wider than it is.
     """
-    style = style or PlotStyle()
     if not band_scale > 0.0:
         raise SettingsError(f"band_scale: expected a positive number, found {band_scale}")
-    with mpl.rc_context({"font.size": style.font_size, "axes.linewidth": 0.6}):
+    with figure_context():
         figure = Figure(layout="constrained")
         axes = figure.add_subplot()
-        # what is drawn first is named first in the legend; what lies on top is told by zorder
+        # the legend names what is drawn first before the rest; zorder decides what lies on top
         for label, boundary in sorted(track.boundaries.items()):
-            draw_boundary(axes, boundary, label, band_scale, style)
+            draw_boundary(axes, boundary, label, WHOLE_TRACK, band_scale)
         if log is not None and log.truth is not None:
-            draw_truth(axes, log.truth, style)
+            draw_truth(axes, log.truth, WHOLE_TRACK)
         if trajectory is not None and len(trajectory):
-            draw_trajectory(axes, np.asarray(trajectory), style)
-        draw_start(axes, style)
-        _finish(figure, axes, title, style)
+            _draw_trajectory(axes, np.asarray(trajectory), WHOLE_TRACK)
+        draw_start(axes, WHOLE_TRACK)
+        _finish(figure, axes, title)
     return figure
 
 
-def save_plot(figure: Figure, file: Path | str, *, style: PlotStyle | None = None) -> None:
-    """Writes a .png, .pdf or .svg, whole or not at all; SettingsError for any other suffix."""
-    file = Path(file)
-    suffix = file.suffix.lower()
-    check_plot_file(file)
-    dpi = (style or PlotStyle()).dpi
-    # text stays text in vector formats, and ids don't change from run to run
-    options = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "pathspace"}
-    with atomic_file(file) as temporary, mpl.rc_context(options):
-        figure.savefig(temporary, dpi=dpi, format=suffix[1:], metadata=_REPRODUCIBLE[suffix])
-
-
-def check_plot_file(file: Path | str) -> None:
-    """SettingsError where a plot can't be saved under that suffix; for a check before long work."""
-    if Path(file).suffix.lower() not in FORMATS:
-        raise SettingsError(f"{file}: expected a file name that ends in {', '.join(FORMATS)}")
-
-
-def uncertainty_band(boundary: SplineBoundary, u: Array, scale: float = 1.0) -> tuple[Array, Array]:
-    """S(u) +- 2 scale sigma(u) n(u), m: left and right edge (k, 2) of the band at parameters u (k,)."""
-    spline = boundary.spline
-    half = BAND_SIGMAS * scale * spline.normal_sigma(u, boundary.covariance)
-    tangent = spline.tangent_unit(u)
-    offsets = half[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    centre = spline.evaluate(u)
-    return centre + offsets, centre - offsets
-
-
-def curve_parameters(spline: BSpline, samples_per_span: int) -> Array:
-    """Parameters (k,) over the whole domain, dense enough on every span to draw it, both ends included."""
-    edges = spline.breaks
-    fractions = np.arange(samples_per_span) / samples_per_span
-    inner = edges[:-1, None] + np.diff(edges)[:, None] * fractions
-    return np.append(inner.ravel(), edges[-1])
-
-
-# --- layers ----------------------------------------------------------------------------------------------
-
-
-def draw_boundary(axes: Axes, boundary: MapBoundary, label: int, band_scale: float, style: PlotStyle) -> None:
-    """A curve with its band and control points, or landmarks with their ellipses, in the map frame (m)."""
+def draw_boundary(
+    axes: Axes, boundary: MapBoundary, label: int, style: MapStyle, band_scale: float = 1.0
+) -> None:
+    """Draws a curve with its band and control points, or landmarks with their ellipses, in the map frame."""
     if isinstance(boundary, PointBoundary):
-        _draw_landmarks(axes, boundary, label, band_scale, style)
+        _draw_landmarks(axes, boundary, label, style, band_scale)
     else:
-        _draw_spline(axes, boundary, label, band_scale, style)
+        _draw_spline(axes, boundary, label, style, band_scale)
 
 
 def _draw_spline(
-    axes: Axes, boundary: SplineBoundary, label: int, band_scale: float, style: PlotStyle
+    axes: Axes, boundary: SplineBoundary, label: int, style: MapStyle, band_scale: float
 ) -> None:
-    color, name = style.color(label), NAMES[label]
-    u = curve_parameters(boundary.spline, style.samples_per_span)
-    left, right = uncertainty_band(boundary, u, band_scale)
-    outline = _band_outline(left, right, closed=boundary.spline.periodic)
-    band = PathPatch(outline, facecolor=color, alpha=style.band_alpha, linewidth=0.0, zorder=2)
-    band.set_label(f"{name} {_band_name(band_scale)}")
-    axes.add_patch(band)
-    axes.plot(
-        *boundary.spline.evaluate(u).T,
-        color=color,
-        linewidth=style.curve_width,
-        zorder=4,
-        label=f"{name} boundary",
-    )
-    axes.plot(
-        *boundary.spline.distinct_control_points.T,
-        linestyle="none",
-        marker="s",
-        markersize=style.marker_size,
-        markerfacecolor="white",
-        markeredgecolor=color,
-        markeredgewidth=0.6,
-        zorder=5,
-        label=f"{name} control points",
-    )
+    color, name, spline = _COLORS[label], NAMES[label], boundary.spline
+    draw_band(axes, boundary, color, f"{name} {_band_name(band_scale)}", band_scale, _BAND_ALPHA)
+    draw_curve(axes, spline, color, f"{name} boundary", style.curve_width, zorder=4)
+    squares = {"markersize": style.marker_size, "markeredgewidth": 0.6, "zorder": 5}
+    points, text = spline.distinct_control_points, f"{name} control points"
+    draw_control_points(axes, points, color, text, polygon=False, **squares)
 
 
 def _draw_landmarks(
-    axes: Axes, boundary: PointBoundary, label: int, band_scale: float, style: PlotStyle
+    axes: Axes, boundary: PointBoundary, label: int, style: MapStyle, band_scale: float
 ) -> None:
-    color, name = style.color(label), NAMES[label]
-    widths, heights, angles = _ellipses(boundary, BAND_SIGMAS * band_scale)
-    ellipses = EllipseCollection(
-        widths,
-        heights,
-        angles,
-        units="xy",
-        offsets=boundary.points,
-        offset_transform=axes.transData,
-        facecolor=color,
-        alpha=style.band_alpha,
-        linewidth=0.0,
-        zorder=2,
-    )
-    axes.add_collection(ellipses)
-    ellipse_key = PathPatch(Outline(np.zeros((0, 2))), facecolor=color, alpha=style.band_alpha, linewidth=0.0)
-    ellipse_key.set_label(f"{name} {_band_name(band_scale, 'ellipses')}")
-    axes.add_patch(ellipse_key)
-    axes.plot(
-        *boundary.points.T,
-        linestyle="none",
-        marker="o",
-        markersize=style.landmark_size,
-        color=color,
-        zorder=4,
-        label=f"{name} landmarks",
-    )
-
-
-def draw_trajectory(axes: Axes, trajectory: Array, style: PlotStyle) -> None:
-    """Poses (n, 3) or positions (n, 2) as a line, map frame (m)."""
-    axes.plot(
-        trajectory[:, 0],
-        trajectory[:, 1],
-        color=style.trajectory_color,
-        linewidth=style.path_width,
-        zorder=3,
-        label="trajectory",
-    )
-
-
-def draw_truth(axes: Axes, truth: Truth, style: PlotStyle) -> None:
-    """The true path dashed and the true cones as crosses, as far as they are known, map frame (m)."""
-    if len(truth.poses):
-        axes.plot(
-            *truth.poses[:, :2].T,
-            color=style.truth_color,
-            linewidth=0.6 * style.path_width,
-            linestyle=(0, (5, 3)),
-            zorder=3.5,
-            label="true path",
-        )
-    if len(truth.cones):
-        axes.plot(
-            *truth.cones.T,
-            linestyle="none",
-            marker="x",
-            markersize=style.marker_size,
-            markeredgewidth=0.6,
-            color=style.truth_color,
-            zorder=6,
-            label="true cones",
-        )
-
-
-def draw_start(axes: Axes, style: PlotStyle) -> None:
-    """The origin of the map frame: where the vehicle stood first, heading along x."""
-    axes.plot(
-        0.0,
-        0.0,
-        linestyle="none",
-        marker=">",
-        markersize=2.0 * style.marker_size,
-        color="black",
-        zorder=7,
-        label="start",
-    )
-
-
-def _finish(figure: Figure, axes: Axes, title: str | None, style: PlotStyle) -> None:
-    axes.set_aspect("equal")
-    axes.margins(0.0)
-    axes.autoscale_view()
-    (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
-    axes.set_xlim(x0 - style.margin, x1 + style.margin)
-    axes.set_ylim(y0 - style.margin, y1 + style.margin)
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
-    axes.tick_params(width=0.6, length=2.5)
-    if title:
-        axes.set_title(title)
-    _add_legend(figure, axes)
-    ratio = (y1 - y0 + 2 * style.margin) / (x1 - x0 + 2 * style.margin)
-    figure.set_size_inches(style.width, min(style.max_height, style.width * ratio + style.furniture))
-
-
-def _add_legend(figure: Figure, axes: Axes) -> None:
-    """Below the axes; a column is as long as a boundary has entries."""
-    handles, labels = axes.get_legend_handles_labels()
-    rows = max(1, *(sum(label.startswith(name) for label in labels) for name in NAMES))
-    columns = -(-len(labels) // rows)
-    figure.legend(
-        handles,
-        labels,
-        loc="outside lower center",
-        ncols=columns,
-        frameon=False,
-        handlelength=1.8,
-        columnspacing=1.4,
-    )
-
-
-# --- shapes ----------------------------------------------------------------------------------------------
+    color, name = _COLORS[label], NAMES[label]
+    area = {"alpha": _BAND_ALPHA, "linewidth": 0.0}
+    own = point_blocks(boundary.covariance)
+    draw_ellipses(axes, boundary.points, own, color, band_scale, zorder=2, **area)
+    # a collection of ellipses has no key of its own in a legend: an empty patch lends it one
+    key = PathPatch(Outline(np.zeros((0, 2))), facecolor=color, **area)
+    key.set_label(f"{name} {_band_name(band_scale, 'ellipses')}")
+    axes.add_patch(key)
+    size = style.landmark_size
+    draw_points(axes, boundary.points, "o", color, f"{name} landmarks", markersize=size, zorder=4)
 
 
 def _band_name(scale: float, shape: str = "band") -> str:
     exaggerated = "" if scale == 1.0 else f" (drawn {scale:g}× as wide)"
-    return f"{BAND_SIGMAS:g}σ {shape}{exaggerated}"
+    return f"{SIGMAS:g}σ {shape}{exaggerated}"
 
 
-def _band_outline(left: Array, right: Array, closed: bool) -> Outline:
-    """One polygon around an open band; a ring (one edge, and the other run backwards) where closed."""
-    if not closed:
-        return Outline(np.concatenate([left, right[::-1], left[:1]]), closed=True)
-    return Outline.make_compound_path(Outline(left, closed=True), Outline(right[::-1], closed=True))
+def _draw_trajectory(axes: Axes, trajectory: Array, style: MapStyle) -> None:
+    """Draws poses (n, 3) or positions (n, 2) as a line, map frame (m)."""
+    line: dict[str, Any] = {"color": _TRAJECTORY_COLOR, "linewidth": style.path_width, "zorder": 3}
+    axes.plot(*trajectory[:, :2].T, label="trajectory", **line)
 
 
-def _ellipses(boundary: PointBoundary, sigmas: float) -> tuple[Array, Array, Array]:
-    """Full widths, full heights (m) and angles (degrees) of the points' own `sigmas`-ellipses."""
-    blocks = boundary.covariance.reshape(boundary.size, 2, boundary.size, 2)
-    own = blocks[np.arange(boundary.size), :, np.arange(boundary.size), :]
-    variances, axes = np.linalg.eigh(own)
-    widths, heights = 2.0 * sigmas * np.sqrt(np.maximum(variances, 0.0)).T
-    return widths, heights, np.degrees(np.arctan2(axes[:, 1, 0], axes[:, 0, 0]))
+def draw_truth(axes: Axes, truth: Truth, style: MapStyle) -> None:
+    """Draws the true path dashed and the true cones as crosses, as far as they are known, map frame (m)."""
+    if len(truth.poses):
+        line: dict[str, Any] = {"linewidth": 0.6 * style.path_width, "linestyle": (0, (5, 3)), "zorder": 3.5}
+        axes.plot(*truth.poses[:, :2].T, color=TRUTH_COLOR, label="true path", **line)
+    if len(truth.cones):
+        cross = {"markersize": style.marker_size, "markeredgewidth": 0.6}
+        draw_points(axes, truth.cones, "x", TRUTH_COLOR, "true cones", **cross)
+
+
+def draw_start(axes: Axes, style: MapStyle) -> None:
+    """Marks the origin of the map frame, where the vehicle stood first, heading along x."""
+    size = 2.0 * style.marker_size
+    draw_points(axes, np.zeros((1, 2)), ">", "black", "start", markersize=size, zorder=7)
+
+
+def _finish(figure: Figure, axes: Axes, title: str | None) -> None:
+    """Adds frame, axis titles and legend, and gives the figure the map's shape."""
+    axes.margins(0.0)
+    axes.autoscale_view()
+    drawn = np.array([axes.get_xlim(), axes.get_ylim()])
+    low, high = drawn[:, 0] - MARGIN, drawn[:, 1] + MARGIN
+    set_frame(axes, low, high)
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    if title:
+        axes.set_title(title)
+    grouped_legend(figure)
+    width, height = high - low
+    figure.set_size_inches(WIDTH, min(_MAX_HEIGHT, WIDTH * height / width + _LABELS_HEIGHT))

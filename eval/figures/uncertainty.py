@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,73 +14,79 @@ from pathspace_graph.factors.gauge import greville, smoothness_matrix
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.spline.bspline import BSpline
 
-from .map_plot import uncertainty_band
-from .style import FigureStyle, draw_control_points, draw_ellipses, figure_context, frame, point_blocks
+from .marks import (
+    draw_control_points,
+    draw_curve,
+    draw_ellipses,
+    draw_points,
+    normals,
+    point_blocks,
+    uncertainty_band,
+)
+from .style import BLUE, DARK, LIGHT, ORANGE, THIN_WIDTH, WIDTH, figure_context, set_frame
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class UncertaintyScene:
-    """A curve that was seen but for one stretch."""
+    """A curve was seen everywhere but on one stretch."""
 
     spacing: float = 5.5
-    """Of the control points (m)."""
+    """Control points are this far apart (m)."""
     control_points: int = 13
-    """Their number."""
+    """The curve has this many control points."""
     swing: float = 6.0
-    """Half the width that the curve swings across (m)."""
+    """The curve swings this far to either side (m)."""
     cones: int = 18
-    """Cones along the curve, evenly."""
+    """This many cones stand along the curve, at equal distances."""
     blind: tuple[float, float] = (0.52, 0.74)
-    """Share of the curve between which none was seen."""
-    sigma_reading: float = 0.3
-    """Of each cone (m)."""
+    """No cone was seen between these shares of the curve's length."""
+    sigma_detection: float = 0.3
+    """A seen cone has this standard deviation across the curve (m)."""
     sigma_bend: float = 1.0
-    """Second difference of the control points (m), a weak prior."""
+    """Second differences of the control points have a weak prior of this standard deviation (m)."""
     sigma_anchor: float = 2.0
-    """Of each control point (m), a weak prior."""
+    """Each control point has a weak prior of this standard deviation (m)."""
     samples: int = 2000
-    """Splines drawn at random."""
+    """This many splines are drawn at random."""
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """A curve with its uncertainty, three ways."""
+    """Holds a curve with its standard deviation across itself, computed in three ways."""
 
     boundary: SplineBoundary
-    """The curve with the joint covariance of its control points."""
+    """This is the curve with the joint covariance of its control points."""
     cones: Array
-    """(k, 2) m, what was seen."""
+    """Each row holds the position (x, y) of a seen cone (m)."""
     u: Array
-    """(n,) parameters."""
+    """These are the parameters (n,) that everything below is computed at."""
     length: Array
-    """(n,) m along the curve."""
+    """These are the lengths (n,) along the curve at the parameters (m)."""
     joint: Array
-    """(n,) m, sigma across the curve by B Sigma B'."""
+    """The joint covariance, B Sigma B', gives these standard deviations (n,), m."""
     marginals: Array
-    """(n,) m, the same by the paper's sum of beta_j^2 Sigma_j."""
+    """The paper's formula, the sum of beta_j^2 Sigma_j, gives these standard deviations (n,), m."""
     sampled: Array
-    """(n,) m, the same of splines drawn at random."""
+    """The splines drawn at random have these standard deviations (n,), m."""
     curves: Array
-    """(s, n, 2) m, those splines."""
+    """These are points (s, n, 2) of the splines drawn at random (m)."""
 
 
 def uncertainty(rng: np.random.Generator, scene: UncertaintyScene | None = None) -> Uncertainty:
-    """The posterior of a curve that cones hold across itself, and splines drawn at random from it."""
+    """Computes the posterior of a curve that cones hold across itself, and draws splines from it."""
     scene = scene or UncertaintyScene()
     x = scene.spacing * np.arange(scene.control_points)
     points = np.stack([x, scene.swing * np.sin(2.0 * np.pi * x / x[-1])], axis=1)
     spline = BSpline.open_uniform(points, interval=scene.spacing).clamp()
-    low, high = spline.domain
     share = (np.arange(scene.cones) + 0.5) / scene.cones
     seen = spline.parameters_at(spline.length() * share[(share < scene.blind[0]) | (share > scene.blind[1])])
-    covariance = posterior(spline, seen, scene.sigma_reading, scene.sigma_bend, scene.sigma_anchor)
-    u = np.linspace(low, high, 301)
+    covariance = posterior(spline, seen, scene.sigma_detection, scene.sigma_bend, scene.sigma_anchor)
+    u = np.linspace(*spline.domain, 301)
     drawn = rng.multivariate_normal(spline.control_points.ravel(), covariance, scene.samples)
     curves = np.einsum("nm,smd->snd", spline.basis_matrix(u), drawn.reshape(scene.samples, -1, 2))
-    normal = _normals(spline, u)
-    across = np.einsum("snd,nd->sn", curves - spline.evaluate(u), normal)
+    across = np.einsum("snd,nd->sn", curves - spline.evaluate(u), normals(spline, u))
     return Uncertainty(
         boundary=SplineBoundary(spline, covariance),
         cones=spline.evaluate(seen),
@@ -93,100 +100,71 @@ def uncertainty(rng: np.random.Generator, scene: UncertaintyScene | None = None)
 
 
 def marginal_sigma(spline: BSpline, u: Array, covariance: Array) -> Array:
-    """sqrt(n' (sum_j beta_j(u)^2 Sigma_j) n) (k,), m: the paper's equation, which has no cross terms."""
+    """Returns sqrt(n' (sum_j beta_j(u)^2 Sigma_j) n) (k,), m: the paper's formula, without cross terms."""
     own = covariance * np.kron(np.eye(spline.size), np.ones((2, 2)))
     return spline.normal_sigma(u, own)
 
 
 def posterior(
-    spline: BSpline, seen: Array, sigma_reading: float, sigma_bend: float, sigma_anchor: float
+    spline: BSpline, seen: Array, sigma_detection: float, sigma_bend: float, sigma_anchor: float
 ) -> Array:
-    """(2m, 2m) m^2: `(R'R / sigma_reading^2 + D'D / sigma_bend^2 + I / sigma_anchor^2)^-1`, sigmas in m.
+    """Returns `(R'R / sigma_detection^2 + D'D / sigma_bend^2 + I / sigma_anchor^2)^-1` (2m, 2m), m^2.
 
-    R: displacement across the curve at the parameters seen (k,); D: second differences of control points.
+    R maps control points to the displacement across the curve at the parameters `seen` (k,), and D to second
+    differences. The sigmas are in m.
     """
-    rows = (spline.basis_matrix(seen)[:, :, None] * _normals(spline, seen)[:, None, :]).reshape(len(seen), -1)
+    rows = (spline.basis_matrix(seen)[:, :, None] * normals(spline, seen)[:, None, :]).reshape(len(seen), -1)
     bend = np.kron(smoothness_matrix(greville(spline.knots, spline.degree), None), np.eye(2))
-    information = rows.T @ rows / sigma_reading**2 + bend.T @ bend / sigma_bend**2
+    information = rows.T @ rows / sigma_detection**2 + bend.T @ bend / sigma_bend**2
     return np.asarray(np.linalg.inv(information + np.eye(len(information)) / sigma_anchor**2))
-
-
-def _normals(spline: BSpline, u: Array) -> Array:
-    tangent = spline.tangent_unit(u)
-    return np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
 
 
 # --- figure ----------------------------------------------------------------------------------------------
 
-_SHOWN = 40
-"""Of the splines drawn at random."""
-_EVERY = 6
-"""Of the parameters at which their spread is marked."""
+_SHOWN: Final = 40
+"""This many of the splines drawn at random are shown."""
+_EVERY: Final = 6
+"""The spread of the samples is marked at every sixth parameter."""
 
 
-def plot_uncertainty(data: Uncertainty, style: FigureStyle | None = None) -> Figure:
-    """(a) the control points' uncertainty, and the curve's; (b) its sigma across itself, three ways."""
-    style = style or FigureStyle()
-    with figure_context(style):
-        figure = Figure((style.width, 4.6), layout="constrained")
+def plot_uncertainty(data: Uncertainty) -> Figure:
+    """Draws (a) the uncertainty of control points and curve, (b) its sigma across itself in three ways."""
+    with figure_context():
+        figure = Figure((WIDTH, 4.6), layout="constrained")
         above, below = figure.subplots(2, 1, height_ratios=(1.55, 1.0))
-        _draw_curve(above, data, style)
-        below.plot(data.length, data.joint, color=style.curve_color, label="joint covariance, $BΣB^⊤$")
-        below.plot(
-            data.length,
-            data.marginals,
-            color=style.other_color,
-            linestyle="--",
-            label=r"marginals only, $\Sigma_j\, β_j^2 Σ_{C_j}$",
-        )
-        below.plot(
-            data.length[::_EVERY],
-            data.sampled[::_EVERY],
-            linestyle="none",
-            marker=".",
-            markersize=style.marker_size,
-            color="black",
-            label=f"spread of {len(data.curves)} sampled splines",
-        )
-        below.set_xlim(0.0, data.length[-1])
-        below.set_ylim(0.0, 1.25 * float(data.joint.max()))
-        below.set_xlabel("length along the curve [m]")
-        below.set_ylabel("σ [m]")
-        below.legend(loc="upper left", ncols=3, columnspacing=1.4)
+        _draw_curves(above, data)
+        _draw_sigmas(below, data)
         above.set_title("(a) uncertainty of the control points, and of the curve that they make")
         below.set_title("(b) standard deviation across the curve")
     return figure
 
 
-def _draw_curve(axes: Axes, data: Uncertainty, style: FigureStyle) -> None:
-    boundary = data.boundary
-    spline = boundary.spline
+def _draw_curves(axes: Axes, data: Uncertainty) -> None:
+    boundary, spline = data.boundary, data.boundary.spline
     for number, curve in enumerate(data.curves[:_SHOWN]):
         label = None if number else "sampled splines"
-        axes.plot(*curve.T, color=style.faint_color, linewidth=style.thin_width, zorder=1.5, label=label)
-    left, right = uncertainty_band(boundary, data.u)
-    for number, edge in enumerate((left, right)):
+        axes.plot(*curve.T, color=LIGHT, linewidth=THIN_WIDTH, zorder=1.5, label=label)
+    for number, edge in enumerate(uncertainty_band(boundary, data.u)):
         label = None if number else "2σ band"
-        axes.plot(*edge.T, color=style.curve_color, linewidth=0.8, zorder=3, label=label)
-    axes.plot(
-        *spline.evaluate(data.u).T,
-        color=style.curve_color,
-        linewidth=style.curve_width,
-        zorder=3,
-        label="spline",
-    )
-    draw_control_points(axes, spline.control_points, style.other_color, style, "control points, 2σ")
-    draw_ellipses(axes, spline.control_points, point_blocks(boundary.covariance), style.other_color, style)
-    axes.plot(
-        *data.cones.T,
-        linestyle="none",
-        marker="x",
-        markersize=style.marker_size,
-        color=style.truth_color,
-        zorder=5,
-        label="cones seen",
-    )
-    low, high = spline.control_points.min(axis=0), spline.control_points.max(axis=0)
-    frame(axes, (low[0] - 3.0, low[1] - 3.0), (high[0] + 3.0, high[1] + 3.0))
+        axes.plot(*edge.T, color=BLUE, linewidth=0.8, zorder=3, label=label)
+    draw_curve(axes, spline, BLUE, "spline")
+    draw_control_points(axes, spline.control_points, ORANGE, "control points, 2σ")
+    draw_ellipses(axes, spline.control_points, point_blocks(boundary.covariance), ORANGE)
+    draw_points(axes, data.cones, "x", DARK, "cones seen", zorder=5)
+    set_frame(axes, spline.control_points.min(axis=0) - 3.0, spline.control_points.max(axis=0) + 3.0)
+    axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    axes.legend(loc="upper right", ncols=1)
+    axes.legend(loc="upper right")
+
+
+def _draw_sigmas(axes: Axes, data: Uncertainty) -> None:
+    axes.plot(data.length, data.joint, color=BLUE, label="joint covariance, $BΣB^⊤$")
+    marginals = r"marginals only, $\Sigma_j\, β_j^2 Σ_{C_j}$"
+    axes.plot(data.length, data.marginals, color=ORANGE, linestyle="--", label=marginals)
+    spread = np.stack([data.length, data.sampled], axis=1)[::_EVERY]
+    draw_points(axes, spread, ".", "black", f"spread of {len(data.curves)} sampled splines", zorder=2)
+    axes.set_xlim(0.0, data.length[-1])
+    axes.set_ylim(0.0, 1.25 * float(data.joint.max()))
+    axes.set_xlabel("length along the curve [m]")
+    axes.set_ylabel("σ [m]")
+    axes.legend(loc="upper left", ncols=3)

@@ -1,8 +1,8 @@
-"""Whether a map's uncertainty is honest: its squared error in units of the covariance that it claims."""
+"""Whether a map's covariance is honest: NEES of the whole map, and errors at the cones by their own sigma."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -17,102 +17,176 @@ from pathspace_graph.factors.gauge import greville
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 
-from .table1 import MISSED_DISTANCE
+from .table1 import MISSED_DISTANCE, closest_points
 from .true_curve import true_curve
 
 Array = NDArray[np.float64]
 
-SHARE: Final = 0.95
-"""Probability of the interval."""
+LEVEL: Final = 0.95
+"""An honest map's NEES lies in the interval with this probability."""
+
+
+# --- the whole map ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class Consistency:
-    """NEES = e' P^-1 e, chi-squared with `freedom` degrees where the covariance P is honest."""
+class Nees:
+    """Holds the normalized estimation error squared `e' P^-1 e` of a map.
 
-    nees: float
-    """The sum over both boundaries; NaN where a covariance is singular."""
-    freedom: int
-    """Its degrees of freedom."""
+    It is chi-squared distributed with `dof` degrees of freedom where the covariance P is honest (Bar-Shalom,
+    Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4).
+    """
+
+    value: float
+    """This is the sum over both boundaries; it is NaN where a covariance is singular."""
+    dof: int
+    """The chi-squared distribution has this many degrees of freedom."""
 
     @property
     def ratio(self) -> float:
-        """NEES per degree of freedom: 1 is honest, more is overconfident, less is timid."""
-        return self.nees / self.freedom if self.freedom else float("nan")
+        """Returns NEES per degree of freedom: 1 is honest, more is overconfident, less is too cautious."""
+        return self.value / self.dof if self.dof else float("nan")
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Where `ratio` lies with 95 % probability if the covariance is honest."""
-        if not self.freedom:
+        """Returns the two-sided 95 % interval of `ratio` for an honest covariance."""
+        if not self.dof:
             return float("nan"), float("nan")
-        low, high = chi2.interval(SHARE, self.freedom)
-        return float(low) / self.freedom, float(high) / self.freedom
+        low, high = chi2.interval(LEVEL, self.dof)
+        return float(low) / self.dof, float(high) / self.dof
 
     @property
     def honest(self) -> bool:
-        """Whether it lies there."""
+        """Returns whether `ratio` lies in its interval."""
         low, high = self.interval
         return low <= self.ratio <= high
 
 
-def map_consistency(track: Map, truth: Truth) -> Consistency:
-    """NEES of a map: of each curve across itself, or of the landmarks in the plane.
+def map_nees(track: Map, truth: Truth) -> Nees:
+    """Returns the NEES of a map by the covariance that the map itself holds.
 
-    The covariance is the one that the map holds, the joint one of each boundary. What the two boundaries err
-    in common (the heading of the whole map above all) counts twice, since a map holds no cross terms between
-    them: the interval is a little too narrow.
+    The error of a curve is its signed distance to the true curve, at as many places as the curve has degrees
+    of freedom across itself. The error of landmarks is their offset in the plane. The state of the estimator
+    isn't judged but the map that a user gets, so every estimator is judged alike: the covariance of a batch
+    map includes the scatter of the cones, for example. A map holds no covariance between its two boundaries,
+    so the errors that they share (above all the heading of the whole map) count twice: the mean of `ratio`
+    over many runs is right, but it spreads more widely than its interval says.
     """
-    nees, freedom = 0.0, 0
+    value, dof = 0.0, 0
     for label, boundary in track.boundaries.items():
         if isinstance(boundary, SplineBoundary):
             error, covariance = curve_errors(boundary, true_curve(truth, label))
         else:
             error, covariance = landmark_errors(boundary, truth.cones[truth.cone_labels == label])
-        nees += _squared(error, covariance)
-        freedom += len(error)
-    return Consistency(nees, freedom)
+        value += _squared(error, covariance)
+        dof += len(error)
+    return Nees(value, dof)
 
 
-def curve_errors(boundary: SplineBoundary, true: Array) -> tuple[Array, Array]:
-    """e_j = n_j . (q_j - S(u_j)) (k,) and N B Sigma B' N' (k, k), a row for each control point.
+def curve_errors(boundary: SplineBoundary, curve_true: Array) -> tuple[Array, Array]:
+    """Returns e_j = n_j . (q_j - S(u_j)), (k,) in m, and its covariance N B Sigma B' N', (k, k) in m^2.
 
-    u_j: the abscissa at which control point j acts, so that the rows are as many as the curve has freedom
-    across itself, and their covariance is regular; those beyond an open curve's ends are one row at the end.
-    n_j: the unit normal there, q_j the nearest true point.
+    There is one row for each control point, at its Greville abscissa u_j. So there are as many rows as the
+    curve has degrees of freedom across itself, and the covariance is regular. Abscissae beyond the ends of an
+    open curve become one row at the end. n_j is the unit normal at u_j, q_j the nearest point of the true
+    curve (n, 2).
     """
     spline = boundary.spline
-    if len(true) == 0:
+    if len(curve_true) == 0:
         return np.zeros(0), np.zeros((0, 0))
     u = greville(spline.knots, spline.degree)[: spline.size]
     low, high = spline.domain
     u = low + np.mod(u - low, high - low) if spline.periodic else np.unique(np.clip(u, low, high))
     tangent, position = spline.tangent_unit(u), spline.evaluate(u)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    nearest = true[KDTree(true).query(position)[1]]
+    nearest = curve_true[KDTree(curve_true).query(position)[1]]
     error = np.einsum("kd,kd->k", normal, nearest - position)
     design = np.einsum("km,kd->kmd", spline.basis_matrix(u), normal).reshape(len(u), -1)
     return error, design @ boundary.covariance @ design.T
 
 
 def landmark_errors(boundary: PointBoundary, cones: Array) -> tuple[Array, Array]:
-    """cone - landmark (2 k,) over x0, y0, x1, ... and their covariance (2 k, 2 k).
+    """Returns cone - landmark, (2 k,) in m over x0, y0, x1, ..., and its covariance (2 k, 2 k) in m^2.
 
-    Pairs one to one, of least distance in sum; one more than 3 m apart is a miss and a ghost, not an error.
+    Landmarks and cones (n, 2) are paired one to one with the smallest total distance. A pair more than 3 m
+    apart is left out: it is a missed cone and a ghost, not an error.
     """
-    apart = cdist(boundary.points, cones) if len(cones) and boundary.size else np.zeros((0, 0))
-    landmark, cone = linear_sum_assignment(np.minimum(apart, MISSED_DISTANCE))
-    near = apart[landmark, cone] <= MISSED_DISTANCE
-    landmark, cone = landmark[near], cone[near]
+    distances = cdist(boundary.points, cones) if len(cones) and boundary.size else np.zeros((0, 0))
+    landmark, cone = linear_sum_assignment(np.minimum(distances, MISSED_DISTANCE))
+    paired = distances[landmark, cone] <= MISSED_DISTANCE
+    landmark, cone = landmark[paired], cone[paired]
     columns = (2 * landmark[:, None] + np.arange(2)).ravel()
     error = (cones[cone] - boundary.points[landmark]).ravel()
     return error, boundary.covariance[np.ix_(columns, columns)]
 
 
 def _squared(error: Array, covariance: Array) -> float:
-    """e' P^-1 e; NaN where P isn't positive definite."""
+    """Returns e' P^-1 e, or NaN where P isn't positive definite."""
     if len(error) == 0:
         return 0.0
     try:
         return float(error @ cho_solve(cho_factor(covariance), error))
     except np.linalg.LinAlgError:
         return float("nan")
+
+
+# --- at the true cones -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class NormalErrors:
+    """Holds the errors of a map's curves at the true cones, and the standard deviations that they claim."""
+
+    errors: Array
+    """Each entry (k,) is the signed distance (m) of a true cone along the normal at its foot point, left
+    positive."""
+
+    sigmas: Array
+    """Each entry (k,) is the standard deviation (m) of the curve along that normal."""
+
+    def share_inside(self, factor: float = 2.0) -> float:
+        """Returns the share of the cones with |error| <= factor * sigma; NaN without cones."""
+        if len(self.errors) == 0:
+            return float("nan")
+        return float(np.mean(np.abs(self.errors) <= factor * self.sigmas))
+
+    def mean_squared(self) -> float:
+        """Returns mean (error / sigma)^2, which is 1 where the band is honest; NaN without cones.
+
+        Every cone is judged alone. In contrast to NEES, correlations between the cones don't count.
+        """
+        if len(self.errors) == 0:
+            return float("nan")
+        return float(np.mean((self.errors / self.sigmas) ** 2))
+
+
+def normal_errors(track: Map, truth: Truth) -> NormalErrors:
+    """Returns e = n . (cone - S(u)), sigma^2 = n' B Sigma B' n at the foot point u of each true cone.
+
+    Only boundaries that are splines count. Missed cones count, too, as the large errors that they are.
+    """
+    errors, sigmas = [np.zeros(0)], [np.zeros(0)]
+    for label, boundary in track.boundaries.items():
+        if isinstance(boundary, SplineBoundary):
+            cones = truth.cones[truth.cone_labels == label]
+            feet = closest_points(boundary.spline, cones)
+            errors.append(feet.distance)
+            sigmas.append(boundary.spline.normal_sigma(feet.u, boundary.covariance))
+    return NormalErrors(np.concatenate(errors), np.concatenate(sigmas))
+
+
+def with_marginals(track: Map) -> Map:
+    """Returns the splines of a map with their control points' own covariances and no cross terms.
+
+    It is the squared basis of the paper: `B blockdiag(Sigma) B' = sum_j beta_j(u)^2 Sigma_jj` (section State
+    Uncertainty).
+    """
+    boundaries = {
+        label: replace(
+            boundary,
+            covariance=boundary.covariance * np.kron(np.eye(boundary.size), np.ones((2, 2))),
+        )
+        for label, boundary in track.boundaries.items()
+        if isinstance(boundary, SplineBoundary)
+    }
+    return Map(track.closed, boundaries)

@@ -15,13 +15,13 @@ from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
 
+from .consistency import normal_errors
 from .table1 import (
     LapMetrics,
     ate,
     lap_end_times,
     lap_metrics,
     laps_metrics,
-    normal_errors,
     root_mean_square,
     trajectory_errors,
 )

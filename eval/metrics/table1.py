@@ -1,4 +1,4 @@
-"""The metrics of the paper's Table 1, the trajectory's error, and the honesty of the map's uncertainty."""
+"""The metrics of the paper's Table 1, and the error of a trajectory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
-from pathspace_graph.factors.odometry import wrap_angle
+from pathspace_graph.factors.se2 import wrap_angle
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
@@ -41,23 +41,6 @@ class LapMetrics:
 
     size: int
     """Control points or landmarks on both boundaries together."""
-
-
-@dataclass(frozen=True, eq=False)
-class NormalErrors:
-    """How the map's curves pass the true cones, against how surely they claim to."""
-
-    errors: Array
-    """(k,) m, signed distance of each true cone along the normal (left positive) at its foot point."""
-
-    sigmas: Array
-    """(k,) m, standard deviation of the curve along that normal, from the joint covariance."""
-
-    def share_inside(self, factor: float = 2.0) -> float:
-        """The share of the cones with |error| <= factor * sigma; NaN where there are none."""
-        if len(self.errors) == 0:
-            return float("nan")
-        return float(np.mean(np.abs(self.errors) <= factor * self.sigmas))
 
 
 def lap_metrics(track: Map, truth: Truth, lap: int) -> LapMetrics:
@@ -123,21 +106,6 @@ def closest_points(spline: BSpline, points_map: Array) -> FootPoints:
 def root_mean_square(values: Array) -> float:
     """sqrt(mean v^2); NaN of nothing."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
-
-
-def normal_errors(track: Map, truth: Truth) -> NormalErrors:
-    """e = n . (cone - S(u)), sigma^2 = n^T B Sigma B^T n at the foot point u of each true cone of a spline.
-
-    Nothing is left out: a missed cone counts as the large error that it is.
-    """
-    errors, sigmas = [np.zeros(0)], [np.zeros(0)]
-    for label, boundary in track.boundaries.items():
-        if isinstance(boundary, SplineBoundary):
-            cones = truth.cones[truth.cone_labels == label]
-            feet = closest_points(boundary.spline, cones)
-            errors.append(feet.distance)
-            sigmas.append(boundary.spline.normal_sigma(feet.u, boundary.covariance))
-    return NormalErrors(np.concatenate(errors), np.concatenate(sigmas))
 
 
 # --- trajectory ------------------------------------------------------------------------------------------

@@ -1,10 +1,9 @@
-"""Online estimators in one process, cycle for cycle in turn, each timed; one that is too slow is stopped."""
+"""Several online estimators in one process: every cycle goes to each in turn, and each update is timed."""
 
 from __future__ import annotations
 
-import time
 import tracemalloc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,77 +12,72 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.estimators import make_online
-from pathspace_graph.io.log import Detections, Log, Odometry
-from pathspace_graph.run import split_odometry
+from pathspace_graph.io.log import Log
+from pathspace_graph.run import split_odometry, timed_update
 from pathspace_graph.settings.mapper import MapperSettings
 
 Array = NDArray[np.float64]
 
 JUDGED: Final = 10
-"""The mean of so many last updates is held against the budget."""
+"""The mean of this many updates is compared with the budget."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """An estimator on a log."""
+    """An estimator is to map a log."""
 
     estimator: str
-    """Its name."""
+    """The estimator has this name."""
     log: Log
-    """What it is fed with."""
+    """The estimator maps this log."""
     variant: int = 0
-    """What tells it from the other lanes of the estimator."""
+    """This number tells the lane from other lanes of the same estimator."""
 
 
 @dataclass(frozen=True, eq=False)
 class LaneTimes:
-    """How a lane went, a row per cycle until it ended or was stopped."""
+    """Holds what was measured in a lane, a row for each cycle until it ended or was stopped."""
 
     lane: Lane
-    """Which it was."""
+    """The times are of this lane."""
     seconds: Array
-    """Wall time of each update (n,), s."""
+    """Each update took this wall time (n,), s."""
     sizes: Array
-    """Control points or landmarks after each (n,)."""
+    """The map had this many control points or landmarks after each update (n,)."""
     stopped: str = ""
-    """Why it did not come to the log's end; empty where it did."""
+    """This says why the lane did not reach the log's end; it is empty where it did."""
 
 
 class _Runner:
-    """A lane under way."""
+    """Runs a lane cycle by cycle."""
 
     def __init__(self, lane: Lane, settings: MapperSettings, budget: float) -> None:
-        self.lane, self._budget = lane, budget
+        self._lane, self._budget = lane, budget
         self._estimator = make_online(lane.estimator, settings, lane.log)
-        self._cycles: Iterator[tuple[Odometry, Detections]] = split_odometry(lane.log)
+        self._cycles = split_odometry(lane.log)
         self._seconds: list[float] = []
         self._sizes: list[int] = []
-        self.stopped = ""
-        self.over = False
+        self._stopped = ""
 
     def cycle(self) -> None:
-        """The next update; nothing once the lane is over."""
-        fed = None if self.over else next(self._cycles, None)
-        if fed is None:
-            self.over = True
+        """Does the next update; does nothing where the lane has ended or was stopped."""
+        cycle = None if self._stopped else next(self._cycles, None)
+        if cycle is None:
             return
-        begin = time.perf_counter()
         try:
-            estimate = self._estimator.update(*fed)
-        except Exception as error:  # whatever ends it belongs into the table
-            self._stop(" ".join(f"{type(error).__name__}: {error}".split()))
+            estimate, seconds = timed_update(self._estimator, *cycle)
+        except Exception as error:  # the table reports any failure
+            self._stopped = " ".join(f"{type(error).__name__}: {error}".split())
             return
-        self._seconds.append(time.perf_counter() - begin)
+        self._seconds.append(seconds)
         self._sizes.append(sum(estimate.sizes))
         if len(self._seconds) >= JUDGED and np.mean(self._seconds[-JUDGED:]) > self._budget:
-            self._stop(f"over {self._budget:g} s an update")
-
-    def _stop(self, why: str) -> None:
-        self.stopped, self.over = why, True
+            self._stopped = f"over {self._budget:g} s an update"
 
     def times(self) -> LaneTimes:
-        """What was measured."""
-        return LaneTimes(self.lane, np.array(self._seconds), np.array(self._sizes, dtype=float), self.stopped)
+        """Returns what was measured."""
+        sizes = np.array(self._sizes, dtype=float)
+        return LaneTimes(self._lane, np.array(self._seconds), sizes, self._stopped)
 
 
 def run_lanes(
@@ -92,7 +86,7 @@ def run_lanes(
     budget: float,
     on_cycle: Callable[[], None] = lambda: None,
 ) -> tuple[LaneTimes, ...]:
-    """Cycle k goes to every lane in turn, the first one of which moves on by one with k.
+    """Gives cycle k to every lane in turn; the lane that is first moves on by one with k.
 
     So whatever slows the machine down slows all alike, and none always follows the same other. A lane is
     stopped where its last updates took more than `budget` (s) each on average. BLAS has one thread.
@@ -108,9 +102,10 @@ def run_lanes(
 
 
 def peak_memory(lane: Lane, settings: MapperSettings) -> float:
-    """Most memory (MB) held at a time while the lane runs, of what tracemalloc sees: Python and numpy.
+    """Returns the most memory (MB) that Python and numpy held at a time while the lane ran.
 
-    What GTSAM and LAPACK take for themselves isn't in it. Not to be timed: tracing slows everything down.
+    This is what tracemalloc sees; it sees nothing of what GTSAM and LAPACK allocate. Don't time a lane
+    meanwhile: tracing slows everything down.
     """
     tracemalloc.start()
     try:

@@ -1,8 +1,7 @@
-"""What a measurement of scaling leaves: a table to print, points, slopes and figures on disk."""
+"""The results of a scaling measurement: a table to print, and points, slopes and figures on disk."""
 
 from __future__ import annotations
 
-import json
 import math
 import platform
 import resource
@@ -10,35 +9,33 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
-from pathspace_graph.eval.figures.map_plot import save_plot
+from pathspace_graph.eval.figures.files import save_figures
 from pathspace_graph.eval.metrics.summary import versions
-from pathspace_graph.eval.tables.text_table import TextTable
+from pathspace_graph.eval.metrics.text_table import TextTable
 from pathspace_graph.io.files import atomic_folder
+from pathspace_graph.io.json_file import write_json
 
 from .plot import plot_laps, plot_scaling
-from .points import CONES, LAPS, READINGS, Slope
-from .scaling import Scaling
+from .points import CONES, LAPS, READINGS, Scaling, Slope
 
 FORMAT: Final = "pathspace-scaling/1"
 MARKER: Final = "scaling.json"
-"""The file that the folder of a measurement is known by."""
-SUFFIXES: Final = (".png", ".pdf")
-"""Each figure is written as."""
+"""A folder of results is known by this file."""
 COMPARED_AT: Final = 200.0
-"""Cones at which estimators are held against each other, an ordinary track's."""
+"""Estimators are compared at this number of cones, that of an ordinary track."""
 
 
 def scaling_table(scaling: Scaling) -> TextTable:
-    """A row per estimator: its slopes, times, ratio to the first, what the laps cost, memory."""
-    road = scaling.settings
+    """Returns a row for each estimator: slopes, times, the ratio to the first, laps and memory."""
+    settings = scaling.settings
     header = (
         "estimator",
-        f"slope, cones ({road.fit_from:g} to {road.cones_max:g})",
+        f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})",
         "slope, readings",
         f"ms at {COMPARED_AT:g} cones",
         f"{scaling.estimators[0]} / this",
         "most cones",
-        f"ms, lap 2 and {road.laps}",
+        f"ms, lap 2 and {settings.laps}",
         "peak MB",
     )
     rows = tuple(_row(scaling, name) for name in scaling.estimators)
@@ -73,7 +70,7 @@ def _number(value: float, form: str) -> str:
 
 
 def stops(scaling: Scaling) -> list[str]:
-    """A line for each estimator and sweep that did not come to the end."""
+    """Returns a line for each estimator and sweep that did not reach the end."""
     return [
         f"{s.estimator}, {s.sweep}: stopped, {s.stopped}" + (f" (slope to {s.high:.0f})" if s.points else "")
         for s in scaling.slopes
@@ -82,20 +79,17 @@ def stops(scaling: Scaling) -> list[str]:
 
 
 def write_scaling(out: Path, scaling: Scaling) -> None:
-    """`points.csv`, `scaling.json` (slopes, settings, versions), `table.md`, two figures; all or nothing."""
+    """Writes `points.csv`, `scaling.json` (with slopes and settings), `table.md` and two figures."""
     with atomic_folder(out, MARKER) as folder:
         scaling.frame().to_csv(folder / "points.csv", index=False, lineterminator="\n")
         (folder / "table.md").write_text(scaling_table(scaling).markdown(), encoding="utf-8")
-        content = json.dumps(_content(scaling), indent=2, allow_nan=False)
-        (folder / MARKER).write_text(content + "\n", encoding="utf-8")
-        for name, figure in {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)}.items():
-            for suffix in SUFFIXES:
-                save_plot(figure, folder / f"{name}{suffix}")
+        write_json(folder / MARKER, _content(scaling))
+        save_figures(folder, {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)})
 
 
 def _content(scaling: Scaling) -> dict[str, Any]:
     at = {name: scaling.seconds_at(COMPARED_AT, name) for name in scaling.estimators}
-    content = {
+    return {
         "format": FORMAT,
         "slopes": [asdict(slope) for slope in scaling.slopes],
         "compared_at_cones": COMPARED_AT,
@@ -107,20 +101,9 @@ def _content(scaling: Scaling) -> dict[str, Any]:
         "estimator_settings": scaling.mapper,
         "versions": versions(),
     }
-    finite: dict[str, Any] = _finite(content)
-    return finite
 
 
 def _process_megabytes() -> float:
-    """The most that the process, with everything loaded and all estimators at once, ever had in memory."""
+    """Returns the most memory (MB) that the process had, with all estimators loaded at once."""
     unit = 1e-6 if platform.system() == "Darwin" else 1.024e-3
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
-def _finite(value: Any) -> Any:
-    """The same with null for what JSON has no number for."""
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,8 +1,9 @@
-"""The scalability figure: time per update against cones and against readings, both axes logarithmic."""
+"""The scalability figures: time per update against cones, against detections, and lap by lap."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from itertools import cycle
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,121 +24,95 @@ from pathspace_graph.eval.figures.style import (
     ORANGE,
     PURPLE,
     RED,
-    FigureStyle,
+    WIDTH,
     figure_context,
+    shared_legend,
 )
 
-from .points import CONES, LAPS, READINGS, Sweep
-from .scaling import Scaling
+from .points import CONES, LAPS, READINGS, Scaling, Sweep
 
-
-@dataclass(frozen=True, slots=True)
-class ScalingPlotStyle:
-    """Beside what all figures share."""
-
-    height: float = 3.1
-    """Of the figure, in."""
-    colors: tuple[str, ...] = (BLUE, ORANGE, RED, PURPLE, GREEN, DARK)
-    """Of the estimators, one after the other."""
-    markers: str = "os^Dv*"
-    """Shapes of their points."""
-    marker_size: float = 3.6
-    """Points."""
-    cones_ticks: tuple[int, ...] = (50, 100, 200, 500, 1000, 2000)
-    """Named on the axis of cones, as far as it reaches."""
-
-
-_TITLES: dict[Sweep, tuple[str, str]] = {
+_HEIGHT: Final = 3.1
+"""A figure is this high (in)."""
+_COLORS: Final = (BLUE, ORANGE, RED, PURPLE, GREEN, DARK)
+"""Estimators have these colours, one after the other."""
+_MARKERS: Final = "os^Dv*"
+"""The estimators' points have these shapes."""
+_MARKER_SIZE: Final = 3.6
+"""The estimators' points have this size (pt)."""
+_CONES_TICKS: Final = (50, 100, 200, 500, 1000, 2000)
+"""The axis of cones is labelled here, as far as it reaches."""
+_LEGEND_COLUMNS: Final = 4
+_TITLES: Final[dict[Sweep, tuple[str, str]]] = {
     CONES: ("cones seen", "(a) map size"),
-    READINGS: ("readings per update", "(b) readings"),
+    READINGS: ("detections per update", "(b) detections"),
     LAPS: ("lap", "time per lap on a closed road"),
 }
-"""What stands below a panel and above it."""
+"""Each panel has an axis title and a title."""
 
 
-def plot_scaling(
-    scaling: Scaling, style: FigureStyle | None = None, own: ScalingPlotStyle | None = None
-) -> Figure:
-    """Points, and the fitted lines where they were fitted; a cross where an estimator was stopped."""
-    style, own = style or FigureStyle(), own or ScalingPlotStyle()
-    with figure_context(style):
-        figure = Figure(figsize=(style.width, own.height), layout="constrained")
-        left, right = figure.subplots(1, 2, sharey=True)
-        for axes, sweep in ((left, CONES), (right, READINGS)):
-            _draw(axes, scaling, sweep, own)
+def plot_scaling(scaling: Scaling) -> Figure:
+    """Draws two sweeps on logarithmic axes, with fitted lines, and a cross where an estimator was stopped."""
+    with figure_context():
+        figure = Figure(figsize=(WIDTH, _HEIGHT), layout="constrained")
+        cones, detections = figure.subplots(1, 2, sharey=True)
+        for axes, sweep in ((cones, CONES), (detections, READINGS)):
+            for name, color in _draw_sweep(axes, scaling, sweep).items():
+                _draw_power_law(axes, scaling, sweep, name, color)
+                if sweep == CONES and scaling.slope(sweep, name).stopped:
+                    last = scaling.of(sweep, name)[-1]
+                    axes.plot(last.at, 1e3 * last.seconds, "x", color=color, markersize=3 * _MARKER_SIZE)
             axes.set_xscale("log")
-        left.set_ylabel("mean update (ms)")
-        _name_ticks(left, tuple(t for t in own.cones_ticks if t <= scaling.settings.cones_max))
-        _name_ticks(right, scaling.settings.readings)
-        _legend(figure, left)
+        cones.set_ylabel("mean update (ms)")
+        _label_ticks(cones, tuple(t for t in _CONES_TICKS if t <= scaling.settings.cones_max))
+        _label_ticks(detections, scaling.settings.readings)
+        shared_legend(figure, min(len(scaling.estimators), _LEGEND_COLUMNS))
     return figure
 
 
-def plot_laps(
-    scaling: Scaling, style: FigureStyle | None = None, own: ScalingPlotStyle | None = None
-) -> Figure:
-    """Time per update of each lap, from the first on."""
-    style, own = style or FigureStyle(), own or ScalingPlotStyle()
-    with figure_context(style):
-        figure = Figure(figsize=(style.width / 2, own.height), layout="constrained")
+def plot_laps(scaling: Scaling) -> Figure:
+    """Draws the time per update of each lap, from the first on."""
+    with figure_context():
+        figure = Figure(figsize=(WIDTH / 2, _HEIGHT), layout="constrained")
         axes = figure.subplots()
-        _draw(axes, scaling, LAPS, own)
+        _draw_sweep(axes, scaling, LAPS, linestyle="-")
         axes.set_ylabel("mean update (ms)")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        _legend(figure, axes)
+        shared_legend(figure, min(len(scaling.estimators), _LEGEND_COLUMNS))
     return figure
 
 
-def _draw(axes: Axes, scaling: Scaling, sweep: Sweep, own: ScalingPlotStyle) -> None:
-    """All estimators of a sweep."""
-    for number, name in enumerate(scaling.estimators):
-        points = scaling.of(sweep, name)
-        if not points:
-            continue
-        color, marker = own.colors[number % len(own.colors)], own.markers[number % len(own.markers)]
-        at, milliseconds = np.array([(p.at, 1e3 * p.seconds) for p in points]).T
-        joined = "-" if sweep == LAPS else "none"
-        axes.plot(
-            at,
-            milliseconds,
-            color=color,
-            marker=marker,
-            markersize=own.marker_size,
-            ls=joined,
-            lw=0.7,
-            label=name,
-        )
-        if sweep != LAPS:
-            _draw_line(axes, scaling, sweep, name, color)
-        if sweep == CONES and scaling.slope(sweep, name).stopped:
-            axes.plot(at[-1], milliseconds[-1], "x", color=color, markersize=3 * own.marker_size)
+def _draw_sweep(axes: Axes, scaling: Scaling, sweep: Sweep, linestyle: str = "none") -> dict[str, str]:
+    """Draws the points of every estimator that has some, and returns the colours by name."""
+    looks = zip(scaling.estimators, cycle(_COLORS), cycle(_MARKERS), strict=False)
+    drawn = {name: (color, marker) for name, color, marker in looks if scaling.of(sweep, name)}
+    for name, (color, marker) in drawn.items():
+        at, milliseconds = np.array([(p.at, 1e3 * p.seconds) for p in scaling.of(sweep, name)]).T
+        line: dict[str, Any] = {"linestyle": linestyle, "linewidth": 0.7}
+        points: dict[str, Any] = {"marker": marker, "markersize": _MARKER_SIZE}
+        axes.plot(at, milliseconds, color=color, label=name, **line, **points)
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    below, above = _TITLES[sweep]
-    axes.set_xlabel(below)
-    axes.set_title(above)
-    axes.grid(which="both", linewidth=0.3, alpha=0.5)
+    abscissa, title = _TITLES[sweep]
+    axes.set_xlabel(abscissa)
+    axes.set_title(title)
+    axes.grid(which="both")
+    return {name: color for name, (color, _) in drawn.items()}
 
 
-def _draw_line(axes: Axes, scaling: Scaling, sweep: Sweep, name: str, color: str) -> None:
-    """The fitted power law through the middle of its points, over their range."""
+def _draw_power_law(axes: Axes, scaling: Scaling, sweep: Sweep, name: str, color: str) -> None:
+    """Draws the fitted power law through the mean of its points' logarithms, over their range."""
     slope = scaling.slope(sweep, name)
     if not np.isfinite(slope.slope):
         return
     fitted = [(p.at, 1e3 * p.seconds) for p in scaling.of(sweep, name) if slope.low <= p.at <= slope.high]
-    middle = np.exp(np.mean(np.log(fitted), axis=0))
+    at, milliseconds = np.exp(np.mean(np.log(fitted), axis=0))
     ends = np.array([slope.low, slope.high])
-    axes.plot(ends, middle[1] * (ends / middle[0]) ** slope.slope, color=color, linewidth=0.9, alpha=0.8)
+    axes.plot(ends, milliseconds * (ends / at) ** slope.slope, color=color, linewidth=0.9, alpha=0.8)
 
 
-def _name_ticks(axes: Axes, ticks: tuple[int, ...]) -> None:
+def _label_ticks(axes: Axes, ticks: tuple[int, ...]) -> None:
     axes.xaxis.set_major_locator(FixedLocator(ticks))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_formatter(NullFormatter())
-
-
-def _legend(figure: Figure, axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4))

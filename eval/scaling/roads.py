@@ -1,8 +1,7 @@
-"""Drives made to measure time by: ever more cones along one long road, ever more readings of a dense one."""
+"""Drives to measure time by: ever more cones along a road, ever more detections, and lap after lap."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -10,51 +9,73 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from pathspace_graph.eval.metrics.summary import lap_times
 from pathspace_graph.io.log import Detections, Log
-from pathspace_graph.settings.checked import Positive
 from pathspace_graph.sim.geometry import along_polyline, arc_lengths, left_normals, unit
 from pathspace_graph.sim.sensor import SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
 from pathspace_graph.sim.vehicle import VehicleSettings
 
+from .settings import RoadSettings, ScalingSettings
+
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int_]
 
 STEP: Final = 0.25
-"""Spacing of the samples of a road's middle, m."""
+"""The samples of a road's middle are this far apart (m)."""
 SPARE: Final = 1.1
-"""A road has so many times the cones that are to be seen, as some of them never are."""
+"""An open road has this many times the cones that are to be seen, since some are never detected."""
 
 
-@dataclass(frozen=True)
-class RoadSettings(Positive):
-    """The roads and the drives on them."""
+@dataclass(frozen=True, eq=False)
+class Drives:
+    """Holds the logs of the three sweeps."""
 
-    gap: float = 5.0
-    """Between the cones of a row, m."""
-    dense_gap: float = 1.0
-    """The same on the road that readings are counted on, m."""
-    dense_range: float = 30.0
-    """Range of the sensor there, m."""
-    width: float = 4.0
-    """Between the rows, m."""
-    swing: float = 0.9
-    """Greatest angle between an open road and its general direction, rad."""
-    wavelength: float = 300.0
-    """Way along an open road from one swing to the next, m."""
-    dent: float = 0.12
-    """How far a closed road leaves its circle, as a share of the radius."""
-    dents: int = 3
-    """How often it does."""
-    speed: float = 20.0
-    """Of the vehicle, m/s."""
-    acceleration_lateral: float = 9.0
-    """Greatest in corners, m/s^2."""
+    cones: Log
+    """This is a long road, up to the cycle in which the last cone asked for is seen."""
+    seen: Array
+    """This is the number of cones seen by the end of each cycle of that log (n,)."""
+    readings: dict[int, Log]
+    """This is a short dense road, by the number of detections in a cycle."""
+    laps: Log
+    """These are the laps of a closed road."""
+    lap_ends: Array
+    """The laps end at these stamps (m,), s."""
+
+    @property
+    def cycles(self) -> int:
+        """Returns the number of cycles of all three sweeps together."""
+        dense = max(len(log.cycles) for log in self.readings.values())
+        return len(self.cones.cycles) + dense + len(self.laps.cycles)
+
+
+def make_drives(settings: ScalingSettings) -> Drives:
+    """Simulates the drives that the estimators are to be timed on."""
+    road, seed = settings.road, settings.seed
+    long = drive_log(open_road(int(settings.cones_max), road.gap, road), road, seed)
+    seen = cones_seen(long)
+    count = int(np.searchsorted(seen, settings.cones_max)) + 1
+    dense = drive_log(open_road(settings.readings_cones, road.dense_gap, road), road, seed, dense=True)
+    rng = np.random.default_rng(seed)
+    laps = drive_log(closed_road(settings.laps_cones, road), road, seed, settings.laps)
+    return Drives(
+        cones=first_cycles(long, count),
+        seen=seen[:count].astype(float),
+        readings={k: thinned(dense, k, rng) for k in settings.readings},
+        laps=laps,
+        lap_ends=lap_times(laps),
+    )
+
+
+# --- roads -----------------------------------------------------------------------------------------------
 
 
 def open_road(cones: int, gap: float, settings: RoadSettings) -> Track:
-    """A long winding road with at least so many cones that can be seen; it never comes near itself."""
+    """Returns a winding road that never comes near itself, on which at least `cones` cones can be seen.
+
+    Its heading is `swing * sin(2 pi s / wavelength)` at the length s along it; cones are `gap` (m) apart.
+    """
     length = SPARE * cones / 2 * gap
     s = np.arange(0.0, length, STEP)
     heading = settings.swing * np.sin(2 * np.pi * s / settings.wavelength)
@@ -63,7 +84,7 @@ def open_road(cones: int, gap: float, settings: RoadSettings) -> Track:
 
 
 def closed_road(cones: int, settings: RoadSettings) -> Track:
-    """A dented circle with about so many cones."""
+    """Returns a dented circle with about `cones` cones: `r = 1 + dent cos(dents phi)`, scaled."""
     phi = np.linspace(0.0, 2 * np.pi, max(int(cones * settings.gap / STEP), 100))
     r = 1.0 + settings.dent * np.cos(settings.dents * phi)
     unscaled = r[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])
@@ -72,7 +93,7 @@ def closed_road(cones: int, settings: RoadSettings) -> Track:
 
 
 def _with_rows(middle: Array, gap: float, settings: RoadSettings, closed: bool) -> Track:
-    """The road with cones on both sides of its middle (n, 2)."""
+    """Returns the road with cones on both sides of its middle (n, 2), `gap` (m) apart."""
     tangents = unit(np.gradient(middle, axis=0))
     rows = []
     for side in (0.5, -0.5):
@@ -84,8 +105,11 @@ def _with_rows(middle: Array, gap: float, settings: RoadSettings, closed: bool) 
     return Track(rows[0], rows[1], np.zeros((0, 2)), closed, start, "road")
 
 
+# --- logs ------------------------------------------------------------------------------------------------
+
+
 def drive_log(track: Track, settings: RoadSettings, seed: int, laps: int = 1, dense: bool = False) -> Log:
-    """What is recorded on a drive at speed from the start on."""
+    """Simulates a drive along a road at full speed from the start on."""
     vehicle = VehicleSettings(
         speed_max=settings.speed,
         speed_start=settings.speed,
@@ -96,7 +120,7 @@ def drive_log(track: Track, settings: RoadSettings, seed: int, laps: int = 1, de
 
 
 def cones_seen(log: Log) -> IntArray:
-    """How many true cones had been detected by the end of each cycle (n,)."""
+    """Returns the number of true cones that had been detected by the end of each cycle (n,)."""
     assert log.truth is not None
     assert log.truth.associations is not None
     ends = np.cumsum([len(cycle.labels) for cycle in log.cycles])
@@ -105,16 +129,16 @@ def cones_seen(log: Log) -> IntArray:
 
 
 def first_cycles(log: Log, count: int) -> Log:
-    """The beginning of a log, without truth."""
+    """Returns the first `count` cycles of a log, without truth."""
     return replace(log, cycles=log.cycles[:count], truth=None)
 
 
-def thinned(log: Log, readings: int, rng: Generator) -> Log:
-    """The same drive with so many readings a cycle, drawn anew in each; fewer where there aren't as many."""
-    return replace(log, cycles=tuple(_drawn(cycle, readings, rng) for cycle in log.cycles), truth=None)
+def thinned(log: Log, count: int, rng: Generator) -> Log:
+    """Returns the drive with `count` detections a cycle, chosen at random, or all where there are fewer."""
+    return replace(log, cycles=tuple(_chosen(cycle, count, rng) for cycle in log.cycles), truth=None)
 
 
-def _drawn(cycle: Detections, readings: int, rng: Generator) -> Detections:
+def _chosen(cycle: Detections, count: int, rng: Generator) -> Detections:
     size = len(cycle.labels)
-    kept: Sequence[int] | IntArray = np.sort(rng.choice(size, min(readings, size), replace=False))
+    kept = np.sort(rng.choice(size, min(count, size), replace=False))
     return Detections(cycle.t, cycle.points_vehicle[kept], cycle.covariances[kept], cycle.labels[kept])

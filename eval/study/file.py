@@ -8,9 +8,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 
-from pathspace_graph.errors import InputError, PathspaceError, SettingsError
+from pathspace_graph.errors import InputError, PathspaceError, SettingsError, check_name
 
-from .overrides import check_name, flatten
+from .overrides import flatten
 from .study import ALL, Baseline, Study
 
 SHIPPED: Final = Path(__file__).parents[1] / "studies"

@@ -7,10 +7,10 @@ from typing import Any, Final
 
 import pandas as pd
 
+from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.eval.metrics.summary import versions
 
 from .cells import Cell, Record
-from .metrics import METRICS, TIMES
 from .overrides import leaves
 from .study import Study
 
@@ -19,7 +19,9 @@ COMBINATION: Final = ("noise", "estimator", "variant")
 RUN: Final = ("track", "seed")
 """What is paired: the same drive, the same noise."""
 SIMULATION: Final = "simulation."
-"""Prefix of the columns that tell the simulation's settings."""
+"""Columns with settings of the simulation have this prefix."""
+TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
+"""These columns hold wall times, all that differs when a study is run again."""
 
 
 def frame_of(study: Study, cells: Sequence[tuple[Cell, Record | None]]) -> pd.DataFrame:

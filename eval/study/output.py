@@ -7,15 +7,16 @@ from typing import Final
 
 import pandas as pd
 
+from pathspace_graph.eval.figures.files import SUFFIXES, render
+from pathspace_graph.io.files import replacing, write_text
+
 from .frame import times_of, without_times
 from .plot import figures
-from .store import replacing, write_text
 from .study import Study
 from .table import as_latex, as_markdown, as_text, caption, summary_tables
 
 RESULTS: Final = "results.csv"
 TIMES: Final = "times.csv"
-FIGURE_SUFFIXES: Final = (".png", ".pdf")
 
 
 def write_tables(study: Study, frame: pd.DataFrame, out: Path) -> str:
@@ -34,7 +35,6 @@ def write_tables(study: Study, frame: pd.DataFrame, out: Path) -> str:
 def write_figures(study: Study, frame: pd.DataFrame, out: Path) -> None:
     """Write the figures, as a picture to look at and as vectors to print."""
     for name, figure in figures(study, frame).items():
-        for suffix in FIGURE_SUFFIXES:
+        for suffix in SUFFIXES:
             with replacing(out / "figures" / f"{name}{suffix}") as temporary:
-                metadata = {"Software": None} if suffix == ".png" else {"CreationDate": None}
-                figure.savefig(temporary, dpi=200, format=suffix[1:], metadata=metadata)
+                render(figure, temporary, suffix)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
-from difflib import get_close_matches
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import SettingsError, check_name
 
 T = TypeVar("T")
 Overrides = Mapping[str, Any]
@@ -41,16 +40,6 @@ def override(settings: T, overrides: Overrides, where: str) -> T:
         check_name(name, known, f"{where}: expected a known setting")
         settings = _set(settings, name.split("."), value, f"{where}.{name}")
     return settings
-
-
-def check_name(name: Any, known: Iterable[str], expected: str) -> None:
-    """SettingsError, naming the nearest known one, unless `name` is among the known."""
-    known = list(known)
-    if name in known:
-        return
-    near = get_close_matches(str(name), known, n=1, cutoff=0.0)
-    hint = f", the nearest is '{near[0]}'" if near else ""
-    raise SettingsError(f"{expected}, found '{name}'{hint}")
 
 
 def _set(settings: Any, path: list[str], value: Any, where: str) -> Any:

@@ -11,15 +11,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from pathspace_graph.errors import OutputError
+from pathspace_graph.eval.harness.drives import Drive, NamedTrack, load_tracks, try_drive
+from pathspace_graph.eval.harness.workers import check_jobs, outcomes, workers
 from pathspace_graph.io.files import check_target
+from pathspace_graph.io.json_file import to_plain, write_json
 from pathspace_graph.io.log import Log
 
-from .cells import Cell, Drive, NamedTrack, Record, failed, load_tracks, run_cell, try_drive
+from .cells import Cell, Record, failed, run_cell
 from .frame import frame_of
 from .overrides import flatten
-from .store import Store, plain, write_text
+from .store import Store
 from .study import Study
-from .workers import check_jobs, outcomes, workers
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -112,7 +114,7 @@ def run_plan(
     store = Store(out)
     left = [cell for cell in plan.cells if _is_left(store.read(cell), retry_failed)]
     with workers(jobs, cluster) if left else nullcontext():
-        write_text(out / STUDY_FILE, json.dumps(plain(plan.resolved()), indent=1) + "\n")
+        write_json(out / STUDY_FILE, plan.resolved(), indent=1)
         if left:
             _run_cells(left, store, on_cell or (lambda done, total: None))
     store.drop_logs()
@@ -133,7 +135,7 @@ def check_folder(out: Path, plan: Plan) -> None:
         raise OutputError(f"{file}: expected a study, found {type(found).__name__}")
     expected, other = (
         flatten({key: value for key, value in content.items() if key not in _PRESENTATION})
-        for content in (plain(plan.resolved()), found)
+        for content in (to_plain(plan.resolved()), found)
     )
     for name in expected | other:
         if expected.get(name) != other.get(name):

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import json
 import pickle
-import secrets
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
+from pathspace_graph.eval.harness.drives import Drive
+from pathspace_graph.io.files import replacing
+from pathspace_graph.io.json_file import write_json
 from pathspace_graph.io.log import Log
 
-from .cells import FORMAT, Cell, Drive, Record
+from .cells import FORMAT, Cell, Record
 
 
 @dataclass(frozen=True)
@@ -40,7 +37,7 @@ class Store:
 
     def write(self, cell: Cell, record: Record) -> None:
         """The record as a file of its own, whole or not at all."""
-        write_text(self._file(cell), json.dumps(plain(record), indent=1) + "\n")
+        write_json(self._file(cell), record, indent=1)
 
     def has_log(self, drive: Drive) -> bool:
         """Whether the drive has been simulated."""
@@ -71,33 +68,3 @@ class Store:
 
     def _log(self, drive: Drive) -> Path:
         return self.logs / f"{drive.id}.pickle"
-
-
-@contextmanager
-def replacing(file: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `file` that takes its place on success; no backup is kept."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    temporary = file.with_name(f".{file.stem}.{secrets.token_hex(4)}.tmp{file.suffix}")
-    try:
-        yield temporary
-        temporary.replace(file)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-
-
-def write_text(file: Path, text: str) -> None:
-    """Text in UTF-8, whole or not at all."""
-    with replacing(file) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
-
-
-def plain(value: Any) -> Any:
-    """The value in strict JSON's types: NaN is null, infinity is a word."""
-    if isinstance(value, dict):
-        return {name: plain(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None if np.isnan(value) else str(value)
-    return value

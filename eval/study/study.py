@@ -9,22 +9,18 @@ from pathlib import Path
 from typing import Any, Final
 
 from pathspace_graph import estimators as registry
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import SettingsError, check_name
+from pathspace_graph.eval.harness.attempts import known_estimators
+from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings
 
-from .metrics import METRICS
-from .overrides import Overrides, check_name, override
+from .overrides import Overrides, override
 
 DEFAULT: Final = "default"
 """The variant without any override, which is part of every study."""
 ALL: Final = "all"
 """In place of estimators: every one that there is."""
-
-
-def known_estimators() -> list[str]:
-    """Every estimator's name, online ones first."""
-    return [*registry.ONLINE, *registry.BATCH]
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
+from pathspace_graph.eval.metrics.measures import MEAN_DIGITS, METRICS
 from pathspace_graph.eval.metrics.paired import CORRECTION, LEVEL, Estimate
-from pathspace_graph.eval.tables.text_table import TextTable
+from pathspace_graph.eval.metrics.text_table import TextTable
 
 from .frame import COMBINATION, RUN
-from .metrics import METRICS
 from .statistics import Contrast, contrasts
 from .study import Study
 
@@ -42,22 +42,23 @@ def caption(study: Study, frame: pd.DataFrame) -> str:
     )
 
 
-def _table(study: Study, frame: pd.DataFrame, metric: str) -> TextTable:
+def _table(study: Study, frame: pd.DataFrame, key: str) -> TextTable:
     several = [name for name in COMBINATION if frame[name].nunique() > 1] or ["variant"]
     header = (*several, *FIGURES)
-    style = METRICS[metric]
+    metric = METRICS[key]
+    digits = max(metric.digits, MEAN_DIGITS)
 
     def row(contrast: Contrast) -> tuple[str, ...]:
         names = tuple(getattr(contrast, name) for name in several)
         value, difference = contrast.value, contrast.difference
-        figures = (str(value.count), *_figures(value, style.factor, style.digits, ""))
+        figures = (str(value.count), *_figures(value, metric.factor, digits, ""))
         if difference is None:
             return (*names, *figures, "baseline", "", "", "")
-        by = _figures(difference, style.factor, style.digits, "+")
+        by = _figures(difference, metric.factor, digits, "+")
         return (*names, *figures, *by, _p(contrast.p), "*" if contrast.significant else "")
 
-    rows = tuple(row(contrast) for contrast in contrasts(study, frame, metric))
-    return TextTable(style.title, header, rows, names=len(several))
+    rows = tuple(row(contrast) for contrast in contrasts(study, frame, key))
+    return TextTable(metric.heading, header, rows, names=len(several))
 
 
 def _p(p: float) -> str:

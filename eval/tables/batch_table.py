@@ -15,16 +15,16 @@ import numpy as np
 import tyro
 
 from pathspace_graph.batch.mapper import BatchMapper
+from pathspace_graph.eval.metrics.consistency import Nees, map_nees
 from pathspace_graph.eval.metrics.limit import limit
-from pathspace_graph.eval.metrics.nees import Nees, curve_nees
 from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.eval.metrics.text_table import TextTable
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .cases import Case, CaseOptions, by_track, measure, show
-from .text_table import TextTable
 
 SAME_COST: Final = 1e-3
 """Costs that differ by no more than this share are one optimum's."""
@@ -61,7 +61,7 @@ class Outcome:
     seconds: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     """Processor time (one thread) of the batch without the online run, of that, and of all from odometry."""
     nees: Nees | None = None
-    """Of the curves at the true cones."""
+    """The NEES of the map."""
 
     @property
     def limit(self) -> float:
@@ -108,7 +108,7 @@ def evaluate(case: Case, log: Log) -> Outcome:
         l=least.l,
         f=least.f,
         seconds=(between - begin - online, online, end - between),
-        nees=curve_nees(result, truth),
+        nees=map_nees(result.map, truth),
     )
 
 
@@ -125,7 +125,7 @@ HEADER: Final = (
     "size [% of cones]",
     "same cost",
     "batch after online, all from odometry [s]",
-    "NEES / cones",
+    "NEES per degree of freedom",
     "in 95 %",
 )
 
@@ -153,8 +153,8 @@ def _row(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
         f"{100 * mean(lambda o: o.share):.1f}",
         f"{sum(o.same_cost for o in done)} of {len(outcomes)}",
         f"{mean(lambda o: o.seconds[0]):.1f}, {mean(lambda o: o.seconds[2]):.1f}",
-        f"{np.mean([n.value / n.cones for n in checked]) if checked else float('nan'):.2f}",
-        f"{sum(n.inside() for n in checked)} of {len(outcomes)}",
+        f"{np.mean([n.ratio for n in checked]) if checked else float('nan'):.2f}",
+        f"{sum(n.honest for n in checked)} of {len(outcomes)}",
     )
 
 

@@ -13,13 +13,12 @@ from joblib import Parallel, delayed, parallel_config
 from rich.console import Console
 
 from pathspace_graph.errors import InputError
+from pathspace_graph.eval.metrics.text_table import TextTable
 from pathspace_graph.io.log import Log
 from pathspace_graph.progress import progress
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.track_generator import generate_track
-
-from .text_table import TextTable
 
 FOLDERS: Final = ("pacsim", "fssim", "eufs")
 """Where the real Formula Student tracks are, in the folder that is given."""

@@ -14,8 +14,10 @@ from typing import Final
 import numpy as np
 import tyro
 
+from pathspace_graph.eval.metrics.consistency import normal_errors
 from pathspace_graph.eval.metrics.limit import limit
-from pathspace_graph.eval.metrics.table1 import LapMetrics, lap_end_times, laps_metrics, normal_errors
+from pathspace_graph.eval.metrics.table1 import LapMetrics, lap_end_times, laps_metrics
+from pathspace_graph.eval.metrics.text_table import TextTable
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.results import CycleRecord, RunResult
@@ -25,7 +27,6 @@ from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .cases import Case, CaseOptions, by_track, measure, show
-from .text_table import TextTable
 
 
 @dataclass(frozen=True)

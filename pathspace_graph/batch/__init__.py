@@ -1,1 +1,1 @@
-"""The spline graph over a whole log: the ground reference."""
+"""The batch optimization of the spline graph over a whole log, which is the ground reference."""

@@ -1,4 +1,4 @@
-"""Cones that were sighted: what a boundary's readings are heaped around, in the order of travel."""
+"""The cones of each boundary: clusters of its detections, in the order of travel."""
 
 from __future__ import annotations
 
@@ -7,200 +7,193 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
+from pathspace_graph.settings.batch import ConeSettings
 from pathspace_graph.settings.mapper import MapperSettings
+
+from .association import find_anywhere
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-DENSITY_STEP = 0.1
-"""Step (m) along a curve of the readings' density."""
-SELDOM = 0.1
-"""What is seen less often than this share of the median cone is no cone."""
-SELDOM_APART = 0.3
-"""The same share where the curve doesn't pass it."""
-APART = 0.6
-"""Least distance of two cones along a curve as a share of the radius within which sightings are merged: in a
-bend the inner curve is shorter than the way from cone to cone."""
-BLUR = 0.4
-"""Standard deviation of the smoothing as a share of that."""
-FEWEST = 4
-"""Cones that are always kept."""
-BACK = -0.5
-"""A row of cones turns back on itself where the cosine of its turn at a cone is less than this."""
-FOLD = 1.5
-"""Distance (m) to the nearer neighbour below which such a turn means that one cone was put down twice."""
-
 
 @dataclass(frozen=True, eq=False)
-class ConeClusters:
-    """What the readings of a boundary are heaped around, in the order of travel."""
+class Cones:
+    """Holds the cones of a boundary in the order of travel."""
 
     points: Array
-    """(k, 2) weighted means, map frame, m."""
+    """Each row (k, 2) is the weighted mean of a cone's detections in m, map frame."""
     u: Array
-    """(k,) their places along the way, m."""
+    """Each entry (k,) is a cone's parameter along the curve or path (m)."""
     count: IntArray
-    """(k,) readings of each."""
+    """Each entry (k,) is the number of a cone's detections."""
 
-    def kept(self, which: BoolArray) -> ConeClusters:
-        """Those alone that `which` (k,) is true of."""
-        return ConeClusters(self.points[which], self.u[which], self.count[which])
+    def where(self, chosen: BoolArray | IntArray) -> Cones:
+        """Returns the chosen cones, in the order in which they are chosen."""
+        return Cones(self.points[chosen], self.u[chosen], self.count[chosen])
 
-    def joined(self, other: ConeClusters) -> ConeClusters:
-        """Both, in order."""
-        order = np.argsort(np.concatenate([self.u, other.u]), kind="stable")
+    def merged(self, other: Cones) -> Cones:
+        """Returns the cones of both, ordered by parameter."""
         pairs = zip((self.points, self.u, self.count), (other.points, other.u, other.count), strict=True)
-        return ConeClusters(*(np.concatenate(pair)[order] for pair in pairs))
+        both = Cones(*(np.concatenate(pair) for pair in pairs))
+        return both.where(np.argsort(both.u, kind="stable"))
 
 
-def cone_clusters(
-    state: State, detections: DetectionTable, label: int, settings: MapperSettings
-) -> ConeClusters:
-    """What the readings on a curve are heaped around.
+# --- cones of a curve ------------------------------------------------------------------------------------
 
-    What is seen again and again beside a curve, but too far from it to be used, is a cone of it as well: the
-    curve cuts a corner there. On a closed curve they are counted from where the drive began, so that it
-    doesn't matter where the curve's own parameter begins; and they are passed in the order in which the
-    vehicle passed them, as a curve may have taken two of them in the wrong one in a hairpin.
+
+def cones_of_curve(state: State, detections: DetectionTable, label: int, settings: MapperSettings) -> Cones:
+    """Returns the cones of a boundary whose curve the state has.
+
+    A cone that is often detected beside the curve, but too far from it to be used, belongs to it as well: the
+    curve cuts a corner there. On a closed curve parameters are counted from the beginning of the drive, so
+    that the beginning of the curve's own parameter doesn't matter. There the cones are ordered as the vehicle
+    passed them, since in a hairpin the curve may have taken two of them in the wrong order.
     """
-    boundary = state.boundaries[label]
+    boundary, begin = state.boundaries[label], first_parameter(state, label)
     rows = np.flatnonzero(detections.label == label)
     points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
     used = detections.used[rows] & (detections.boundary[rows] == label)
-    beside, ending, u = used.copy(), used.copy(), detections.u[rows].copy()
-    beside[~used], ending[~used], u[~used] = _beside(state, points[~used], label, settings)
-    if boundary.periodic:
-        u = np.mod(u - path_begin(state, label), boundary.length)
-    else:
-        u = u - path_begin(state, label)
+    beside, on_curve, u = used.copy(), used.copy(), detections.u[rows].copy()
+    beside[~used], on_curve[~used], u[~used] = _beside(state, points[~used], label, settings)
+    u = np.mod(u - begin, boundary.length) if boundary.periodic else u - begin
     weight = 1.0 / np.trace(detections.covariance[rows], axis1=1, axis2=2)
 
-    def heaped(which: BoolArray) -> ConeClusters:
-        return cluster(points[which], u[which], weight[which], boundary.length, boundary.periodic, settings)
+    def clustered(chosen: BoolArray) -> Cones:
+        return cluster(
+            points[chosen], u[chosen], weight[chosen], boundary.length, boundary.periodic, settings
+        )
 
-    cones = heaped(ending)
-    if len(cones.points) == 0:
+    cones = clustered(on_curve)
+    if len(cones.u) == 0:
         return cones
-    alone = beside & ~ending & _far_from(points, cones.points, settings.growth.merge_radius)
-    apart = heaped(alone)
-    apart = apart.kept(apart.count >= SELDOM_APART * np.median(cones.count))
-    cones = cones.joined(apart)
+    radius, min_share = settings.growth.merge_radius, settings.batch.cones.min_share_beside
+    others = clustered(beside & ~on_curve & _far_from(points, cones.points, radius))
+    cones = cones.merged(others.where(others.count >= min_share * np.median(cones.count)))
     if boundary.periodic:
-        cones = as_passed(cones, last_lap(state, label))
-    return unfolded(cones, boundary.periodic)
+        cones = in_order_of_drive(cones, last_lap(state, label))
+    return without_folds(cones, boundary.periodic, settings.batch.cones)
+
+
+def cone_counts(state: State, detections: DetectionTable, settings: MapperSettings) -> list[int]:
+    """Returns the number of cones of each boundary."""
+    return [len(cones_of_curve(state, detections, label, settings).u) for label in state.boundaries]
+
+
+def first_parameter(state: State, label: int) -> float:
+    """Returns the parameter of a curve from which those of its cones are counted."""
+    boundary = state.boundaries[label]
+    return float(state.pose_u[label][0]) if boundary.periodic else boundary.tables.low
 
 
 def last_lap(state: State, label: int) -> Array:
-    """(l, 3) the poses of the last way around a closed curve, map frame."""
-    stations = state.pose_u[label]
-    return np.asarray(state.poses[stations > stations[-1] - state.boundaries[label].length])
+    """Returns the poses (l, 3) of the last lap around a closed curve, map frame."""
+    pose_u = state.pose_u[label]
+    return np.asarray(state.poses[pose_u > pose_u[-1] - state.boundaries[label].length])
 
 
-def as_passed(cones: ConeClusters, lap: Array) -> ConeClusters:
-    """In the order of the way driven, poses (l, 3), abeam of each: from the nearest pose, ahead or behind."""
+def in_order_of_drive(cones: Cones, lap: Array) -> Cones:
+    """Returns the cones in the order in which the poses (l, 3) of a lap pass them.
+
+    A cone is passed at the path length of its nearest pose, plus its distance ahead of that pose.
+    """
     driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(lap[:, :2], axis=0).T)))
     offset = cones.points[:, None] - lap[:, :2]
     nearest = (offset**2).sum(axis=2).argmin(axis=1)
     dx, dy = offset[np.arange(len(nearest)), nearest].T
     ahead = dx * np.cos(lap[nearest, 2]) + dy * np.sin(lap[nearest, 2])
-    order = np.argsort(driven[nearest] + ahead, kind="stable")
-    return ConeClusters(cones.points[order], cones.u[order], cones.count[order])
-
-
-def cone_counts(state: State, detections: DetectionTable, settings: MapperSettings) -> list[int]:
-    """How many cones were sighted of each boundary."""
-    return [len(cone_clusters(state, detections, label, settings).u) for label in state.boundaries]
-
-
-def path_begin(state: State, label: int) -> float:
-    """Parameter of a curve at which the places of its cones are counted from."""
-    boundary = state.boundaries[label]
-    return float(state.pose_u[label][0]) if boundary.periodic else boundary.tables.low
+    return cones.where(np.argsort(driven[nearest] + ahead, kind="stable"))
 
 
 def _beside(
     state: State, points: Array, label: int, settings: MapperSettings
 ) -> tuple[BoolArray, BoolArray, Array]:
-    """Whether a cone of a curve may stand at each point (m, 2), or its very last one; foot points (m,).
+    """Returns which points (m, 2) lie beside a curve, which lie about its end, and their foot points u (m,).
 
-    What is read of the cone at which an open curve ends lies half beyond it.
+    Half of the detections of the cone at which an open curve ends lie beyond its end.
     """
     boundary = state.boundaries[label]
-    low, high = np.full(len(points), boundary.tables.low), np.full(len(points), boundary.tables.high)
-    foot = boundary.find(state.control_points(label), points, low, high)
-    away = np.hypot(*(points - foot.position).T)
-    beside = foot.interior & (away < settings.gate.rough)
-    return beside, ~foot.interior & (away < settings.growth.merge_radius), foot.u
+    foot = find_anywhere(boundary, state.control_points(label), points)
+    distance = np.hypot(*(points - foot.position).T)
+    beside = foot.interior & (distance < settings.gate.rough)
+    return beside, ~foot.interior & (distance < settings.growth.merge_radius), foot.u
 
 
 def _far_from(points: Array, cones: Array, radius: float) -> BoolArray:
-    """(m,) whether a point (m, 2) is farther than that from every cone (k, 2)."""
-    away = (points[:, :1] - cones[:, 0]) ** 2 + (points[:, 1:] - cones[:, 1]) ** 2
-    return np.asarray(away.min(axis=1) > radius**2)
+    """Returns (m,) whether each point (m, 2) is farther than the radius from every cone (k, 2)."""
+    square = (points[:, :1] - cones[:, 0]) ** 2 + (points[:, 1:] - cones[:, 1]) ** 2
+    return np.asarray(square.min(axis=1) > radius**2)
+
+
+# --- clustering ------------------------------------------------------------------------------------------
 
 
 def cluster(
     points: Array, u: Array, weight: Array, length: float, periodic: bool, settings: MapperSettings
-) -> ConeClusters:
-    """Peaks of the density of readings (m, 2) along a way, at least `growth.sightings` readings each.
+) -> Cones:
+    """Returns a cone at each peak of the density of detections (m, 2) along a curve or a path.
 
-    u (m,) in [0, length]: places along the way (m); weight (m,): information, 1/m^2.
+    u (m,) in [0, length] are the parameters of the detections (m), and weight (m,) is their information
+    (1/m^2). A cone has at least `growth.sightings` detections.
     """
     peaks = _peaks(u, weight, length, periodic, settings)
-    member = _nearest(u, peaks, length if periodic else np.inf, settings)
+    member = _nearest_peak(u, peaks, length if periodic else np.inf, settings.growth.merge_radius)
     count = np.bincount(member[member >= 0], minlength=len(peaks))
     typical = float(np.median(count)) if len(count) else 0.0
-    cones = ConeClusters(_means(points, weight, member, len(peaks)), peaks, count)
-    return unfolded(cones.kept(count >= max(settings.growth.sightings, SELDOM * typical)), periodic)
+    cones = Cones(_means(points, weight, member, len(peaks)), peaks, count)
+    enough = count >= max(settings.growth.sightings, settings.batch.cones.min_share * typical)
+    return without_folds(cones.where(enough), periodic, settings.batch.cones)
 
 
-def unfolded(cones: ConeClusters, periodic: bool) -> ConeClusters:
-    """Without cones at which the way would turn back on itself at once: one cone, put down twice."""
+def without_folds(cones: Cones, periodic: bool, settings: ConeSettings) -> Cones:
+    """Returns the cones without those at which their row folds back on itself over a short distance.
+
+    Such a cone is a duplicate of its neighbour.
+    """
     points = cones.points
-    if len(points) < FEWEST:
+    if len(points) < settings.min_count:
         return cones
     into, out = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
     lengths = np.hypot(*into.T), np.hypot(*out.T)
     cosine = (into * out).sum(axis=1) / np.maximum(lengths[0] * lengths[1], np.finfo(float).tiny)
-    folded = (cosine < BACK) & (np.minimum(*lengths) < FOLD)
+    folded = (cosine < -settings.fold_cosine) & (np.minimum(*lengths) < settings.fold_distance)
     if not periodic:
         folded[[0, -1]] = False
-    return unfolded(cones.kept(~folded), periodic) if folded.any() else cones
+    return without_folds(cones.where(~folded), periodic, settings) if folded.any() else cones
 
 
 def _peaks(u: Array, weight: Array, length: float, periodic: bool, settings: MapperSettings) -> Array:
-    """(k,) maxima of the density, smoothed: a share of `growth.merge_radius` apart, at least."""
-    bins = max(int(np.ceil(length / DENSITY_STEP)), 1)
+    """Returns the parameters (k,) of the smoothed density's maxima, which are `separation` apart at least."""
+    own = settings.batch.cones
+    bins = max(int(np.ceil(length / own.density_step)), 1)
     step = length / bins
     density = np.bincount(np.minimum((u / step).astype(np.intp), bins - 1).clip(0), weight, bins)
-    radius = APART * settings.growth.merge_radius
+    radius = own.separation * settings.growth.merge_radius
     reach = round(radius / step)
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * step / (BLUR * radius)) ** 2)
-    padded = (
-        np.concatenate([density[-reach:], density, density[:reach]]) if periodic else np.pad(density, reach)
-    )
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * step / (own.bandwidth * radius)) ** 2)
+    padded = np.pad(density, reach, "wrap" if periodic else "constant")
     smooth = np.convolve(padded, kernel, "same")
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(smooth, reach), 2 * reach + 1)
     highest = (smooth > 0.0) & (smooth >= windows.max(axis=1))
     return np.asarray((np.flatnonzero(highest[reach : reach + bins]) + 0.5) * step, np.float64)
 
 
-def _nearest(u: Array, peaks: Array, period: float, settings: MapperSettings) -> IntArray:
-    """(m,) the peak within `growth.merge_radius` of each parameter, -1 where there is none."""
+def _nearest_peak(u: Array, peaks: Array, period: float, radius: float) -> IntArray:
+    """Returns the index (m,) of the peak nearest to each parameter, -1 where none is within the radius."""
     if len(peaks) == 0:
         return np.full(len(u), -1)
-    away = np.abs(u[:, None] - peaks)
+    distance = np.abs(u[:, None] - peaks)
     if np.isfinite(period):
-        away = np.minimum(away, period - away)
-    nearest = away.argmin(axis=1)
-    return np.where(away[np.arange(len(u)), nearest] < settings.growth.merge_radius, nearest, -1)
+        distance = np.minimum(distance, period - distance)
+    nearest = distance.argmin(axis=1)
+    return np.where(distance[np.arange(len(u)), nearest] < radius, nearest, -1)
 
 
 def _means(points: Array, weight: Array, member: IntArray, count: int) -> Array:
+    """Returns the weighted mean (count, 2) of the points (m, 2) of each cluster."""
     inside = member >= 0
     total = np.bincount(member[inside], weight[inside], count)
     sums = [np.bincount(member[inside], weight[inside] * points[inside, k], count) for k in range(2)]

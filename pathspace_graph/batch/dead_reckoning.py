@@ -1,4 +1,4 @@
-"""Where the batch begins without an online run: at the odometry alone, and what recurs in it."""
+"""The start of the batch from odometry alone: dead reckoning, laps brought together, curves beside lap 1."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_keys
 from pathspace_graph.graph.rows import Rows
@@ -19,185 +19,120 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.measurements import Chain
 from pathspace_graph.mapping.path import along_and_across
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.mapper import ClosingSettings, MapperSettings
+from pathspace_graph.settings.batch import LapCorrespondenceSettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import add_drive
 from .cones import cluster
-from .knots import fit_through, on_knots_of
+from .knots import boundary_of, fit_through
+from .recurrence import Recurrence, find_recurrence
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-
-PROFILE_STEP = 0.5
-"""Step (m) of the curvature profile along the way driven."""
-SMOOTHING = 3.0
-"""Length (m) over which its curvature is averaged."""
-LEAST_CORRELATION = 0.8
-"""Correlation of the profile with itself a lap later, as a share of the best of all lags."""
-LEAST_OVERLAP = 5.0
-"""Stretch (m) that must be driven twice to tell where a lap ends."""
-REFERENCE_STEP = 8.0
-"""Way (m) between the reference poses that all laps are tied to."""
-TIE = np.array([1.5, 1.5, 0.15])
-"""Standard deviation (m, m, rad) of a lap's poses about the reference: laps are driven differently."""
-TIE_STEPS = 8
-"""Most Gauss-Newton steps that tie the laps together."""
-TIED = 1e-6
-"""Laps are tied where a step moves nothing farther than this (m, rad)."""
-LEAST_CONES = 4
-"""Fewest cones that a boundary is begun with."""
-
-
-@dataclass(frozen=True, eq=False)
-class Recurrence:
-    """The way driven, and where it repeats itself."""
-
-    driven: Array
-    """(P,) way driven to each pose, m."""
-    lap: float
-    """Way of a lap, m; infinite where nothing repeats itself."""
-    turn: float
-    """What the heading gains in a lap, by the odometry (rad)."""
+BoolArray = NDArray[np.bool_]
 
 
 def start_odometry(chain: Chain, detections: DetectionTable, settings: MapperSettings) -> State:
-    """Poses by dead reckoning, laps tied together where the way repeats, and curves through lap 1's cones."""
-    poses = chain.dead_reckoned(np.zeros(CALIBRATION_SIZE))
-    recurrence = find_recurrence(poses, settings)
+    """Returns poses by dead reckoning, and curves through the cones that were seen in the first lap.
+
+    Where the path recurs, the drift of the odometry is taken out first: every lap passes the same places.
+    """
     calibration = np.zeros(CALIBRATION_SIZE)
-    if np.isfinite(recurrence.lap):
-        calibration = _bias(chain, recurrence)
-        poses, calibration = tie_laps(chain, recurrence, calibration)
+    poses = chain.dead_reckoned(calibration)
+    recurrence = find_recurrence(poses, settings)
+    if recurrence.recurs:
+        poses, calibration = align_laps(chain, recurrence, settings.batch.laps)
     state = State()
     for label in BOUNDARIES:
         _begin_boundary(state, label, poses, recurrence, detections, settings)
-    add_drive(state, poses, calibration)
+    add_drive(state, poses, calibration, settings.batch.association)
     return state
 
 
-# --- the lap ---------------------------------------------------------------------------------------------
+# --- laps ------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Profile:
-    """The way driven at equal steps along it."""
+def align_laps(
+    chain: Chain, recurrence: Recurrence, settings: LapCorrespondenceSettings
+) -> tuple[Array, Array]:
+    """Returns the poses (P, 3) and the calibration (2,) at which every lap passes the same reference poses.
 
-    position: Array
-    """(n, 2) m."""
-    heading: Array
-    """(n,) rad, not wrapped."""
-    curvature: Array
-    """(n,) averaged over a stretch, 1/m."""
-
-    def likeness(self, lag: int, settings: ClosingSettings) -> float:
-        """Correlation of the curvature with itself `lag` steps later; -inf where that is somewhere else."""
-        away = np.hypot(*(self.position[lag:] - self.position[:-lag]).T)
-        turned = self.heading[lag:] - self.heading[:-lag]
-        off = np.abs(turned - 2.0 * np.pi * np.round(turned / (2.0 * np.pi)))
-        near = settings.radius + settings.drift * lag * PROFILE_STEP
-        if np.median(away) >= near or np.median(off) >= settings.heading:
-            return -np.inf
-        first, second = self.curvature[:-lag], self.curvature[lag:]
-        power = np.mean(first**2) + np.mean(second**2)
-        return float(1.0 - np.mean((first - second) ** 2) / max(power, np.finfo(float).tiny))
-
-
-def find_recurrence(poses: Array, settings: MapperSettings) -> Recurrence:
-    """The shortest way after which the curvature repeats itself, back at about the same place and heading."""
-    driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-    profile = _profile(poses, driven)
-    first, last = int(settings.closing.min_path / PROFILE_STEP), int(LEAST_OVERLAP / PROFILE_STEP)
-    lags = np.arange(first, len(profile.heading) - last)
-    scores = np.array([profile.likeness(int(lag), settings.closing) for lag in lags])
-    if not scores.max(initial=-np.inf) > 0.0:
-        return Recurrence(driven, np.inf, 0.0)
-    begin = int(np.argmax(scores >= LEAST_CORRELATION * scores.max()))
-    reach = int(settings.closing.radius / PROFILE_STEP)
-    lag = int(lags[begin + int(np.argmax(scores[begin : begin + reach]))])
-    turn = float(np.median(profile.heading[lag:] - profile.heading[:-lag]))
-    return Recurrence(driven, lag * PROFILE_STEP, turn)
-
-
-def _profile(poses: Array, driven: Array) -> Profile:
-    """Poses (P, 3), so far driven (P,), at equal steps."""
-    s = np.arange(0.0, driven[-1], PROFILE_STEP)
-    x, y, heading = (np.interp(s, driven, poses[:, k]) for k in range(POSE))
-    half, number = max(int(0.5 * SMOOTHING / PROFILE_STEP), 1), np.arange(len(s))
-    later, before = np.minimum(number + half, len(s) - 1), np.maximum(number - half, 0)
-    return Profile(np.column_stack([x, y]), heading, (heading[later] - heading[before]) / SMOOTHING)
-
-
-def _bias(chain: Chain, recurrence: Recurrence) -> Array:
-    """(2,) the calibration at which a lap turns by whole turns."""
-    whole = 2.0 * np.pi * np.round(recurrence.turn / (2.0 * np.pi))
-    laps = recurrence.driven[-1] / recurrence.lap
-    seconds = (chain.stamps[-1] - chain.stamps[0]) / laps
-    return np.array([0.0, (recurrence.turn - whole) / seconds])
-
-
-@dataclass(frozen=True, eq=False)
-class Ties:
-    """Poses that pass a reference pose, each of a lap: `(x_k - reference - turns) / TIE`."""
-
-    cycles: IntArray
-    """(k,) the poses."""
-    reference: IntArray
-    """(k,) the reference pose that each passes, by number."""
-    turns: Array
-    """(k,) what the heading has gained in whole laps, rad."""
-
-    @property
-    def begin(self) -> IntArray:
-        """(c,) the first pose that passes each reference pose."""
-        return np.unique(self.reference, return_index=True)[1]
-
-    def rows(self, poses: Array, references: Array) -> Rows:
-        """Whitened rows at poses (P, 3) and reference poses (c, 3), whose keys come after theirs."""
-        off = poses[self.cycles] - references[self.reference]
-        off[:, 2] -= self.turns
-        keys = pose_keys(np.column_stack([self.cycles, len(poses) + self.reference]))
-        both = np.concatenate([np.diag(1.0 / TIE), np.diag(-1.0 / TIE)], axis=1)
-        return Rows(
-            keys=np.repeat(keys, POSE, axis=0),
-            jacobian=np.tile(both, (len(off), 1)),
-            residual=(off / TIE).ravel(),
-            owner=np.repeat(owners(self.cycles), POSE),
-        )
-
-
-def tie_laps(chain: Chain, recurrence: Recurrence, calibration: Array) -> tuple[Array, Array]:
-    """Poses (P, 3) and calibration (2,): every lap passes the same reference poses, about.
-
-    The reference poses are unknown themselves: poses of cycles past the last.
+    Gauss-Newton minimizes the odometry's cost and that of the lap correspondences. The reference poses are
+    unknown, too: their keys are those of cycles after the last one.
     """
-    ties, poses, count = _ties(recurrence), chain.dead_reckoned(calibration), len(chain)
-    references = poses[ties.cycles[ties.begin]] - ties.turns[ties.begin, None] * [0.0, 0.0, 1.0]
-    poses, variables = np.concatenate([poses, references]), Variables()
+    calibration, count = _bias_of_turn(chain, recurrence), len(chain)
+    correspondences, poses = lap_correspondences(recurrence, settings), chain.dead_reckoned(calibration)
+    poses, variables = np.concatenate([poses, correspondences.references_at(poses)]), Variables()
     variables.insert(np.array([CALIBRATION_KEY]), calibration)
     variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
-    for _ in range(TIE_STEPS):
+    for _ in range(settings.max_steps):
         poses, calibration = variables.poses[:count], variables.calibration
         rows = chain.rows(chain.terms(poses, calibration), poses[0], calibration)
-        graph = linear_graph([*rows, ties.rows(poses, variables.poses[count:])], variables)
-        step = Elimination(graph, variables.layout).step(np.zeros(CALIBRATION_SIZE))
+        rows.append(correspondences.rows(poses, variables.poses[count:]))
+        step = Elimination(linear_graph(rows, variables), variables.layout).step(np.zeros(CALIBRATION_SIZE))
         variables.values = variables.values + step
-        if np.abs(step).max() < TIED:
+        if np.abs(step).max() < settings.tolerance:
             break
     return variables.poses[:count], variables.calibration
 
 
-def _ties(recurrence: Recurrence) -> Ties:
-    """A reference pose every so many metres of a lap, and the poses nearest to where it is passed."""
-    count = max(int(np.ceil(recurrence.lap / REFERENCE_STEP)), 1)
+def _bias_of_turn(chain: Chain, recurrence: Recurrence) -> Array:
+    """Returns the calibration (2,) by whose yaw-rate bias the heading changes by whole turns in a lap."""
+    laps = recurrence.driven[-1] / recurrence.lap
+    seconds = (chain.stamps[-1] - chain.stamps[0]) / laps
+    return np.array([0.0, (recurrence.turn - recurrence.whole_turn) / seconds])
+
+
+@dataclass(frozen=True, eq=False)
+class LapCorrespondences:
+    """Each correspondence k is a residual `(x_k - reference_k - (0, 0, turns_k)) / sigmas`.
+
+    It says that a pose passes a reference pose, which the other laps pass as well.
+    """
+
+    cycles: IntArray
+    """Each entry (k,) is the perception cycle of the pose."""
+    reference: IntArray
+    """Each entry (k,) is the number of the reference pose that the pose passes."""
+    turns: Array
+    """Each entry (k,) is the change of the heading in the whole laps before the pose (rad)."""
+    sigmas: Array
+    """These are the standard deviations (3,) of a residual (m, m, rad)."""
+
+    def references_at(self, poses: Array) -> Array:
+        """Returns the reference poses (c, 3): the first of the poses (P, 3) that passes each of them."""
+        first = np.unique(self.reference, return_index=True)[1]
+        return poses[self.cycles[first]] - self.turns[first, None] * [0.0, 0.0, 1.0]
+
+    def rows(self, poses: Array, references: Array) -> Rows:
+        """Returns whitened rows at poses (P, 3) and reference poses (c, 3), whose keys follow the poses'."""
+        off = poses[self.cycles] - references[self.reference]
+        off[:, 2] -= self.turns
+        keys = pose_keys(np.column_stack([self.cycles, len(poses) + self.reference]))
+        jacobian = np.concatenate([np.diag(1.0 / self.sigmas), np.diag(-1.0 / self.sigmas)], axis=1)
+        return Rows(
+            keys=np.repeat(keys, POSE, axis=0),
+            jacobian=np.tile(jacobian, (len(off), 1)),
+            residual=(off / self.sigmas).ravel(),
+            owner=np.repeat(owners(self.cycles), POSE),
+        )
+
+
+def lap_correspondences(recurrence: Recurrence, settings: LapCorrespondenceSettings) -> LapCorrespondences:
+    """Returns the correspondences of the poses nearest to where each lap passes each reference pose.
+
+    A lap has a whole number of reference poses, equally spaced by `reference_step` at most.
+    """
+    count = max(int(np.ceil(recurrence.lap / settings.reference_step)), 1)
     places = recurrence.driven / recurrence.lap * count
     cycles = _nearest_cycles(places)
     reference = np.mod(np.round(places[cycles]).astype(np.intp), count)
-    whole = 2.0 * np.pi * np.round(recurrence.turn / (2.0 * np.pi))
-    return Ties(cycles, reference, whole * np.round((places[cycles] - reference) / count))
+    turns = recurrence.whole_turn * np.round((places[cycles] - reference) / count)
+    return LapCorrespondences(cycles, reference, turns, np.array(settings.sigmas))
 
 
 def _nearest_cycles(places: Array) -> IntArray:
-    """The cycle nearest to each whole number that the increasing places (P,) pass."""
+    """Returns the cycle nearest to each whole number that the increasing places (P,) pass."""
     whole = np.arange(np.ceil(places[0]), np.floor(places[-1]) + 1.0)
     after = np.clip(np.searchsorted(places, whole), 1, len(places) - 1)
     nearer = np.abs(places[after - 1] - whole) < np.abs(places[after] - whole)
@@ -215,20 +150,20 @@ def _begin_boundary(
     detections: DetectionTable,
     settings: MapperSettings,
 ) -> None:
-    """A curve through what was seen of a boundary in the first lap, beside the path of that lap."""
-    closed = bool(np.isfinite(recurrence.lap))
-    first = recurrence.driven < recurrence.lap
-    rows = np.flatnonzero((detections.label == label) & first[detections.cycle])
-    if len(rows) == 0 or first.sum() < 2:
+    """Adds a curve through the cones of a boundary that were seen in the first lap, if there are enough."""
+    first_lap = recurrence.driven < recurrence.lap
+    rows = np.flatnonzero((detections.label == label) & first_lap[detections.cycle])
+    if len(rows) == 0 or first_lap.sum() < 2:
         return
-    points = to_map(detections.point[rows], poses[detections.cycle[rows]])
-    station, kept, length = _beside_path(points, detections.cycle[rows], label, poses, recurrence, settings)
+    cycles = detections.cycle[rows]
+    points = to_map(detections.point[rows], poses[cycles])
+    station, kept, length = _beside_path(points, cycles, label, poses, recurrence, settings)
     weight = 1.0 / np.trace(detections.covariance[rows[kept]], axis1=1, axis2=2)
-    cones = cluster(points[kept], station[kept], weight, length, closed, settings)
-    if len(cones.points) < LEAST_CONES:
+    cones = cluster(points[kept], station[kept], weight, length, recurrence.recurs, settings)
+    if len(cones.u) < settings.batch.cones.min_count:
         return
-    spline = fit_through(cones.points, closed, settings, settings.batch.size_share)
-    state.add_boundary(label, *on_knots_of(spline, settings))
+    spline = fit_through(cones.points, recurrence.recurs, settings, settings.batch.size_share)
+    state.add_boundary(label, *boundary_of(spline, settings))
 
 
 def _beside_path(
@@ -238,16 +173,19 @@ def _beside_path(
     poses: Array,
     recurrence: Recurrence,
     settings: MapperSettings,
-) -> tuple[Array, NDArray[np.bool_], float]:
-    """Stations (m,) of points (m, 2) along the first lap, which are beside it, and how far it goes (m)."""
-    closed, first = bool(np.isfinite(recurrence.lap)), recurrence.driven < recurrence.lap
-    path, stations = poses[first, :2], recurrence.driven[first]
-    if closed:
+) -> tuple[Array, BoolArray, float]:
+    """Returns the stations (m,) of points (m, 2) on the path of lap 1, which lie beside it, and its length.
+
+    A point whose station isn't about that of its cycle (m,) belongs to a stretch that is driven later.
+    """
+    first_lap = recurrence.driven < recurrence.lap
+    path, stations = poses[first_lap, :2], recurrence.driven[first_lap]
+    if recurrence.recurs:
         path, stations = np.concatenate([path, path[:1]]), np.append(stations, recurrence.lap)
     station, lateral = along_and_across(points, path, stations)
-    length = recurrence.lap if closed else float(stations[-1]) + settings.growth.reach
+    length = recurrence.lap if recurrence.recurs else float(stations[-1]) + settings.growth.reach
     side, gate = SIDES[label] * lateral, settings.gate
     kept = (side > settings.growth.min_lateral) & (side < settings.growth.max_lateral)
-    ahead = station - recurrence.driven[cycles]  # else it is of a stretch that comes later, or again
+    ahead = station - recurrence.driven[cycles]
     kept &= (ahead > -gate.view_behind) & (ahead < gate.view_ahead)
     return station, np.asarray(kept & (station >= 0.0) & (station < length)), length

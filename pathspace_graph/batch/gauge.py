@@ -1,4 +1,4 @@
-"""Weak priors on what readings leave free, over a whole curve: where its points are along it, smoothness."""
+"""Weak priors on what detections leave free of a whole curve: the place of control points along it, shape."""
 
 from __future__ import annotations
 
@@ -18,39 +18,42 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 POINTS_A_FACTOR = 8
-"""Neighbouring control points whose smoothness makes one factor: all in one would join the whole curve."""
+"""The smoothness of this number of neighbouring control points makes one factor. One factor for all of them
+would join the whole curve in the elimination. The number changes the speed, not the result."""
 
 
 @dataclass(frozen=True, eq=False)
 class CurveGauge:
-    """`(h_k . (c_j - p_k) - ahead_j) / sigma` and `D c / sigma'`, D of `smoothness_matrix`.
+    """Holds the residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` and `D c / sigma_smoothness` of a curve.
 
-    h_k is the heading of the pose p_k that control point c_j began beside. Readings say nothing along a
-    curve, so its control points would slide, by metres and for a hundred steps. Held beside a pose they
-    can't, and the map is as free as before: wherever that pose turns out to have been, they come along.
+    p_k is the position of the pose that control point c_j began beside, and h_k is its heading. D is
+    `smoothness_matrix`. A detection constrains nothing along a curve, so control points would slide along it,
+    by metres in a hundred steps. Held beside a pose they don't, and the map is as free as before: wherever
+    that pose goes, they go with it.
     """
 
     label: int
-    """The boundary."""
+    """This is the label of the boundary."""
     keys: IntArray
-    """(m,) its control points."""
+    """These are the keys (m,) of its control points."""
     cycle: IntArray
-    """(m,) perception cycle of the pose that each is held beside."""
+    """Each entry (m,) is the perception cycle of the pose beside a control point."""
     ahead: Array
-    """(m,) how far ahead of it (m)."""
+    """Each entry (m,) is the distance of a control point ahead of its pose (m)."""
     sigma: float
-    """Its standard deviation, m."""
+    """This is the standard deviation of that distance (m)."""
     smoothness: Array
-    """(r, m) D."""
+    """This is D (r, m)."""
     sigma_smoothness: float
-    """sigma', m."""
+    """This is the standard deviation of a second difference (m)."""
     sigma_anchor: float
-    """Standard deviation (m) that holds each control point where it is: no gradient, so not in the cost."""
+    """This standard deviation (m) holds each control point where it is linearized. The anchor has no
+    gradient, so it isn't part of the cost."""
 
     def terms(self, control_points: Array, beside: Array) -> tuple[Array, Array, Array]:
-        """Whitened residuals (m,) of control points (m, 2), each beside its pose (m, 3), and derivatives.
+        """Returns whitened residuals (m,) of control points (m, 2), each beside its pose (m, 3).
 
-        (m, 2) by the control point, (m, 3) by the pose.
+        Also returns their derivatives by the control point (m, 2) and by the pose (m, 3).
         """
         heading = np.column_stack([np.cos(beside[:, 2]), np.sin(beside[:, 2])]) / self.sigma
         arm = control_points - beside[:, :2]
@@ -59,7 +62,7 @@ class CurveGauge:
         return residual, heading, np.column_stack([-heading, by_theta])
 
     def beside(self, control_points: Array, poses: Array) -> Rows:
-        """The same as rows on [control point | pose], from all poses (P, 3)."""
+        """Returns the same as rows on [control point | pose], from all poses (P, 3)."""
         residual, by_point, by_pose = self.terms(control_points, poses[self.cycle])
         return Rows(
             keys=np.column_stack([self.keys, pose_keys(self.cycle)]),
@@ -69,37 +72,40 @@ class CurveGauge:
         )
 
     def smooth(self, control_points: Array) -> Rows:
-        """Whitened second differences, one row for x and one for y: each is of three neighbours."""
-        near = (np.arange(len(self.smoothness))[:, None] + np.arange(3)) % len(self.keys)
-        weights = np.take_along_axis(self.smoothness, near, axis=1) / self.sigma_smoothness
-        keys = np.repeat(self.keys[near], POINT, axis=0)
+        """Returns whitened second differences of three neighbours each, one row for x and one for y."""
+        neighbours = (np.arange(len(self.smoothness))[:, None] + np.arange(3)) % len(self.keys)
+        weights = np.take_along_axis(self.smoothness, neighbours, axis=1) / self.sigma_smoothness
+        keys = np.repeat(self.keys[neighbours], POINT, axis=0)
         jacobian = (weights[:, None, :, None] * np.eye(POINT)[:, None, :]).reshape(-1, 3 * POINT)
         residual = (self.smoothness @ control_points).ravel() / self.sigma_smoothness
         return Rows(keys, jacobian, residual, self._owners(keys[:, 0]))
 
     def anchor(self) -> Rows:
-        """Rows that hold each control point where it is."""
+        """Returns rows that hold each control point where it is."""
         keys = np.repeat(self.keys, POINT)
         jacobian = np.tile(np.eye(POINT), (len(self.keys), 1)) / self.sigma_anchor
         return Rows(keys[:, None], jacobian, np.zeros(len(keys)), self._owners(keys))
 
     def _owners(self, keys: IntArray) -> IntArray:
-        """The factor of rows on control points alone, by the first of each: numbers below those of cycles."""
+        """Returns the factor of each row on control points alone, by its first key.
+
+        The numbers are negative, so that they differ from those of cycles.
+        """
         return np.asarray(-1 - self.label - 2 * (indices(keys) // POINTS_A_FACTOR))
 
     def cost(self, control_points: Array, poses: Array) -> float:
-        """Half the sum of squares."""
+        """Returns half the sum of the squared residuals at control points (m, 2) and all poses (P, 3)."""
         beside, _, _ = self.terms(control_points, poses[self.cycle])
         smooth = self.smoothness @ control_points / self.sigma_smoothness
         return 0.5 * float(beside @ beside + (smooth**2).sum())
 
 
 def curve_gauge(state: State, label: int, sigma: float) -> CurveGauge:
-    """The gauge of a boundary's curve as it is, beside the poses as they are."""
+    """Returns the gauge of a curve that holds each control point where it is now beside its pose."""
     boundary, control_points, poses = state.boundaries[label], state.control_points(label), state.poses
-    cycle = _beside(boundary, control_points, poses)
+    cycle = _nearest_poses(boundary, control_points, poses)
     heading = np.column_stack([np.cos(poses[cycle, 2]), np.sin(poses[cycle, 2])])
-    mean = boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)
+    mean_spacing = boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)
     return CurveGauge(
         label=label,
         keys=state.keys(label),
@@ -107,17 +113,17 @@ def curve_gauge(state: State, label: int, sigma: float) -> CurveGauge:
         ahead=(heading * (control_points - poses[cycle, :2])).sum(axis=1),
         sigma=sigma,
         smoothness=smoothness_matrix(boundary.abscissae, boundary.length if boundary.periodic else None),
-        sigma_smoothness=boundary.gauge.sigma_smoothness * mean,
+        sigma_smoothness=boundary.gauge.sigma_smoothness * mean_spacing,
         sigma_anchor=boundary.gauge.sigma_anchor,
     )
 
 
-def _beside(boundary: Boundary, control_points: Array, poses: Array) -> IntArray:
-    """(m,) the pose nearest to where each control point acts, of those that head the same way."""
+def _nearest_poses(boundary: Boundary, control_points: Array, poses: Array) -> IntArray:
+    """Returns (m,) the pose nearest to where each control point acts, of those with the curve's direction."""
     u = boundary.abscissae
     position, tangent = (boundary.evaluate(control_points, u, order) for order in (0, 1))
     dx, dy = position[:, :1] - poses[:, 0], position[:, 1:] - poses[:, 1]
     along = tangent[:, :1] * np.cos(poses[:, 2]) + tangent[:, 1:] * np.sin(poses[:, 2])
-    away = dx**2 + dy**2
-    away[along <= 0.0] += away.max(initial=0.0)
-    return np.asarray(away.argmin(axis=1))
+    square = dx**2 + dy**2
+    square[along <= 0.0] += square.max(initial=0.0)
+    return np.asarray(square.argmin(axis=1))

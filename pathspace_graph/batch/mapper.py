@@ -1,4 +1,4 @@
-"""The offline batch: every pose, every reading and both curves of a log, in one least-squares problem."""
+"""The offline batch: every pose, every detection and both curves of a log in one least-squares problem."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
 
 import gtsam
 import numpy as np
@@ -22,69 +21,68 @@ from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
 from pathspace_graph.mapping.state import State
-from pathspace_graph.run import settings_dict
+from pathspace_graph.run import Stopwatch, settings_dict
+from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
-from pathspace_graph.stopwatch import Stopwatch
 
 from .cones import cone_counts
 from .dead_reckoning import start_odometry
-from .knots import map_block, reknot, simplified
+from .knots import reknot
 from .nonlinear_graph import nonlinear_graph
 from .optimizer import Convergence, Optimizer, Schedule
-from .scatter import Scatter, scatter_of_cones
+from .simplification import Scatter, map_block, scatter_of_cones, simplify
 from .start import CurveMapper, start_online
 from .system import BatchSystem, Biweight, Evaluation
 
 Array = NDArray[np.float64]
-Start = Literal["online", "odometry"]
 
 NAME = "spline"
-"""What the command line calls this estimator."""
+"""This is the name of the estimator on the command line."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BatchResult(BatchRun):
-    """What the batch optimization gives: a run's result, how it ended, and how sure it is."""
+    """Holds the result of a batch optimization, how it ended, and its uncertainty."""
 
     convergence: Convergence
-    """Whether and how it converged."""
+    """This is how the optimization ended."""
     map_covariance: Array
-    """(2m, 2m) m^2, joint covariance of both boundaries' control points, left first: what the readings say,
-    without the cones' scatter."""
+    """This is the joint covariance (2m, 2m) of the control points of both boundaries, left first, in m^2. It
+    comes from the measurements alone: the scatter of the cones isn't added."""
     scatter: Scatter
-    """How far cones stand off the curves: what no curve of that size follows."""
+    """This is how far cones lie from the map's curves, which have too few control points to follow them."""
     calibration: Array
-    """(2,) scale error of the speeds, bias of the yaw rate (rad/s)."""
+    """This is the calibration (2,): scale error of the speeds [-], bias of the yaw rate [rad/s]."""
     online: RunResult | None
-    """The online run that it began at, where it did."""
+    """This is the online run that the batch began with, if it did."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """Wall time of each stage."""
+    """This is the wall time of each stage (s)."""
     system: BatchSystem
-    """The problem that was solved, on curves of nearly a knot for each cone."""
+    """This is the problem that was solved, on curves with about one knot for each cone."""
     optimum: Evaluation
-    """The same where it ended."""
+    """This is the problem at the optimum."""
 
     @cached_property
     def pose_covariances(self) -> Array:
-        """(n, 3, 3) marginal covariance of each pose (x, y, theta), map frame; found when first asked for."""
+        """Returns the marginal covariance (n, 3, 3) of each pose (x, y, theta), map frame.
+
+        It is computed when it is first asked for.
+        """
         with threadpool_limits(limits=1):
             return self.system.eliminated(self.optimum).pose_marginals
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """The whole problem at the optimum as GTSAM's own nonlinear factors (see `nonlinear_graph`)."""
+        """Returns the whole problem at the optimum as GTSAM's nonlinear factors (see `nonlinear_graph`)."""
         return nonlinear_graph(self.system, self.optimum)
 
     def values(self) -> gtsam.Values:
-        """The optimum: control points l_j and r_j, calibration b_0, poses x_k."""
+        """Returns the optimum: control points l_j and r_j, calibration b_0, poses x_k."""
         variables = self.optimum.state.variables
         return variables.gtsam_values(variables.keys)
 
 
 class BatchMapper:
-    """Maps a whole log at once. `odometry_sigma` (3,): standard deviation of a twist (m/s, m/s, rad/s).
-
-    `online` makes the online mapper whose map the optimization begins with. A start from odometry needs none.
-    """
+    """A batch mapper maps a whole log at once."""
 
     def __init__(
         self,
@@ -92,16 +90,25 @@ class BatchMapper:
         odometry_sigma: Array | None = None,
         online: Callable[[MapperSettings, Array], CurveMapper] | None = None,
     ) -> None:
+        """`odometry_sigma` (3,) is the standard deviation of a measured twist (m/s, m/s, rad/s).
+
+        `online` makes the online mapper whose map the optimization begins with. A start from odometry needs
+        none.
+        """
         self.settings = settings or MapperSettings()
         self.online = online
         self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
 
     def solve(
-        self, log: Log, start: Start = "online", on_round: Callable[[], None] | None = None
+        self, log: Log, start: Start | None = None, on_round: Callable[[], None] | None = None
     ) -> BatchResult:
-        """The optimum from an online run's map, or from odometry alone."""
+        """Returns the optimum, which is searched from an online map or from odometry alone.
+
+        By default `batch.start` decides. `on_round` is called after each round. SettingsError if there is no
+        online mapper to begin with.
+        """
         with threadpool_limits(limits=1):
-            return self._solve(log, start, on_round)
+            return self._solve(log, start or self.settings.batch.start, on_round)
 
     def _solve(self, log: Log, start: Start, on_round: Callable[[], None] | None) -> BatchResult:
         settings, batch, watch = own_settings(self.settings), self.settings.batch, Stopwatch()
@@ -118,16 +125,17 @@ class BatchMapper:
         else:
             state = start_odometry(chain, detections, settings)
         watch.lap("start")
-        state = optimizer.hold_map(state, batch.pose_steps, batch.loose_gate)
+        state = optimizer.align_poses(state, batch.pose_steps, batch.loose_gate)
         watch.lap("poses")
         at, convergence = _optimum(optimizer, state, detections, settings, on_round)
         watch.lap("optimum")
         joint = system.eliminated(at).joint(at.state.map_keys)
         watch.lap("covariance")
-        detections = deepcopy(detections)  # those of the problem stay as they were solved for
-        state, joint = simplified(at.state, joint, detections, settings)
+        detections = deepcopy(detections)  # the result's problem keeps its own associations
+        state, joint = simplify(at.state, joint, detections, settings)
         scatter = scatter_of_cones(state, detections, settings)
         watch.lap("simplify")
+        records, laps = _records(state, detections, chain, sum(watch.laps.values()))
         return BatchResult(
             estimator=NAME,
             settings=settings_dict(self.settings),
@@ -135,8 +143,8 @@ class BatchMapper:
             scatter=scatter,
             trajectory_t=chain.stamps,
             trajectory=at.state.poses.copy(),
-            cycles=_records(state, detections, chain, sum(watch.laps.values())),
-            laps=_completed(at.state.poses),
+            cycles=records,
+            laps=laps,
             converged=convergence.converged,
             convergence=convergence,
             map_covariance=joint,
@@ -155,9 +163,9 @@ def _optimum(
     settings: MapperSettings,
     on_round: Callable[[], None] | None,
 ) -> tuple[Evaluation, Convergence]:
-    """The optimum on curves of nearly a knot for each cone, which meet them all.
+    """Returns the optimum on curves with about one knot for each cone, which meet the cones.
 
-    Chosen anew where a cone was missing or put down twice.
+    It is searched again if the number of cones has changed: then one was missing or was a duplicate.
     """
     batch = settings.batch
     rough = Schedule(batch.loose_gate, batch.rough_rounds, batch.rough_tolerance)
@@ -172,7 +180,7 @@ def _optimum(
 
 
 def own_settings(settings: MapperSettings) -> MapperSettings:
-    """The settings with the batch's own in place of what they stand for online."""
+    """Returns the settings with the batch's own values in the groups that it shares with online mapping."""
     batch = settings.batch
     return replace(
         settings,
@@ -182,7 +190,7 @@ def own_settings(settings: MapperSettings) -> MapperSettings:
 
 
 def _map(state: State, joint: Array, scatter: Scatter) -> Map:
-    """The curves with their joint covariance, to which the cones' scatter is added."""
+    """Returns the curves with their covariance, to which the scatter of the cones is added."""
     closed = any(boundary.periodic for boundary in state.boundaries.values())
     boundaries = {}
     for label, boundary in state.boundaries.items():
@@ -196,22 +204,13 @@ def _map(state: State, joint: Array, scatter: Scatter) -> Map:
 
 def _records(
     state: State, detections: DetectionTable, chain: Chain, seconds: float
-) -> tuple[CycleRecord, ...]:
-    """A record of each cycle: its share of the time, its readings in use, its lap."""
+) -> tuple[tuple[CycleRecord, ...], int]:
+    """Returns a record of each cycle, with its share of the seconds, and the number of complete laps."""
     left, right = (state.boundaries[b].size if b in state.boundaries else 0 for b in (LEFT, RIGHT))
-    used = np.bincount(detections.cycle[detections.used], minlength=len(chain))
-    counter = LapCounter()
-    return tuple(
-        CycleRecord(
-            k, float(t), seconds / len(chain), left, right, int(used[k]), counter.update(state.poses[k])
-        )
-        for k, t in enumerate(chain.stamps)
+    used = np.bincount(detections.cycle[detections.used], minlength=len(chain)).tolist()
+    counter, share = LapCounter(), seconds / len(chain)
+    records = tuple(
+        CycleRecord(k, t, share, left, right, used[k], counter.update(state.poses[k]))
+        for k, t in enumerate(chain.stamps.tolist())
     )
-
-
-def _completed(poses: Array) -> int:
-    """Complete laps, one that ends just short of the line included."""
-    counter = LapCounter()
-    for pose in poses:
-        counter.update(pose)
-    return counter.completed
+    return records, counter.completed

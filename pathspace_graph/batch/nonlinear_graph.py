@@ -1,4 +1,4 @@
-"""The whole log's problem as GTSAM's own nonlinear factors."""
+"""The problem of a whole log as GTSAM's own nonlinear factors."""
 
 from __future__ import annotations
 
@@ -9,14 +9,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.gtsam_factors import (
-    pose_array,
-    rotation,
-    smoothness_factors,
-    spline_projection_factor,
-)
-from pathspace_graph.factors.projection import to_map
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_key
+from pathspace_graph.factors.gtsam_factors import pose_array, smoothness_factors, spline_projection_factors
+from pathspace_graph.factors.se2 import rotation, to_map
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_key, pose_keys
 from pathspace_graph.graph.odometry import odometry_factor
 from pathspace_graph.mapping.measurements import Chain
 from pathspace_graph.spline.boundary import Boundary
@@ -27,22 +22,22 @@ from .system import BatchSystem, Evaluation
 Array = NDArray[np.float64]
 
 ROOM = 4.0
-"""Stretch (m) of a curve on either side of a foot point where its factor looks for it."""
+"""A factor searches its foot points within this distance (m along the curve) of where they are."""
 HALVINGS = 6
-"""Most times that the stretch is halved while another foot point in it is nearer: a bend may turn about a
-reading."""
+"""The room is halved at most this number of times while another foot point in it is nearer. That happens
+where a bend turns about a detection."""
 SAME = 1e-3
-"""Foot points as near along the curve (m) are one."""
+"""Two foot points closer than this (m along the curve) are the same."""
 
 
 def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:
-    """Every factor of the problem, on the keys that `graph.keys` has.
+    """Returns every factor of the problem, on the keys of `graph.keys`.
 
-    What a round of the optimization holds is held here as it is at `at`: which readings are in use, and their
-    sigmas across the curve, divided by the root of their robust weights, so that the graph is one of plain
-    least squares; and what anchors each control point anchors it where it is. So at an optimum the gradient
-    is zero and the linearization is the optimization's own, but the error is not its robust cost, and beyond
-    some decimetres from there the weights would be others.
+    The graph holds what a round of the optimization holds, as it is at `at`: the associations, and the sigmas
+    across the curve, divided by the root of their robust weights. So it is a graph of plain least squares.
+    Each control point is anchored where it is. At an optimum the gradient is zero, and the linearization is
+    that of the optimization. But the error isn't its robust cost, and some decimetres away from the optimum
+    the weights would be others.
     """
     graph = gtsam.NonlinearFactorGraph()
     for factor in _odometry(system.chain):
@@ -56,23 +51,27 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
 
 
 def _odometry(chain: Chain) -> Iterator[gtsam.NonlinearFactor]:
-    """Between every two cycles."""
+    """Yields the odometry factor between every two neighbouring cycles."""
     for k, interval in enumerate(chain.odometry.intervals):
         yield odometry_factor(k, interval)
 
 
 def _priors(chain: Chain, heading: float) -> Iterator[gtsam.NonlinearFactor]:
-    """Of the first pose and of the calibration; GTSAM has the former in the frame of that pose."""
-    turn = np.eye(POSE)
-    turn[:2, :2] = rotation(heading)
-    noise = gtsam.noiseModel.Gaussian.Information(turn.T @ chain.first_information @ turn)
+    """Yields the priors of the first pose and of the calibration.
+
+    GTSAM's tangents of a pose are in its own frame, so the information is rotated by the heading (rad).
+    """
+    map_from_pose = np.eye(POSE)
+    map_from_pose[:2, :2] = rotation(heading)
+    information = map_from_pose.T @ chain.first_information @ map_from_pose
+    noise = gtsam.noiseModel.Gaussian.Information(information)
     yield gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(*chain.first), noise)
     sigmas = gtsam.noiseModel.Diagonal.Sigmas(chain.calibration_sigma)
     yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, np.zeros(2), sigmas)
 
 
 def _gauge(gauge: CurveGauge, control_points: Array) -> Iterator[gtsam.NonlinearFactor]:
-    """What holds the control points (m, 2) of a curve."""
+    """Yields the weak priors of a curve, which has control points (m, 2)."""
     keys = gauge.keys.tolist()
     anchor = gtsam.noiseModel.Isotropic.Sigma(2, gauge.sigma_anchor)
     for j, (key, point) in enumerate(zip(keys, control_points, strict=True)):
@@ -82,7 +81,7 @@ def _gauge(gauge: CurveGauge, control_points: Array) -> Iterator[gtsam.Nonlinear
 
 
 def beside_factor(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
-    """Control point j of a curve held beside its pose."""
+    """Returns the factor that holds control point j of a curve beside its pose."""
     only = slice(j, j + 1)
     one = replace(gauge, keys=gauge.keys[only], cycle=gauge.cycle[only], ahead=gauge.ahead[only])
     keys = [int(gauge.keys[j]), pose_key(gauge.cycle[j])]
@@ -98,34 +97,33 @@ def beside_factor(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), keys, error)
 
 
-def _projections(system: BatchSystem, at: Evaluation, label: int) -> Iterator[gtsam.NonlinearFactor]:
-    """A factor for each cycle of the readings in use on a boundary that have any weight.
+def _projections(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.CustomFactor]:
+    """Returns a factor for each cycle, of its used detections on a boundary that have any weight.
 
-    A reading that is as sure in every direction keeps its sigma however the curve turns.
+    The covariances are isotropic, so that a detection keeps its sigma when the curve's direction changes.
     """
-    p, boundary, keys = at.projected[label], at.state.boundaries[label], at.state.keys(label).tolist()
-    scale, detections = system.scale(p), system.detections
-    weighted, cycle = np.flatnonzero(scale > 0.0), detections.cycle[p.rows]
-    points = to_map(detections.point[p.rows], at.state.variables.poses_at(cycle))
-    room = _room(boundary, at.state.control_points(label), points, p.foot.u)
-    for one in np.split(weighted, np.flatnonzero(np.diff(cycle[weighted])) + 1):
-        if len(one) == 0:
-            continue
-        yield spline_projection_factor(
-            pose_key(cycle[one[0]]),
-            keys,
-            boundary.tables,
-            points_vehicle=detections.point[p.rows[one]],
-            covariances=scale[one, None, None] ** -2.0 * np.eye(2),
-            low=p.foot.u[one] - room[one],
-            high=p.foot.u[one] + room[one],
-            sigma_model=0.0,
-            huber=np.inf,
-        )
+    projected, boundary = at.projected[label], at.state.boundaries[label]
+    scale, detections = system.scale(projected), system.detections
+    weighted = scale > 0.0
+    scale, u, rows = scale[weighted], projected.foot.u[weighted], projected.rows[weighted]
+    cycles, points_vehicle = detections.cycle[rows], detections.point[rows]
+    points = to_map(points_vehicle, at.state.variables.poses_at(cycles))
+    room = _room(boundary, at.state.control_points(label), points, u)
+    return spline_projection_factors(
+        pose_keys(cycles),
+        at.state.keys(label).tolist(),
+        boundary.tables,
+        points_vehicle=points_vehicle,
+        covariances=scale[:, None, None] ** -2.0 * np.eye(2),
+        low=u - room,
+        high=u + room,
+        sigma_model=0.0,
+        huber=np.inf,
+    )
 
 
 def _room(boundary: Boundary, control_points: Array, points: Array, u: Array) -> Array:
-    """(m,) how far (m) to either side of u the foot point of each point (m, 2) is still the one at u."""
+    """Returns the room (m,) about u in which the nearest foot point of each point (m, 2) is that at u."""
     room = np.full(len(u), ROOM)
     for _ in range(HALVINGS):
         nearest = boundary.find(control_points, points, u - room, u + room).u

@@ -1,4 +1,4 @@
-"""The whole log's least-squares problem: its cost at a state, and its linear factors there."""
+"""The least-squares problem of a whole log: its cost at a state, and its linear factors there."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.projection import ProjectionRows, huber_loss, huber_weights, project, to_map
+from pathspace_graph.factors.projection import ProjectionRows, project
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.elimination import Elimination, linear_graph, map_held, owners
 from pathspace_graph.graph.keys import are_poses, pose_keys
 from pathspace_graph.graph.rows import Rows
@@ -26,46 +27,28 @@ IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Kernel:
-    """Robust loss of a whitened residual: Huber's, constant beyond a gate."""
+class Biweight:
+    """Tukey's robust loss `rho(z) = g^2 / 6 (1 - (1 - z^2 / g^2)^3)`, which is constant beyond the gate g.
 
-    gate: float
-    """Beyond it a reading isn't used, and its loss is that at the gate."""
-    huber: float
-    """Beyond it the loss grows linearly only."""
-
-    def loss(self, whitened: Array) -> Array:
-        """`rho(z)` (m,), Huber's alone: the gate is what decides which rows are used."""
-        return huber_loss(whitened, self.huber)
-
-    def weights(self, whitened: Array) -> Array:
-        """`rho'(z) / z` (m,)."""
-        return huber_weights(whitened, self.huber)
-
-    @property
-    def ceiling(self) -> float:
-        """Loss of a reading that isn't used."""
-        return float(self.loss(np.array([self.gate]))[0])
-
-
-@dataclass(frozen=True)
-class Biweight(Kernel):
-    """Tukey's `rho(z) = g^2 / 6 (1 - (1 - z^2 / g^2)^3)`, constant beyond the gate g.
-
-    A reading at the gate has no weight, so that one more or less of them moves nothing, as it would with
-    Huber's loss and a hard gate.
+    A detection at the gate has no weight. So nothing moves when one more or one less is used. With Huber's
+    loss and a hard gate it would.
     """
 
-    huber: float = np.inf
-    """Not used."""
+    gate: float
+    """This is the gate g in sigmas."""
 
     def loss(self, whitened: Array) -> Array:
-        """`rho(z)` (m,)."""
+        """Returns `rho(z)` (m,) of whitened residuals z (m,)."""
         return np.asarray(self.gate**2 / 6.0 * (1.0 - self._inner(whitened) ** 3))
 
     def weights(self, whitened: Array) -> Array:
-        """`(1 - z^2 / g^2)^2` (m,)."""
+        """Returns the robust weights `rho'(z) / z = (1 - z^2 / g^2)^2` (m,)."""
         return np.asarray(self._inner(whitened) ** 2)
+
+    @property
+    def ceiling(self) -> float:
+        """Returns the loss of a detection that isn't used, which is that at the gate."""
+        return float(self.loss(np.array([self.gate]))[0])
 
     def _inner(self, whitened: Array) -> Array:
         return np.maximum(1.0 - (whitened / self.gate) ** 2, 0.0)
@@ -73,63 +56,66 @@ class Biweight(Kernel):
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """The readings in use on one boundary, at a state."""
+    """Holds the detections that are used on one boundary, projected on its curve at a state."""
 
     rows: IntArray
-    """(m,) readings."""
+    """These are the rows (m,) of the detections in their table."""
     foot: FootPoints
-    """Their foot points."""
+    """These are their foot points."""
     projection: ProjectionRows
-    """Their residuals and derivatives."""
+    """These are their residuals and derivatives."""
     sigma: Array
-    """(m,) held for a round, m."""
+    """These are their standard deviations (m,) across the curve in m, which a round holds."""
 
     @property
     def whitened(self) -> Array:
-        """(m,) residuals in sigmas."""
+        """Returns the residuals (m,) in sigmas."""
         return np.asarray(self.projection.residual / self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The problem at one state."""
+    """Holds the problem at one state."""
 
     state: State
-    """Where."""
+    """This is the state."""
     projected: dict[int, Projected]
-    """Of each boundary."""
+    """These are the used detections of each boundary."""
     odometry: tuple[Array, Array]
-    """What `Chain.terms` gives."""
+    """These are the residuals and derivatives of `Chain.terms`."""
     cost: float
-    """Half the sum of squares, robust losses in place of the readings' own."""
+    """This is half the sum of squares, with the robust losses of the detections."""
 
 
 class BatchSystem:
-    """`min 1/2 |odometry|^2 + sum rho(readings) + 1/2 |spacing, smoothness, calibration, first pose|^2`."""
+    """Minimizes `1/2 |odometry|^2 + sum rho(detections) + 1/2 |gauge, calibration, first pose|^2`."""
 
     def __init__(
-        self, detections: DetectionTable, chain: Chain, settings: MapperSettings, kernel: Kernel
+        self, detections: DetectionTable, chain: Chain, settings: MapperSettings, kernel: Biweight
     ) -> None:
         self.detections = detections
         self.chain = chain
         self.settings = settings
         self.kernel = kernel
         self.gauges: dict[int, CurveGauge] = {}
-        """What holds each curve where readings don't."""
+        """These are the weak priors of each boundary."""
         self._sigma = np.ones(len(detections))
 
     def begin(self, state: State) -> None:
-        """The curves' own gauges, where control points are now: to be called when knots change."""
+        """Makes the gauges anew, which hold the control points where they are now.
+
+        The optimizer calls this when knots have changed.
+        """
         sigma = self.settings.batch.sigma_slide
         self.gauges = {label: curve_gauge(state, label, sigma) for label in state.boundaries}
 
     # --- cost --------------------------------------------------------------------------------------------
 
     def evaluate(self, state: State, hold: bool = False) -> Evaluation:
-        """Everything at a state; foot points are refined from where the readings have them.
+        """Returns the problem at a state; foot points are refined from those that the detections have.
 
-        `hold`: from now on each reading's sigma across its curve is what it is here. How it turns is in no
-        derivative.
+        `hold` sets the sigma of each detection across its curve, which later evaluations keep. No derivative
+        has that the sigma depends on the direction of the curve.
         """
         projected = {label: self._project(state, label, hold) for label in state.boundaries}
         odometry = self.chain.terms(state.poses, state.calibration)
@@ -160,7 +146,7 @@ class BatchSystem:
     # --- linear factors ----------------------------------------------------------------------------------
 
     def rows(self, at: Evaluation) -> list[Rows]:
-        """Every whitened row at a state: Gauss-Newton's, readings weighted as their loss has it."""
+        """Returns every whitened row of Gauss-Newton at a state; those of detections have robust weights."""
         state = at.state
         groups = self.chain.rows(at.odometry, state.poses[0], state.calibration)
         for label, gauge in self.gauges.items():
@@ -170,7 +156,7 @@ class BatchSystem:
         return groups
 
     def detection_rows(self, at: Evaluation, label: int) -> Rows:
-        """The readings in use on a boundary, on the control points of their span and their pose."""
+        """Returns the rows of the used detections on [control points of their span | pose]."""
         p, state = at.projected[label], at.state
         cycle, scale = self.detections.cycle[p.rows], self.scale(p)
         control = state.keys(label)[state.boundaries[label].columns(p.foot.span)]
@@ -183,27 +169,27 @@ class BatchSystem:
         )
 
     def scale(self, projected: Projected) -> Array:
-        """(m,) what a reading's row is multiplied by, 1/m: zero beside the ends of a curve."""
+        """Returns the factor (m,) that whitens and weights each row (1/m); it is zero at a curve's ends."""
         weights = self.kernel.weights(projected.whitened)
         return np.asarray(np.sqrt(weights) * projected.foot.interior / projected.sigma)
 
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
-        """All of it, whose solution is the change from the state."""
+        """Returns all rows as a linear graph, whose solution is the change from the state."""
         return linear_graph(self.rows(at), at.state.variables)
 
     def eliminated(self, at: Evaluation) -> Elimination:
-        """The same, with the poses eliminated."""
+        """Returns the linear problem with its poses eliminated."""
         return Elimination(self.linear_graph(at), at.state.variables.layout)
 
     def poses_alone(self, at: Evaluation) -> Array:
-        """(3 P,) the step of the poses beside a map and a calibration that are held."""
+        """Returns the step (3 P,) of the poses while the map and the calibration are held."""
         keys = at.state.variables.keys
         graph = linear_graph(map_held(self.rows(at)), at.state.variables)
         return Elimination(graph, Layout(keys[are_poses(keys)])).beside(np.zeros(0))
 
 
 def moved(state: State, step: Array) -> State:
-    """The state after a step (n,) of its last variables."""
-    following = state.copy()
-    following.variables.values[len(following.variables.values) - len(step) :] += step
-    return following
+    """Returns the state after a step (n,) of its last n entries: of all variables, or of the poses alone."""
+    after = state.copy()
+    after.variables.values[len(after.variables.values) - len(step) :] += step
+    return after

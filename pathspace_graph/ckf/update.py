@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pathspace_graph.factors.bspline import scatter
-from pathspace_graph.factors.projection import project, to_map
+from pathspace_graph.factors.projection import project
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN

@@ -10,15 +10,17 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.harness.workers import check_jobs
 from pathspace_graph.eval.study.file import find_study, read_study
 from pathspace_graph.eval.study.output import write_figures, write_tables
-from pathspace_graph.eval.study.progress import study_progress
 from pathspace_graph.eval.study.run import make_plan, run_plan
 from pathspace_graph.eval.study.study import Study
-from pathspace_graph.eval.study.workers import check_jobs
+from pathspace_graph.progress import progress
 
 CELLS_FAILED: Final = 3
 """Exit code of a study that is written, but some of whose cells failed."""
+LINES: Final = 20
+"""A whole study writes about this many lines of progress where there is no terminal."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +49,8 @@ class Ablate:
         check_jobs(self.jobs)
         study = self._study()
         plan = make_plan(study)
-        with study_progress() as told:
-            frame = run_plan(plan, self.out, self.jobs, self.cluster, self.retry_failed, told)
+        with progress("cells", lines=LINES) as advance:
+            frame = run_plan(plan, self.out, self.jobs, self.cluster, self.retry_failed, advance)
         summary = write_tables(study, frame, self.out)
         write_figures(study, frame, self.out)
         say = Console(soft_wrap=True, highlight=False, markup=False)

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Final
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from pathspace_graph.batch.mapper import BatchMapper, BatchResult, Start
+from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.estimators import DEFAULT_BATCH, check_batch, check_settings, make_batch
+from pathspace_graph.estimators import DEFAULT_BATCH, check_batch, make_batch
 from pathspace_graph.eval.metrics.gap import gap
 from pathspace_graph.eval.metrics.summary import summarize
 from pathspace_graph.io.files import check_target
@@ -19,6 +19,7 @@ from pathspace_graph.io.log import Log, read_log
 from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.results import BatchRun, write_result
 from pathspace_graph.progress import progress
+from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .online import report
@@ -37,17 +38,16 @@ class Batch:
     """Map folder to write; an earlier map there is kept as a numbered backup."""
     estimator: str = DEFAULT_BATCH
     """Name of the batch estimator."""
-    start: Start = "online"
-    """Begin at an online run's map, or at odometry alone."""
+    start: Start | None = None
+    """The optimization begins at an online map, or at odometry alone; by default `batch.start` decides."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
     """The mapper."""
 
     def run(self) -> None:
         """Read, optimize, write, and say what came out; exit code 3 where it did not converge."""
         check_batch(self.estimator)
-        if self.start != "online" and self.estimator != DEFAULT_BATCH:
+        if self.start == "odometry" and self.estimator != DEFAULT_BATCH:
             raise SettingsError(f"--start: expected online for {self.estimator}, found {self.start}")
-        check_settings(self.settings)
         check_target(self.out, MAP_FILE)
         log = read_log(self.log)
         with progress("optimizing") as advance:
@@ -56,7 +56,7 @@ class Batch:
                 result: BatchRun = estimator.solve(log, self.start, advance)
             else:
                 result = estimator.solve(log)
-        write_result(self.out, result, summarize_batch(result, log, self.start))
+        write_result(self.out, result, summarize_batch(result, log, self.start or self.settings.batch.start))
         report(result, log)
         Console().print(f"written to {self.out}", highlight=False, soft_wrap=True, markup=False)
         if not result.converged:

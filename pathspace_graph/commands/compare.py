@@ -9,12 +9,11 @@ from typing import Annotated, Final
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from pathspace_graph.estimators import check_settings
 from pathspace_graph.eval.compare.comparison import Comparison, choose, choose_reference, compare, read_logs
 from pathspace_graph.eval.compare.gap import with_gaps
 from pathspace_graph.eval.compare.output import MARKER, tables, write_comparison
+from pathspace_graph.eval.harness.workers import check_jobs
 from pathspace_graph.eval.metrics.ghosts import GhostSettings
-from pathspace_graph.eval.study.workers import check_jobs
 from pathspace_graph.io.files import check_target
 from pathspace_graph.progress import progress
 from pathspace_graph.settings.mapper import MapperSettings
@@ -54,7 +53,6 @@ class Compare:
         estimators = choose(self.estimators)
         reference = choose_reference(self.reference, estimators)
         check_jobs(self.jobs)
-        check_settings(self.settings)
         check_target(self.out, MARKER)
         logs = read_logs(self.log)
         with progress("comparing", len(logs) * len(estimators)) as advance:

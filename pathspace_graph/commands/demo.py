@@ -11,9 +11,10 @@ from joblib import Parallel, delayed, parallel_config
 from rich.console import Console
 
 from pathspace_graph.estimators import DEFAULT
-from pathspace_graph.eval.compare.comparison import run_estimator
 from pathspace_graph.eval.compare.table import side_by_side
-from pathspace_graph.eval.figures.map_plot import PlotStyle, plot_map, save_plot
+from pathspace_graph.eval.figures.files import save_plot
+from pathspace_graph.eval.figures.map_plot import plot_map
+from pathspace_graph.eval.harness.attempts import run_estimator
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.io.files import atomic_folder, check_target
 from pathspace_graph.io.log import Log, write_log
@@ -28,8 +29,8 @@ from .simulate import describe, generated_track
 RIVAL: Final = "landmark-fixed-lag"
 """The estimator whose table stands beside ours."""
 PICTURE: Final = "track.png"
-PICTURE_STYLE: Final = PlotStyle(dpi=150.0)
-"""Of a size that suits a web page."""
+PICTURE_DPI: Final = 150.0
+"""The picture has this resolution (dots per inch), which suits a web page."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,5 +78,5 @@ def write_demo(out: Path, log: Log, result: RunResult) -> None:
     with progress("writing"), atomic_folder(out, PICTURE) as folder:
         write_log(log, folder / "log")
         write_result(folder / "map", result, summarize(result, log))
-        picture = plot_map(result.map, log=log, trajectory=result.trajectory, style=PICTURE_STYLE)
-        save_plot(picture, folder / PICTURE, style=PICTURE_STYLE)
+        picture = plot_map(result.map, log=log, trajectory=result.trajectory)
+        save_plot(picture, folder / PICTURE, PICTURE_DPI)

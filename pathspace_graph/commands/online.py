@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from pathspace_graph.estimators import DEFAULT, check_online, check_settings, make_online
+from pathspace_graph.estimators import DEFAULT, check_online, make_online
 from pathspace_graph.eval.metrics.summary import lap_times, laps_of, not_mapped, summarize
 from pathspace_graph.eval.metrics.table1 import LapMetrics
 from pathspace_graph.io.files import check_target
@@ -39,7 +39,6 @@ class Online:
     def run(self) -> None:
         """Read, map, write, and say what came out."""
         check_online(self.estimator)
-        check_settings(self.settings)
         check_target(self.out, MAP_FILE)
         log = read_log(self.log)
         result = map_online(log, self.settings, self.estimator)

@@ -115,7 +115,7 @@ def jacobian_factor(keys: IntArray, A: Array, b: Array) -> gtsam.GaussianConditi
     return linear_factor(keys.tolist(), sizes(keys).tolist(), A, b)
 
 
-def rooted(information: Array, vector: Array) -> tuple[Array, Array]:
+def square_root_form(information: Array, vector: Array) -> tuple[Array, Array]:
     """`A` (r, n) and `b` (r,) with `A'A = L` and `A'b = g`: as many rows as L (n, n), which may be singular,
     has rank.
 
@@ -132,7 +132,7 @@ def rooted(information: Array, vector: Array) -> tuple[Array, Array]:
     return root * scale, np.asarray(right)
 
 
-def combined(graph: gtsam.GaussianFactorGraph) -> gtsam.HessianFactor:
+def as_hessian_factor(graph: gtsam.GaussianFactorGraph) -> gtsam.HessianFactor:
     """All factors of a graph as one, on all of their keys."""
     return gtsam.HessianFactor(graph)
 
@@ -150,7 +150,7 @@ def eliminate(
     leaving, factors = frozenset(keys.tolist()), factors_of(graph)
     holding = [factor for factor in factors if not leaving.isdisjoint(factor.keys())]
     others = [factor for factor in factors if leaving.isdisjoint(factor.keys())]
-    dense = graph_of(combined(graph_of(*holding)))  # one factor, hence one clique
+    dense = graph_of(as_hessian_factor(graph_of(*holding)))  # one factor, hence one clique
     tree, remaining = dense.eliminatePartialMultifrontal(gtsam.Ordering(keys.tolist()))
     return tree.roots()[0].conditional(), graph_of(*others, remaining)
 
@@ -167,7 +167,9 @@ def marginalize(graph: gtsam.GaussianFactorGraph, keys: IntArray) -> gtsam.Gauss
     return remaining
 
 
-def forget(graph: gtsam.GaussianFactorGraph, layout: Layout, values: Array) -> gtsam.GaussianFactorGraph:
+def remove_information(
+    graph: gtsam.GaussianFactorGraph, layout: Layout, values: Array
+) -> gtsam.GaussianFactorGraph:
     """A graph that knows nothing of a layout's keys any more, and of the others no less than before.
 
     It may know a part of them only: a negligible information about `values` (n,) of d makes them regular.
@@ -177,7 +179,7 @@ def forget(graph: gtsam.GaussianFactorGraph, layout: Layout, values: Array) -> g
     return eliminate(graph_of(graph, weak), layout.keys)[1]
 
 
-def merged(
+def merge_variables(
     graph: gtsam.GaussianFactorGraph, gone: IntArray, kept: IntArray, offset: Array
 ) -> gtsam.GaussianFactorGraph:
     """A graph where `d_gone = d_kept + offset`: keys `gone` (k,) of it have become `kept` (k,), offset (n,).
@@ -192,8 +194,8 @@ def merged(
     E[np.arange(old.size), new.entries(becomes)] = 1.0
     e[old.entries(gone[places >= 0])] = offset[np.repeat(places >= 0, sizes(gone))]
     information, vector = normal_equations(graph, old)
-    root, right = rooted(E.T @ information @ E, E.T @ (vector - information @ e))
-    return graph_of(combined(graph_of(jacobian_factor(new.keys, root, right))))
+    root, right = square_root_form(E.T @ information @ E, E.T @ (vector - information @ e))
+    return graph_of(as_hessian_factor(graph_of(jacobian_factor(new.keys, root, right))))
 
 
 def conditioned(

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .gaussian import combined, eliminate, graph_of, keys_of
+from .gaussian import as_hessian_factor, eliminate, graph_of, keys_of
 from .keys import are_poses
 from .variables import Variables, spread
 
@@ -92,5 +92,5 @@ class InactiveMap:
         if len(self) == 0:
             return prior
         negative = [factor.negate() for factor in self._shared]
-        whole = graph_of(combined(graph_of(prior, self.net, *negative)))
+        whole = graph_of(as_hessian_factor(graph_of(prior, self.net, *negative)))
         return eliminate(whole, self._gone)[1] if len(self._gone) else whole

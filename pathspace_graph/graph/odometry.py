@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, odometry_residuals
+from pathspace_graph.factors.se2 import compose
 
 from .keys import CALIBRATION_KEY, POSE, pose_key, pose_keys
 from .rows import Rows
@@ -93,10 +94,8 @@ def odometry_factor(cycle: int, interval: IntegratedOdometry) -> gtsam.CustomFac
 
 
 def calibrated_delta(odometry: IntegratedOdometry, calibration: Array) -> Array:
-    """(3,) the relative pose of an interval, less what the calibration says is wrong with it."""
-    error = odometry.calibration_jacobian @ calibration
-    c, s = np.cos(odometry.delta[2]), np.sin(odometry.delta[2])
-    return np.asarray(odometry.delta - [c * error[0] - s * error[1], s * error[0] + c * error[1], error[2]])
+    """Returns `delta * (-G b)` (3,), the relative pose of an interval corrected by the calibration b (2,)."""
+    return compose(odometry.delta, -odometry.calibration_jacobian @ calibration)
 
 
 def through_odometry(by_pose: Array, poses: Array, odometry: OdometryChain) -> tuple[Array, Array, Array]:

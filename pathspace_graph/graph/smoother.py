@@ -16,20 +16,21 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import IntegratedOdometry, compose
+from pathspace_graph.factors.odometry import IntegratedOdometry
+from pathspace_graph.factors.se2 import compose
 
 from .gaussian import (
     cholesky,
     covariance,
     covariance_of,
     eliminate,
-    forget,
     graph_of,
     half_solve,
     jacobian_factor,
     marginalize,
-    merged,
+    merge_variables,
     normal_equations,
+    remove_information,
     solve,
 )
 from .inactive import InactiveMap
@@ -128,7 +129,7 @@ class FixedLagSmoother(Generic[M_co]):
         self.variables.insert(key, np.zeros(POINT))
         self.prior.push_back(jacobian_factor(key, np.diag(1.0 / sigma), np.zeros(POINT)))
 
-    def drive(
+    def predict(
         self, t: float, odometry: IntegratedOdometry, sigmas_start: tuple[float, float, float]
     ) -> Array:
         """The pose (3,) at t (s), predicted by the calibrated odometry since the newest one; and gives it.
@@ -138,13 +139,13 @@ class FixedLagSmoother(Generic[M_co]):
         delta = calibrated_delta(odometry, self.variables.calibration)
         if self.times:
             pose = compose(self.variables.poses[-1], delta)
-            self.follow(t, pose, odometry)
+            self.add_pose(t, pose, odometry)
         else:
             pose = compose(np.zeros(POSE), delta)
-            self.begin(t, pose, odometry.covariance + np.diag(sigmas_start) ** 2)
+            self.add_first_pose(t, pose, odometry.covariance + np.diag(sigmas_start) ** 2)
         return pose
 
-    def begin(self, t: float, pose: Array, sigma: Array) -> None:
+    def add_first_pose(self, t: float, pose: Array, sigma: Array) -> None:
         """The first pose (3,), with its covariance (3, 3) in the map frame."""
         key = pose_keys(np.array([self.next_cycle]))
         self.variables.insert(key, pose)
@@ -153,7 +154,7 @@ class FixedLagSmoother(Generic[M_co]):
         self.prior.push_back(jacobian_factor(key, root, np.zeros(POSE)))
         self.submaps = Submaps(graph_of(self.prior), self.settings.keyframe_interval)
 
-    def follow(self, t: float, pose: Array, odometry: IntegratedOdometry) -> None:
+    def add_pose(self, t: float, pose: Array, odometry: IntegratedOdometry) -> None:
         """The next pose (3,), and how it was reached."""
         self.window.of_cycle.pop(self.next_cycle - 1, None)
         self.variables.insert(pose_keys(np.array([self.next_cycle])), pose)
@@ -183,14 +184,14 @@ class FixedLagSmoother(Generic[M_co]):
             return self.first_cycle <= cycle <= self.next_cycle
         return bool(self.variables.layout.positions(np.array(key)) >= 0)
 
-    def forget(self, keys: IntArray) -> None:
+    def remove_information(self, keys: IntArray) -> None:
         """Removes all prior information about map points."""
         self.reactivate()
         self.epoch += 1
         now = self.variables.change(self.variables.layout.entries(keys))
-        self.prior = forget(self.prior, Layout(keys), now)
+        self.prior = remove_information(self.prior, Layout(keys), now)
         if self.submaps is not None:
-            self.submaps.forget(keys, self.variables)
+            self.submaps.remove_information(keys, self.variables)
 
     # --- the graph ---------------------------------------------------------------------------------------
 
@@ -370,7 +371,7 @@ class FixedLagSmoother(Generic[M_co]):
         held, layout = self.user_factors.leave(gone, self.variables), self.variables.layout
         reference = self.variables.reference
         offset = reference[layout.entries(kept)] - reference[layout.entries(gone)]
-        self.prior = merged(graph_of(self.prior, *held), gone, kept, offset)
+        self.prior = merge_variables(graph_of(self.prior, *held), gone, kept, offset)
         self.variables.remove(gone)
         self.window.clear()
 
@@ -392,7 +393,7 @@ class FixedLagSmoother(Generic[M_co]):
         layout = self.variables.layout if whole else self.layout
         return covariance(self.linear_graph(whole), layout, keys)
 
-    def predicted(self, rows: Rows, together: int = 1) -> Array:
+    def predicted_covariance(self, rows: Rows, together: int = 1) -> Array:
         """`J Sigma J'` (m / k, k, k) of each k rows that stand together, the pose first among their keys.
 
         Sigma is that of the last step. The newest pose was not part of it: it is reached through its

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from .gaussian import (
     conditioned,
-    forget,
     graph_of,
     jacobian_factor,
     keys_of,
     marginalize,
     normal_equations,
-    rooted,
+    remove_information,
+    square_root_form,
 )
 from .keys import CALIBRATION_KEY, POSE
 from .variables import Layout, Variables
@@ -67,8 +67,8 @@ class Submap:
             return self
         kept, leaving = Layout(np.setdiff1d(self.keys.keys, gone)), Layout(gone)
         graph = graph_of(jacobian_factor(self.keys.keys, self.root, self.right))
-        graph = forget(graph, leaving, np.zeros(leaving.size))
-        root, right = rooted(*normal_equations(graph, kept))
+        graph = remove_information(graph, leaving, np.zeros(leaving.size))
+        root, right = square_root_form(*normal_equations(graph, kept))
         return Submap(self.keyframe, kept, root, right, self.local[self.keys.entries(kept.keys)])
 
 
@@ -143,7 +143,7 @@ class Submaps:
             self.finished.append(self._finish(variables))
             self._graph = None
 
-    def forget(self, keys: IntArray, variables: Variables) -> None:
+    def remove_information(self, keys: IntArray, variables: Variables) -> None:
         """Know nothing of some map points any more."""
         self.cut(variables)
         self.finished = [submap.without(keys) for submap in self.finished]
@@ -171,6 +171,6 @@ class Submaps:
         kept, own = Layout(known), keys.entries(known)
         entries = variables.layout.entries(known)
         vector = vector[own] - information[np.ix_(own, own)] @ variables.change(entries)
-        root, right = rooted(information[np.ix_(own, own)], vector)
+        root, right = square_root_form(information[np.ix_(own, own)], vector)
         local = _local(variables.values[entries], frame, kept)
         return Submap(self._keyframe, kept, root @ _turn(kept, frame), right, local)

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.gtsam_factors import rotation
+from pathspace_graph.factors.se2 import rotation
 
-from .gaussian import graph_of, jacobian_factor, normal_equations, rooted
+from .gaussian import graph_of, jacobian_factor, normal_equations, square_root_form
 from .keys import POINT, POSE, are_poses, name, sizes
 from .variables import Layout, Variables
 
@@ -121,7 +121,7 @@ def as_nonlinear(factor: gtsam.GaussianFactor, variables: Variables) -> gtsam.Li
     information, vector = normal_equations(graph_of(factor), layout)
     turn = _turn(layout.keys, variables)
     negative_gradient = vector - information @ variables.change(variables.layout.entries(layout.keys))
-    root, right = rooted(turn.T @ information @ turn, turn.T @ negative_gradient)
+    root, right = square_root_form(turn.T @ information @ turn, turn.T @ negative_gradient)
     linear = jacobian_factor(layout.keys, root, right)
     return gtsam.LinearContainerFactor(gtsam.JacobianFactor(linear), variables.gtsam_values(layout.keys))
 

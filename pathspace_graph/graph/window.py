@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .gaussian import combined, graph_of
+from .gaussian import as_hessian_factor, graph_of
 from .keys import CALIBRATION_LETTER, POSE, POSE_LETTER
 from .odometry import OdometryChain
 from .rows import LinearFactor, Rows, jacobian_factors, one_factor
@@ -163,7 +163,7 @@ class WindowFactors(Generic[M_co]):
             self.gauge, self._structure = {}, structure
             linear = jacobian_factors(self.map.linear_gauge(False), self.variables)
             rows = graph_of(*(factor.linear for factor in linear.values()))
-            self._linear_gauge = graph_of(combined(rows)) if linear else rows
+            self._linear_gauge = graph_of(as_hessian_factor(rows)) if linear else rows
         kept = [owner for owner, factor in self.gauge.items() if gone.isdisjoint(factor.keys)]
         if len(kept) == len(self.gauge) > 0:
             return

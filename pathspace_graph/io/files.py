@@ -53,6 +53,25 @@ def atomic_file(path: Path | str) -> Iterator[Path]:
         raise
 
 
+@contextmanager
+def replacing(file: Path) -> Iterator[Path]:
+    """Yields a temporary path beside `file` that takes its place on success; no backup is kept."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    temporary = _temporary_sibling(file)
+    try:
+        yield temporary
+        temporary.replace(file)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def write_text(file: Path, text: str) -> None:
+    """Writes text in UTF-8, whole or not at all; an earlier file is replaced."""
+    with replacing(file) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
 def check_target(target: Path | str, marker: str) -> None:
     """Raise an OutputError where `atomic_folder` couldn't write `target` without losing something foreign."""
     target = Path(target).absolute()

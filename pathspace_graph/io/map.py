@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,8 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.spline.bspline import BSpline
+
+from .json_file import read_json
 
 Array = NDArray[np.float64]
 
@@ -211,12 +212,4 @@ def _is_covariance(P: Array) -> bool:
 def read_map(folder: Path | str) -> Map:
     """The map of a folder that follows FORMATS, as `write_result`'s do; InputError where it doesn't."""
     file = Path(folder) / MAP_FILE
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(file, f"expected a map, can't be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputError(file, "expected text in UTF-8") from None
-    except json.JSONDecodeError as error:
-        raise InputError(file, f"expected JSON ({error.msg})", row=error.lineno) from None
-    return map_from_json(content, file)
+    return map_from_json(read_json(file, "a map"), file)

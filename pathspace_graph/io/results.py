@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .files import atomic_folder
+from .json_file import write_json
 from .map import MAP_FILE, Map, map_to_json
 
 _CYCLE_COLUMNS = ("cycle", "t", "seconds", "size_left", "size_right", "readings", "lap")
@@ -24,10 +24,10 @@ def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, An
     An earlier result in `folder` is kept as a numbered backup; OutputError where anything else stands there.
     """
     with atomic_folder(Path(folder), marker=MAP_FILE) as temporary:
-        _write_json(temporary / MAP_FILE, map_to_json(result.map))
+        write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
         write_trajectory(temporary / "trajectory.tum", result.trajectory_t, result.trajectory)
         _write_cycles(temporary / "cycles.csv", result.cycles)
-        _write_json(temporary / "summary.json", dict(summary), indent=2)
+        write_json(temporary / "summary.json", summary)
 
 
 def write_trajectory(file: Path, t: ArrayLike, poses: ArrayLike) -> None:
@@ -49,26 +49,6 @@ def _write_cycles(file: Path, cycles: Iterable[CycleRecord]) -> None:
 def _cycle_row(record: CycleRecord) -> list[float | int]:
     values = (getattr(record, column) for column in _CYCLE_COLUMNS)
     return [value.item() if isinstance(value, np.generic) else value for value in values]
-
-
-def _write_json(file: Path, content: Mapping[str, Any], indent: int | None = None) -> None:
-    text = json.dumps(_plain(content), indent=indent, allow_nan=False)
-    file.write_text(text + "\n", encoding="utf-8")
-
-
-def _plain(value: Any) -> Any:
-    """Plain Python types for JSON, which knows neither arrays nor NaN (written as null)."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    if isinstance(value, Path):
-        return str(value)
-    return value
 
 
 Array = NDArray[np.float64]

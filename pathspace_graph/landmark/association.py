@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from pathspace_graph.factors.landmark import landmark_residuals
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.keys import POINT
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.settings.comparison import LandmarkSettings
@@ -166,7 +166,7 @@ def predict(smoother: LandmarkSmoother, landmarks: IntArray) -> Prediction:
         return Prediction(landmarks, expected.residual, np.zeros((k, POINT, POINT)))
     jacobian = np.concatenate([expected.by_pose, expected.by_landmark], axis=2)
     rows = two_rows(np.full(k, smoother.next_cycle - 1), state.numbers[landmarks], jacobian, zero)
-    return Prediction(landmarks, expected.residual, smoother.predicted(rows, together=POINT))
+    return Prediction(landmarks, expected.residual, smoother.predicted_covariance(rows, together=POINT))
 
 
 # --- new landmarks ---------------------------------------------------------------------------------------

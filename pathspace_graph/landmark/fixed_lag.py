@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
@@ -15,9 +15,8 @@ from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import smoother_settings
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks
-from pathspace_graph.run import CycleResult
+from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
-from pathspace_graph.stopwatch import Stopwatch
 
 from .association import associate_created, associate_newest
 from .closing import detect_loop, optimize_loop
@@ -57,7 +56,7 @@ class LandmarkFixedLag:
         """Processes one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
         motion = integrate_odometry(odometry, detections.t, self.odometry_sigma)
-        self.path.update(self.smoother.drive(detections.t, motion, self.settings.odometry.sigmas_start))
+        self.path.update(self.smoother.predict(detections.t, motion, self.settings.odometry.sigmas_start))
         watch.lap("predict")
         new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
         associate_newest(self.smoother, new, self._eligible())

@@ -7,8 +7,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.landmark import landmark_residuals, whiteners
-from pathspace_graph.factors.projection import huber_weights
+from pathspace_graph.factors.landmark import landmark_residuals
+from pathspace_graph.factors.noise import huber_weights, whiteners
 from pathspace_graph.graph.keys import POINT, POSE, landmark_keys, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother

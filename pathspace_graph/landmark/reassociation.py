@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from pathspace_graph.factors.landmark import landmark_residuals
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.elimination import Elimination
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES

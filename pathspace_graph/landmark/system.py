@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.projection import huber_loss
+from pathspace_graph.factors.noise import huber_loss
 from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
 from pathspace_graph.graph.keys import CALIBRATION_KEY, indices, pose_keys
 from pathspace_graph.graph.rows import Rows

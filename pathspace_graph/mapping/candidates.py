@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.settings.mapper import GrowthSettings
 

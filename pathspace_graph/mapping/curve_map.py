@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.gauge import pair_residuals
-from pathspace_graph.factors.projection import huber_weights, project, project_to_point, to_map
+from pathspace_graph.factors.noise import huber_weights
+from pathspace_graph.factors.projection import offset_from_foot_point, project
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.keys import CONTROL_LETTERS, POSE, control_keys, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
@@ -176,7 +178,7 @@ def _to_point(
     points: Array, covariances: Array, poses: Array, foot: FootPoints, settings: MapperSettings
 ) -> tuple[Array, Array]:
     """The same (2 m, ...) and (2 m,) of the offsets from the foot points, a reading's two rows together."""
-    projected = project_to_point(points, covariances, poses, foot, settings.spline.sigma_model)
+    projected = offset_from_foot_point(points, covariances, poses, foot, settings.spline.sigma_model)
     size = np.hypot(projected.residual[:, 0], projected.residual[:, 1])
     weight = np.repeat(np.sqrt(huber_weights(size, settings.gate.huber)) * foot.interior, 2)
     by_control = projected.by_control.reshape(len(weight), 2 * foot.basis.shape[1])

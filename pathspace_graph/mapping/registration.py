@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import wrap_angle
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map, wrap_angle
 from pathspace_graph.settings.mapper import ClosingSettings
 
 from .curve_map import CurveMap

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.projection import ProjectionRows, project, sigma_across, to_map
+from pathspace_graph.factors.projection import ProjectionRows, project, sigma_across
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.labels import UNKNOWN
@@ -126,4 +127,4 @@ def joint_variance(
     keys = np.concatenate([pose_keys(cycles)[:, None], smoother.map.state.curves.keys[foot.columns]], axis=1)
     by_control = projected.by_control.reshape(len(cycles), -1)
     jacobian = np.concatenate([projected.by_pose, by_control], axis=1)
-    return smoother.predicted(Rows(keys, jacobian, projected.residual, cycles))[:, 0, 0]
+    return smoother.predicted_covariance(Rows(keys, jacobian, projected.residual, cycles))[:, 0, 0]

@@ -21,10 +21,9 @@ from pathspace_graph.mapping.measurements import integrate_odometry
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import smoother_settings
 from pathspace_graph.mapping.registration import near_start, register
-from pathspace_graph.run import CycleResult
+from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 from pathspace_graph.spline.boundary import Boundary
-from pathspace_graph.stopwatch import Stopwatch
 
 from .activation import narrow
 from .association import associate
@@ -121,7 +120,7 @@ class FixedLagMapper:
     def _predict(self, odometry: Odometry, t: float) -> None:
         """The newest pose, by the calibrated odometry; and how the way goes on from there."""
         integrated = integrate_odometry(odometry, t, self.odometry_sigma)
-        self.path.update(self.smoother.drive(t, integrated, self.settings.odometry.sigmas_start))
+        self.path.update(self.smoother.predict(t, integrated, self.settings.odometry.sigmas_start))
         if self.solver is not None:
             self.smoother.submaps = None  # nothing of another solver is relinearized when the loop closes
         self.path.steer(odometry.twist)

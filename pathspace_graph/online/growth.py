@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.candidates import SIDES, Candidates, End, chain, undisputed
 from pathspace_graph.mapping.curve_map import CurveSmoother
@@ -119,7 +119,7 @@ class Growth:
         boundary, detections = smoother.map.state.boundaries[label], smoother.map.detections
         self.tentative[label].restore(np.array(boundary.observed[kept:]), smoother.times[-1])
         boundary.take_back(kept)
-        smoother.forget(smoother.map.state.keys(label)[boundary.settled(boundary.size) :])
+        smoother.remove_information(smoother.map.state.keys(label)[boundary.settled(boundary.size) :])
         rows = detections.used_on(label)
         detections.release(rows[detections.u[rows] > boundary.trusted])
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.gtsam_factors import (
     smoothness_factors,
     spacing_factors,
-    spline_projection_factor,
+    spline_projection_factors,
 )
 from pathspace_graph.graph.gaussian import factors_of
-from pathspace_graph.graph.keys import control_keys, pose_key
+from pathspace_graph.graph.keys import control_keys, pose_keys
 from pathspace_graph.graph.odometry import odometry_factor
 from pathspace_graph.graph.user_factors import as_nonlinear
 from pathspace_graph.mapping.curve_map import CurveSmoother
@@ -67,27 +67,18 @@ def detection_factors(
 
     `room`: how far before and past its parameter (m,), (m,) each foot point may be.
     """
-    keys, u, cycles = (
+    u = detections.u[rows]
+    return spline_projection_factors(
+        pose_keys(detections.cycle[rows]),
         control_keys(label, boundary.numbers).tolist(),
-        detections.u[rows],
-        detections.cycle[rows],
+        boundary.tables,
+        points_vehicle=detections.point[rows],
+        covariances=detections.covariance[rows],
+        low=u - room[0],
+        high=boundary.believed(u + room[1]),
+        sigma_model=settings.spline.sigma_model,
+        huber=settings.gate.huber,
     )
-    low, high = u - room[0], boundary.believed(u + room[1])
-    return [
-        spline_projection_factor(
-            pose_key(cycle),
-            keys,
-            boundary.tables,
-            points_vehicle=detections.point[rows[own]],
-            covariances=detections.covariance[rows[own]],
-            low=low[own],
-            high=high[own],
-            sigma_model=settings.spline.sigma_model,
-            huber=settings.gate.huber,
-        )
-        for cycle in np.unique(cycles).tolist()
-        for own in [cycles == cycle]
-    ]
 
 
 def _room(boundary: Boundary, active: IntArray, u: Array, room: float) -> tuple[Array, Array]:

@@ -2,63 +2,185 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 from .checked import Positive
+
+Start = Literal["online", "odometry"]
+
+
+@dataclass(frozen=True)
+class RecurrenceSettings(Positive, group="batch.recurrence"):
+    """How a start from odometry finds the length of a lap."""
+
+    profile_step: float = 0.5
+    """The curvature of the path driven is sampled at this step (m)."""
+    smoothing: float = 3.0
+    """The curvature is averaged over this length (m)."""
+    correlation_share: float = 0.8
+    """The shortest lag whose correlation reaches this share of the best one's is about a lap."""
+    min_overlap: float = 5.0
+    """The path must go on for this length (m) after a lap, or the lap isn't found."""
+
+
+@dataclass(frozen=True)
+class LapCorrespondenceSettings(Positive, group="batch.laps"):
+    """How a start from odometry makes every lap pass the same places."""
+
+    reference_step: float = 8.0
+    """The reference poses that every lap passes are this distance (m) apart."""
+    sigma_position: float = 1.5
+    """The position at which a lap passes a reference pose scatters by this (m, one sigma): laps differ."""
+    sigma_heading: float = 0.15
+    """The heading with which a lap passes a reference pose scatters by this (rad, one sigma)."""
+    max_steps: int = 8
+    """At most this number of Gauss-Newton steps brings the laps together."""
+    tolerance: float = 1e-6
+    """The steps end with the first one that moves nothing farther than this (m, rad)."""
+
+    @property
+    def sigmas(self) -> tuple[float, float, float]:
+        """Returns the standard deviations (m, m, rad) of a pose about its reference pose."""
+        return self.sigma_position, self.sigma_position, self.sigma_heading
+
+
+@dataclass(frozen=True)
+class ConeSettings(Positive, group="batch.cones"):
+    """How the detections along a curve are clustered to cones."""
+
+    density_step: float = 0.1
+    """The density of the detections along a curve is sampled at this step (m)."""
+    separation: float = 0.6
+    """Two cones are at least this share of `growth.merge_radius` apart along a curve. It is less than 1, as
+    the inner curve of a bend is shorter than the distances of its cones add up to."""
+    bandwidth: float = 0.4
+    """The density is smoothed with a Gaussian whose standard deviation is this share of that distance."""
+    min_share: float = 0.1
+    """A cluster with fewer detections than this share of the median cluster's is no cone."""
+    min_share_beside: float = 0.3
+    """A cluster beside a curve, whose detections aren't used, is no cone below this share."""
+    min_count: int = 4
+    """A curve is fitted to no fewer cones than this, and no cone is removed where there are fewer."""
+    fold_cosine: float = 0.5
+    """The row of cones folds back at a cone where the cosine of its turn is below the negative of this."""
+    fold_distance: float = 1.5
+    """A cone where the row folds back is a duplicate if its nearer neighbour is closer than this (m)."""
+
+
+@dataclass(frozen=True)
+class AssociationSettings(Positive, group="batch.association"):
+    """How poses and detections are placed along the curves."""
+
+    step: float = 1.0
+    """Nearest points of a curve are first searched for at this step (m along the curve)."""
+    direction_penalty: float = 100.0
+    """A stretch of curve that runs against a pose's heading counts as this much farther away (m)."""
+
+
+@dataclass(frozen=True)
+class FootPointSettings(Positive, group="batch.foot_points"):
+    """How foot points are computed: more exactly than online, as an optimum needs it."""
+
+    refine_room: float = 8.0
+    """A foot point is followed this far (m along the curve) in a step, instead of `spline.refine_room`."""
+    refine_iterations: int = 2
+    """A step takes this number of Newton steps at a foot point, instead of `spline.refine_iterations`."""
+    search_iterations: int = 4
+    """A global search takes this number of Newton steps, instead of `spline.search_iterations`."""
+
+
+@dataclass(frozen=True)
+class ScatterSettings(Positive, group="batch.scatter"):
+    """How the distance of cones from the map's curves is measured."""
+
+    folds: int = 4
+    """The cross-validation deals the cones in turn into this number of groups, and leaves out one group at a
+    time. So the neighbours of a cone that is left out are always there."""
+    foot_room: float = 1.5
+    """The foot point of a cone is searched within this distance (m along the curve) of its own place."""
 
 
 @dataclass(frozen=True)
 class BatchSettings(Positive):
-    """The batch optimization over a whole log."""
+    """Describes the batch optimization over a whole log."""
 
+    start: Start = "online"
+    """The optimization begins at the map of an online run over the log, or at odometry alone."""
     size: int | None = None
-    """Control points of both boundaries together; where not given, the readings decide."""
+    """Both boundaries together have this number of control points; where it is not given, the number of cones
+    decides."""
     size_share: float = 0.43
-    """Most control points as a share of the distinct cones sighted (the paper has 0.44)."""
+    """The number of control points is at most this share of the number of distinct cones that were detected
+    (the paper has 0.44)."""
     sigma_model: float = 0.05
-    """How far cones stand off the curve that is solved for (m, one sigma), added to each reading across it.
-    Online it is larger (`spline.sigma_model`), as the curve has fewer control points there."""
+    """This is the standard deviation (m) of a cone's distance from the curves that are solved for; its square
+    is added to the variance of each detection across them. Online it is larger (`spline.sigma_model`), since
+    the curves have fewer control points there."""
     sigma_smoothness: float = 0.4
-    """Second difference of control points, as a share of their spacing: stronger than online's, as a curve
-    between cones that were never seen has many shapes that fit as well, and each start ends in its own."""
+    """This is the standard deviation of the second difference of control points, as a share of their spacing.
+    It is smaller than online, since a curve between cones that were never detected has many shapes that fit
+    equally well, and each start would end in its own."""
     sigma_slide: float = 0.2
-    """How far (m) a control point slides along its curve from beside the pose that it began beside."""
+    """A control point slides along its curve by this standard deviation (m) from its place beside the pose
+    that it began beside."""
     gate: float = 4.0
-    """Width of Tukey's loss: a reading farther than so many sigmas from its curve says nothing."""
+    """Tukey's loss has this width: a detection farther from its curve than this number of standard deviations
+    has no weight."""
     pose_steps: int = 3
-    """Gauss-Newton steps of the poses alone, beside the map that the start has found."""
+    """The poses alone take this number of Gauss-Newton steps at first, while the map of the start is held."""
     rough_rounds: int = 24
-    """Most rounds of a first optimization, on knots that the start decides."""
+    """The first optimization, on knots that follow the start, has at most this number of rounds."""
     rough_tolerance: float = 8.0
-    """Multiplies the tolerances below in the first optimization."""
+    """The tolerances are multiplied by this in the first optimization."""
     dense_share: float = 1.0
-    """Control points by cones of the curves that are solved for: they meet the cones. The map's own, fewer,
-    are fitted to them in the end."""
+    """The curves that are solved for have this number of control points for each cone, so that they meet the
+    cones. The map's own curves have fewer, and are fitted to them in the end."""
     knot_passes: int = 2
-    """Most times that they are solved for: once, unless the cones' number has changed then."""
+    """The dense curves are solved for at most this number of times; more than once only if the number of
+    cones has changed."""
     max_rounds: int = 80
-    """Steps, each with new foot points, gates and weights; the last of them is told as not converged."""
+    """The optimization has at most this number of rounds, each with new foot points, gates and weights; one
+    that uses them all is reported as not converged."""
     loose_gate: float = 8.0
-    """The first round uses readings within so many sigmas of a curve."""
+    """The first round uses detections within this number of standard deviations from a curve."""
     gate_factor: float = 0.7
-    """Multiplies the gate from each round to the next, down to `gate`."""
+    """The gate is multiplied by this from each round to the next, down to `gate`."""
     damping: float = 1e-2
-    """First hold on control points (1/m^2)."""
+    """This is the first damping of control points (1/m^2)."""
     damping_up: float = 5.0
-    """Multiplies the damping after a step that made the cost larger."""
+    """The damping is multiplied by this after a step that increased the cost."""
     damping_down: float = 0.1
-    """Multiplies the damping after a step that made the cost smaller."""
+    """The damping is multiplied by this after a step that decreased the cost."""
     damping_least: float = 1e-6
-    """Least damping (1/m^2)."""
+    """The damping is at least this (1/m^2)."""
     damping_most: float = 1e6
-    """Damping (1/m^2) at which no step is left that makes it better."""
+    """A round ends without a step if the cost still increases at this damping (1/m^2)."""
     share_least: float = 0.3
-    """Least share of the step before at which a step is tried as far as those that would follow lead."""
+    """A step is extended to the sum of those that would follow it if its ratio to the step before is larger
+    than this."""
     share_most: float = 0.97
-    """Largest such share."""
+    """A step is not extended if its ratio to the step before is larger than this."""
     tolerance_cost: float = 1e-5
-    """Converged where |cost_before - cost_after| <= tolerance * cost_before, and both below hold."""
+    """The optimization has converged when |cost_before - cost_after| <= tolerance_cost * cost_before, and the
+    other two tolerances hold."""
     tolerance_curve: float = 2e-3
-    """No point of a curve moved farther than this across it (m)."""
+    """At convergence, no point of a curve moved farther than this across it in a round (m)."""
     tolerance_pose: float = 2e-3
-    """No pose moved farther than this (m, and rad)."""
+    """At convergence, no pose moved farther than this in a round (m, and rad)."""
+    min_size_share: float = 0.6
+    """The fewest control points that the map's curves are tried with, as a share of the most."""
+    curve_samples: int = 2
+    """The movement of a curve is measured at this number of points in each knot interval."""
+    recurrence: RecurrenceSettings = field(default_factory=RecurrenceSettings)
+    """These settings find the length of a lap in a start from odometry."""
+    laps: LapCorrespondenceSettings = field(default_factory=LapCorrespondenceSettings)
+    """These settings bring the laps together in a start from odometry."""
+    cones: ConeSettings = field(default_factory=ConeSettings)
+    """These settings cluster detections to cones."""
+    association: AssociationSettings = field(default_factory=AssociationSettings)
+    """These settings place poses and detections along the curves."""
+    foot_points: FootPointSettings = field(default_factory=FootPointSettings)
+    """These settings compute foot points."""
+    scatter: ScatterSettings = field(default_factory=ScatterSettings)
+    """These settings measure how far cones lie from the map's curves."""

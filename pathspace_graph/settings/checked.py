@@ -3,18 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from math import inf
+from typing import ClassVar
 
 from pathspace_graph.errors import SettingsError
 
 
 class Positive:
-    """Settings whose numbers are all positive; infinity is allowed."""
+    """Holds settings whose numbers are all positive and, unless they are listed as unlimited, finite."""
+
+    UNLIMITED: ClassVar[tuple[str, ...]] = ()
+    """These numbers may be infinite, which means that there is no limit."""
+
+    prefix: ClassVar[str]
+    """This stands before the names of the settings on the command line."""
+
+    def __init_subclass__(cls, group: str | None = None) -> None:
+        """Sets the prefix from the name of the group, which is by default that of the class."""
+        group = cls.__name__.removesuffix("Settings").lower() if group is None else group
+        cls.prefix = "" if group == "mapper" else f"{group}."
 
     def __post_init__(self) -> None:
-        """SettingsError names the first setting that isn't, as the command line knows it."""
-        group = type(self).__name__.removesuffix("Settings").lower()
-        prefix = "" if group == "mapper" else f"{group}."
+        """Raises a SettingsError that names the first wrong setting, as the command line knows it."""
         for entry in fields(self):  # type: ignore[arg-type]  # every heir is a dataclass
             value = getattr(self, entry.name)
-            if isinstance(value, int | float) and not value > 0:
-                raise SettingsError(f"{prefix}{entry.name}: expected a positive number, found {value}")
+            if not isinstance(value, int | float):
+                continue
+            if not value > 0:
+                raise SettingsError(f"{self.prefix}{entry.name}: expected a positive number, found {value}")
+            if value == inf and entry.name not in self.UNLIMITED:
+                raise SettingsError(f"{self.prefix}{entry.name}: expected a finite number, found {value}")

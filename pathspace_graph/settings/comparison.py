@@ -11,78 +11,95 @@ from .knots import Knots
 
 @dataclass(frozen=True)
 class CkfSettings(Positive):
-    """The paper's filters."""
+    """Describes the paper's filters."""
 
     ridge: float = 0.05
-    """lambda of the ridge regression: how strongly control points are held where they are (paper: Update)."""
+    """This is lambda of the ridge regression, which says how strongly control points are held at their places
+    (paper: Update)."""
     penalty: Literal["solution", "cost"] = "solution"
-    """Whether L stands in the normal equations as the paper's solution has it, or squared as its cost has."""
+    """L stands in the normal equations as in the paper's solution, or squared as its cost implies."""
     prediction: Literal["fitted", "direct"] = "fitted"
-    """What S_z is held against: the same fit of the curve's own points, or the control points as they are."""
+    """S_z is compared with the same fit of the curve's own points, or directly with the control points."""
     sigma_kept: float = 0.05
-    """Added to each control point of S_z (m, one sigma) where `prediction` is direct: without it, one that no
-    reading reaches would be known exactly."""
+    """Where `prediction` is direct, this standard deviation (m) is added to each control point of S_z;
+    without it, a control point that no detection reaches would be known exactly."""
     least_basis: float = 1e-3
-    """A control point is updated where the basis of the readings adds up to this at least (-)."""
+    """A control point is updated where its basis values at the detections add up to at least this (-)."""
     sigma_model: float = 0.25
-    """How far cones stand off a smooth curve (m, one sigma): added to each reading."""
+    """This is the standard deviation (m) of a cone's distance from a smooth curve; its square is added to the
+    covariance of each detection."""
     sigma_along: float = 1.0
-    """How far along the curve from its foot point a cone may stand (m, one sigma): added to the reading."""
+    """This is the standard deviation (m) of the distance along the curve between a cone and its foot point;
+    its square is added to the covariance of each detection."""
     reach: float = 9.0
-    """How far ahead of the vehicle along its path (m) a curve is led."""
+    """A curve is extended up to this far ahead of the vehicle (m along the predicted path)."""
     threshold: float = 4.0
-    """Growth threshold (m): a reading nearer to the end than this updates the curve instead."""
+    """A detection nearer to the end than this growth threshold (m) updates the curve instead of extending
+    it."""
     separation: float = 4.0
-    """An extension keeps this distance from the last control point but one (m)."""
+    """An extension keeps at least this distance from the second-to-last control point (m)."""
     stretch: float = 12.0
-    """Longest extension at once (m): a farther one takes several."""
+    """An extension is at most this long (m), so a longer one takes several."""
     sigma_carry: float = 1.0
-    """Of the control point that carries a stranded end on beside the way (m, one sigma)."""
+    """This is the standard deviation (m) of the control point that carries on a stranded end along the
+    path."""
     sigma_start: float = 0.3
-    """Of each control point of a new curve beside what the first readings say (m, one sigma)."""
+    """This standard deviation (m) is added to each control point of a new curve, beyond the uncertainty of
+    its first detections."""
     sigma_bend: float = 0.5
-    """Second difference of the control points that an extension moves or adds, as a share of their spacing
-    (one sigma): the end's bending is known from the readings on it only, and multiplies with each extension
-    where nothing holds it. Large: as written."""
+    """This is the standard deviation of the second difference of the control points that an extension moves
+    or adds, as a share of their spacing. The bending of the end is known from the detections on it only, and
+    without a prior its uncertainty multiplies with each extension. A large value gives the filter as it is
+    published."""
     knots: Knots = "curvature"
-    """Knots of a closed boundary: by curvature as in the paper, or where cones ask for them as in ours."""
+    """The knots of a closed boundary follow its curvature as in the paper, or its cones as in the spline
+    graph."""
     sigma_tie: float = 0.15
-    """How far apart the end of a curve and its beginning may be where the loop closes (m, one sigma)."""
+    """This is the standard deviation (m) of the distance between the end of a curve and its beginning where
+    the loop closes."""
     sigma_match: float = 0.6
-    """Deviation (m) of a reading from the early segment that it is associated with: more than in the mapper's
-    own closing, since the filter's early segment is the worse, ..."""
+    """This is the standard deviation (m) of a detection in the registration with the early segment. It is
+    larger than `closing.sigma_reading`, since the filter's early segment is worse."""
     patience: float = 30.0
-    """... so that a stretch driven again (m), rather than certainty of the place, closes the loop, ..."""
+    """Once this length of the beginning has been driven again (m), `sigma_patience` replaces
+    `closing.sigma_max`."""
     sigma_patience: float = 1000.0
-    """... however uncertain that is then (m)."""
+    """After `patience`, the standard deviation of the registered position must be below this (m). A large
+    value lets the length that is driven again close the loop, however uncertain the position is."""
     tie_reach: float = 1.0
-    """Points of the end that the registration leaves farther from the beginning (m) aren't tied to it."""
+    """Points of the end that the registration leaves farther from the beginning than this (m) are not used as
+    correspondences."""
     sightings: int = 3
-    """Readings that make a landmark of the baseline; 1 takes every reading, as its description does."""
+    """A landmark of the baseline filter is made by this number of detections; 1 takes every detection, as the
+    description of the baseline does."""
 
 
 @dataclass(frozen=True)
 class LandmarkSettings(Positive):
-    """The Hungarian landmark graph."""
+    """Describes the Hungarian landmark graph."""
 
     match: float = 0.95
-    """Probability of the gate inside which a reading may be of a landmark."""
+    """The gate inside which a detection may be of a landmark has this probability."""
     create: float = 0.99
-    """Probability of the gate outside which, from every landmark of its colour, it may be of a new one."""
+    """A detection may be of a new landmark if it lies outside the gate of this probability of every landmark
+    of its colour."""
     rough: float = 5.0
-    """A landmark farther from every reading of a cycle than this (m) isn't tested at all."""
+    """A landmark farther from every detection of a cycle than this (m) is not tested at all."""
     max_rounds: int = 10
-    """Times that the batch associates anew, ..."""
+    """The batch associates all detections anew at most this number of times."""
     settled: float = 1e-3
-    """... or until no more than this share of the readings is of another landmark then."""
+    """The batch ends when at most this share of the detections changed its landmark in a round."""
     tolerance: float = 1e-6
     """A round's optimization ends where |cost_before - cost_after| <= tolerance * cost_before."""
     sigma_merge: float = 0.1
-    """Two landmarks of one cone may be so far apart (m, one sigma) beyond what their covariance says."""
+    """This is the standard deviation (m) of the distance between two landmarks of one cone, beyond their
+    covariance."""
     unseen: float = 40.0
-    """A landmark not seen for so long (m, path driven) belongs to an earlier stretch: near the start, until
-    the loop has closed, no reading is of it."""
+    """A landmark that was not detected along this length of the driven path (m) belongs to an earlier
+    stretch. Until the loop has closed, no detection near the start is associated with it."""
     min_pairs: int = 4
-    """Fewest landmarks that must be recognized together to close the loop, a third of them of each colour."""
+    """At least this number of landmarks must be recognized together to close the loop, a third of them of
+    each colour."""
     min_lead: float = 2.0
-    """They must explain so many landmarks more than any other set does (landmarks, each worth a gate)."""
+    """The recognized pairs must score this much better than any other set, where each landmark counts as one
+    gate (landmarks)."""

@@ -8,17 +8,19 @@ from typing import Literal
 from pathspace_graph.errors import SettingsError
 
 Knots = Literal["cones", "curvature"]
-"""What the knots of a closed boundary follow."""
+"""The knots of a closed boundary follow its cones or its curvature."""
 
 
 @dataclass(frozen=True)
 class BreakSettings:
-    """How a curve's knots follow its curvature (paper: Simplification)."""
+    """Describes how a curve's knots follow its curvature (paper: Simplification)."""
 
     baseline: float = 0.5
-    """Share in [0, 1] of the knots spread equally along the curve, so that straights keep their minimum."""
+    """This share in [0, 1] of the knots is spread evenly along the curve, so that straights keep their
+    minimum."""
     curvature_max: float = 0.7
-    """Curvature counts up to this (1/m): the inside of a tight hairpin, so that no kink draws all knots."""
+    """Larger curvatures count as this one (1/m), that of the inside of a tight hairpin, so that a kink does
+    not attract all knots."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.baseline <= 1.0:
@@ -29,15 +31,17 @@ class BreakSettings:
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How a spline is fitted to ordered points."""
+    """Describes how a spline is fitted to ordered points."""
 
     degree: int = 3
-    """Degree p of the curve."""
+    """The curve has this degree p."""
     smoothness: float = 1e-3
-    """Weight (m^3) of the bending integral of |S''|^2 beside the sum of squared distances."""
+    """The bending integral of |S''|^2 has this weight (m^3) beside the sum of squared distances."""
     rounds: int = 4
-    """Times that the knots are placed anew by curvature, after a first fit on equally spaced ones."""
+    """The knots are placed anew by curvature this number of times, after a first fit on evenly spaced
+    ones."""
     refits: int = 4
-    """Least-squares fits with refreshed foot points on each set of knots."""
+    """On each set of knots, the curve is fitted by least squares this number of times, with refreshed foot
+    points."""
     breaks: BreakSettings = BreakSettings()
-    """Placement of the knots."""
+    """These settings describe the placement of the knots."""

@@ -1,4 +1,4 @@
-"""Settings of the mapper: frozen dataclasses, a sentence for each field, and no number anywhere else."""
+"""Settings of the mapper: frozen dataclasses with a sentence for each field, and no number anywhere else."""
 
 from __future__ import annotations
 
@@ -13,302 +13,352 @@ from .knots import Knots
 
 @dataclass(frozen=True)
 class SplineSettings(Positive):
-    """The two boundary curves."""
+    """Describes the two boundary curves."""
 
     degree: int = 3
-    """Degree of the splines (1 or more; cubic has a continuous curvature)."""
+    """The splines have this degree, 1 or more; a cubic spline has a continuous curvature."""
     spacing: float = 3.5
-    """Distance of the control points (m) while the curve is open and grows."""
+    """Neighbouring control points of an open, growing curve are this far apart (m)."""
     size_share: float = 0.43
-    """Control points after closing, as a share of the distinct cones sighted (the paper has 0.44)."""
+    """After closing, the number of control points is this share of the number of distinct cones that were
+    detected (the paper has 0.44)."""
     min_size: int = 8
-    """Fewest control points of a closed boundary."""
+    """A closed boundary has at least this many control points."""
     knots: Knots = "cones"
-    """Knots of a closed boundary: one at each cone but those that are missed least, or at equal quantiles of
-    the curvature (paper: Simplification), from which cones stand off half as much again."""
+    """The knots of a closed boundary follow its cones or its curvature. With `cones` they begin at the cones,
+    and those whose removal costs least are removed. With `curvature` they lie at equal quantiles of the
+    curvature (paper: Simplification), and the distances of cones from the curve are half as large again."""
     linear_baseline: float = 0.5
-    """Of knots by curvature the share that is spread evenly."""
+    """This share of the knots that follow the curvature is spread evenly along the curve."""
     sigma_model: float = 0.25
-    """Added to each reading across the curve (m, one sigma): how far cones stand off it. That error is the
-    same every time a cone is seen, which is why it is larger than the offsets themselves, about 0.1 m."""
+    """This is the standard deviation (m) of a cone's distance from the curve; its square is added to the
+    variance of each detection across the curve. A cone has the same offset each time it is detected, so this
+    is larger than the offsets themselves, which are about 0.1 m."""
     residual: Literal["across", "point"] = "across"
-    """What a reading says online: its distance across the curve, or how far it is from its foot point in both
-    directions, as if that were a landmark (for comparison only)."""
+    """The residual of a detection online is its distance across the curve, or with `point` its offset from
+    its foot point in both directions, as if that were a landmark. `point` is for comparison only."""
     sigma_shape: float = 0.1
-    """What a curve of so few control points can't follow (m, one sigma): added to the covariance of a closed
-    map, since no number of readings averages it out."""
+    """This is the standard deviation (m) of what a curve with few control points cannot follow. It is added
+    to the covariance of a closed map, since no number of detections averages it out."""
     sigma_simplify: float = 0.1
-    """Shift of a control point (m, one sigma) that simplification may cause: loosens the prior by as much."""
+    """Simplification may move a control point by this standard deviation (m); the prior is loosened by as
+    much."""
     confirmed_margin: float = 0.5
-    """So far past its last sighting (m) an open curve is believed; beyond, it is extrapolated."""
+    """An open curve is believed up to this distance (m) past the last cone it was grown through; beyond, it
+    is extrapolated."""
     search_step: float = 1.0
-    """Coarse step (m along the curve) of a global search for foot points."""
+    """A global search for foot points begins on a grid with this step (m along the curve)."""
     search_iterations: int = 2
-    """Newton steps of a global search."""
+    """A global search for foot points ends with this number of Newton steps."""
     refine_room: float = 2.0
-    """How far from where it was (m along the curve) a foot point is looked for in a Gauss-Newton step."""
+    """A Gauss-Newton step looks for a foot point within this distance (m along the curve) of its last
+    place."""
     refine_iterations: int = 1
-    """Newton steps of each foot point in a Gauss-Newton step, which start at the last one's parameter."""
+    """A Gauss-Newton step refines each foot point by this number of Newton steps, from its last parameter
+    on."""
     fit_smoothness: float = 0.1
-    """Weight of second differences where new control points are placed through sightings."""
+    """This is the weight of second differences where new control points are fitted to tentative tracks."""
     fit_held: int = 4
-    """Points on the end of the known curve that new control points must keep to."""
+    """New control points are fitted to this number of points at the end of the known curve, too, so that it
+    keeps its shape."""
 
 
 @dataclass(frozen=True)
 class GaugeSettings(Positive):
-    """Weak priors on what readings leave free."""
+    """Describes the weak priors on what detections leave free."""
 
     sigma_spacing: float = 0.3
-    """Deviation of neighbouring control points from their nominal distance, as a share of it."""
+    """This is the standard deviation of the distance of neighbouring control points from its nominal value,
+    as a share of that value."""
     sigma_smoothness: float = 1.0
-    """Second difference of control points, as a share of their spacing (1: a circle of that radius)."""
+    """This is the standard deviation of the second difference of control points, as a share of their spacing;
+    at 1, a circle whose radius is the spacing is one standard deviation away."""
     sigma_anchor: float = 1e4
-    """Weak hold of every control point where it is (m): keeps the system regular, too weak to be seen, also
-    where the thousand of them on a long track hold its heading together."""
+    """This is the standard deviation (m) of the prior that holds each control point at its place. It keeps
+    the system regular, and is too weak to be noticed even where a thousand control points of a long track
+    hold its heading together."""
 
 
 @dataclass(frozen=True)
 class GateSettings(Positive):
-    """Which readings are used."""
+    """Describes which detections are used, and how much they weigh."""
+
+    UNLIMITED = ("huber",)
 
     chi: float = 3.0
-    """A reading joins the curve within this many sigmas of its joint uncertainty."""
+    """A detection is associated with a curve within this many standard deviations of their joint
+    uncertainty."""
     chi_unknown: float = 1.5
-    """The same of a reading of unknown colour, by its own uncertainty alone: the large cones of a start line
-    stand beside the boundary, and would bend it."""
+    """A detection of unknown colour is associated with a curve within this many standard deviations of its
+    own uncertainty alone. The large cones of a start line stand beside the boundary, and would bend it."""
     sigma_floor: float = 0.1
-    """Added to that uncertainty (m): what the model doesn't know of its own errors."""
+    """The square of this standard deviation (m) is added to the variance in the gate, for errors that the
+    model does not know."""
     rough: float = 3.0
-    """A reading farther from the curve than this (m) isn't tested at all."""
+    """A detection farther from the curve than this (m) is never associated with it."""
     huber: float = 1.5
-    """Whitened residual beyond which a row's weight falls."""
+    """Beyond this whitened residual, the Huber loss reduces the weight of a detection; inf means plain least
+    squares."""
     view_ahead: float = 25.0
-    """Stretch of the curve ahead of the vehicle (m along it) that a reading may belong to."""
+    """A detection may belong to the curve up to this far ahead of the vehicle (m along the curve)."""
     view_behind: float = 4.0
-    """The same behind the vehicle."""
+    """A detection may belong to the curve up to this far behind the vehicle (m along the curve)."""
     station_step: float = 1.5
-    """A vehicle that moved less than this (m) in a cycle has its foot point near the last one's; else ..."""
+    """If the vehicle moved less than this in a cycle (m), the foot point of its newest pose on each curve is
+    refined from the last pose's foot point; otherwise it is searched for."""
     station_ahead: float = 8.0
-    """... it is searched for as far ahead of that (m) as this, ..."""
+    """The foot point of the newest pose is searched for up to this far ahead of the last pose's foot point (m
+    along the curve)."""
     station_behind: float = 3.0
-    """... and so far behind it (m)."""
+    """The foot point of the newest pose is searched for up to this far behind the last pose's foot point (m
+    along the curve)."""
     station_lateral: float = 10.0
-    """A curve farther from the vehicle than this (m), or running against it, isn't beside it: the vehicle has
-    lost its place, which is looked for all around a closed curve, ..."""
+    """The vehicle has lost its place on a curve that is farther from it than this (m), or that leads in the
+    opposite direction. Its place is then searched for on the whole of a closed curve, or at the end of an
+    open one."""
     station_room: float = 40.0
-    """... and on the last such stretch (m) of an open one."""
+    """This is the length (m) at the end of an open curve that is searched when the vehicle has lost its
+    place."""
 
 
 @dataclass(frozen=True)
 class PathSettings(Positive):
-    """The way driven, and the way ahead."""
+    """Describes the driven path, and the prediction of the path ahead."""
 
     step: float = 0.3
-    """Least distance of two kept positions (m)."""
+    """Neighbouring positions of the stored path are at least this far apart (m)."""
     memory: float = 60.0
-    """Stretch behind the vehicle (m) that is kept; the drive's first such stretch is kept for closing."""
+    """The path is stored for this distance behind the vehicle (m). The first stretch of the drive, as long as
+    this, is stored for loop closing."""
     beginning_step: float = 1.0
-    """Least distance of two kept poses of the first stretch (m)."""
+    """Neighbouring poses of the stored first stretch are at least this far apart (m)."""
     max_curvature: float = 0.3
-    """Largest curvature of the path predicted ahead of the vehicle (1/m)."""
+    """The curvature of the path predicted ahead of the vehicle is at most this (1/m)."""
     curvature_gain: float = 0.4
-    """Share of a cycle's measured curvature in the smoothed one."""
+    """The smoothed curvature takes over this share of each cycle's measured curvature."""
     min_speed: float = 1.0
-    """Slower than this (m/s), yaw rate over speed says nothing of the curvature."""
+    """Below this speed (m/s), the curvature is not measured, since yaw rate over speed is too uncertain."""
 
 
 @dataclass(frozen=True)
 class GrowthSettings(Positive):
-    """How an open end grows."""
+    """Describes how the open end of a curve grows."""
+
+    UNLIMITED = ("forget_after",)
 
     reach: float = 7.0
-    """How far ahead of the vehicle along its path (m) a boundary is extended."""
+    """A boundary is extended up to this far ahead of the vehicle (m along the predicted path)."""
     sightings: int = 3
-    """Readings within `merge_radius` that make a sighting trustworthy."""
+    """A tentative track is confirmed by this number of detections within `merge_radius`."""
     merge_radius: float = 1.0
-    """Readings of one label so close together are one sighting (m)."""
+    """Detections of one label that are nearer to each other than this (m) belong to one tentative track."""
     forget_after: float = 6.0
-    """A sighting not seen again for so long (s) is dropped."""
+    """A tentative track is dropped when it has not been detected for this time (s)."""
     threshold: float = 0.7
-    """A sighting closer than this to the end of the curve (m) doesn't extend it."""
+    """A tentative track nearer to the end of the curve than this (m) does not extend it."""
     max_lateral: float = 10.0
-    """Farthest from the driven path (m) that a boundary may start: circuits are up to 15 m wide."""
+    """A boundary begins with tentative tracks nearer to the driven path than this (m); circuits are up to 15
+    m wide."""
     lateral_change: float = 1.5
-    """How much farther from the path than the end of the curve the next sighting may be (m)."""
+    """The next tentative track may be this much farther from the path than the end of the curve (m)."""
     lateral_rate: float = 0.2
-    """The same, for each metre along the path beyond that (-)."""
+    """For each metre along the path, the next tentative track may be this much farther from the path, in
+    addition to `lateral_change` (m/m)."""
     beside: float = 2.0
-    """Of sightings that are so near to each other along the path (m) ..."""
+    """Tentative tracks that are less than this apart (m along the path) stand beside each other."""
     lateral_gap: float = 0.8
-    """... those are left out that stand so much farther from it than the nearest (m)."""
+    """A tentative track is left out if another one beside it is nearer to the path by more than this (m)."""
     station_margin: float = 0.3
-    """A sighting must lie so far past the end of the curve (m along the path) to extend it."""
+    """A tentative track must lie at least this far past the end of the curve (m along the path) to extend
+    it."""
     end_behind: float = 5.0
-    """An end is no farther behind the vehicle than this (m along the path), as a stranded one is carried on;
-    that it may be nearer to an older stretch of the path, across the infield, says nothing."""
+    """The end of a curve is at most this far behind the vehicle (m along the path), since a stranded end is
+    carried on. An older stretch of the path across the infield may be nearer to it, which means nothing."""
     recall: float = 25.0
-    """On the last stretch of a curve, so long (m), it is seen to that cones are in the order of the drive."""
+    """Cones along this length of the curve at its end (m) are checked to be in the order in which the vehicle
+    passed them."""
     stranded: float = 2.0
-    """An end so far behind the vehicle (m along the path), nothing ahead, is carried along it, ..."""
+    """An end farther behind the vehicle than this (m along the path), with nothing ahead that extends it, is
+    stranded and is carried on along the path."""
     stranded_left: float = 0.5
-    """... to this share of that distance behind it."""
+    """A stranded end is carried on to this share of `stranded` behind the vehicle."""
     min_lateral: float = 0.5
-    """A carried end keeps at least so far from the path (m)."""
+    """A carried end keeps at least this distance from the path (m)."""
     min_carry: float = 0.5
-    """An end is carried by so much at least (m), or not at all."""
+    """An end is carried on by at least this distance (m), or not at all."""
 
 
 @dataclass(frozen=True)
 class ClosingSettings(Positive):
-    """Loop closing."""
+    """Describes loop closing."""
 
     min_path: float = 60.0
-    """Shortest lap (m)."""
+    """A lap is at least this long (m)."""
     check_interval: float = 2.0
-    """Path (m) between two attempts to close."""
+    """Two attempts to close the loop are at least this far apart (m along the path)."""
     radius: float = 8.0
-    """Distance from the start (m) within which the loop may close, ..."""
+    """The loop may close within this distance from the first stretch of the drive (m), enlarged by
+    `drift`."""
     drift: float = 0.03
-    """... and this much more for each metre driven."""
+    """The distance within which the loop may close grows by this for each metre driven (m/m)."""
     heading: float = 0.8
-    """Largest angle to the heading at the start (rad)."""
+    """The loop may close where the heading differs by less than this from the heading at the beginning
+    (rad)."""
     overlap: float = 8.0
-    """Stretch of the beginning (m) that must have been driven again."""
+    """This length of the beginning must have been driven again (m)."""
     inlier_distance: float = 0.4
-    """A reading this near to the beginning's curve (m) agrees with it."""
+    """A detection nearer to the beginning's curve than this (m) is an inlier of the registration."""
     inlier_share: float = 0.8
-    """Share of the readings that must agree."""
+    """At least this share of the matched detections must be inliers."""
     min_readings: int = 25
-    """Fewest readings that may close a loop, ..."""
+    """At least this number of detections must be matched to close a loop."""
     min_boundary_readings: int = 5
-    """... and fewest of each boundary among those that agree."""
+    """Each boundary must have at least this number of inliers."""
     window: float = 2.0
-    """Time (s) of the newest readings that are registered with the beginning."""
+    """Detections that are at most this old (s) are registered with the beginning."""
     prior_scale: float = 1.5
-    """Trust in the vehicle's own uncertainty: its sigmas are multiplied by this."""
+    """The standard deviations of the vehicle's own uncertainty are multiplied by this in the prior of the
+    registration."""
     sigma_reading: float = 0.5
-    """Deviation (m) of a reading in the registration: large, since many readings are of one cone."""
+    """This is the standard deviation of a detection in the registration (m); it is large, since many
+    detections are of one cone."""
     sigma_max: float = 0.3
-    """The registered position must be this certain (m, one sigma along its worst direction) ..."""
+    """The standard deviation of the registered position along its worst direction must be below this (m)."""
     patience: float = 40.0
-    """... or, once so much of the beginning (m) has been driven again, ..."""
+    """Once this length of the beginning has been driven again (m), `sigma_patience` replaces `sigma_max`."""
     sigma_patience: float = 0.85
-    """... this certain: a straight says nothing along it, however much of it is driven again. Not where the
-    vehicle is less certain itself than `icp_reach`."""
+    """After `patience`, the standard deviation of the registered position must be below this (m): detections
+    on a straight leave the position along it free, however much of it is driven again. Where the vehicle
+    itself is less certain than `icp_reach`, `sigma_max` stays in force."""
     beginning: float = 60.0
-    """Stretch of the curves (m) that counts as their beginning, ..."""
+    """This length of the curves counts as their beginning (m)."""
     beginning_share: float = 0.6
-    """... or this share of a shorter curve."""
+    """Of a short curve, at most this share counts as its beginning."""
     icp_reach: float = 3.0
-    """A reading farther than this from the beginning doesn't pull in the first iteration (m), ..."""
+    """In the first iteration of the registration, detections nearer to the beginning than this are used
+    (m)."""
     icp_shrink: float = 0.7
-    """... and this share of the distance with each further one, down to `inlier_distance`."""
+    """The distance `icp_reach` is multiplied by this in each further iteration, down to `inlier_distance`."""
     start_step: float = 2.0
-    """Where the vehicle is less certain than that, the registration tries places so far apart (m) on the
-    beginning to start from, ..."""
+    """Where the position of the vehicle is less certain than `icp_reach`, the registration is started from
+    poses of the beginning that are this far apart (m)."""
     start_chi2: float = 16.3
-    """... as long as the vehicle's uncertainty allows them (chi-square of 3, 99.9 %)."""
+    """The registration starts only from poses whose squared Mahalanobis distance under the vehicle's
+    uncertainty is below this (chi-square with 3 degrees of freedom, 99.9 %)."""
     icp_iterations: int = 7
-    """Iterations of the registration."""
+    """The registration has this number of iterations."""
     keyframe_interval: float = 12.0
-    """Path (m) between the keyframes in whose frames the drive so far is kept until the loop closes."""
+    """Until the loop closes, keyframes are this far apart (m along the path); the drive so far is kept in
+    their frames."""
     iterations: int = 2
-    """Gauss-Newton steps after the tie, and again after simplification, ..."""
+    """The loop is optimized by this number of Gauss-Newton steps after it is found, and again after
+    simplification."""
     sigma_step: float = 10.0
-    """... in which a control point moves so far freely (m): hardly damped."""
+    """While the loop is optimized, a control point moves this far freely in a step (m), so it is hardly
+    damped."""
     join_margin: float = 10.0
-    """The seam lies on a curve's last stretch, as long as `beginning` and this (m), ..."""
+    """The seam lies within the last `beginning` plus this length of a curve (m)."""
     join_share: float = 0.5
-    """... or, on a short curve, past this share of it."""
+    """On a short curve, the seam lies past this share of its length."""
     overlap_step: float = 1.0
-    """Step (m) at which the overlap's end is put on its beginning."""
+    """Points of the overlap are placed on the beginning at this step (m)."""
     overlap_room: float = 4.0
-    """Room (m along the curve) about the place on the beginning where a point of the overlap belongs."""
+    """A point of the overlap is searched for on the beginning within this distance of its expected place (m
+    along the curve)."""
     seam_margin: float = 0.5
-    """A sighting this near to the seam (m) is the beginning's own cone, and isn't counted twice."""
+    """A cone nearer to the seam than this (m) was also detected at the beginning, and is not counted
+    twice."""
 
 
 @dataclass(frozen=True)
 class OdometrySettings(Positive):
-    """What is not white in the odometry: constant errors, estimated along with the map."""
+    """Describes the constant errors of the odometry, which are estimated along with the map."""
 
     sigma_scale: float = 0.005
-    """Scale error of the speeds (one sigma)."""
+    """This is the standard deviation of the scale error of the speeds (-)."""
     sigma_bias: float = 0.002
-    """Bias of the yaw rate (rad/s, one sigma)."""
+    """This is the standard deviation of the bias of the yaw rate (rad/s)."""
     sigma_start: float = 1e-4
-    """Position of the vehicle at the first odometry stamp (m, one sigma): zero by definition, ..."""
+    """This is the standard deviation of the position at the first odometry stamp (m); the position is zero by
+    definition."""
     sigma_start_heading: float = 1e-5
-    """... and its heading (rad): not exactly zero, so that the first pose's information is finite."""
+    """This is the standard deviation of the heading at the first odometry stamp (rad); it is not zero, so
+    that the first pose's information is finite."""
 
     @property
     def sigmas_start(self) -> tuple[float, float, float]:
-        """Of the pose at the first odometry stamp: (m, m, rad), one sigma."""
+        """Returns the standard deviations (m, m, rad) of the pose at the first odometry stamp."""
         return self.sigma_start, self.sigma_start, self.sigma_start_heading
 
 
 @dataclass(frozen=True)
 class FarSettings(Positive):
-    """The part of the map that is not solved for in every cycle: changes speed, not results."""
+    """Describes the inactive part of the map, which is not solved for in every cycle: this changes speed, not
+    results."""
 
     stretch: float = 12.0
-    """So much of an open curve behind the vehicle (m) becomes far at once."""
+    """Control points of an open curve become inactive in stretches of at least this length behind the vehicle
+    (m)."""
     room: float = 25.0
-    """The near part of a closed curve reaches so far beyond what the vehicle sees (m), so that it lasts."""
+    """The active part of the curves reaches this far beyond what the vehicle sees (m), so that it need not
+    change in every cycle."""
 
 
 @dataclass(frozen=True)
 class RelinearizeSettings(Positive):
-    """Which factors of the window are linearized anew in a step: those that hold what has moved farther.
+    """Says which factors of the window are linearized anew in a step: those whose variables have moved
+    farther.
 
-    After the loop has closed. Until then all are: an error of linearization is a rotation of the map with a
-    long lever there.
+    This applies after the loop has closed. Until then all factors are linearized anew, since an error of
+    linearization turns the map with a long lever there.
     """
 
     point: float = 0.2
-    """A control point, or the position of a pose (m)."""
+    """A factor is linearized anew when a control point or the position of a pose has moved farther than this
+    (m)."""
     heading: float = 0.02
-    """The heading of a pose (rad)."""
+    """A factor is linearized anew when the heading of a pose has turned by more than this (rad)."""
 
 
 @dataclass(frozen=True)
 class MapperSettings(Positive):
-    """Everything that the estimators can be told; each takes the parts that are its own."""
+    """Holds all settings of the estimators; each estimator takes the groups that are its own."""
 
     lag: float = 3.0
-    """Time (s) that poses stay in the window."""
+    """Poses stay in the window for this time (s)."""
     steps: int = 1
-    """Gauss-Newton steps a cycle, each relinearized at the current estimate."""
+    """Each cycle takes this number of Gauss-Newton steps, each relinearized at the current estimate."""
     steps_grown: int = 1
-    """The same in a cycle in which a curve grew."""
+    """A cycle in which a curve grew takes this number of Gauss-Newton steps."""
     sigma_step: float = 0.5
-    """How far a control point moves freely in a step (m): damps sliding along the curve, not the optimum."""
+    """A control point moves this far freely in a step (m): this damps sliding along the curve, and leaves the
+    optimum where it is."""
     spline: SplineSettings = field(default_factory=SplineSettings)
-    """The curves."""
+    """These settings describe the two boundary curves."""
     gauge: GaugeSettings = field(default_factory=GaugeSettings)
-    """Weak priors."""
+    """These settings describe the weak priors on what detections leave free."""
     gate: GateSettings = field(default_factory=GateSettings)
-    """Which readings are used."""
+    """These settings describe which detections are used, and how much they weigh."""
     path: PathSettings = field(default_factory=PathSettings)
-    """The way driven and the way ahead."""
+    """These settings describe the driven path and the predicted path ahead."""
     growth: GrowthSettings = field(default_factory=GrowthSettings)
-    """How ends grow."""
+    """These settings describe how the open end of a curve grows."""
     closing: ClosingSettings = field(default_factory=ClosingSettings)
-    """How the loop closes."""
+    """These settings describe loop closing."""
     far: FarSettings = field(default_factory=FarSettings)
-    """What is not solved for in every cycle."""
+    """These settings describe the inactive part of the map, which is not solved for in every cycle."""
     relinearize: RelinearizeSettings = field(default_factory=RelinearizeSettings)
-    """Which factors are linearized anew in a step."""
+    """These settings say which factors are linearized anew in a step."""
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
-    """Calibration of the odometry."""
+    """These settings describe the constant errors of the odometry."""
     batch: BatchSettings = field(default_factory=BatchSettings)
-    """The batch optimization over a whole log."""
+    """These settings describe the batch optimization over a whole log."""
     landmark: LandmarkSettings = field(default_factory=LandmarkSettings)
-    """The Hungarian landmark graph."""
+    """These settings describe the Hungarian landmark graph."""
     ckf: CkfSettings = field(default_factory=CkfSettings)
-    """The paper's filters."""
+    """These settings describe the paper's filters."""
 
 
 ODOMETRY_SIGMA = (0.25, 0.12, 0.035)
-"""Noise of a twist reading (m/s, m/s, rad/s) where nothing else is told: that of the simulator."""
+"""These are the standard deviations of a twist (m/s, m/s, rad/s) where none are given; they are the
+simulator's."""

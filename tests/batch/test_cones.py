@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.cones import ConeClusters, as_passed, cluster, cone_clusters, unfolded
-from pathspace_graph.batch.scatter import Scatter, left_out
+from pathspace_graph.batch.cones import Cones, cluster, cones_of_curve, in_order_of_drive, without_folds
+from pathspace_graph.batch.simplification import Scatter, cross_validated
 from pathspace_graph.labels import LEFT
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -44,20 +44,20 @@ def test_what_is_seen_seldom_is_none() -> None:
 
 def test_a_cone_put_down_twice_is_one() -> None:
     x = np.array([0.0, 4.0, 8.0, 7.4, 12.0, 16.0])
-    cones = ConeClusters(np.column_stack([x, np.zeros(6)]), np.arange(6.0), np.full(6, 9))
-    assert (np.diff(unfolded(cones, False).points[:, 0]) > 0.0).all()
+    cones = Cones(np.column_stack([x, np.zeros(6)]), np.arange(6.0), np.full(6, 9))
+    assert (np.diff(without_folds(cones, False, SETTINGS.batch.cones).points[:, 0]) > 0.0).all()
 
 
 def test_a_cone_that_the_curve_cuts_off_is_one_as_well() -> None:
     """Its readings are too far off to be used, and heaped all the same."""
     system, state = straight()
     detections = system.detections
-    one = cone_clusters(state, detections, LEFT, system.settings)
+    one = cones_of_curve(state, detections, LEFT, system.settings)
     k = len(one.u) // 2
     mine = np.flatnonzero((detections.label == LEFT) & (np.abs(detections.u - one.u[k]) < 1.0))
     detections.point[mine] += np.array([0.0, 1.8])
     detections.used[mine] = False
-    two = cone_clusters(state, detections, LEFT, system.settings)
+    two = cones_of_curve(state, detections, LEFT, system.settings)
     assert len(two.u) == len(one.u)
     np.testing.assert_allclose(two.points[k] - one.points[k], [0.0, 1.8], atol=0.05)
 
@@ -77,9 +77,9 @@ def test_left_out_is_what_a_missing_cone_is_missed_by() -> None:
     phi = 2.0 * np.pi * np.arange(40) / 40
     circle = 20.0 * np.column_stack([np.cos(phi), np.sin(phi)])
     zigzag = circle * (1.0 + 0.02 * (-1.0) ** np.arange(40))[:, None]
-    assert len(left_out(circle, True, SETTINGS, 0.43)) == 40
-    assert np.abs(left_out(circle, True, SETTINGS, 0.43)).max() < 0.05
-    assert np.sqrt(np.mean(left_out(zigzag, True, SETTINGS, 0.43) ** 2)) > 0.3
+    assert len(cross_validated(circle, True, SETTINGS, 0.43)) == 40
+    assert np.abs(cross_validated(circle, True, SETTINGS, 0.43)).max() < 0.05
+    assert np.sqrt(np.mean(cross_validated(zigzag, True, SETTINGS, 0.43) ** 2)) > 0.3
 
 
 def test_cones_are_passed_in_the_order_of_the_drive() -> None:
@@ -93,7 +93,7 @@ def test_cones_are_passed_in_the_order_of_the_drive() -> None:
         [[1.2, -1.5], [5.0, -1.5], [10.0, -1.5], [11.5, 0.2], [10.0, 1.5], [5.3, 1.5], [1.0, 1.5]]
     )
     wrong = np.array([0, 1, 4, 3, 2, 5, 6])
-    cones = ConeClusters(true[wrong], np.arange(7.0), wrong)
-    passed = as_passed(cones, lap)
+    cones = Cones(true[wrong], np.arange(7.0), wrong)
+    passed = in_order_of_drive(cones, lap)
     np.testing.assert_array_equal(passed.points, true)
     np.testing.assert_array_equal(passed.count, np.arange(7))

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.knots import map_block
+from pathspace_graph.batch.simplification import map_block
 from pathspace_graph.graph.elimination import Elimination
 from pathspace_graph.mapping.state import State
 

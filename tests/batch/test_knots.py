@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.knots import new_from_old, reknot, simplified
+from pathspace_graph.batch.knots import reknot
+from pathspace_graph.batch.simplification import new_from_old, simplify
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
@@ -35,7 +36,7 @@ def by_turn(state: State) -> Array:
 
 def test_the_drive_stays_and_the_curves_have_fewer_control_points_on_the_same_lines() -> None:
     state, detections, settings = dense_scene()
-    thin, _ = simplified(state, np.eye(state.map_points.size), detections, settings)
+    thin, _ = simplify(state, np.eye(state.map_points.size), detections, settings)
     np.testing.assert_array_equal(thin.poses, state.poses)
     np.testing.assert_array_equal(thin.calibration, state.calibration)
     for label, boundary in thin.boundaries.items():
@@ -50,7 +51,7 @@ def test_a_map_that_is_uncertain_as_a_whole_stays_so() -> None:
     state, detections, settings = dense_scene()
     for direction in (lambda s: by_shift(s, 0), lambda s: by_shift(s, 1), by_turn):
         dense = direction(state)
-        thin, covariance = simplified(state, np.outer(dense, dense), detections, settings)
+        thin, covariance = simplify(state, np.outer(dense, dense), detections, settings)
         expected = direction(thin)
         across = np.arange(1, thin.map_points.size, 2)
         np.testing.assert_allclose(

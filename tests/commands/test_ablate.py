@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.cli import main
-from pathspace_graph.eval.study.progress import time_left
 
 from ..scenes.pretenders import Fragile, contents, register, write_round_track
 
@@ -108,9 +107,3 @@ def test_the_command_refuses_the_folder_of_another_study(
     assert main([*arguments, "--laps", "2"]) == 2
     assert "found another, with 1" in capsys.readouterr().err
     assert contents(tmp_path / "out") == before
-
-
-def test_the_time_left_is_that_of_the_mean_cell() -> None:
-    assert time_left(30.0, 0, 4) == "time left unknown"
-    assert time_left(30.0, 1, 4) == "0:01:30 left"
-    assert time_left(30.0, 4, 4) == "0:00:00 left"

@@ -157,6 +157,14 @@ def test_settings_of_the_mapper_are_options(log_folder: Path, tmp_path: Path) ->
     assert (settings["lag"], settings["growth"]["reach"]) == (1.5, 6.5)
 
 
+@pytest.mark.parametrize("command", ["online", "batch"])
+def test_a_huber_loss_without_a_limit_is_least_squares(
+    command: str, log_folder: Path, tmp_path: Path
+) -> None:
+    assert main([command, str(log_folder), "--out", str(tmp_path / "map"), "--gate.huber", "inf"]) == 0
+    assert read_map(tmp_path / "map").boundaries
+
+
 def test_a_second_run_keeps_the_earlier_result(tmp_path: Path) -> None:
     assert simulate(tmp_path / "log") == 0
     first = contents(tmp_path / "log")
@@ -233,6 +241,7 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
         (["online", "LOG", "--out", "MAP", "--lag", "-1"], "lag: expected"),
         (["online", "LOG", "--out", "MAP", "--spline.degree", "0"], "spline.degree: expected"),
         (["online", "LOG", "--out", "MAP", "--gauge.sigma-spacing", "inf"], "gauge.sigma_spacing: expected"),
+        (["online", "LOG", "--out", "MAP", "--gate.huber", "nan"], "gate.huber: expected a positive number"),
         (["simulate", "--out", "LOG"], "--track FILE or --generate SEED"),
         (["simulate", "--generate", "1", "--laps", "0", "--out", "LOG"], "laps"),
         (["simulate", "--generate", "-1", "--out", "LOG"], "seed"),

@@ -12,7 +12,6 @@ from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.gauge import greville, smoothness_matrix
 from pathspace_graph.factors.gtsam_factors import (
     calibrated_odometry_factor,
-    huber_roots,
     linear_factor,
     odometry_factor,
     pose_array,
@@ -134,15 +133,6 @@ def single(key: int, vector: Array) -> gtsam.VectorValues:
     values = gtsam.VectorValues()
     values.insert(key, vector)
     return values
-
-
-@pytest.mark.parametrize("threshold", [1.5, np.inf])
-def test_huber_roots(threshold: float) -> None:
-    z = np.array([-4.0, -1.0, 0.0, 1.5, 100.0])
-    loss = np.where(np.abs(z) <= threshold, 0.5 * z**2, np.minimum(threshold, 1e9) * (np.abs(z) - 0.75))
-    roots = huber_roots(z, threshold)
-    np.testing.assert_allclose(0.5 * roots**2, loss, rtol=1e-14)
-    np.testing.assert_array_equal(np.sign(roots), np.sign(z))
 
 
 def pose_plus(pose: Array, delta: Array) -> Array:

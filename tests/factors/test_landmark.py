@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.landmark import landmark_residuals, whiteners
+from pathspace_graph.factors.landmark import landmark_residuals
 
 from ..scenes.jacobians import assert_jacobians
 
@@ -39,12 +39,3 @@ def test_it_agrees_with_gtsam() -> None:
     rows = landmark_residuals(poses, landmarks, np.zeros((20, 2)))
     for pose, landmark, seen in zip(poses, landmarks, rows.residual, strict=True):
         np.testing.assert_allclose(gtsam.Pose2(*pose).transformTo(landmark), seen, atol=1e-12)
-
-
-def test_whitened_rows_are_independent_and_of_unit_variance() -> None:
-    rng = np.random.default_rng(2)
-    roots = rng.normal(0.0, 1.0, (50, 2, 2)) + np.eye(2)
-    covariances = roots @ np.swapaxes(roots, 1, 2)
-    w = whiteners(covariances)
-    whitened = w @ covariances @ np.swapaxes(w, 1, 2)
-    np.testing.assert_allclose(whitened, np.tile(np.eye(2), (50, 1, 1)), atol=1e-8)

@@ -9,16 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import (
-    MIN_SIGMA,
-    between,
-    compose,
-    integrate_poses,
-    integrate_twists,
-    odometry_residuals,
-    se2_exp,
-    wrap_angle,
-)
+from pathspace_graph.factors.odometry import MIN_SIGMA, integrate_poses, integrate_twists, odometry_residuals
+from pathspace_graph.factors.se2 import compose, se2_exp
 
 from ..scenes.jacobians import assert_jacobians
 
@@ -51,25 +43,6 @@ def test_integration_is_gtsams_composition(seed: int) -> None:
     np.testing.assert_allclose(delta, as_array(gtsam_composition(durations, twists)), atol=1e-12)
     for k, pose in enumerate(integrate_poses(durations, twists), start=1):
         np.testing.assert_allclose(pose, as_array(gtsam_composition(durations[:k], twists[:k])), atol=1e-12)
-
-
-@pytest.mark.parametrize("turn", [0.0, 1e-12, 1e-6, 0.1, 3.0, -3.0])
-def test_exponential_is_gtsams_also_without_a_turn(turn: float) -> None:
-    tangent = np.array([1.5, -0.4, turn])
-    np.testing.assert_allclose(se2_exp(tangent[None])[0], as_array(gtsam.Pose2.Expmap(tangent)), atol=1e-11)
-
-
-def test_compose_and_between_are_gtsams_and_turns_accumulate() -> None:
-    a, b = np.array([1.0, -2.0, 2.5]), np.array([0.3, 0.8, 2.0])
-    expected = gtsam.Pose2(*a).compose(gtsam.Pose2(*b))
-    np.testing.assert_allclose(compose(a, b)[:2], as_array(expected)[:2], atol=1e-12)
-    assert compose(a, b)[2] == 4.5
-    np.testing.assert_allclose(between(a, compose(a, b)), b, atol=1e-12)
-
-
-def test_wrap_angle_is_half_open() -> None:
-    angles = np.array([np.pi, -np.pi, 3.0 * np.pi, 0.0, 2.0 * np.pi + 0.1, -0.1])
-    np.testing.assert_allclose(wrap_angle(angles), [np.pi, np.pi, np.pi, 0.0, 0.1, -0.1], atol=1e-12)
 
 
 def test_covariance_against_monte_carlo() -> None:

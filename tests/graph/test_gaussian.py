@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.graph.gaussian import (
+    as_hessian_factor,
     cholesky,
-    combined,
     conditioned,
     covariance,
     eliminate,
     factors_of,
-    forget,
     graph_of,
     half_solve,
     jacobian_factor,
     keys_of,
     marginalize,
-    merged,
+    merge_variables,
     normal_equations,
-    rooted,
+    remove_information,
     solve,
+    square_root_form,
 )
 from pathspace_graph.graph.keys import POSE
 from pathspace_graph.graph.variables import Layout
@@ -63,7 +63,7 @@ def at(values: Array, keys: IntArray = KEYS) -> gtsam.VectorValues:
 
 def root_factor(layout: Layout, information: Array, vector: Array) -> gtsam.GaussianConditional:
     """Information of any rank as rows."""
-    return jacobian_factor(layout.keys, *rooted(information, vector))
+    return jacobian_factor(layout.keys, *square_root_form(information, vector))
 
 
 # --- factors ---------------------------------------------------------------------------------------------
@@ -274,7 +274,7 @@ def test_merged_keys_are_one_variable() -> None:
         becomes = kept[gone == key] if key in gone else np.array([key])
         E[columns_of(np.array([key]), KEYS), columns_of(becomes, new)] = 1.0
     e[columns_of(gone, KEYS)] = offset
-    found, found_vector = normal_equations(merged(graph, gone, kept, offset), Layout(new))
+    found, found_vector = normal_equations(merge_variables(graph, gone, kept, offset), Layout(new))
     np.testing.assert_allclose(found, E.T @ hessian @ E, atol=1e-9 * hessian.max())
     np.testing.assert_allclose(found_vector, E.T @ (vector - hessian @ e), atol=1e-9 * hessian.max())
 
@@ -289,7 +289,7 @@ def test_forgetting_leaves_the_others_as_sure_as_before(unknown: bool) -> None:
         free = RIGHT_KEYS[-1:] + 7  # one direction of it is held, the other is not
         graph = graph_of(graph, jacobian_factor(free, np.array([[1.0, 2.0]]), np.ones(1)))
         gone = np.append(gone, free)
-    left = forget(graph, Layout(np.sort(gone)), rng.normal(size=2 * len(gone)))
+    left = remove_information(graph, Layout(np.sort(gone)), rng.normal(size=2 * len(gone)))
     assert np.isin(gone, keys_of(left)).sum() == 0
     information, negative_gradient = schur(hessian, vector, columns_of(LEFT_KEYS[[1, 3]], KEYS))
     found, found_vector = normal_equations(left, Layout(rest))
@@ -322,7 +322,7 @@ def test_a_graph_of_graphs_nets_and_factors_has_all_of_their_factors() -> None:
     np.testing.assert_allclose(found, hessian, rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(found_vector, vector, rtol=1e-8, atol=1e-8)
     np.testing.assert_array_equal(keys_of(again), KEYS)
-    whole = graph_of(combined(again))
+    whole = graph_of(as_hessian_factor(again))
     assert whole.size() == 1
     np.testing.assert_allclose(normal_equations(whole, LAYOUT)[0], hessian, rtol=1e-8, atol=1e-8)
 
@@ -340,7 +340,7 @@ def test_the_binding_gives_views_that_nobody_owns(name: str) -> None:
 
 def test_the_linear_term_of_a_hessian_factor_is_such_a_view_too() -> None:
     factor, *_ = random_factor(np.random.default_rng(18), LEFT_KEYS)
-    array = combined(graph_of(factor)).linearTerm()
+    array = as_hessian_factor(graph_of(factor)).linearTerm()
     assert not array.flags.owndata and array.base is None
 
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SingularSystemError
-from pathspace_graph.factors.odometry import compose
+from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.gaussian import graph_of, keys_of, normal_equations
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
 from pathspace_graph.graph.rows import LinearFactor, Rows
@@ -114,7 +114,7 @@ def test_forgetting_a_point_removes_what_had_left_and_keeps_what_is_in_the_windo
     hessian = hessian + 1e-9 * np.eye(len(hessian))
     joint = np.linalg.inv(hessian)
     epoch = smoother.epoch
-    smoother.forget(gone)
+    smoother.remove_information(gone)
     assert smoother.epoch > epoch
     found, found_vector = normal_equations(smoother.prior, rest)
     found = found + 1e-9 * np.eye(len(found))
@@ -332,7 +332,7 @@ def test_predicted_is_that_of_the_dense_joint_covariance_with_the_newest_pose(to
     for i in range(len(keys)):
         np.add.at(J[i], columns_of(keys[i], everything), rows.jacobian[i])
     dense = J @ whole @ J.T
-    found = smoother.predicted(rows, together)
+    found = smoother.predicted_covariance(rows, together)
     assert found.shape == (len(keys) // together, together, together)
     for i, block in enumerate(found):
         own = slice(i * together, (i + 1) * together)

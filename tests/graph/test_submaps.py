@@ -269,7 +269,7 @@ def test_submaps_forget_map_points_and_go_on() -> None:
     submaps, *_ = drive_on(drive, groups, 2.5)
     gone = control_keys(1, np.array([1, 2]))
     assert any(np.isin(gone, submap.keys.keys).any() for submap in submaps.finished)
-    submaps.forget(gone, drive.variables)
+    submaps.remove_information(gone, drive.variables)
     assert not any(np.isin(gone, submap.keys.keys).any() for submap in submaps.finished)
     assert all(control_keys(0, np.array(0)) in submap.keys.keys for submap in submaps.finished)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, merged, normal_equations
+from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, merge_variables, normal_equations
 from pathspace_graph.graph.keys import landmark_keys, sizes
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.landmark.state import LandmarkState
@@ -77,7 +77,7 @@ def test_a_merged_graph_has_the_error_of_the_old_one_where_both_are_one() -> Non
     rng, keys = np.random.default_rng(2), landmark_keys(np.arange(4))
     gone, kept, offset = keys[[3, 1]], keys[[0, 2]], rng.normal(0.0, 1.0, 4)
     factors = [_random(rng, of) for of in (keys[[0, 3]], keys[[1, 2, 3]], keys[[0, 1, 2]])]
-    old, new = graph_of(*factors), merged(graph_of(*factors), gone, kept, offset)
+    old, new = graph_of(*factors), merge_variables(graph_of(*factors), gone, kept, offset)
     raised = []
     for _ in range(5):
         known = {int(key): rng.normal(0.0, 3.0, 2) for key in kept}
@@ -93,7 +93,7 @@ def test_a_key_that_the_graph_does_not_hold_merges_into_nothing() -> None:
     keys = landmark_keys(np.arange(3))
     graph = graph_of(_random(np.random.default_rng(3), keys[:2]))
     hessian, vector = graph.hessian(gtsam.Ordering(keys[:2].tolist()))
-    found = merged(graph, keys[2:], keys[:1], np.ones(2)).hessian(gtsam.Ordering(keys[:2].tolist()))
+    found = merge_variables(graph, keys[2:], keys[:1], np.ones(2)).hessian(gtsam.Ordering(keys[:2].tolist()))
     np.testing.assert_allclose(found[0], hessian, atol=1e-9)
     np.testing.assert_allclose(found[1], vector, atol=1e-9)
 

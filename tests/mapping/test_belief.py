@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
-from pathspace_graph.mapping.belief import Belief, compose_rows, point_columns, to_map_rows, to_vehicle_rows
+from pathspace_graph.factors.se2 import compose
+from pathspace_graph.mapping.belief import Belief, point_columns, to_map_rows, to_vehicle_rows
 
 Array = NDArray[np.float64]
 
@@ -31,7 +32,7 @@ def test_prediction_has_the_moments_of_a_sample() -> None:
     noise = rng.multivariate_normal(np.zeros(3), odometry.covariance, 200_000)
     moved = sample.copy()
     error = noise - sample[:, 3:5] @ odometry.calibration_jacobian.T
-    moved[:, :3] = compose_rows(compose_rows(sample[:, :3], odometry.delta), error)
+    moved[:, :3] = compose(compose(sample[:, :3], odometry.delta), error)
     belief.predict(odometry)
     np.testing.assert_allclose(belief.mean, moved.mean(axis=0), atol=3e-3)
     np.testing.assert_allclose(belief.covariance, np.cov(moved.T), atol=1e-3)

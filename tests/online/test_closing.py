@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.table1 import cone_distances
-from pathspace_graph.factors.projection import to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.gaussian import keys_of, normal_equations
 from pathspace_graph.graph.keys import control_keys
 from pathspace_graph.graph.variables import Layout

@@ -75,7 +75,7 @@ def test_a_new_smoother_begins_where_an_end_is_taken_back() -> None:
     for odometry, cycle in cycles[:-5]:
         mapper.update(odometry, cycle)
     old = solver_of(mapper)._gtsam
-    mapper.smoother.forget(np.array(mapper.control_keys(0)[3:]))
+    mapper.smoother.remove_information(np.array(mapper.control_keys(0)[3:]))
     for odometry, cycle in cycles[-5:]:
         result = mapper.update(odometry, cycle)
     assert solver_of(mapper)._gtsam is not old

@@ -39,7 +39,7 @@ def straight(seconds: float = 6.0, smoothness: float = SMOOTHNESS) -> tuple[Batc
     state = start_odometry(chain, detections, settings)
     system = BatchSystem(detections, chain, settings, Biweight(LEAST_SQUARES))
     system.begin(state)
-    locate_poses(state)
+    locate_poses(state, settings.batch.association)
     associate(state, detections, settings, settings.batch.gate, True)
     system.evaluate(state, hold=True)
     return system, settled(system, state)

@@ -18,8 +18,10 @@ from pathspace_graph.factors.gtsam_factors import (
     spacing_factors,
     spline_projection_factor,
 )
-from pathspace_graph.factors.odometry import IntegratedOdometry, compose, integrate_twists, odometry_residuals
-from pathspace_graph.factors.projection import huber_weights, project, to_map
+from pathspace_graph.factors.noise import huber_weights
+from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists, odometry_residuals
+from pathspace_graph.factors.projection import project
+from pathspace_graph.factors.se2 import compose, to_map
 from pathspace_graph.factors.spans import SpanPolynomials
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE
 

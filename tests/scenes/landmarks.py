@@ -36,7 +36,7 @@ def drive_on(smoother: LandmarkSmoother, cycle: int, twist: tuple[float, float, 
     """Adds the pose of one more cycle, reached with a twist (m/s, m/s, rad/s)."""
     steps = 1 if cycle else 0
     odometry = integrate_twists(np.full(steps, PERIOD), np.tile(twist, (steps, 1)), ODOMETRY_SIGMA)
-    smoother.drive(PERIOD * cycle, odometry, smoother.map.settings.odometry.sigmas_start)
+    smoother.predict(PERIOD * cycle, odometry, smoother.map.settings.odometry.sigmas_start)
 
 
 def see_all(smoother: LandmarkSmoother, cycle: int, noise: float) -> None:

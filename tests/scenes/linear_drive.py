@@ -139,7 +139,7 @@ class LinearDrive:
     def predict(self) -> None:
         k, smoother = self.cycles, self.smoother
         if k == 0:
-            smoother.begin(0.0, self.start.copy(), np.diag(SIGMA_START**2))
+            smoother.add_first_pose(0.0, self.start.copy(), np.diag(SIGMA_START**2))
             self.see(np.arange(3))
             return
         W = np.triu(self.rng.normal(size=(POSE, POSE))) + 3.0 * np.eye(POSE)
@@ -147,7 +147,7 @@ class LinearDrive:
         G = self.rng.normal(size=(POSE, 2))
         step = IntegratedOdometry(self.rng.normal(size=POSE), covariance, G, W)
         self.odometry.append(step)
-        smoother.follow(float(k), smoother.variables.poses[-1] + self.rng.normal(size=POSE), step)
+        smoother.add_pose(float(k), smoother.variables.poses[-1] + self.rng.normal(size=POSE), step)
         if k + 2 < POINTS:
             self.see(np.array([k + 2]))
 

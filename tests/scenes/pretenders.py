@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -11,20 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph import estimators as registry
-from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.run import CycleResult
 from pathspace_graph.settings.mapper import MapperSettings
-
-
-@dataclass(frozen=True)
-class Step:
-    """What they say of every cycle."""
-
-    pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    sizes: tuple[int, int] = (2, 2)
-    readings: int = 1
-    stages: Mapping[str, float] = field(default_factory=dict)
 
 
 class Pretender:
@@ -32,12 +21,12 @@ class Pretender:
 
     calls = 0
 
-    def __init__(self, settings: MapperSettings, log: Log) -> None:
+    def __init__(self, settings: MapperSettings, odometry_sigma: NDArray[np.float64]) -> None:
         type(self).calls += 1
         self.settings = settings
 
-    def update(self, odometry: Odometry, detections: Detections) -> Step:
-        return Step()
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        return CycleResult(detections.t, np.zeros(3), (2, 2), 1, False)
 
     def map(self) -> Map:
         points = np.array([[self.settings.lag, 0.0], [0.0, -10.0]])
@@ -49,7 +38,7 @@ class Fragile(Pretender):
 
     broken = True
 
-    def update(self, odometry: Odometry, detections: Detections) -> Step:
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         if self.broken and self.settings.lag == 1.0:
             raise ValueError("lost")
         return super().update(odometry, detections)

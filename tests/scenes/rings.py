@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry, write_log
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.io.results import BatchRun
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.run import CycleResult
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_files import read_track
@@ -27,24 +27,14 @@ RADII = {LEFT: 8.0, RIGHT: 12.0}
 CENTRE = np.array([0.0, 10.0])
 
 
-@dataclass(frozen=True)
-class Step:
-    """Of every cycle: at the origin."""
-
-    pose: Array = field(default_factory=lambda: np.zeros(3))
-    sizes: tuple[int, int] = (16, 16)
-    readings: int = 1
-    stages: dict[str, float] = field(default_factory=lambda: {"guess": 1e-6})
-
-
 class Rings:
     """Both boundaries as closed splines through the truth, 0.1 m too wide."""
 
-    def __init__(self, settings: MapperSettings, log: Log) -> None:
+    def __init__(self, settings: MapperSettings, odometry_sigma: Array) -> None:
         self.settings = settings
 
-    def update(self, odometry: Odometry, detections: Detections) -> Step:
-        return Step()
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        return CycleResult(detections.t, np.zeros(3), (16, 16), 1, True, {"guess": 1e-6})
 
     def map(self) -> Map:
         angle = 2 * np.pi * np.arange(16) / 16
@@ -77,7 +67,7 @@ class Gaps(Rings):
 class Broken(Rings):
     """Fails at once."""
 
-    def update(self, odometry: Odometry, detections: Detections) -> Step:
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         raise ValueError("lost\nthe way")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal
 
@@ -23,19 +23,11 @@ from pathspace_graph.eval.benchmark.baseline import (
     read_baseline,
     write_baseline,
 )
-from pathspace_graph.eval.benchmark.benchmark import (
-    Gtsam,
-    Measurement,
-    linear_window,
-    marginal_keys,
-    measure,
-    metrics,
-    orderings,
-    rich_table,
-    time_gtsam,
-    write_json,
-)
+from pathspace_graph.eval.benchmark.benchmark import rich_table
+from pathspace_graph.eval.benchmark.gtsam_window import linear_window, marginal_keys, orderings, time_gtsam
+from pathspace_graph.eval.benchmark.measurement import Gtsam, Measurement, measure, metrics
 from pathspace_graph.eval.benchmark.metric import Metric
+from pathspace_graph.io.json_file import write_json
 from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
@@ -135,7 +127,7 @@ def test_a_bound_is_kept_or_not() -> None:
 
 def test_output(tmp_path: Path) -> None:
     figures = [Metric("mean_by_gtsam", 1.234, "", bound=2.0), Metric("closing", float("nan"), "ms")]
-    write_json(tmp_path / "figures.json", figures)
+    write_json(tmp_path / "figures.json", [asdict(metric) for metric in figures])
     rows = json.loads((tmp_path / "figures.json").read_text())
     assert rows[0] == {
         "key": "mean_by_gtsam",

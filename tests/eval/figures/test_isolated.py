@@ -71,13 +71,13 @@ def test_extension_leaves_the_curve_and_its_uncertainty_as_they_were() -> None:
     # of a point on the old curve the new last control point has no share but near the seam
     np.testing.assert_allclose(after[:30], before[:30], rtol=1e-9)
     last = data.extended.covariance[-2:, -2:]
-    np.testing.assert_allclose(last, ExpansionScene().sigma_reading ** 2 * np.eye(2))
+    np.testing.assert_allclose(last, ExpansionScene().sigma_detection ** 2 * np.eye(2))
 
 
 def test_the_covariance_of_an_extension_is_that_of_extended_samples() -> None:
     data, rng = expansion(), np.random.default_rng(4)
     reading, scene = data.detections[4], ExpansionScene()
-    extended = extend(data.before, reading, scene.sigma_reading**2 * np.eye(2))
+    extended = extend(data.before, reading, scene.sigma_detection**2 * np.eye(2))
     drawn = rng.multivariate_normal(data.before.spline.control_points.ravel(), data.before.covariance, 4000)
     knots = extended.spline.knots
     lengthened = []
@@ -118,9 +118,9 @@ def test_each_spline_is_the_ridge_regression_of_its_sigma_point() -> None:
     for sigma_point, fitted in zip(data.sigma_points, data.fitted_points, strict=True):
         expected = np.linalg.solve(data.basis.T @ data.basis + L, data.basis.T @ sigma_point + L @ known)
         np.testing.assert_allclose(fitted, expected, atol=1e-8)
-    np.testing.assert_allclose(data.fitted_points.mean(axis=0), data.reading.points, atol=1e-9)
-    spread = (data.fitted_points - data.reading.points).reshape(-1, 2 * n)
-    np.testing.assert_allclose(spread.T @ spread / len(spread), data.reading.covariance, atol=1e-9)
+    np.testing.assert_allclose(data.fitted_points.mean(axis=0), data.measurement.points, atol=1e-9)
+    spread = (data.fitted_points - data.measurement.points).reshape(-1, 2 * n)
+    np.testing.assert_allclose(spread.T @ spread / len(spread), data.measurement.covariance, atol=1e-9)
 
 
 def test_the_fit_lies_between_the_curve_and_the_readings_and_moves_what_the_basis_touches() -> None:
@@ -129,9 +129,9 @@ def test_the_fit_lies_between_the_curve_and_the_readings_and_moves_what_the_basi
     after = data.fitted.foot_points(data.detections).distance
     assert (np.abs(after) < 0.3 * np.abs(before)).all()
     touched = data.basis.sum(axis=0) > 0.0
-    moved = np.linalg.norm(data.reading.points - data.curve.control_points, axis=1)
+    moved = np.linalg.norm(data.measurement.points - data.curve.control_points, axis=1)
     assert (moved[~touched] < 1e-9).all() and moved[touched].max() > 1.0
-    own = np.diag(data.reading.covariance).reshape(-1, 2).sum(axis=1)
+    own = np.diag(data.measurement.covariance).reshape(-1, 2).sum(axis=1)
     assert (own[~touched] < 1e-15).all()
 
 

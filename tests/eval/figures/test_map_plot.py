@@ -10,13 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.figures.map_plot import (
-    check_plot_file,
-    curve_parameters,
-    plot_map,
-    save_plot,
-    uncertainty_band,
-)
+from pathspace_graph.eval.figures.files import check_plot_file, save_plot
+from pathspace_graph.eval.figures.map_plot import plot_map
+from pathspace_graph.eval.figures.marks import curve_parameters, uncertainty_band
 from pathspace_graph.io.log import Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
@@ -100,7 +96,7 @@ def test_equal_aspect_and_everything_in_sight() -> None:
     figure = plot_map(ring_map(), log=ring_log(), title="ring")
     axes = figure.axes[0]
     assert axes.get_aspect() == 1.0
-    assert axes.get_title() == "ring"
+    assert axes.get_title("left") == "ring"
     assert axes.get_xlim()[0] < -22.4 and axes.get_xlim()[1] > 22.4
     assert axes.get_ylim()[0] < -2.4 and axes.get_ylim()[1] > 42.4
 

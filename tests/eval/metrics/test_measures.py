@@ -7,12 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.metrics.consistency import (
-    Consistency,
-    curve_errors,
-    landmark_errors,
-    map_consistency,
-)
+from pathspace_graph.eval.metrics.consistency import Nees, curve_errors, landmark_errors, map_nees
 from pathspace_graph.eval.metrics.cost import WHOLE, covariance_bytes, map_bytes, stage_times
 from pathspace_graph.eval.metrics.curve_distance import curve_distance
 from pathspace_graph.eval.metrics.ghosts import GhostSettings, ghosts
@@ -172,8 +167,8 @@ def test_nees_of_honest_maps_is_one_per_degree_and_lies_in_its_interval_95_times
     for _ in range(200):
         points = base + (sigma @ rng.normal(size=60)).reshape(30, 2) * [0.0, 1.0]
         spline = BSpline.clamped_from(np.linspace(0.0, 56.0, 28), points)
-        found.append(map_consistency(Map(False, {LEFT: SplineBoundary(spline, sigma @ sigma.T)}), true))
-    assert found[0].freedom == 30
+        found.append(map_nees(Map(False, {LEFT: SplineBoundary(spline, sigma @ sigma.T)}), true))
+    assert found[0].dof == 30
     assert np.mean([c.ratio for c in found]) == pytest.approx(1.0, abs=0.06)
     assert 0.88 <= np.mean([c.honest for c in found]) <= 1.0
     low, high = found[0].interval
@@ -182,12 +177,12 @@ def test_nees_of_honest_maps_is_one_per_degree_and_lies_in_its_interval_95_times
 
 def test_nees_counts_overconfidence_and_knows_what_it_cannot_tell() -> None:
     true = truth(row(2.0))
-    timid = map_consistency(Map(False, {LEFT: landmarks((0, 2.3), (5, 2), (10, 2), sigma=3.0)}), true)
-    assert (timid.nees, timid.freedom) == (pytest.approx(0.01), 6)
+    timid = map_nees(Map(False, {LEFT: landmarks((0, 2.3), (5, 2), (10, 2), sigma=3.0)}), true)
+    assert (timid.value, timid.dof) == (pytest.approx(0.01), 6)
     assert timid.ratio < timid.interval[0] and not timid.honest
     singular = SplineBoundary(line(2.0).spline, np.zeros((8, 8)))
-    assert np.isnan(map_consistency(Map(False, {LEFT: singular}), true).ratio)
-    assert np.isnan(Consistency(0.0, 0).ratio) and np.isnan(Consistency(0.0, 0).interval[0])
+    assert np.isnan(map_nees(Map(False, {LEFT: singular}), true).ratio)
+    assert np.isnan(Nees(0.0, 0).ratio) and np.isnan(Nees(0.0, 0).interval[0])
 
 
 # --- memory and time -------------------------------------------------------------------------------------

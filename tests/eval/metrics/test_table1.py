@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from pathspace_graph.eval.metrics.consistency import normal_errors
 from pathspace_graph.eval.metrics.table1 import (
     ate,
     boundary_distances,
@@ -16,7 +17,6 @@ from pathspace_graph.eval.metrics.table1 import (
     lap_end_times,
     lap_metrics,
     laps_metrics,
-    normal_errors,
     trajectory_errors,
     two_way_distance,
 )

@@ -19,15 +19,15 @@ from pathspace_graph.eval.scaling.lanes import Lane, LaneTimes, run_lanes
 from pathspace_graph.eval.scaling.output import MARKER, scaling_table, stops, write_scaling
 from pathspace_graph.eval.scaling.points import CONES, LAPS, READINGS, Point, binned, fit_slope
 from pathspace_graph.eval.scaling.roads import (
-    RoadSettings,
     closed_road,
     cones_seen,
     drive_log,
+    make_drives,
     open_road,
     thinned,
 )
-from pathspace_graph.eval.scaling.scaling import make_drives, measure_scaling
-from pathspace_graph.eval.scaling.settings import ScalingSettings
+from pathspace_graph.eval.scaling.scaling import measure_scaling
+from pathspace_graph.eval.scaling.settings import RoadSettings, ScalingSettings
 from pathspace_graph.io.log import Log
 from pathspace_graph.settings.mapper import MapperSettings
 

@@ -12,10 +12,9 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.errors import OutputError, SettingsError
-from pathspace_graph.eval.metrics.table1 import normal_errors
+from pathspace_graph.eval.metrics.consistency import normal_errors, with_marginals
 from pathspace_graph.eval.study import run as study_run
-from pathspace_graph.eval.study.frame import without_times
-from pathspace_graph.eval.study.metrics import TIMES, with_marginals
+from pathspace_graph.eval.study.frame import TIMES, without_times
 from pathspace_graph.eval.study.output import write_figures, write_tables
 from pathspace_graph.eval.study.run import make_plan, run_study
 from pathspace_graph.eval.study.study import Study

@@ -144,7 +144,7 @@ def test_figures_of_what_differs(frame: pd.DataFrame) -> None:
     drawn = figures(STUDY, frame)
     assert set(drawn) == {"differences", "accuracy_size", "accuracy_time"}
     (panel,) = drawn["differences"].axes
-    assert panel.get_title() == "rmse [m]"
+    assert panel.get_title("left") == "rmse [m]"
     assert [label.get_text() for label in panel.get_yticklabels()] == [
         "nominal, lag=1",
         "nominal, lag=2",

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.eval.study.cells import load_tracks
+from pathspace_graph.eval.harness.drives import load_tracks
 from pathspace_graph.eval.study.file import SHIPPED, find_study, read_study, shipped_studies, study_from
 from pathspace_graph.eval.study.overrides import as_type, leaves, override
 from pathspace_graph.eval.study.run import make_plan

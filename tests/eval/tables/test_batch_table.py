@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.metrics.nees import Nees
+from pathspace_graph.eval.metrics.consistency import Nees
 from pathspace_graph.eval.tables.batch_table import HEADER, BatchTable, Outcome, evaluate, rows, worse
 from pathspace_graph.eval.tables.cases import Case
 from pathspace_graph.sim.simulate import SimulationSettings, simulate

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
-from pathspace_graph.eval.tables.text_table import TextTable, latex_text
+from pathspace_graph.eval.metrics.text_table import TextTable
 
 
 def test_a_table_keeps_its_units_and_escapes_what_latex_would_take_for_commands() -> None:
-    table = TextTable("50 % of a_b", ("name", "rmse [m]"), (("x|y", "1.0"), ("z", "–")), groups=(1,))
+    rows = (("x|y", "2σ < 5 %"), ("z", "–"))
+    table = TextTable("50 % of a_b ± 1", ("name", "rmse [m]"), rows, groups=(1,))
     assert table.rich().columns[1].header.plain == "rmse [m]"  # type: ignore[union-attr]
-    assert "| x\\|y | 1.0 |" in table.markdown()
     latex = table.latex()
-    assert "\\caption{50 \\% of a\\_b}" in latex and "z & -- \\\\" in latex
-    assert latex.count("\\midrule") == 2 and "{lr}" in latex
-    assert latex_text("2σ & 5 % {x}") == "2$\\sigma$ \\& 5 \\% \\{x\\}"
+    assert r"\caption{50 \% of a\_b $\pm$ 1}" in latex and r"2$\sigma$ \ensuremath{<} 5 \%" in latex
+    assert latex.count(r"\midrule") == 2 and "{lr}" in latex and latex.isascii()
+
+
+def test_names_are_aligned_to_the_left_and_numbers_to_the_right() -> None:
+    table = TextTable("Title", ("name", "a", ""), (("x|y", "1.0", ""), ("long name", "12.25", "*")))
+    assert [line.rstrip() for line in table.text().split("\n")] == [
+        "name           a",
+        "---------  -----  --",
+        "x|y          1.0",
+        "long name  12.25   *",
+    ]
+    lines = table.markdown().split("\n")
+    assert lines[:2] == ["Title", ""] and lines[-1] == ""
+    assert lines[3] == "|:----------|------:|---:|"
+    assert lines[4] == r"| x\|y      |   1.0 |    |"
 
 
 def test_a_table_too_wide_is_cut_into_parts_that_keep_the_names() -> None:

@@ -1,0 +1,1 @@
+"""The one way in which estimators are run and measured over many logs, in parallel."""

@@ -1,0 +1,266 @@
+"""What is measured of a run: the one list of metrics, and the one function that measures them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.io.map import Map
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
+from pathspace_graph.labels import BOUNDARIES
+
+from .consistency import map_nees, normal_errors, with_marginals
+from .cost import covariance_bytes, map_bytes, stage_times
+from .curve_distance import curve_distance
+from .ghosts import GhostSettings, ghosts
+from .limit import limit
+from .summary import has_cones, lap_times
+from .table1 import (
+    capped_rmse,
+    cone_distances,
+    lap_metrics,
+    missed_share,
+    root_mean_square,
+    trajectory_errors,
+)
+
+FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3}
+"""Columns hold shares and bytes, which these factors turn into the units of the tables."""
+MEAN_DIGITS: Final = 2
+"""A mean with its interval is shown with at least this many digits after the decimal point."""
+UNKNOWN: Final = "–"
+"""Tables show this in place of a value that isn't known."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A metric is one number that is measured of every lap or of every run."""
+
+    key: str
+    """Every file has the metric in the column of this name."""
+    title: str
+    """Tables call the metric so."""
+    unit: str = ""
+    """Tables show the values in this unit; it is empty for pure numbers and counts."""
+    digits: int = 3
+    """Tables show this many digits after the decimal point."""
+    better: Literal["lower", "higher", "none"] = "lower"
+    """Lower or higher values are better, or neither is."""
+    scope: Literal["lap", "run"] = "lap"
+    """A lap's metric is measured of every lap and of the whole run, a run's metric of the whole run only."""
+    time: bool = False
+    """A wall time differs whenever the same run is repeated; nothing else does."""
+
+    @property
+    def heading(self) -> str:
+        """Returns the title with the unit in brackets."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+    @property
+    def factor(self) -> float:
+        """Returns the factor from the column's unit to that of the tables."""
+        return FACTORS.get(self.unit, 1.0)
+
+    def text(self, value: float) -> str:
+        """Returns a value as tables show it."""
+        return UNKNOWN if np.isnan(value) else f"{self.factor * value:.{self.digits}f}"
+
+
+PAPER: Final = (
+    Metric("rmse", "rmse", "m"),
+    Metric("missed", "missed", "%", 1),
+    Metric("size", "size", digits=0),
+)
+"""These are the metrics of the paper's Table 1."""
+_ALL: Final = (
+    *PAPER,
+    Metric("cones", "true cones", digits=0, better="none"),
+    Metric("size_share", "size by true cones", "%", 1),
+    Metric("missed_2m", "missed at 2 m", "%", 1),
+    Metric("missed_1m", "missed at 1 m", "%", 1),
+    Metric("rmse_capped", "rmse, a missed cone as 3 m", "m"),
+    Metric("mapped_to_truth", "curve distance, mapped to truth", "m"),
+    Metric("truth_to_mapped", "curve distance, truth to mapped", "m"),
+    Metric("two_way", "curve distance, two-way", "m"),
+    Metric("ghost_landmarks", "ghost landmarks", digits=1),
+    Metric("ghost_metres", "ghost curve", "m", 1),
+    Metric("ghost_share", "ghosts, share of the map", "%", 2),
+    Metric("duplicates", "landmarks of a cone mapped before", digits=1),
+    Metric("ate", "trajectory error (ATE)", "m"),
+    Metric("along", "trajectory error along", "m"),
+    Metric("across", "trajectory error across", "m"),
+    Metric("gap_curves", "gap to batch, curves", "m", scope="run"),
+    Metric("gap_trajectory", "gap to batch, trajectory", "m", scope="run"),
+    Metric("l", "limit, landmarks by oracle association", "m", scope="run", better="none"),
+    Metric("f", "limit, fit of the curves", "m", scope="run", better="none"),
+    Metric("limit", "limit", "m", scope="run", better="none"),
+    Metric("nees", "NEES per degree of freedom", digits=2, better="none"),
+    Metric("nees_low", "its 95 % interval, from", digits=2, better="none"),
+    Metric("nees_high", "its 95 % interval, to", digits=2, better="none"),
+    Metric("nees_inside", "NEES within its interval", "%", 1, better="higher"),
+    Metric("nees_marginals", "NEES per degree of freedom, of the marginals", digits=2, better="none"),
+    Metric("inside", "cones within 2σ of the curve", "%", 1, better="none"),
+    Metric("inside_marginals", "cones within 2σ of the marginals", "%", 1, better="none"),
+    Metric("normalized_error", "mean squared error by variance at the cones", digits=2, better="none"),
+    Metric("normalized_error_marginals", "the same by variance of the marginals", digits=2, better="none"),
+    Metric("closed", "loop closed", "%", 0, better="higher"),
+    Metric("converged", "batch converged", "%", 0, better="higher", scope="run"),
+    Metric("bytes", "map", "kB", 2),
+    Metric("bytes_covariance", "its covariance", "kB", 1),
+    Metric("ms_mean", "update, mean", "ms", 2, time=True),
+    Metric("ms_median", "update, median", "ms", 2, time=True),
+    Metric("ms_p99", "update, 99th percentile", "ms", 2, time=True),
+    Metric("seconds", "whole run", "s", 1, scope="run", time=True),
+)
+METRICS: Final[Mapping[str, Metric]] = {metric.key: metric for metric in _ALL}
+"""These are all metrics by key, in the order of the tables."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Holds what was measured of one lap, or of a whole run."""
+
+    lap: int | None
+    """The lap counts from 1; it is None for the whole run."""
+    values: dict[str, float]
+    """These are the values by the metric's key, counts as whole numbers and `closed` as a truth value. What
+    isn't known, for example without truth, is absent."""
+
+
+def measure(
+    run: RunResult,
+    log: Log,
+    seconds: float | None = None,
+    ghost_settings: GhostSettings | None = None,
+    *,
+    marginals: bool = False,
+    yardsticks: bool = False,
+) -> list[Row]:
+    """Returns a row for each complete lap, and one for the whole run as the last.
+
+    The row of a lap has the map as it stood at its end, and the poses and updates of its cycles. Laps are the
+    true ones where the log has a true path, else the estimator's own. A batch has one map for all laps, and
+    so one row, that of the last lap. `seconds` is the wall time of the whole run. `marginals` asks for the
+    metrics of the paper's squared basis, `yardsticks` for `l`, `f` and `limit`, which take a batch with
+    oracle association and thus a simulated log (ValueError without associations).
+    """
+    rows = []
+    for lap, track, begin, end in _laps(run, log):
+        values = _map_values(track, log.truth, ghost_settings, marginals)
+        rows.append(Row(lap, values | _drive_values(run, log.truth, begin, end)))
+    values = _map_values(run.map, log.truth, ghost_settings, marginals)
+    values |= _drive_values(run, log.truth, -np.inf, np.inf)
+    if isinstance(run, BatchRun):
+        values["converged"] = run.converged
+    if yardsticks:
+        least = limit(log, run.map)
+        values |= {"l": least.l, "f": least.f, "limit": least.total}
+    if seconds is not None:
+        values["seconds"] = seconds
+    return [*rows, Row(None, values)]
+
+
+def _laps(run: RunResult, log: Log) -> Iterator[tuple[int, Map, float, float]]:
+    """Yields (lap, its map, begin, end); the cycles in (begin, end] s belong to the lap."""
+    ends = [-np.inf, *lap_times(log)]
+    true_laps = len(ends) - 1
+    if isinstance(run, BatchRun):
+        if true_laps:
+            yield true_laps, run.map, ends[-2], ends[-1]
+        elif run.laps:
+            yield run.laps, run.map, -np.inf, np.inf
+        return
+    maps = tuple(enumerate(run.snapshots, start=1))
+    if not true_laps:
+        maps = run.lap_maps
+        ends += [max(record.t for record in run.cycles if record.lap <= lap) for lap, _ in maps]
+    for index, (lap, track) in enumerate(maps):
+        yield lap, track, ends[index], ends[index + 1]
+
+
+def _map_values(
+    track: Map, truth: Truth | None, ghost_settings: GhostSettings | None, marginals: bool
+) -> dict[str, float]:
+    """Returns the metrics of a map as it stands; without true cones only those that need none."""
+    values: dict[str, float] = {
+        "size": track.size,
+        "closed": bool(track.closed),
+        "bytes": map_bytes(track),
+        "bytes_covariance": covariance_bytes(track),
+    }
+    if truth is None or not has_cones(truth):
+        return values
+    values |= _cone_values(track, truth) | _curve_values(track, truth, ghost_settings)
+    values |= _consistency_values(track, truth)
+    if marginals:
+        by_marginals = _consistency_values(with_marginals(track), truth)
+        keys = ("nees", "inside", "normalized_error")
+        values |= {f"{key}_marginals": by_marginals[key] for key in keys}
+    return values
+
+
+def _cone_values(track: Map, truth: Truth) -> dict[str, float]:
+    paper, distances = lap_metrics(track, truth, 0), cone_distances(track, truth)
+    cones = int(np.isin(truth.cone_labels, BOUNDARIES).sum())
+    return {
+        "rmse": paper.rmse,
+        "missed": paper.missed,
+        "cones": cones,
+        "size_share": track.size / cones,
+        "missed_2m": missed_share(distances, 2.0),
+        "missed_1m": missed_share(distances, 1.0),
+        "rmse_capped": capped_rmse(distances),
+    }
+
+
+def _curve_values(track: Map, truth: Truth, ghost_settings: GhostSettings | None) -> dict[str, float]:
+    curve, ghost = curve_distance(track, truth), ghosts(track, truth, ghost_settings)
+    return {
+        "mapped_to_truth": curve.mapped_to_truth,
+        "truth_to_mapped": curve.truth_to_mapped,
+        "two_way": curve.two_way,
+        "ghost_landmarks": ghost.landmarks,
+        "ghost_metres": ghost.metres,
+        "ghost_share": ghost.share,
+        "duplicates": ghost.duplicates,
+    }
+
+
+def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:
+    nees, at_cones = map_nees(track, truth), normal_errors(track, truth)
+    low, high = nees.interval
+    known = {} if np.isnan(nees.ratio) else {"nees_inside": nees.honest}
+    return {
+        "nees": nees.ratio,
+        "nees_low": low,
+        "nees_high": high,
+        **known,
+        "inside": at_cones.share_inside(),
+        "normalized_error": at_cones.mean_squared(),
+    }
+
+
+def _drive_values(run: RunResult, truth: Truth | None, begin: float, end: float) -> dict[str, float]:
+    """Returns the trajectory's errors (m) and an online run's update times (ms) in (begin, end] s."""
+    values: dict[str, float] = {}
+    if truth is not None and len(truth.poses):
+        inside = (run.trajectory_t > begin) & (run.trajectory_t <= end)
+        errors = trajectory_errors(run.trajectory_t[inside], run.trajectory[inside], truth)
+        values["ate"] = root_mean_square(np.linalg.norm(errors[:, :2], axis=1))
+        values["along"], values["across"] = (root_mean_square(column) for column in errors[:, :2].T)
+    cycles = online_cycles(run, begin, end)
+    if cycles:
+        whole = stage_times(cycles)[0]
+        values |= {f"ms_{name}": 1e3 * getattr(whole, name) for name in ("mean", "median", "p99")}
+    return values
+
+
+def online_cycles(run: RunResult, begin: float = -np.inf, end: float = np.inf) -> list[CycleRecord]:
+    """Returns the cycles in (begin, end] s; a batch has none, since its cycles take no time of their own."""
+    if isinstance(run, BatchRun):
+        return []
+    return [record for record in run.cycles if begin < record.t <= end]

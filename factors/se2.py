@@ -1,0 +1,52 @@
+"""Rigid motions of the plane, SE(2): a pose is `(x, y, theta)` in m, m and rad."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def wrap_angle(angle: Array) -> Array:
+    """Returns each angle (rad) wrapped to (-pi, pi]."""
+    return -((np.pi - angle) % (2.0 * np.pi) - np.pi)
+
+
+def rotation(theta: float) -> Array:
+    """Returns R(theta) (2, 2), which turns a vector from the vehicle frame to the map frame."""
+    c, s = np.cos(theta), np.sin(theta)
+    return np.array([[c, -s], [s, c]])
+
+
+def compose(pose: Array, delta: Array) -> Array:
+    """Returns `pose * delta` on SE(2), for one pose (3,) or row by row (k, 3).
+
+    Headings are added and not wrapped, so that whole turns accumulate.
+    """
+    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    dx, dy = delta[..., 0], delta[..., 1]
+    moved = [pose[..., 0] + c * dx - s * dy, pose[..., 1] + s * dx + c * dy, pose[..., 2] + delta[..., 2]]
+    return np.stack(moved, axis=-1)
+
+
+def to_map(points_vehicle: Array, poses: Array) -> Array:
+    """Returns `p = R z + t` (m, 2) in the map frame.
+
+    points_vehicle (m, 2) are in the vehicle frame of each row's own pose (m, 3).
+    """
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x, y = points_vehicle[:, 0], points_vehicle[:, 1]
+    return np.array([c * x - s * y + poses[:, 0], s * x + c * y + poses[:, 1]]).T
+
+
+def se2_exp(tangents: Array) -> Array:
+    """Returns the exponential of SE(2), row by row: relative poses (k, 3).
+
+    Each row of tangents (k, 3) is a twist `(vx, vy, wz)` times its duration, in m, m and rad.
+    """
+    x, y, theta = tangents.T
+    half = np.where(theta == 0.0, np.finfo(float).tiny, 0.5 * theta)  # so that sin(half) / half is 1
+    sine, cosine = np.sin(half), np.cos(half)
+    sinc, cosc = sine * cosine / half, sine * sine / half
+    return np.array([sinc * x - cosc * y, cosc * x + sinc * y, theta]).T

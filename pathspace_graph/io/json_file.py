@@ -1,0 +1,49 @@
+"""JSON files: strict JSON is written whole or not at all, and an error names the row of what is read."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pathspace_graph.errors import InputError
+
+from .files import write_text
+
+
+def to_plain(value: Any) -> Any:
+    """Returns the value in the types of strict JSON.
+
+    Arrays and tuples become lists, numpy's scalars become numbers, and paths become texts. JSON has no numbers
+    for what is not finite: NaN becomes null, since it is no value, and infinity becomes the text "inf".
+    """
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return to_plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [to_plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None if math.isnan(value) else str(value)
+    return str(value) if isinstance(value, Path) else value
+
+
+def write_json(file: Path, content: Any, indent: int | None = 2) -> None:
+    """Writes the content as strict JSON, see `to_plain`, and replaces an earlier file."""
+    write_text(file, json.dumps(to_plain(content), indent=indent, allow_nan=False) + "\n")
+
+
+def read_json(file: Path, expected: str) -> Any:
+    """Returns the content of a JSON file; an InputError says that `expected` was expected where it fails."""
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(file, f"expected {expected}, can't be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise InputError(file, "expected text in UTF-8") from None
+    except json.JSONDecodeError as error:
+        raise InputError(file, f"expected JSON ({error.msg})", row=error.lineno) from None

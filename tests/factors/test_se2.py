@@ -1,0 +1,46 @@
+"""Motions of the plane against GTSAM's Pose2 and by hand."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from pathspace_graph.factors.gtsam_factors import pose_array
+from pathspace_graph.factors.se2 import compose, rotation, se2_exp, to_map, wrap_angle
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-12, 1e-6, 0.1, 3.0, -3.0])
+def test_exponential_is_gtsams_also_without_a_turn(turn: float) -> None:
+    tangent = np.array([1.5, -0.4, turn])
+    np.testing.assert_allclose(se2_exp(tangent[None])[0], pose_array(gtsam.Pose2.Expmap(tangent)), atol=1e-11)
+
+
+def test_compose_is_gtsams_and_turns_accumulate() -> None:
+    a, b = np.array([1.0, -2.0, 2.5]), np.array([0.3, 0.8, 2.0])
+    expected = gtsam.Pose2(*a).compose(gtsam.Pose2(*b))
+    np.testing.assert_allclose(compose(a, b)[:2], pose_array(expected)[:2], atol=1e-12)
+    assert compose(a, b)[2] == 4.5
+
+
+def test_wrap_angle_is_half_open() -> None:
+    angles = np.array([np.pi, -np.pi, 3.0 * np.pi, 0.0, 2.0 * np.pi + 0.1, -0.1])
+    np.testing.assert_allclose(wrap_angle(angles), [np.pi, np.pi, np.pi, 0.0, 0.1, -0.1], atol=1e-12)
+
+
+def test_to_map_is_the_rigid_transform() -> None:
+    points = to_map(np.array([[1.0, 2.0], [1.0, 0.0]]), np.array([[3.0, 4.0, np.pi / 2], [0.0, 0.0, np.pi]]))
+    np.testing.assert_allclose(points, [[1.0, 5.0], [-1.0, 0.0]], atol=1e-12)
+
+
+def test_poses_are_composed_row_by_row() -> None:
+    rng = np.random.default_rng(0)
+    poses, deltas = rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
+    found = compose(poses, deltas)
+    for k in range(5):
+        np.testing.assert_allclose(found[k], compose(poses[k], deltas[k]), atol=1e-15)
+    np.testing.assert_array_equal(compose(poses, deltas[0])[2], compose(poses[2], deltas[0]))
+
+
+def test_a_quarter_turn_leads_from_ahead_to_the_left() -> None:
+    np.testing.assert_allclose(rotation(np.pi / 2.0) @ [2.0, 0.0], [0.0, 2.0], atol=1e-15)

@@ -1,0 +1,42 @@
+"""Settings refuse numbers that mean nothing, by the name that the command line knows them by."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
+from math import inf, nan
+from typing import Any
+
+import pytest
+
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.settings.mapper import MapperSettings
+
+UNLIMITED = {"gate.huber", "growth.forget_after"}
+
+
+def numbers(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
+    """The dotted name of each number in a tree of settings, the group that holds it, and its field."""
+    for entry in fields(settings):
+        name, value = f"{prefix}{entry.name}", getattr(settings, entry.name)
+        if is_dataclass(value):
+            yield from numbers(value, f"{name}.")
+        elif isinstance(value, int | float):
+            yield name, settings, entry.name
+
+
+NUMBERS = list(numbers(MapperSettings()))
+
+
+@pytest.mark.parametrize(("name", "group", "field"), NUMBERS, ids=[name for name, *_ in NUMBERS])
+def test_every_number_is_positive_and_most_are_finite(name: str, group: Any, field: str) -> None:
+    for wrong in (0, -1.0, nan, *(() if name in UNLIMITED else (inf,))):
+        with pytest.raises(SettingsError, match=f"^{re.escape(name)}: expected a .*, found {wrong}"):
+            replace(group, **{field: wrong})
+
+
+def test_infinity_means_no_limit_where_a_limit_is_set() -> None:
+    settings = MapperSettings()
+    assert replace(settings.gate, huber=inf).huber == inf
+    assert replace(settings.growth, forget_after=inf).forget_after == inf

@@ -1,0 +1,352 @@
+"""The pages: their links lead somewhere, the code that they name exists, and their examples run."""
+
+from __future__ import annotations
+
+import csv
+import inspect
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from pathspace_graph import FixedLagMapper, Log
+from pathspace_graph.cli import COMMANDS, _parse
+from pathspace_graph.errors import InputError
+from pathspace_graph.io.log import write_log
+from pathspace_graph.io.results import write_result
+from pathspace_graph.run import run_online, split_odometry
+from pathspace_graph.sim import track_files
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
+
+from .scenes.jacobians import numeric_jacobian
+from .scenes.paths import ROOT
+from .test_rooms import ARROWS, LEAVES
+
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+PACKAGE = "pathspace_graph"
+
+every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+
+
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """The code blocks of a language, in order."""
+    return re.findall(rf"^```{language}\n(.*?)^```", text_of(page), flags=re.DOTALL | re.MULTILINE)
+
+
+def prose(page: Path) -> str:
+    """The page without its code blocks."""
+    return re.sub(r"^```.*?^```", "", text_of(page), flags=re.DOTALL | re.MULTILINE)
+
+
+def file_blocks(page: Path) -> dict[str, str]:
+    """The code blocks that begin with a comment that names their file, by that name."""
+    named = re.findall(r"^```\w+\n# (\S+\.\w+)\n(.*?)^```", text_of(page), flags=re.DOTALL | re.MULTILINE)
+    return dict(named)
+
+
+# --- links -----------------------------------------------------------------------------------------------
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", prose(page), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@every_page
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
+        if "://" not in target:
+            file, _, anchor = target.partition("#")
+            linked = (page.parent / file).resolve() if file else page
+            assert linked.exists(), target
+            assert linked.is_relative_to(ROOT), target
+            assert not anchor or anchor in anchors(linked), target
+
+
+def test_every_page_is_found_from_the_readme() -> None:
+    linked = set(re.findall(r"\]\(((?:docs/)?\w+\.md)[)#]", text_of(ROOT / "README.md")))
+    assert {str(page.relative_to(ROOT)) for page in PAGES} - {"README.md"} == linked
+
+
+# --- code that is named ----------------------------------------------------------------------------------
+
+NAMED = re.compile(r"`([a-z_]+(?:\.[a-z_]+)*):([A-Za-z_]\w*(?:\.\w+)*)`")
+"""`module.path:Name.member`, without the package's own name."""
+FILE = re.compile(r"`(\.?[a-z_][\w/.-]*/[\w-]*(?:\.(?:py|md))?|\w+\.(?:py|md))`")
+"""`folder/file.py` or `folder/`, below the root or below the package; other suffixes are of data."""
+OUTSIDE = {"cells/", "figures/", "captions.md", "table.md", "pacsim/", "fssim/", "eufs/"}
+"""Files and folders that commands write, and folders of track files."""
+ELSEWHERE = {"dead_reckoning", "compass"}
+"""Modules that a page tells its reader to write."""
+
+
+def member(owner: Any, name: str) -> Any:
+    """An attribute, or None where it is a field or is set by a method of the class."""
+    if hasattr(owner, name):
+        return getattr(owner, name)
+    assert inspect.isclass(owner), f"{owner.__name__} has no {name}"
+    declared = {field.name for field in fields(owner)} if is_dataclass(owner) else set()
+    assert name in declared or f"self.{name}" in inspect.getsource(owner), f"{owner.__name__} has no {name}"
+    return None
+
+
+@every_page
+def test_named_code_exists(page: Path) -> None:
+    for module, path in NAMED.findall(prose(page)):
+        if module not in ELSEWHERE:
+            found: Any = import_module(f"{PACKAGE}.{module}")
+            for name in path.split("."):
+                found = member(found, name)
+
+
+@every_page
+def test_named_files_exist(page: Path) -> None:
+    if page.name == "CHANGELOG.md":
+        return
+    for name in set(FILE.findall(prose(page))) - OUTSIDE:
+        assert any((home / name).exists() for home in (ROOT, ROOT / PACKAGE, page.parent)), name
+
+
+@every_page
+def test_named_commands_are_accepted(page: Path) -> None:
+    """Every command of a shell block has only options that there are."""
+    for line in "\n".join(blocks(page, "sh")).replace("\\\n", " ").splitlines():
+        command = re.search(r"(?:^|/|\s)pathspace-graph (\S.*)$", line)
+        if command is not None:
+            name, *arguments = re.sub(r"\s+#.*", "", command[1]).split()
+            assert name in COMMANDS, line
+            assert _parse(name, arguments) is not None, line
+
+
+# --- blocks of Python ------------------------------------------------------------------------------------
+
+
+@every_page
+def test_python_blocks_compile(page: Path) -> None:
+    for block in blocks(page, "python"):
+        compile(block, str(page), "exec")
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    """A short drive on a generated track."""
+    short = SimulationSettings(laps=1)
+    drive = simulate(generate_track(np.random.default_rng(0)), short, seed=0)
+    return Log(drive.odometry, drive.cycles[:60], drive.odometry_sigma, truth=drive.truth)
+
+
+def test_the_graph_is_asked_as_the_architecture_page_does(log: Log) -> None:
+    mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
+    for odometry, detections in split_odometry(log):
+        mapper.update(odometry, detections)
+    (block,) = blocks(ROOT / "docs" / "architecture.md", "python")
+    exec(compile(block, "architecture.md", "exec"), {"mapper": mapper, "gtsam": gtsam})
+
+
+def test_each_step_of_the_paper_is_two_calls_from_the_update() -> None:
+    page = text_of(ROOT / "docs" / "architecture.md")
+    steps = re.findall(r"^\| [^|]* \| `FixedLagMapper\.(\w+)` \| ([^|]*) \|", page, flags=re.MULTILINE)
+    assert len(steps) == 7
+    update = inspect.getsource(FixedLagMapper.update)
+    for method, functions in steps:
+        assert f"self.{method}(" in update
+        for _, function in NAMED.findall(functions):
+            called = function.rpartition(".")[2]
+            assert f"{called}(" in inspect.getsource(getattr(FixedLagMapper, method)), function
+
+
+def test_the_architecture_page_has_the_rooms_in_the_order_of_their_imports() -> None:
+    """A room stands below all that it may import, as `test_rooms` has it."""
+    page = text_of(ROOT / "docs" / "architecture.md")
+    table = page[page.index("## Rooms") : page.index("## What flows where")]
+    listed = re.findall(r"^\| `([a-z_.]+)` \|", table, flags=re.MULTILINE)
+    assert set(listed) == set(ARROWS) - LEAVES - {"cli", "__main__"}
+    for place, room in enumerate(listed):
+        assert ARROWS[room] <= set(listed[:place]), room
+
+
+# --- formats ---------------------------------------------------------------------------------------------
+
+
+def keys_of(content: Any) -> Iterator[str]:
+    """Every key of a JSON object and of the objects in it."""
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield key
+            yield from keys_of(value)
+
+
+def test_the_formats_page_has_every_file_column_and_key(log: Log, tmp_path: Path) -> None:
+    page = text_of(ROOT / "docs" / "formats.md")
+    write_log(log, tmp_path / "log")
+    result = run_online(log, FixedLagMapper(odometry_sigma=log.odometry_sigma))
+    write_result(tmp_path / "map", result, {})
+    for file in (*(tmp_path / "log").iterdir(), *(tmp_path / "map").iterdir()):
+        assert f"`{file.name}`" in page
+        if file.suffix == ".csv":
+            header = file.read_text().splitlines()[0]
+            assert f"`{header}`" in page
+    for key in keys_of(json.loads((tmp_path / "map" / "map.json").read_text())):
+        assert f"`{key}`" in page, key
+    for key in tomllib.loads((tmp_path / "log" / "log.toml").read_text())["sensor"]:
+        assert f"`{key}`" in page, key
+
+
+# --- extending -------------------------------------------------------------------------------------------
+
+EXTENDING = ROOT / "docs" / "extending.md"
+
+
+def module_of(name: str, code: str) -> ModuleType:
+    module = ModuleType(name)
+    exec(compile(code, f"{name}.py", "exec"), vars(module))
+    return module
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the page's estimator as pip would install it: the module beside its metadata."""
+    folder = tmp_path_factory.mktemp("site")
+    files = file_blocks(EXTENDING)
+    (folder / "dead_reckoning.py").write_text(files["dead_reckoning.py"])
+    project = tomllib.loads(files["pyproject.toml"])["project"]
+    info = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    )
+    groups = [
+        "\n".join([f"[{group}]", *(f"{name} = {target}" for name, target in points.items())])
+        for group, points in project["entry-points"].items()
+    ]
+    (info / "entry_points.txt").write_text("\n".join(groups) + "\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def log_folder(installed: Path) -> Path:
+    """The log of one lap of a small track."""
+    run_command(installed, "simulate --generate 0 --laps 1 --out log")
+    return installed / "log"
+
+
+def run_command(folder: Path, command: str) -> str:
+    """What a command prints; the folder is both where it runs and where the estimator is installed."""
+    paths = [str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "MPLBACKEND": "Agg"}
+    arguments = [sys.executable, "-m", PACKAGE, *command.split()]
+    done = subprocess.run(arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def csv_rows(file: Path) -> list[dict[str, str]]:
+    with file.open(encoding="utf-8", newline="") as lines:
+        return list(csv.DictReader(lines))
+
+
+def test_the_new_estimator_maps_online(installed: Path, log_folder: Path) -> None:
+    printed = run_command(installed, f"online {log_folder} --out map --estimator dead-reckoning")
+    assert "loop not closed" in printed
+    assert len((installed / "map" / "trajectory.tum").read_text().splitlines()) > 100
+
+
+def test_the_new_estimator_is_compared(installed: Path, log_folder: Path) -> None:
+    run_command(
+        installed, f"compare {log_folder} --out comparison --estimators dead-reckoning landmark-fixed-lag"
+    )
+    rows = csv_rows(installed / "comparison" / "table.csv")
+    rmse = {row["estimator"]: float(row["rmse"]) for row in rows}
+    assert rmse["dead-reckoning"] > rmse["landmark-fixed-lag"]
+
+
+@pytest.mark.slow
+def test_the_new_estimator_is_ablated(installed: Path) -> None:
+    (installed / "study.toml").write_text(file_blocks(EXTENDING)["dead_reckoning.toml"])
+    run_command(installed, "ablate study.toml --out study --tracks 0 --jobs 1")
+    rows = csv_rows(installed / "study" / "results.csv")
+    assert {row["estimator"] for row in rows} == {"fixed-lag", "dead-reckoning"}
+
+
+@pytest.mark.slow
+def test_the_new_estimator_is_scaled(installed: Path) -> None:
+    run_command(installed, "scale --out scaling --quick --estimators dead-reckoning")
+    rows = csv_rows(installed / "scaling" / "points.csv")
+    assert {row["estimator"] for row in rows} == {"dead-reckoning"}
+
+
+def test_the_new_factor_has_the_jacobian_that_it_says() -> None:
+    factor = module_of("compass", file_blocks(EXTENDING)["compass.py"]).compass_factor(0, 3.1, 0.5)
+
+    def whitened(pose: np.ndarray) -> np.ndarray:
+        values = gtsam.Values()
+        values.insert(0, gtsam.Pose2(1.0, 2.0, -3.0).retract(pose))
+        return np.asarray(factor.whitenedError(values))
+
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose2(1.0, 2.0, -3.0))
+    jacobian, _ = factor.linearize(values).jacobian()
+    np.testing.assert_allclose(jacobian, numeric_jacobian(whitened, np.zeros(3)), atol=1e-6)
+    np.testing.assert_allclose(whitened(np.zeros(3)), [(2.0 * np.pi - 6.1) / 0.5])
+
+
+def test_the_new_factor_holds_the_heading(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = file_blocks(EXTENDING)
+    monkeypatch.setitem(sys.modules, "compass", module_of("compass", files["compass.py"]))
+    drive = module_of("drive", files["drive.py"]).drive
+    assert log.truth is not None
+    stamps = [cycle.t for cycle in log.cycles]
+    headings = np.interp(stamps, log.truth.pose_t, np.unwrap(log.truth.poses[:, 2]))
+    offset = drive(log, headings + 0.05).poses[-1, 2] - drive(log, headings).poses[-1, 2]
+    assert 0.02 < offset < 0.06
+
+
+def test_the_new_track_format_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    namespace = dict(vars(track_files))
+    exec(compile(file_blocks(EXTENDING)["sim/track_files.py"], "extending.md", "exec"), namespace)
+    line = blocks(EXTENDING, "python")[-1]
+    added: tuple[track_files.TrackFormat, ...] = eval(line, namespace)
+    monkeypatch.setattr(track_files, "FORMATS", (*track_files.FORMATS, *added))
+    file = tmp_path / "oval.json"
+    file.write_text(oval())
+    track = track_files.read_track(file)
+    assert len(track.left) == len(track.right) == 30
+    assert track.name == "oval"
+    file.write_text('{"left": [["a", 0]], "right": []}')
+    with pytest.raises(InputError, match="expected 2 numbers at left"):
+        track_files.read_track(file)
+
+
+def oval() -> str:
+    """A round track in the page's format, driven counterclockwise."""
+    angles = 2.0 * np.pi * np.arange(30) / 30.0
+    left, right = (
+        [[float(radius * np.cos(a)), float(radius * np.sin(a))] for a in angles] for radius in (18.0, 22.0)
+    )
+    return f'{{"left": {left}, "right": {right}, "start": [20.0, 0.0, {np.pi / 2}]}}'
+
+
+def sections(page: Path) -> Iterator[str]:
+    yield from re.findall(r"^## (.*)$", prose(page), flags=re.MULTILINE)
+
+
+def test_the_page_has_what_it_promises() -> None:
+    assert list(sections(EXTENDING)) == ["A new estimator", "A new factor", "A new track format"]
