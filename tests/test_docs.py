@@ -329,6 +329,7 @@ def test_the_new_estimator_maps_online(installed: Path, log_folder: Path) -> Non
     assert len((installed / "map" / "trajectory.tum").read_text().splitlines()) == 80
 
 
+@pytest.mark.slow
 def test_the_new_estimator_is_compared(installed: Path, log_folder: Path) -> None:
     names = ["dead-reckoning", "landmark-fixed-lag"]
     run_command(installed, f"compare {log_folder} --out comparison --estimators {' '.join(names)}")
