@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 from pathspace_graph.batch.mapper import BatchMapper
-from pathspace_graph.eval.metrics.consistency import Nees, map_nees
+from pathspace_graph.eval.metrics.consistency import NormalizedError, joint_cone_error
 from pathspace_graph.eval.metrics.limit import limit
 from pathspace_graph.eval.metrics.table1 import lap_metrics
 from pathspace_graph.eval.metrics.text_table import TextTable
@@ -60,8 +60,8 @@ class Outcome:
     """Its second: what a spline of that size leaves, m."""
     seconds: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     """Processor time (one thread) of the batch without the online run, of that, and of all from odometry."""
-    nees: Nees | None = None
-    """The NEES of the map."""
+    nees: NormalizedError | None = None
+    """The squared errors at the true cones by their joint covariance."""
 
     @property
     def limit(self) -> float:
@@ -108,7 +108,7 @@ def evaluate(case: Case, log: Log) -> Outcome:
         l=least.l,
         f=least.f,
         seconds=(between - begin - online, online, end - between),
-        nees=map_nees(result.map, truth),
+        nees=joint_cone_error(result, truth),
     )
 
 
@@ -125,7 +125,7 @@ HEADER: Final = (
     "size [% of cones]",
     "same cost",
     "batch after online, all from odometry [s]",
-    "NEES per degree of freedom",
+    "squared cone error by joint covariance",
     "in 95 %",
 )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.metrics.consistency import Nees
+from pathspace_graph.eval.metrics.consistency import NormalizedError
 from pathspace_graph.eval.tables.batch_table import HEADER, BatchTable, Outcome, evaluate, rows, worse
 from pathspace_graph.eval.tables.cases import Case
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -27,7 +27,7 @@ def outcome(seed: int, rmse: float, costs: tuple[float, float] = (100.0, 100.05)
         l=0.3,
         f=0.4,
         seconds=(2.0, 8.0, 3.0),
-        nees=Nees(100.0, 100),
+        nees=NormalizedError(100.0, 100),
     )
 
 
