@@ -20,13 +20,7 @@ from .curves import curve_distance
 from .ghosts import GhostSettings, ghosts
 from .limit import limit
 from .summary import has_cones, lap_times
-from .table1 import (
-    capped_rmse,
-    cone_distances,
-    lap_metrics,
-    missed_share,
-    root_mean_square,
-)
+from .table1 import capped_rmse, cone_distances, lap_metrics, missed_share, root_mean_square
 from .trajectory import position_rms, trajectory_errors
 
 FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3}
@@ -130,6 +124,7 @@ _ALL: Final = (
     ),
     Metric("closed", "loop closed", "%", 0, better="higher"),
     Metric("converged", "batch converged", "%", 0, better="higher", scope="run"),
+    Metric("cost", "cost of the batch", digits=1, scope="run"),
     Metric("bytes", "map", "kB", 2),
     Metric("bytes_covariance", "covariance of the map", "kB", 1),
     Metric("ms_mean", "update, mean", "ms", 2, time=True),
@@ -176,7 +171,7 @@ def measure(
     values = _map_values(run.map, log.truth, ghost_settings, marginals)
     values |= _drive_values(run, log.truth, -np.inf, np.inf)
     if isinstance(run, BatchRun):
-        values["converged"] = run.converged
+        values |= {"converged": run.converged, "cost": run.cost}
     if isinstance(run, BatchResult) and log.truth is not None and has_cones(log.truth):
         joint = joint_cone_error(run, log.truth)
         values |= {"normalized_error_joint": joint.ratio, "normalized_error_joint_inside": joint.honest}

@@ -16,13 +16,7 @@ from pathspace_graph.io.results import BatchRun, RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
 
 from .consistency import normal_errors
-from .table1 import (
-    LapMetrics,
-    lap_end_times,
-    lap_metrics,
-    laps_metrics,
-    root_mean_square,
-)
+from .table1 import LapMetrics, lap_end_times, lap_metrics, laps_metrics, root_mean_square
 from .trajectory import ate, trajectory_errors
 
 Array = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""The whole log's problem: its losses, gradients against the cost, steps and covariances against GTSAM's."""
+"""The problem of a whole log: its loss, its gradient against its cost, and its steps against GTSAM's."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from pathspace_graph.batch.mapper import own_settings
 from pathspace_graph.batch.optimizer import gradient_norm
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved
 from pathspace_graph.graph.keys import pose_key
-from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
+from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -26,11 +27,11 @@ KERNEL = Biweight(4.0)
 
 @cache
 def small_system() -> tuple[BatchSystem, State]:
-    """An exact lap with some noise on its readings, linearized beside the optimum."""
+    """Returns an exact lap with some noise on its detections, linearized beside the optimum."""
     log = lap_log(bean_track())
     settings = own_settings(MapperSettings())
     chain = integrate_log(log, log.odometry_sigma, settings.odometry)
-    detections = collect_detections(log)
+    detections = DetectionTable.of(log.cycles)
     detections.point = detections.point + np.random.default_rng(1).normal(0.0, 0.1, detections.point.shape)
     state = start_odometry(chain, detections, settings)
     system = BatchSystem(detections, chain, settings, Biweight(settings.batch.gate))
@@ -44,7 +45,7 @@ def small_system() -> tuple[BatchSystem, State]:
 
 def test_dead_reckoning_of_an_exact_log_is_the_truth() -> None:
     log = lap_log(bean_track())
-    chain: Chain = integrate_log(log, log.odometry_sigma, MapperSettings().odometry)
+    chain: LogOdometry = integrate_log(log, log.odometry_sigma, MapperSettings().odometry)
     np.testing.assert_allclose(chain.dead_reckoned(np.zeros(2))[:, :2], true_poses(log)[:, :2], atol=1e-6)
 
 
@@ -64,7 +65,7 @@ def test_the_gradient_is_that_of_the_cost() -> None:
 
 
 def test_the_step_is_that_of_gtsam() -> None:
-    """A map of 30 to 40 control points and some hundred poses as one Gaussian factor graph."""
+    """The map has 30 to 40 control points and some hundred poses."""
     system, state = small_system()
     at, keys = system.evaluate(state), state.variables.keys.tolist()
     problem = system.eliminated(at)

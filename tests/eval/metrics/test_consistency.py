@@ -19,15 +19,13 @@ from pathspace_graph.eval.metrics.consistency import (
     normal_errors,
     with_marginals,
 )
-from pathspace_graph.eval.metrics.curves import (
-    true_curve,
-)
+from pathspace_graph.eval.metrics.curves import true_curve
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 
-from ...scenes.straight_maps import landmarks, line, row, truth
+from .straight_maps import landmarks, line, row, truth
 
 
 def test_errors_of_a_curve_are_one_for_each_control_point_and_have_its_covariance() -> None:

@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.limit import (
-    Limit,
-    fit_rmse,
-    landmark_rmse,
-    limit,
-    solve_oracle_landmarks,
-)
+from pathspace_graph.eval.metrics.limit import Limit, fit_rmse, landmark_rmse, limit, solve_oracle_landmarks
 from pathspace_graph.eval.metrics.table1 import root_mean_square
 from pathspace_graph.eval.metrics.trajectory import ate
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
