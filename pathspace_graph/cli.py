@@ -1,4 +1,4 @@
-"""The command line: finds the command, turns errors into one line and an exit code."""
+"""The command line: it finds the command, and turns errors into one line and an exit code."""
 
 from __future__ import annotations
 
@@ -19,14 +19,17 @@ INTERRUPTED: Final = 130
 
 @dataclass(frozen=True)
 class Command:
-    """A command, imported only when it is called: `--help` needn't wait for GTSAM and matplotlib."""
+    """Names a command, which is imported only when it is called.
+
+    `--help` need not wait for GTSAM and matplotlib.
+    """
 
     module: str
-    """Module of this package."""
+    """This module of `commands` holds the command."""
     name: str
-    """Dataclass in it whose fields are the options and whose `run` does the work."""
+    """This dataclass in it has the options as fields, and does the work in `run`."""
     summary: str
-    """One line for the list of commands."""
+    """This line stands in the list of commands."""
 
 
 COMMANDS: Final = {
@@ -37,13 +40,13 @@ COMMANDS: Final = {
     "compare": Command("compare", "Compare", "every estimator on one log or many: the paper's table"),
     "ablate": Command("ablate", "Ablate", "run a study: estimators and settings over many drives"),
     "figures": Command("figures", "Figures", "the paper's isolated tests as figures"),
-    "scale": Command("scale", "Scale", "time per update against map size, readings and laps"),
+    "scale": Command("scale", "Scale", "time per update against map size, detections and laps"),
     "plot": Command("plot", "Plot", "draw a map with its uncertainty band"),
 }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; 0 on success, 2 with one line on standard error on bad usage or bad input."""
+    """Runs a command; returns 0 on success, and 2 with one line on standard error on bad usage or input."""
     try:
         return _run(list(sys.argv[1:] if arguments is None else arguments))
     except PathspaceError as error:
@@ -72,7 +75,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def overview() -> str:
-    """The list of commands."""
+    """Returns the list of commands."""
     width = max(map(len, COMMANDS)) + 2
     lines = [f"  {name:<{width}}{command.summary}" for name, command in COMMANDS.items()]
     usage = f"usage: {PROGRAM} COMMAND [OPTIONS]"
@@ -80,7 +83,7 @@ def overview() -> str:
 
 
 def _parse(name: str, arguments: list[str]) -> Any:
-    """The command with its options; None where it was asked for help, which is printed by then."""
+    """Returns the command with its options, or None where its help was asked for and printed."""
     options = import_module(".commands.options", __package__)
     command = import_module(f".commands.{COMMANDS[name].module}", __package__)
     return options.parse(getattr(command, COMMANDS[name].name), f"{PROGRAM} {name}", arguments)

@@ -1,4 +1,4 @@
-"""The few exceptions this library raises; the command line turns each into one line and exit code 2."""
+"""The few exceptions of this library; the command line turns each into one line and exit code 2."""
 
 from __future__ import annotations
 
@@ -9,11 +9,17 @@ from typing import Any
 
 
 class PathspaceError(Exception):
-    """Base of all errors that a user can mend; its text is one line that says expected and found."""
+    """This is the base of all errors that a user can mend.
+
+    Its text is one line that says what was expected and what was found.
+    """
 
 
 class InputError(PathspaceError):
-    """A user's file is missing or wrong: names the file, the row (1 is the first line), what was expected."""
+    """A user's file is missing or wrong.
+
+    The text names the file, the row (1 is the first line) and what was expected.
+    """
 
     def __init__(self, file: Path | str, message: str, row: int | None = None) -> None:
         self.file = Path(file)
@@ -23,7 +29,7 @@ class InputError(PathspaceError):
 
 
 class OutputError(PathspaceError):
-    """An output path can't be written without losing something that is there already."""
+    """An output path cannot be written without losing something that is there already."""
 
 
 class SettingsError(PathspaceError):
@@ -31,11 +37,11 @@ class SettingsError(PathspaceError):
 
 
 class SingularSystemError(PathspaceError):
-    """The normal equations are not positive definite: nothing holds some variable."""
+    """The normal equations are not positive definite, since nothing determines some variable."""
 
 
 def check_name(name: Any, known: Iterable[str], expected: str) -> None:
-    """SettingsError, naming the nearest known one, unless `name` is among the known."""
+    """Raises a SettingsError that names the nearest known name, unless `name` is known."""
     known = list(known)
     if name in known:
         return

@@ -1,7 +1,7 @@
-"""The estimators by the names that the command line knows them by: ours, and those that others installed.
+"""The estimators by their names on the command line: our own, and those of other installed packages.
 
 An installed package adds an estimator by an entry point in the group `pathspace_graph.online` or
-`pathspace_graph.batch`. The entry point tells the estimator's name, and where to find what makes it.
+`pathspace_graph.batch`. The entry point has the estimator's name, and refers to what makes it.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ MakeOnline = Callable[[MapperSettings, Array], OnlineEstimator]
 MakeBatch = Callable[[MapperSettings, Array], BatchEstimator]
 
 DEFAULT: Final = "fixed-lag"
-"""The online estimator that runs where none is named."""
+"""This online estimator runs where none is named."""
 DEFAULT_BATCH: Final = "spline"
-"""The batch estimator that runs where none is named."""
+"""This batch estimator runs where none is named."""
 ONLINE_GROUP: Final = "pathspace_graph.online"
-"""The group of entry points that add online estimators."""
+"""Entry points of this group add online estimators."""
 BATCH_GROUP: Final = "pathspace_graph.batch"
-"""The group of entry points that add batch estimators."""
+"""Entry points of this group add batch estimators."""
 
 
 def _spline(settings: MapperSettings, odometry_sigma: Array) -> BatchEstimator:
@@ -45,7 +45,7 @@ def _spline(settings: MapperSettings, odometry_sigma: Array) -> BatchEstimator:
 
 
 def _installed(group: str) -> dict[str, Callable[[MapperSettings, Array], Any]]:
-    """The estimators that other packages add, each imported when it is made."""
+    """Returns the estimators that other packages add; each is imported when it is made."""
     return {point.name: _loading(point) for point in entry_points(group=group)}
 
 
@@ -64,23 +64,25 @@ ONLINE: Final[dict[str, MakeOnline]] = {
     "landmark-ckf": LandmarkCkf,
     "incremental-fixed-lag": incremental_fixed_lag,
 }
-"""What makes each online estimator from its settings and the standard deviation (3,) of a twist reading."""
+"""Each online estimator is made from its settings and the standard deviations (3,) of a twist (m/s, m/s,
+rad/s)."""
 
 BATCH: Final[dict[str, MakeBatch]] = {
     **_installed(BATCH_GROUP),
     DEFAULT_BATCH: _spline,
     "landmark-batch": LandmarkBatch,
 }
-"""The same of the batch estimators."""
+"""Each batch estimator is made from its settings and the standard deviations (3,) of a twist (m/s, m/s,
+rad/s)."""
 
 
 def check_online(name: str) -> None:
-    """SettingsError, naming the known ones, where there is no online estimator of that name."""
+    """Raises a SettingsError that names the known online estimators, unless the name is one of them."""
     _check(name, ONLINE, "online")
 
 
 def check_batch(name: str) -> None:
-    """SettingsError, naming the known ones, where there is no batch estimator of that name."""
+    """Raises a SettingsError that names the known batch estimators, unless the name is one of them."""
     _check(name, BATCH, "batch")
 
 
@@ -91,12 +93,12 @@ def _check(name: str, known: dict[str, Any], kind: str) -> None:
 
 
 def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimator:
-    """The online estimator of that name for a log, of which it is told the noise of the odometry only."""
+    """Returns a new online estimator for a log, of which it is given the noise of the odometry only."""
     check_online(name)
     return ONLINE[name](settings, log.odometry_sigma)
 
 
 def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:
-    """The batch estimator of that name for a log, of which it is told the noise of the odometry only."""
+    """Returns a new batch estimator for a log, of which it is given the noise of the odometry only."""
     check_batch(name)
     return BATCH[name](settings, log.odometry_sigma)

@@ -1,4 +1,4 @@
-"""Boundary labels: which side of the track a detected cone marks."""
+"""Boundary labels: the side of the track that a detected cone marks."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ RIGHT: Final = 1
 UNKNOWN: Final = 2
 
 NAMES: Final = ("left", "right", "unknown")
-"""The words of the file format, indexed by label."""
+"""These are the words of the file format, indexed by label."""
 
 BOUNDARIES: Final = (LEFT, RIGHT)
-"""The labels that name a boundary."""
+"""These labels name a boundary."""
 
 _CODES: Final = {"left": LEFT, "blue": LEFT, "right": RIGHT, "yellow": RIGHT}
 
 
 def label_from_name(name: str) -> int:
-    """`left`/`blue` -> LEFT, `right`/`yellow` -> RIGHT, any other word -> UNKNOWN (FORMATS: a log)."""
+    """Returns LEFT for `left` or `blue`, RIGHT for `right` or `yellow`, UNKNOWN for any other word
+    (FORMATS)."""
     return _CODES.get(name.strip().lower(), UNKNOWN)

@@ -1,4 +1,4 @@
-"""Laps: counted online from poses, the same way for an estimate and for the truth."""
+"""Laps: they are counted online from poses, in the same way for an estimate and for the truth."""
 
 from __future__ import annotations
 
@@ -12,44 +12,46 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class LapSettings:
-    """What counts as passing the start line, which is the y axis of the map frame at the first pose."""
+    """Describes what counts as passing the start line, the y axis of the map frame at the first pose."""
 
     min_path: float = 40.0
-    """Shortest lap (m, path driven); a line crossed sooner is crossed by jitter or by an overlap."""
+    """A lap is at least this long (m along the path); jitter or an overlap may cross the line sooner."""
 
     min_distance: float = 15.0
-    """How far from the start (m) a lap must have led at some time."""
+    """A lap leads at least this far away from the start (m)."""
 
     gate_half_width: float = 5.0
-    """Half the length of the start line (m): room for the racing line and for the drift of one lap."""
+    """This is half the length of the start line (m), with room for the racing line and for the drift of one
+    lap."""
 
     gate_depth: float = 10.0
-    """How far behind the line (m) a crossing is still noticed where an estimate jumped over it."""
+    """A crossing is still noticed up to this far past the line (m), where an estimate jumped over it."""
 
     max_heading: float = np.pi / 3
-    """Largest angle (rad) between the heading and the start's own for it to be the same stretch of road."""
+    """The heading differs from the start's by less than this (rad) where the line is crossed."""
 
     end_tolerance: float = 5.0
-    """A last lap that ends at most this far (m) before the line is as good as complete."""
+    """A last lap that ends at most this far before the line (m) counts as complete."""
 
 
 class LapCounter:
-    """Counts laps pose by pose: it ends where the start line is crossed forward after a lap's worth of path.
+    """Counts laps pose by pose: a lap ends where the start line is crossed forward after a lap's length of
+    path.
 
     Poses are [x, y, theta] in the map frame, whose origin and x axis are the start. An online estimate may
-    jump (a closing loop), so a pose just behind the line and heading forward ends the lap as well.
+    jump when a loop closes, so a pose just behind the line that heads forward ends the lap as well.
     """
 
     def __init__(self, settings: LapSettings | None = None) -> None:
         self.settings = settings or LapSettings()
         self.lap = 1
-        """The lap being driven, counted from 1."""
+        """This is the current lap, counted from 1."""
         self._path = 0.0
         self._farthest = 0.0
         self._last: tuple[float, float, float] | None = None
 
     def update(self, pose: ArrayLike) -> int:
-        """The lap (counted from 1) that `pose` (3,) [x, y, theta] belongs to."""
+        """Returns the lap, counted from 1, that the next `pose` (3,) [x, y, theta] belongs to."""
         x, y, theta = (float(value) for value in np.asarray(pose, dtype=float))
         if self._last is not None:
             self._path += float(np.hypot(x - self._last[0], y - self._last[1]))
@@ -62,7 +64,7 @@ class LapCounter:
 
     @property
     def last_lap_is_complete(self) -> bool:
-        """Whether the lap being driven has come back to within `end_tolerance` of the start line."""
+        """Says whether the current lap has come back to within `end_tolerance` of the start line."""
         if self._last is None or not self._has_driven_a_lap():
             return False
         x, y, theta = self._last
@@ -70,7 +72,7 @@ class LapCounter:
 
     @property
     def completed(self) -> int:
-        """How many laps are complete, the one just short of the line included."""
+        """Returns the number of complete laps, with a last one that ends just before the line."""
         return self.lap - 1 + int(self.last_lap_is_complete)
 
     def _has_driven_a_lap(self) -> bool:
@@ -90,10 +92,10 @@ class LapCounter:
 
 
 def lap_end_indices(poses: Array, settings: LapSettings | None = None) -> NDArray[np.intp]:
-    """Index of the pose at which each complete lap ends, of poses (N, 3) in the map frame.
+    """Returns the index of the pose (k,) at which each complete lap ends, of poses (N, 3) in the map frame.
 
-    A last lap that ends within a few metres of the line is complete and ends with the last pose; a lap that
-    the log breaks off in the middle isn't listed.
+    A last lap that ends within `end_tolerance` of the line is complete, and ends with the last pose. A lap
+    that the log breaks off is not listed.
     """
     counter = LapCounter(settings)
     laps = np.array([counter.update(pose) for pose in poses], dtype=int)

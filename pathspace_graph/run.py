@@ -44,7 +44,7 @@ class OnlineEstimator(Protocol):
 
     @property
     def settings(self) -> Any:
-        """A frozen dataclass holds all settings of the estimator."""
+        """Returns a frozen dataclass with all settings of the estimator."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """Processes one perception cycle: the twists since the last one, and the detections of this one."""
@@ -58,7 +58,7 @@ class BatchEstimator(Protocol):
 
     @property
     def settings(self) -> Any:
-        """A frozen dataclass holds all settings of the estimator."""
+        """Returns a frozen dataclass with all settings of the estimator."""
 
     def solve(self, log: Log) -> BatchRun:
         """Returns the optimum over a whole log, whose truth is not read."""

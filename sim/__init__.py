@@ -1,1 +1,1 @@
-"""Simulation: tracks, a vehicle, a sensor; gives a log and knows no estimator."""
+"""Simulation: tracks, a vehicle and a sensor give a log; no estimator is known here."""

@@ -16,51 +16,53 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int_]
 
 STEP: Final = 0.25
-"""Spacing of the samples while the curve is fitted, m."""
+"""While the curve is fitted, its samples are this far apart (m)."""
 KNOT_STEP: Final = 0.5
-"""Spacing of the knots of the finished curve, m."""
+"""The knots of the finished curve are this far apart (m)."""
 SMOOTHING: Final = 1.0
-"""Standard deviation of the smoothing Gaussian, m; a corner of radius R is cut by its square / 2R."""
+"""The smoothing Gaussian has this standard deviation (m); it cuts a corner of radius R by its square / 2R."""
 CENTRINGS: Final = 4
-"""How often the curve is moved to equal distances from both rows, and smoothed."""
+"""The curve is moved to equal distances from both rows and smoothed this number of times."""
 NEIGHBOURS: Final = 3
-"""A sample measures its distance to the row's segments up to so many cones from its own."""
+"""The distance of a sample to a row is measured to the segments within this number of cones from its own
+cone."""
 START_CANDIDATES: Final = 4
-"""So many cones of each row nearest the start are tried as the pair that the matching starts with."""
+"""This number of cones of each row, those nearest to the start, are tried as the pair that the matching
+starts with."""
 
 
 @dataclass(frozen=True, eq=False)
 class CentreLine:
-    """A twice differentiable curve `c(s)` by arc length `s`; periodic where closed."""
+    """Holds a twice differentiable curve `c(s)` by arc length `s`, periodic where the track is closed."""
 
     spline: CubicSpline
-    """The curve (s) -> (2,), m; the parameter is the arc length to about 0.1 %."""
+    """The curve maps s to points (2,) in m; its parameter is the arc length to about 0.1 %."""
     length: float
-    """Length of the curve, one lap where closed, m."""
+    """The curve, or one lap of it where it is closed, has this length (m)."""
     closed: bool
-    """Whether the end meets the beginning."""
+    """The end meets the beginning where this is true."""
     clearance: FloatArray
-    """Distance to the nearer row of cones at the spline's knots (k,), m."""
+    """This is the distance to the nearer row of cones at the spline's knots (k,) in m."""
 
     def points(self, s: FloatArray) -> FloatArray:
-        """The curve at `s` (n,) -> (n, 2)."""
+        """Returns the points (n, 2) of the curve at `s` (n,)."""
         return np.asarray(self.spline(s))
 
     def tangents(self, s: FloatArray) -> FloatArray:
-        """Unit tangents in the direction of travel (n, 2)."""
+        """Returns the unit tangents (n, 2) in the direction of travel."""
         return unit(np.asarray(self.spline(s, 1)))
 
     def curvatures(self, s: FloatArray) -> FloatArray:
-        """Signed curvature (n,), 1/m, positive to the left."""
+        """Returns the signed curvature (n,) in 1/m, positive to the left."""
         return curvature(np.asarray(self.spline(s, 1)), np.asarray(self.spline(s, 2)))
 
     def clearances(self, s: FloatArray) -> FloatArray:
-        """Distance to the nearer row of cones (n,), m."""
+        """Returns the distance to the nearer row of cones (n,) in m."""
         period = self.length if self.closed else None
         return np.interp(s, self.spline.x, self.clearance, period=period)
 
     def nearest(self, pose: FloatArray) -> float:
-        """Arc length of the point nearest to a pose [x, y, theta], among those that head its way."""
+        """Returns the arc length of the point nearest to a pose (3,) whose tangent leads forward."""
         s = np.arange(0.0, self.length, STEP)
         distances = np.linalg.norm(self.points(s) - pose[:2], axis=1)
         ahead = self.tangents(s) @ direction(pose[2])
@@ -68,11 +70,11 @@ class CentreLine:
 
 
 def fit_centre_line(left: FloatArray, right: FloatArray, closed: bool, near: FloatArray) -> CentreLine:
-    """The curve halfway between two rows of cones (n, 2), (m, 2) in driving order; matching starts at `near`.
+    """Returns the curve halfway between two rows of cones (n, 2) and (m, 2) in driving order.
 
-    The rows are matched by the triangulation of least total squared width that runs along both, so that their
-    counts and spacings may differ and other parts of the track may be near; the midpoints are then smoothed
-    and moved to equal distances from both rows.
+    The rows are matched from `near` on by the triangulation of least total squared width that runs along
+    both. So their counts and spacings may differ, and other parts of the track may be near. The midpoints are
+    then smoothed and moved to equal distances from both rows.
     """
     rungs = match_rows(left, right, closed, near)
     middles = (left[rungs[:, 0]] + right[rungs[:, 1]]) / 2
@@ -91,7 +93,7 @@ def fit_centre_line(left: FloatArray, right: FloatArray, closed: bool, near: Flo
 
 
 def match_rows(left: FloatArray, right: FloatArray, closed: bool, near: FloatArray) -> IntArray:
-    """Index pairs (k, 2) into both rows, each step advancing one of them, of least total squared distance."""
+    """Returns index pairs (k, 2) into both rows, each step advancing one, of least total squared distance."""
     if not closed:
         return _match(left, right)[1]
     best_cost, best = np.inf, np.zeros((0, 2), dtype=int)
@@ -106,7 +108,7 @@ def match_rows(left: FloatArray, right: FloatArray, closed: bool, near: FloatArr
 
 
 def _match(left: FloatArray, right: FloatArray) -> tuple[float, IntArray]:
-    """Least total squared distance and the pairs, from the first cones to the last (dynamic programming)."""
+    """Returns the least total squared distance and its pairs, by dynamic programming along both rows."""
     width = np.sum((left[:, None] - right[None]) ** 2, axis=-1)
     total = np.empty_like(width)
     total[0] = np.cumsum(width[0])
@@ -125,7 +127,7 @@ def _match(left: FloatArray, right: FloatArray) -> tuple[float, IntArray]:
 
 
 def _resample(points: FloatArray, step: float, closed: bool) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 2) about `step` apart along a polyline, and the fractional index of each in it (n,)."""
+    """Returns points (n, 2) about `step` apart along a polyline, and their fractional indices in it (n,)."""
     polyline = ring(points) if closed else points
     s = arc_lengths(polyline)
     count = max(int(np.ceil(s[-1] / step)), 2)
@@ -143,14 +145,14 @@ def _smooth(curve: FloatArray, closed: bool) -> FloatArray:
 
 
 def _normals(curve: FloatArray, closed: bool) -> FloatArray:
-    """Unit normals to the left of a sampled curve (n, 2)."""
+    """Returns the unit normals (n, 2) to the left of a sampled curve."""
     if not closed:
         return left_normals(unit(np.gradient(curve, axis=0)))
     return left_normals(unit(np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)))
 
 
 def _row_distances(curve: FloatArray, row: FloatArray, index: IntArray, closed: bool) -> FloatArray:
-    """Distance of each sample to the row's segments near its matched cone `index` (n,)."""
+    """Returns the distance of each sample to the row's segments near its matched cone `index` (n,)."""
     segments = index[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS)
     if closed:
         a, b = row[segments % len(row)], row[(segments + 1) % len(row)]

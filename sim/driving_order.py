@@ -17,11 +17,11 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int_]
 
 RUNG_MAX: Final = 12.0
-"""A left and a right cone further apart than this, m, aren't the two sides of one lane."""
+"""A left and a right cone farther apart than this (m) are not the two sides of one lane."""
 GATE_REACH: Final = 12.0
-"""Gate cones within this distance of the start, m, stand in for the boundary cones missing there."""
+"""Gate cones within this distance of the start (m) stand in for the boundary cones missing there."""
 INSERTION_DETOUR: Final = 5.0
-"""A cone missed by the walk, as at an outer corner, joins its row if the row grows by less than this, m."""
+"""A cone missed by the walk, as at an outer corner, joins its row if the row grows by less than this (m)."""
 
 Rung = tuple[int, int]
 Apexes = Mapping[Rung, Sequence[int]]
@@ -29,24 +29,25 @@ Apexes = Mapping[Rung, Sequence[int]]
 
 @dataclass(frozen=True)
 class DrivingOrder:
-    """Which cones make each boundary, in driving order."""
+    """Says which cones make each boundary, in driving order."""
 
     left: IntArray
-    """Indices into the left cones (n,)."""
+    """These are indices into the left cones (n,)."""
     right: IntArray
-    """Indices into the right cones (m,)."""
+    """These are indices into the right cones (m,)."""
     closed: bool
-    """Whether the walk came back to where it began."""
+    """The walk came back to where it began where this is true."""
 
 
 def driving_order(
     left: FloatArray, right: FloatArray, gate: FloatArray, start: FloatArray
 ) -> DrivingOrder | None:
-    """Order cones (n, 2), (m, 2) of both boundaries along the lane that the start [x, y, theta] stands in.
+    """Orders cones (n, 2), (m, 2) of both boundaries along the lane that the start [x, y, theta] stands in.
 
-    The Delaunay triangles that join both boundaries are the lane; each shares with the next a rung from a
+    The Delaunay triangles that join both boundaries are the lane. Each shares with the next a rung from a
     left to a right cone, so walking them gives both rows in order, whatever else is near. Gate cones stand in
-    for missing boundary cones, unless the walk goes round without them only. None where no lane is found.
+    for missing boundary cones, unless the walk goes round only without them. It returns None where no lane is
+    found.
     """
     order = _order(left, right, _gate_sides(gate, start), start)
     if order is None or not order.closed:
@@ -76,7 +77,7 @@ def _order(
 
 
 def _gate_sides(gate: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The gate cones near the start, left and right of its heading."""
+    """Returns the gate cones near the start, left and right of its heading."""
     step = gate - start[:2]
     near = np.linalg.norm(step, axis=1) < GATE_REACH
     side = step @ left_normals(direction(start[2]))
@@ -84,7 +85,7 @@ def _gate_sides(gate: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _apexes(points: FloatArray) -> Apexes:
-    """The third corners of the triangles on each edge (i < j)."""
+    """Returns the third corners of the triangles on each edge (i < j)."""
     apexes: dict[Rung, list[int]] = defaultdict(list)
     try:
         triangles = Delaunay(points).simplices.tolist()
@@ -99,7 +100,7 @@ def _apexes(points: FloatArray) -> Apexes:
 
 
 def _first_rung(points: FloatArray, split: int, apexes: Apexes, start: FloatArray) -> Rung | None:
-    """The rung that the line along the start's heading crosses nearest to it, left cone on its left."""
+    """Returns the nearest rung across the start's heading, its left cone on the left."""
     rungs = np.array([edge for edge in apexes if edge[0] < split <= edge[1]], dtype=int).reshape(-1, 2)
     heading = direction(start[2])
     step = points[rungs] - start[:2]
@@ -118,7 +119,7 @@ def _first_rung(points: FloatArray, split: int, apexes: Apexes, start: FloatArra
 def _walk(
     points: FloatArray, split: int, apexes: Apexes, first: Rung, forward: bool
 ) -> tuple[list[Rung], bool]:
-    """Rungs from the first one on, and whether they come back to it."""
+    """Returns the rungs from the first one on, and whether they come back to it."""
     rungs = [first]
     seen = {first}
     while True:
@@ -146,7 +147,7 @@ def _next_apex(points: FloatArray, apexes: Sequence[int], rung: Rung, forward: b
 
 
 def _row(cones: FloatArray, walked: list[int], closed: bool) -> IntArray:
-    """A row in order: the cones walked, once each, and those that the walk missed where they fit in."""
+    """Returns the cones walked, in order and once each, with missed ones inserted where they fit."""
     row = list(dict.fromkeys(walked))
     for missed in sorted(set(range(len(cones))) - set(row)):
         if len(row) < 2:

@@ -17,19 +17,21 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int_]
 
 FALSE_POSITIVE: Final = -1
-"""The association of a detection that is of no cone."""
+"""This is the association of a detection that is of no cone."""
 
 
 @dataclass(frozen=True)
 class OdometryNoise:
-    """Errors of the measured twist."""
+    """Describes the errors of the measured twist."""
 
     white: tuple[float, float, float] = (0.25, 0.12, 0.035)
-    """Standard deviation of each reading of [vx, vy, wz], white from sample to sample, m/s, m/s, rad/s."""
+    """Each measurement of [vx, vy, wz] has these standard deviations (m/s, m/s, rad/s), white from sample to
+    sample."""
     scale: float = 0.004
-    """Standard deviation of the relative scale error of vx and vy, drawn once for a log."""
+    """This is the standard deviation of the relative scale error of vx and vy, which is drawn once for a log
+    (-)."""
     gyro_bias: float = 0.0015
-    """Standard deviation of the bias of wz, drawn once for a log, rad/s."""
+    """This is the standard deviation of the bias of wz, which is drawn once for a log (rad/s)."""
 
     def __post_init__(self) -> None:
         if len(self.white) != 3 or not all(0 < sigma < np.inf for sigma in self.white):
@@ -39,38 +41,40 @@ class OdometryNoise:
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """What the cone detector sees, and its errors."""
+    """Describes what the cone detector sees, and its errors."""
 
     rate: float = 10.0
-    """Perception cycles per second, Hz."""
+    """The detector gives this number of perception cycles per second (Hz)."""
     range_max: float = 15.0
-    """Greatest true range of a detected cone, m."""
+    """This is the greatest true range of a detected cone (m)."""
     range_min: float = 0.5
-    """Least true range of a detected cone, m."""
+    """This is the least true range of a detected cone (m)."""
     fov: float = float(np.deg2rad(110.0))
-    """Field of view, the whole angle, rad."""
+    """This is the field of view, the whole angle (rad)."""
     range_sigma: float = 0.05
-    """Standard deviation of the range at range 0, m."""
+    """This is the standard deviation of the range at range 0 (m)."""
     range_sigma_growth: float = 0.012
-    """Growth of that standard deviation with range, m per m."""
+    """The standard deviation of the range grows by this with the range (m/m)."""
     bearing_sigma: float = float(np.deg2rad(0.9))
-    """Standard deviation of the bearing, rad."""
+    """This is the standard deviation of the bearing (rad)."""
     detection_probability: float = 0.98
-    """Probability that a cone in the field is detected, at range 0."""
+    """A cone in the field of view is detected with this probability at range 0."""
     detection_falloff: float = 0.01
-    """Loss of that probability with range, per m."""
+    """The probability of detection decreases by this with the range (1/m)."""
     blind_fraction: float = 0.05
-    """Share of the cones that are never seen, drawn once for a log."""
+    """This share of the cones is never detected; they are drawn once for a log."""
     wrong_colour: float = 0.01
-    """Probability that a detected boundary cone has the other boundary's label."""
+    """A detected boundary cone has the other boundary's label with this probability."""
     false_positives: float = 0.03
-    """Expected number of detections of nothing in a cycle."""
+    """A cycle has this expected number of detections of nothing."""
     range_bias: bool = False
-    """Whether ranges have a systematic error, as those of cameras do."""
+    """Ranges have a systematic error, as those of cameras do, where this is true."""
     range_bias_at: tuple[float, ...] = (4.0, 9.0)
-    """Ranges at which the systematic error is given, m, increasing; linear between, constant outside."""
+    """The systematic error is given at these increasing ranges (m); it is linear between them and constant
+    outside."""
     range_bias_values: tuple[float, ...] = (0.02, 0.34)
-    """The systematic error there, m (typical of cameras: 0.02 m below 4 m, 0.34 m beyond 8 m)."""
+    """The systematic error has these values at those ranges (m). Cameras typically have 0.02 m below 4 m and
+    0.34 m beyond 8 m."""
 
     def __post_init__(self) -> None:
         positive = ("rate", "range_max", "bearing_sigma", "range_sigma", "fov")
@@ -88,22 +92,22 @@ class SensorSettings:
             )
 
     def range_sigmas(self, ranges: FloatArray) -> FloatArray:
-        """Standard deviation of the range at each range (n,), m."""
+        """Returns the standard deviation of the range at each range (n,) in m."""
         return self.range_sigma + self.range_sigma_growth * ranges
 
     def range_biases(self, ranges: FloatArray) -> FloatArray:
-        """Systematic error at each range (n,), m."""
+        """Returns the systematic error at each range (n,) in m."""
         if not self.range_bias or not self.range_bias_at:
             return np.zeros_like(ranges)
         return np.interp(ranges, self.range_bias_at, self.range_bias_values)
 
     def detection_probabilities(self, ranges: FloatArray) -> FloatArray:
-        """Probability of detection at each range (n,)."""
+        """Returns the probability of detection at each range (n,)."""
         return np.clip(self.detection_probability - self.detection_falloff * ranges, 0.0, 1.0)
 
 
 def measure_twists(twists: FloatArray, noise: OdometryNoise, rng: Generator) -> FloatArray:
-    """Measured twists (N, 3): `(1 + scale) [vx, vy]` and `wz + bias`, each plus white noise."""
+    """Returns measured twists (N, 3): `(1 + scale) [vx, vy]` and `wz + bias`, each plus white noise."""
     scale = 1.0 + noise.scale * rng.standard_normal()
     bias = noise.gyro_bias * rng.standard_normal()
     white = rng.standard_normal(twists.shape) * np.array(noise.white)
@@ -121,7 +125,7 @@ class ConeSensor:
         self._seen = np.setdiff1d(np.arange(len(cones)), self.blind)
 
     def detect(self, t: float, pose: FloatArray) -> tuple[Detections, IntArray]:
-        """One perception cycle from a pose [x, y, theta], and the true cone of each detection (m,)."""
+        """Returns a perception cycle from a pose [x, y, theta], and the true cone of each detection (m,)."""
         ranges, bearings, labels, cones = self._detect_cones(pose)
         false_ranges, false_bearings, false_labels = self._false_positives()
         ranges = np.concatenate([ranges, false_ranges])
@@ -147,7 +151,7 @@ class ConeSensor:
         return measured[hit], (bearings + settings.bearing_sigma * noise[1])[hit], labels[hit], cones[hit]
 
     def _false_positives(self) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Detections of nothing, uniform over the area of the field, of either boundary's label."""
+        """Draws detections of nothing, uniform over the area of the field, with either boundary's label."""
         settings, rng = self._settings, self._false_rng
         count = int(rng.poisson(settings.false_positives))
         ranges = np.sqrt(rng.uniform(settings.range_min**2, settings.range_max**2, count))
@@ -156,7 +160,7 @@ class ConeSensor:
 
 
 def _polar(cones: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Range and bearing (n,) of points in the map frame, from a pose."""
+    """Returns range and bearing (n,) of points in the map frame, seen from a pose."""
     step = cones - pose[:2]
     bearings = np.arctan2(step[:, 1], step[:, 0]) - pose[2]
     return np.hypot(step[:, 0], step[:, 1]), np.asarray((bearings + np.pi) % (2 * np.pi) - np.pi)
@@ -165,7 +169,7 @@ def _polar(cones: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArray]
 def _cartesian(
     ranges: FloatArray, bearings: FloatArray, settings: SensorSettings
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (m, 2) and covariances (m, 2, 2) in the vehicle frame: `R(b) diag(s_r^2, (r s_b)^2) R(b)^T`."""
+    """Returns points (m, 2) and covariances `R(b) diag(s_r^2, (r s_b)^2) R(b)^T`, vehicle frame."""
     cos, sin = np.cos(bearings), np.sin(bearings)
     along, across = settings.range_sigmas(ranges) ** 2, (ranges * settings.bearing_sigma) ** 2
     xx = cos**2 * along + sin**2 * across

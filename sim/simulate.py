@@ -1,4 +1,4 @@
-"""A drive on a track: track, vehicle and sensors joined into a log with truth."""
+"""A drive on a track: track, vehicle and sensors give a log with truth."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ IntArray = NDArray[np.int_]
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """A simulated drive."""
+    """Describes a simulated drive."""
 
     laps: int = 5
-    """Laps of a closed track; an open one is driven once."""
+    """A closed track is driven for this number of laps, an open one once."""
     vehicle: VehicleSettings = field(default_factory=VehicleSettings)
-    """How the vehicle drives."""
+    """These settings describe how the vehicle drives."""
     odometry: OdometryNoise = field(default_factory=OdometryNoise)
-    """Errors of the measured twist."""
+    """These settings describe the errors of the measured twist."""
     sensor: SensorSettings = field(default_factory=SensorSettings)
-    """What the cone detector sees, and its errors."""
+    """These settings describe what the cone detector sees, and its errors."""
 
     def __post_init__(self) -> None:
         if self.laps < 1:
@@ -38,10 +38,10 @@ class SimulationSettings:
 
 
 def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
-    """The log of a drive; a seed gives the same log to the byte.
+    """Returns the log of a drive; a seed gives the same log to the byte.
 
-    Wander, odometry and sensor have random streams of their own, so that a setting of one doesn't shift the
-    others. A cycle in which nothing is detected isn't in the log, as the file format has no row for it.
+    Wander, odometry and sensor have random streams of their own, so that a setting of one does not shift the
+    others. A cycle in which nothing is detected is not in the log, since the file format has no row for it.
     """
     if seed < 0:
         raise SettingsError(f"seed: expected at least 0, found {seed}")
@@ -77,7 +77,7 @@ def _perceive(
 
 
 def _poses_at(driven: Drive, stamps: FloatArray) -> FloatArray:
-    """True poses (n, 3) at any stamps within the drive: the twist before each is held until then."""
+    """Returns true poses (n, 3) at any stamps within the drive; the twist before each is held until then."""
     index = np.searchsorted(driven.t, stamps, side="right") - 1
     since = stamps - driven.t[index]
     poses = driven.poses[index].copy()

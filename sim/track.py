@@ -1,4 +1,4 @@
-"""A track: two rows of cones in driving order, and where the vehicle starts."""
+"""A track: two rows of cones in driving order, and the pose that the vehicle starts from."""
 
 from __future__ import annotations
 
@@ -19,39 +19,39 @@ IntArray = NDArray[np.int_]
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The cones of a track, in any frame of its own."""
+    """Holds the cones of a track, in a frame of its own."""
 
     left: FloatArray
-    """Cones of the left boundary in driving order (n, 2), m."""
+    """These are the cones of the left boundary in driving order (n, 2) in m."""
     right: FloatArray
-    """Cones of the right boundary in driving order (m, 2), m."""
+    """These are the cones of the right boundary in driving order (m, 2) in m."""
     other: FloatArray
-    """Cones of no boundary, such as those of a gate (k, 2), m."""
+    """These are the cones of no boundary, such as those of a gate (k, 2) in m."""
     closed: bool
-    """Whether the last cones are followed by the first."""
+    """The last cones are followed by the first where this is true."""
     start: FloatArray
-    """Pose that the vehicle starts from [x, y, theta] (3,), m, m, rad."""
+    """The vehicle starts from this pose [x, y, theta] (3,) in m, m, rad."""
     name: str
-    """What the track is called."""
+    """The track is known by this name."""
 
     @cached_property
     def centre_line(self) -> CentreLine:
-        """The smooth curve halfway between the boundaries, in the track's frame."""
+        """Returns the smooth curve halfway between the boundaries, in the track's frame."""
         return fit_centre_line(self.left, self.right, self.closed, self.start[:2])
 
     @property
     def cones(self) -> FloatArray:
-        """All cones: left, right, other (M, 2), m."""
+        """Returns all cones (M, 2) in m: left, right, other."""
         return np.vstack([self.left, self.right, self.other])
 
     @property
     def cone_labels(self) -> IntArray:
-        """LEFT, RIGHT or UNKNOWN of each of `cones` (M,)."""
+        """Returns LEFT, RIGHT or UNKNOWN for each of `cones` (M,)."""
         return np.repeat([LEFT, RIGHT, UNKNOWN], [len(self.left), len(self.right), len(self.other)])
 
 
 def to_map_frame(track: Track) -> Track:
-    """The track moved so that its start pose is (0, 0, 0): the map frame of a log that starts there."""
+    """Moves the track so that its start pose is (0, 0, 0): the map frame of a log that starts there."""
     ahead = direction(track.start[2])
     rotation = np.column_stack([ahead, left_normals(ahead)])
 

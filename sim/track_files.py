@@ -23,23 +23,24 @@ from .track import Track
 FloatArray = NDArray[np.float64]
 
 MIN_CONES: Final = 3
-"""A boundary has at least so many cones."""
+"""A boundary has at least this number of cones."""
 DUPLICATE_DISTANCE: Final = 0.3
-"""Two surveyed cones of one colour nearer than this are one, m."""
+"""Two surveyed cones of one colour nearer to each other than this (m) are one."""
 REPEAT_DISTANCE: Final = 0.01
-"""Cones of an ordered row nearer than this to the one before are that cone again, m."""
+"""A cone of an ordered row nearer to the one before than this (m) is that cone again."""
 MAX_UNPLACED: Final = 0.2
-"""Share of the boundary cones that may belong to no lane, as strays; more isn't a track of one lane."""
+"""At most this share of the boundary cones may belong to no lane, as strays; more is not a track of one
+lane."""
 MAX_START_DISTANCE: Final = 10.0
-"""The start is at most so far from the middle of the track, m."""
+"""The start is at most this far from the middle of the track (m)."""
 CONE_SPACING: Final = 5.0
-"""Greatest gap of the cones that stand along a circuit given by its widths, m."""
+"""The cones along a circuit that is given by its widths are at most this far apart (m)."""
 WIDTH_STEP: Final = 0.5
-"""Spacing of the samples of such a circuit's boundaries, m."""
+"""The samples of such a circuit's boundaries are this far apart (m)."""
 TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
-"""Centre line and the distances of the boundaries from it."""
+"""These columns hold the centre line and the distances of the boundaries from it."""
 EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
-"""The EUFS tags of cones that belong to no boundary; further tags, such as midpoint, aren't cones."""
+"""Cones with these EUFS tags belong to no boundary; further tags, such as midpoint, are no cones."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,7 @@ def _list(path: Path, value: object, key: str) -> list[Any]:
 
 
 def _vector(path: Path, value: object, size: int, key: str) -> FloatArray:
-    """The first `size` numbers of a list, all finite."""
+    """Returns the first `size` numbers of a list, all finite."""
     try:
         if not isinstance(value, list) or len(value) < size:
             raise ValueError
@@ -198,7 +199,7 @@ def _vector(path: Path, value: object, size: int, key: str) -> FloatArray:
 
 
 def _without_repeats(row: FloatArray, closed: bool) -> FloatArray:
-    """A row without cones that repeat the one before, nor, where closed, a last that repeats the first."""
+    """Removes cones that repeat the one before, and on a closed row a last one that repeats the first."""
     if not len(row):
         return row
     keep = np.append(True, np.linalg.norm(np.diff(row, axis=0), axis=1) > REPEAT_DISTANCE)
@@ -248,7 +249,7 @@ def _eufs(path: Path, _: Table) -> Track:
 def _eufs_start(
     table: Table, tags: NDArray[np.str_], points: FloatArray, left: FloatArray, right: FloatArray
 ) -> FloatArray:
-    """The pose of the first `car_start`; without one, between the first blue cone and the nearest yellow."""
+    """Returns the pose of the first `car_start`, or one between the first blue cone and its opposite."""
     rows = np.flatnonzero(tags == "car_start")
     if len(rows):
         text = table.columns.get("direction", [""] * len(table))[rows[0]].strip()
@@ -267,7 +268,7 @@ def _eufs_start(
 
 
 def _without_duplicates(cones: FloatArray) -> FloatArray:
-    """The cones (n, 2) that aren't within the duplicate distance of one kept before."""
+    """Returns the cones (n, 2) that are not within the duplicate distance of one kept before."""
     kept: list[FloatArray] = []
     for cone in cones:
         if not kept or np.linalg.norm(np.array(kept) - cone, axis=1).min() >= DUPLICATE_DISTANCE:
@@ -289,7 +290,7 @@ def _tum(path: Path, _: Table) -> Track:
 
 
 def _tum_circuit(path: Path) -> FloatArray:
-    """Checked rows [x, y, right width, left width], the first repeated at the end (n + 1, 4)."""
+    """Returns checked rows [x, y, right width, left width], with the first repeated at the end (n + 1, 4)."""
     table = read_table(path, TUM_COLUMNS, comment="#")
     circuit = table.stack(TUM_COLUMNS)
     table.require(np.asarray(circuit[:, 2:].min(axis=1) > 0), "expected widths above 0")
@@ -303,7 +304,7 @@ def _tum_circuit(path: Path) -> FloatArray:
 
 
 def _spaced(boundary: FloatArray) -> FloatArray:
-    """Cones at equal gaps along a closed polyline (n, 2)."""
+    """Returns cones at equal gaps along a closed polyline (n, 2)."""
     polyline = ring(boundary)
     s = arc_lengths(polyline)
     at = np.linspace(0.0, s[-1], math.ceil(s[-1] / CONE_SPACING), endpoint=False)

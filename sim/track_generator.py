@@ -21,49 +21,52 @@ from .track import Track
 FloatArray = NDArray[np.float64]
 
 STEP: Final = 0.25
-"""Spacing of the samples of the centre line, m."""
+"""The samples of the centre line are this far apart (m)."""
 SMOOTHING: Final = 1.0
-"""Standard deviation of the Gaussian that eases the way into corners, m."""
+"""The Gaussian that eases corners in and out has this standard deviation (m)."""
 MAX_ATTEMPTS: Final = 500
-"""Two attempts in three keep the default rules: so many failing means that the settings contradict."""
+"""This number of attempts may fail. Two in three keep the default rules, so this many mean that the settings
+contradict each other."""
 STRAIGHT_RADIUS: Final = 150.0
-"""A stretch of a larger radius than this is straight, m."""
+"""A stretch with a larger radius than this (m) is straight."""
 CORNER_RADIUS: Final = 8.0
-"""At this radius cones stand twice as close as on straights, m."""
+"""At this radius (m), cones stand twice as close as on straights."""
 CORNER_BLUR: Final = 2.0
-"""Standard deviation of the Gaussian over which corners draw cones closer before and after them, m."""
+"""Corners draw cones closer before and after them, by a Gaussian with this standard deviation (m)."""
 MIN_CONE_GAP: Final = 1.0
-"""Cones never stand closer than this along a row, m."""
+"""Cones are never closer than this along a row (m)."""
 
 
 @dataclass(frozen=True)
 class TrackGeneratorSettings:
-    """The rules a generated track keeps."""
+    """Holds the rules that a generated track keeps."""
 
     lap_length: tuple[float, float] = (220.0, 400.0)
-    """Least and greatest length of the centre line, m (the rules allow 200 to 500)."""
+    """The centre line has at least and at most this length (m); the rules allow 200 to 500."""
     width: tuple[float, float] = (3.2, 4.2)
-    """Least and greatest width between the boundaries, m (the rules ask for 3); constant along one track."""
+    """The boundaries are at least and at most this far apart (m), constant along one track; the rules ask for
+    3."""
     hairpin_diameter: float = 9.0
-    """Least outside diameter of any corner, m."""
+    """The outside diameter of any corner is at least this (m)."""
     straight_max: float = 80.0
-    """Greatest length of a straight, m."""
+    """A straight is at most this long (m)."""
     cones: int = 200
-    """Number of cones on both boundaries together, as near as the gaps allow."""
+    """Both boundaries together have this number of cones, as nearly as the gaps allow."""
     cone_gap_max: float = 5.0
-    """Greatest gap between cones of a row, m; they stand closer in corners."""
+    """The gap between cones of a row is at most this (m); they stand closer in corners."""
     separation: float = 1.5
-    """Least distance between boundaries of different stretches, m."""
+    """Boundaries of different stretches are at least this far apart (m)."""
     corners: tuple[int, int] = (5, 9)
-    """Least and greatest number of corners of the layout that the elements are put into."""
+    """The layout that the elements are put into has at least and at most this number of corners."""
     hairpins: tuple[int, int] = (0, 3)
-    """Least and greatest number of hairpins put into it; corners of the layout may be hairpins as well."""
+    """At least and at most this number of hairpins is put into the layout, whose corners may be hairpins as
+    well."""
     hairpin_inward: float = 0.3
-    """Probability that a hairpin put in points to the inside of the layout."""
+    """A hairpin that is put in points to the inside of the layout with this probability."""
     slalom_probability: float = 0.35
-    """Probability that a straight long enough becomes a slalom."""
+    """A straight that is long enough becomes a slalom with this probability."""
     chicane_probability: float = 0.3
-    """Probability that a straight long enough becomes a chicane."""
+    """A straight that is long enough becomes a chicane with this probability."""
 
     def __post_init__(self) -> None:
         for name in ("lap_length", "width", "corners", "hairpins"):
@@ -82,9 +85,10 @@ class TrackGeneratorSettings:
 
 
 def generate_track(rng: Generator, settings: TrackGeneratorSettings | None = None) -> Track:
-    """A random closed track that keeps the rules, starting on its longest straight; its frame is its own.
+    """Returns a random closed track that keeps the rules and starts on its longest straight, in a frame of
+    its own.
 
-    Layouts are drawn until one keeps every rule; SettingsError where none does.
+    Layouts are drawn until one keeps every rule; a SettingsError is raised where none does.
     """
     settings = settings or TrackGeneratorSettings()
     for _ in range(MAX_ATTEMPTS):
@@ -98,21 +102,21 @@ def generate_track(rng: Generator, settings: TrackGeneratorSettings | None = Non
 
 @dataclass(frozen=True)
 class _Layout:
-    """A polygon whose corners are to be rounded."""
+    """Holds a polygon whose corners are to be rounded."""
 
     corners: FloatArray
-    """(n, 2), m."""
+    """Each row is a corner (n, 2) in m."""
     radii: FloatArray
-    """Radius of the arc at each corner (n,), m."""
+    """This is the radius of the arc at each corner (n,) in m."""
 
 
 def _least_radius(width: float, settings: TrackGeneratorSettings) -> float:
-    """Least radius of the centre line, m."""
+    """Returns the least radius of the centre line in m."""
     return (settings.hairpin_diameter - width) / 2
 
 
 def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _Layout | None:
-    """A star-shaped polygon with hairpins on some of its sides, or None where a corner can't be rounded."""
+    """Returns a star-shaped polygon with hairpins on some sides, or None where a corner cannot be rounded."""
     count = int(rng.integers(*settings.corners, endpoint=True))
     angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
     distances = rng.uniform(0.35, 1.0, count)
@@ -121,7 +125,7 @@ def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _
     )
     legs = rng.uniform(12.0, 30.0, int(rng.integers(*settings.hairpins, endpoint=True)))
     perimeter = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum()
-    # rounding the corners takes about a tenth of the way
+    # rounding the corners shortens the lap by about a tenth
     corners *= (rng.uniform(*settings.lap_length) * 1.1 - 2 * legs.sum()) / perimeter
     least = _least_radius(width, settings)
     radii = least + rng.gamma(2.0, 4.0, count)
@@ -139,7 +143,7 @@ def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _
 
 
 def _with_hairpin(layout: _Layout, leg: float, least: float, rng: Generator) -> _Layout | None:
-    """A finger on a random side long enough for it: out (inward for a negative leg), round and back."""
+    """Adds a finger to a random side long enough for it: out (inward for a negative leg), round and back."""
     radius, bend = least + rng.uniform(0.3, 1.5), least + rng.uniform(0.5, 3.0)
     sides = np.roll(layout.corners, -1, axis=0) - layout.corners
     lengths = np.linalg.norm(sides, axis=1)
@@ -159,7 +163,7 @@ def _with_hairpin(layout: _Layout, leg: float, least: float, rng: Generator) -> 
 
 
 def _rounded(layout: _Layout, least: float) -> _Layout | None:
-    """The layout with radii cut to what its sides have room for; None where one is less than the least."""
+    """Cuts the radii to what the sides have room for; returns None where one is less than the least."""
     half_turn = np.abs(_turns(layout.corners)) / 2
     before = np.linalg.norm(layout.corners - np.roll(layout.corners, 1, axis=0), axis=1)
     # both corners of a side may take half of it
@@ -169,7 +173,7 @@ def _rounded(layout: _Layout, least: float) -> _Layout | None:
 
 
 def _turns(corners: FloatArray) -> FloatArray:
-    """Signed change of direction at each corner (n,), rad."""
+    """Returns the signed change of direction at each corner (n,) in rad."""
     before = corners - np.roll(corners, 1, axis=0)
     after = np.roll(before, -1, axis=0)
     cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
@@ -177,7 +181,7 @@ def _turns(corners: FloatArray) -> FloatArray:
 
 
 def _curve(layout: _Layout, width: float, settings: TrackGeneratorSettings, rng: Generator) -> FloatArray:
-    """Samples of the centre line (n, 2): straights, some with an element, joined by arcs, then eased."""
+    """Returns samples (n, 2) of the centre line: straights and their elements, joined by eased arcs."""
     turns = _turns(layout.corners)
     tangent = layout.radii * np.tan(np.abs(turns) / 2)
     pieces: list[FloatArray] = []
@@ -196,7 +200,7 @@ def _curve(layout: _Layout, width: float, settings: TrackGeneratorSettings, rng:
 
 
 def _arc(begin: FloatArray, direction: FloatArray, radius: float, turn: float) -> FloatArray:
-    """Samples of an arc from `begin` on, first along `direction`."""
+    """Returns samples of an arc from `begin` on, first along `direction`."""
     angles = turn * np.linspace(0.0, 1.0, max(int(radius * abs(turn) / STEP), 1), endpoint=False)
     normal = left_normals(direction) * np.sign(turn)
     forward, sideways = np.sin(np.abs(angles))[:, None], 1 - np.cos(angles)[:, None]
@@ -206,7 +210,7 @@ def _arc(begin: FloatArray, direction: FloatArray, radius: float, turn: float) -
 def _straight(
     begin: FloatArray, end: FloatArray, settings: TrackGeneratorSettings, rng: Generator
 ) -> FloatArray:
-    """Samples from `begin` to `end`, with a slalom or a chicane where there is room and the dice say so."""
+    """Returns samples from `begin` to `end`, by chance with a slalom or a chicane where there is room."""
     length = float(np.linalg.norm(end - begin))
     if length < STEP:
         return begin[None]
@@ -219,7 +223,7 @@ def _straight(
 def _element(
     along: FloatArray, length: float, settings: TrackGeneratorSettings, rng: Generator
 ) -> FloatArray:
-    """Lateral offset (n,) of a slalom, a chicane or nothing, on a straight of this length."""
+    """Returns the lateral offset (n,) of a slalom, a chicane or nothing, on a straight of this length."""
     dice = rng.random()
     elements: tuple[tuple[float, Callable[[FloatArray, float, Generator], FloatArray]], ...] = (
         (settings.slalom_probability, _slalom),
@@ -233,7 +237,7 @@ def _element(
 
 
 def _slalom(along: FloatArray, length: float, rng: Generator) -> FloatArray:
-    """`A sin(2 pi s / wavelength)` of two or three waves, eased in and out; nothing where it has no room."""
+    """Returns two or three eased waves `A sin(2 pi s / wavelength)`, or zeros where there is no room."""
     wavelength = rng.uniform(14.0, 22.0)
     waves = min(int(length / wavelength), 3)
     if waves < 2:
@@ -249,7 +253,7 @@ def _slalom(along: FloatArray, length: float, rng: Generator) -> FloatArray:
 
 
 def _chicane(along: FloatArray, length: float, rng: Generator) -> FloatArray:
-    """A shift to one side and back, each along half a cosine wave; nothing where there is no room."""
+    """Returns a shift to one side and back by half cosine waves, or zeros where there is no room."""
     shift, hold = rng.uniform(8.0, 13.0), rng.uniform(0.0, 5.0)
     total = 2 * shift + hold
     if length < total:
@@ -262,7 +266,7 @@ def _chicane(along: FloatArray, length: float, rng: Generator) -> FloatArray:
 
 
 def _evenly(points: FloatArray) -> FloatArray:
-    """Samples (n, 2) of a closed polyline at equal distances of about STEP."""
+    """Returns samples (n, 2) of a closed polyline at equal distances of about STEP."""
     polyline = ring(points)
     s = arc_lengths(polyline)
     return along_polyline(np.linspace(0.0, s[-1], int(s[-1] / STEP), endpoint=False), s, polyline)
@@ -284,13 +288,13 @@ def _length(curve: FloatArray) -> float:
 
 
 def _curvature(curve: FloatArray) -> FloatArray:
-    """Signed curvature (n,) of an evenly sampled closed curve, 1/m."""
+    """Returns the signed curvature (n,) in 1/m of an evenly sampled closed curve."""
     after, before = np.roll(curve, -1, axis=0), np.roll(curve, 1, axis=0)
     return curvature((after - before) / 2, after - 2 * curve + before)
 
 
 def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
-    """Start and length of the longest run of good samples on a ring."""
+    """Returns start and length of the longest run of good samples on a ring."""
     bad = np.flatnonzero(~good)
     if not len(bad):
         return 0, len(good)
@@ -300,7 +304,7 @@ def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def _is_separate(curve: FloatArray, distance: float) -> bool:
-    """Whether samples nearer than `distance` are of one stretch: less apart than half such a circle."""
+    """Says whether samples nearer than `distance` are of one stretch: less apart than half such a circle."""
     pairs = cKDTree(curve).query_pairs(distance, output_type="ndarray")
     apart = np.abs(pairs[:, 0] - pairs[:, 1])
     apart = np.minimum(apart, len(curve) - apart) * STEP
@@ -308,7 +312,7 @@ def _is_separate(curve: FloatArray, distance: float) -> bool:
 
 
 def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSettings, rng: Generator) -> Track:
-    """The track whose start is early on the longest straight, with cones along both boundaries."""
+    """Returns the track that starts early on the longest straight, with cones along both boundaries."""
     first, run = _longest_run(np.abs(_curvature(curve)) < 1 / STRAIGHT_RADIUS)
     curve = np.roll(curve, -(first + run // 3), axis=0)
     along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
@@ -324,12 +328,12 @@ def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSetting
 
 
 def _density(gap: float, crowding: FloatArray, settings: TrackGeneratorSettings) -> FloatArray:
-    """Cones per metre (n,) along a row for this gap on straights."""
+    """Returns the number of cones per metre (n,) along a row for this gap on straights."""
     return 1.0 / np.clip(gap / crowding, MIN_CONE_GAP, settings.cone_gap_max)
 
 
 def _straight_gap(rows: list[FloatArray], crowding: FloatArray, settings: TrackGeneratorSettings) -> float:
-    """The gap on straights, before it is cut to the greatest one, that gives the wanted number of cones."""
+    """Returns the gap on straights, before it is limited, that gives the wanted number of cones."""
 
     def excess(gap: float) -> float:
         density = _density(gap, crowding, settings)
@@ -344,13 +348,13 @@ def _straight_gap(rows: list[FloatArray], crowding: FloatArray, settings: TrackG
 
 
 def _cumulative(row: FloatArray, density: FloatArray) -> FloatArray:
-    """Number of cones from the first sample to each sample and round to the first again (n + 1,)."""
+    """Returns the number of cones from the first sample to each, and round to the first again (n + 1,)."""
     steps = np.diff(arc_lengths(ring(row)))
     return np.concatenate([[0.0], np.cumsum(steps * density)])
 
 
 def _place_cones(row: FloatArray, density: FloatArray, rng: Generator) -> FloatArray:
-    """Cones (k, 2) along a closed row at this density, from a random place between the first two on."""
+    """Places cones (k, 2) along a closed row at this density, with a random offset."""
     total = _cumulative(row, density)
     count = int(np.ceil(total[-1]))
     at = (np.arange(count) + rng.random()) * total[-1] / count

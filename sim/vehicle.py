@@ -19,41 +19,42 @@ from .track import Track
 FloatArray = NDArray[np.float64]
 
 PATH_STEP: Final = 0.25
-"""Spacing of the samples of the driven path, m."""
+"""The samples of the driven path are this far apart (m)."""
 WAVES: Final = 8
-"""Number of sines that the wander is made of."""
+"""The wander is a sum of this number of sines."""
 MIN_PATH: Final = 10
-"""A path has at least so many samples."""
+"""A path has at least this number of samples."""
 
 
 @dataclass(frozen=True)
 class VehicleSettings:
-    """How the vehicle drives."""
+    """Describes how the vehicle drives."""
 
     speed_max: float = 12.0
-    """Greatest speed, m/s."""
+    """This is the greatest speed (m/s)."""
     speed_start: float = 0.0
-    """Speed at the start pose, m/s."""
+    """This is the speed at the start pose (m/s)."""
     acceleration_lateral: float = 5.0
-    """Greatest lateral acceleration, m/s^2; it limits the speed in corners."""
+    """This is the greatest lateral acceleration (m/s^2), which limits the speed in corners."""
     acceleration: float = 3.0
-    """Greatest longitudinal acceleration, m/s^2."""
+    """This is the greatest longitudinal acceleration (m/s^2)."""
     deceleration: float = 4.0
-    """Greatest longitudinal deceleration, m/s^2."""
+    """This is the greatest longitudinal deceleration (m/s^2)."""
     wander: float = 0.3
-    """Greatest distance of the smooth lateral wander from the middle, m."""
+    """The smooth lateral wander leads at most this far from the middle (m)."""
     wander_wavelengths: tuple[float, float] = (15.0, 60.0)
-    """Shortest and longest wavelength of the wander, m."""
+    """These are the shortest and the longest wavelength of the wander (m)."""
     half_width: float = 0.75
-    """Half the vehicle's width, m; the wander never brings its side nearer to the cones than `margin`."""
+    """This is half the vehicle's width (m); the wander never brings its side nearer to the cones than
+    `margin`."""
     margin: float = 0.25
-    """Distance that the vehicle's side keeps from the cones, m, where the track is wide enough."""
+    """The vehicle's side keeps this distance from the cones (m) where the track is wide enough."""
     settle_distance: float = 5.0
-    """Distance over which the vehicle moves from its start pose to the middle, m."""
+    """The vehicle moves from its start pose to the middle over this distance (m)."""
     overrun: float = 10.0
-    """Distance driven beyond the last lap's end, m, so that the lap is complete."""
+    """The vehicle drives this far beyond the last lap's end (m), so that the lap is complete."""
     rate: float = 50.0
-    """True poses per second, Hz; the odometry's rate."""
+    """There are this many true poses per second (Hz), at the odometry's rate."""
 
     def __post_init__(self) -> None:
         positive = (
@@ -79,18 +80,19 @@ class VehicleSettings:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """What the vehicle truly did."""
+    """Holds what the vehicle truly did."""
 
     t: FloatArray
-    """Stamps (N,), s, from 0."""
+    """These are the stamps (N,) in s, from 0."""
     poses: FloatArray
-    """True poses [x, y, theta] (N, 3), map frame; the first is (0, 0, 0), theta isn't wrapped."""
+    """Each row is a true pose [x, y, theta] (N, 3), map frame; the first is (0, 0, 0), and theta is not
+    wrapped."""
     twists: FloatArray
-    """True body twist [vx, vy, wz] (N, 3), constant until the next stamp; the last is held."""
+    """Each row is a true body twist [vx, vy, wz] (N, 3), constant until the next stamp; the last is held."""
 
 
 def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) -> Drive:
-    """Drive `laps` laps of a track in the map frame and a little more, or once along an open one."""
+    """Drives `laps` laps of a track in the map frame and a little more, or once along an open one."""
     path = _driven_path(track, laps, settings, rng)
     speeds = _speed_profile(path, settings)
     t, s = _sample_times(path, speeds, settings.rate)
@@ -102,7 +104,8 @@ def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) ->
 
 
 def integrate(twists: FloatArray, dt: float) -> FloatArray:
-    """Poses (N + 1, 3) from (0, 0, 0) under body twists (N, 3), each constant for `dt`; theta isn't wrapped.
+    """Integrates body twists (N, 3), each constant for `dt`, to poses (N + 1, 3) from (0, 0, 0); theta is not
+    wrapped.
 
     Over one step the vehicle moves by `V(wz dt) [vx, vy] dt` in its own frame, the exponential map of SE(2).
     """
@@ -116,7 +119,8 @@ def integrate(twists: FloatArray, dt: float) -> FloatArray:
 
 
 def _twists(poses: FloatArray, dt: float) -> FloatArray:
-    """Body twists (N, 3) that carry each pose to the next in `dt` (logarithm of SE(2)); the last repeats."""
+    """Returns body twists (N, 3) that carry each pose to the next in `dt` (SE(2) logarithm); the last
+    repeats."""
     step = np.diff(poses, axis=0)
     cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     dx, dy = cos * step[:, 0] + sin * step[:, 1], -sin * step[:, 0] + cos * step[:, 1]
@@ -127,13 +131,13 @@ def _twists(poses: FloatArray, dt: float) -> FloatArray:
 
 
 def _exponential(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """sin(angle) / angle and (1 - cos(angle)) / angle, also at 0."""
+    """Returns `sin(angle) / angle` and `(1 - cos(angle)) / angle`, also at 0."""
     half = np.sinc(angle / (2 * np.pi))
     return np.sinc(angle / np.pi), np.sin(angle / 2) * half
 
 
 def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Generator) -> CubicSpline:
-    """The driven path, nearly by arc length: the centre line and a lateral offset, from the start pose on."""
+    """Returns the path from the start pose on, nearly by arc length: the centre line with an offset."""
     line = track.centre_line
     start = line.nearest(track.start)
     total = laps * line.length + settings.overrun if line.closed else line.length - start
@@ -149,7 +153,7 @@ def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Genera
 def _settling(
     line: CentreLine, start: float, pose: FloatArray, s: FloatArray, settings: VehicleSettings
 ) -> FloatArray:
-    """Lateral offset (n,) that begins with the start pose's own offset and slope and dies away."""
+    """Returns a lateral offset (n,) that begins with the start pose's offset and slope and dies away."""
     point, tangent = line.points(np.array([start]))[0], line.tangents(np.array([start]))[0]
     normal = left_normals(tangent)
     offset = float(normal @ (pose[:2] - point))
@@ -161,7 +165,7 @@ def _settling(
 
 
 def _wander(s: FloatArray, clearance: FloatArray, settings: VehicleSettings, rng: Generator) -> FloatArray:
-    """Band-limited lateral wander (n,), m: a sum of sines with random phases that begins from nothing."""
+    """Returns the lateral wander (n,) in m: a sum of sines with random phases that begins at 0."""
     shortest, longest = settings.wander_wavelengths
     wavenumbers = 2 * np.pi * rng.uniform(1 / longest, 1 / shortest, WAVES)
     phases = rng.uniform(0.0, 2 * np.pi, WAVES)
@@ -172,7 +176,7 @@ def _wander(s: FloatArray, clearance: FloatArray, settings: VehicleSettings, rng
 
 
 def _speed_profile(path: CubicSpline, settings: VehicleSettings) -> FloatArray:
-    """Speeds (n,) at the path's knots that keep all three acceleration limits (forward and backward pass)."""
+    """Returns speeds (n,) at the path's knots that keep the acceleration limits, by two passes."""
     s = path.x
     bend = np.abs(curvature(np.asarray(path(s, 1)), np.asarray(path(s, 2))))
     cornering2 = settings.acceleration_lateral / np.maximum(bend, np.finfo(float).tiny)
@@ -189,7 +193,7 @@ def _speed_profile(path: CubicSpline, settings: VehicleSettings) -> FloatArray:
 
 
 def _sample_times(path: CubicSpline, speeds: FloatArray, rate: float) -> tuple[FloatArray, FloatArray]:
-    """Stamps k / rate and the arc length at each, with constant acceleration between the path's knots."""
+    """Returns stamps k / rate and their arc lengths, with constant acceleration between knots."""
     s = path.x
     durations = 2 * np.diff(s) / (speeds[1:] + speeds[:-1])
     knots_t = np.concatenate([[0.0], np.cumsum(durations)])

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
-from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 from .scenes.paths import ROOT
+from .scenes.source import PACKAGE, modules, room_of
 
-PACKAGE = "pathspace_graph"
-BESIDE = ("factors", "sim", "eval")
-"""Folders at the root that are parts of the package."""
 MOST_FILES = 15
 EXTRAS = {"distributed"}
 """Optional packages, which are imported only where they are needed."""
@@ -40,33 +37,18 @@ ARROWS: dict[str, set[str]] = {
     **dict.fromkeys(ESTIMATORS, BELOW_ESTIMATORS),
     "estimators": BELOW_ESTIMATORS | ESTIMATORS,
     "eval.metrics": BELOW_EVAL,
-    "eval.tables": BELOW_EVAL | {"eval.metrics"},
     "eval.figures": BELOW_EVAL | {"eval.metrics"},
     "eval.harness": BELOW_EVAL | {"eval.metrics"},
-    "eval.study": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures"},
-    "eval.compare": BELOW_EVAL
-    | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures", "eval.study"},
-    "eval.scaling": BELOW_EVAL
-    | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures", "eval.study"},
-    "eval.benchmark": BELOW_EVAL
-    | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures", "eval.study"},
+    "eval.study": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures"},
+    "eval.compare": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
+    "eval.scaling": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
+    "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "commands": BELOW_EVAL
-    | {f"eval.{room}" for room in ("metrics", "harness", "tables", "figures", "study", "compare", "scaling")},
+    | {f"eval.{room}" for room in ("metrics", "harness", "figures", "study", "compare", "scaling")},
     "cli": {"commands"},
     "__main__": {"cli"},
 }
 """What each room may import, beside itself and the leaves: arrows point down only."""
-
-
-@cache
-def modules() -> dict[str, Path]:
-    """Every module of the package by its name without the package's own."""
-    files = {}
-    for home in (ROOT / PACKAGE, *(ROOT / folder for folder in BESIDE)):
-        for file in sorted(home.rglob("*.py")):
-            parts = file.relative_to(ROOT / PACKAGE if home.name == PACKAGE else ROOT).with_suffix("").parts
-            files[".".join(parts)] = file
-    return files
 
 
 def imports(module: str, file: Path) -> Iterator[tuple[str, ast.ImportFrom]]:
@@ -84,11 +66,6 @@ def imports(module: str, file: Path) -> Iterator[tuple[str, ast.ImportFrom]]:
         for alias in node.names:
             inner = f"{home}.{alias.name}".strip(".")
             yield (inner if inner in modules() else home), node
-
-
-def room_of(module: str) -> str:
-    """The folder that a module lies in, or the module itself where it lies at the top."""
-    return module.rpartition(".")[0] or module
 
 
 def test_every_room_has_its_arrows_written_down() -> None:

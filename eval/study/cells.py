@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Final
 
 from pathspace_graph.eval.harness.attempts import Attempt, attempt
@@ -31,12 +31,15 @@ class Cell:
     variant: str
     """Name of its settings."""
     settings: MapperSettings
-    """Everything it is told."""
+    """The estimator has these settings."""
+    yardsticks: bool = False
+    """The limit of the run is computed, too."""
 
     @cached_property
     def id(self) -> str:
         """The same for the same run: everything that its result depends on, but for the code."""
-        return identity(drive=self.drive.id, estimator=self.estimator, settings=asdict(self.settings))
+        parts = {"drive": self.drive.id, "estimator": self.estimator, "settings": asdict(self.settings)}
+        return identity(**parts, **({"yardsticks": True} if self.yardsticks else {}))
 
     @property
     def names(self) -> dict[str, Any]:
@@ -51,7 +54,8 @@ class Cell:
 
 def run_cell(cell: Cell, log: Log) -> Record:
     """Runs the cell's estimator on its log; a failure is a record as well."""
-    return record_of(cell, attempt(cell.estimator, cell.settings, log, lap_rows))
+    measured = partial(lap_rows, yardsticks=cell.yardsticks)
+    return record_of(cell, attempt(cell.estimator, cell.settings, log, measured))
 
 
 def record_of(cell: Cell, what: Attempt[list[dict[str, Any]]]) -> Record:
@@ -72,11 +76,11 @@ def failed(cell: Cell, error: BaseException) -> Record:
     return record_of(cell, Attempt.failed(error))
 
 
-def lap_rows(run: RunResult, log: Log, seconds: float) -> list[dict[str, Any]]:
+def lap_rows(run: RunResult, log: Log, seconds: float, *, yardsticks: bool = False) -> list[dict[str, Any]]:
     """Returns a row for each lap, with the metrics of the whole run beside its own.
 
     A run that completed no lap has one row, that of the whole run as lap 1.
     """
-    *laps, whole = measure(run, log, seconds, marginals=True)
+    *laps, whole = measure(run, log, seconds, marginals=True, yardsticks=yardsticks)
     shared = {key: value for key, value in whole.values.items() if METRICS[key].scope == "run"}
     return [{"lap": row.lap, **row.values, **shared} for row in laps] or [{"lap": 1, **whole.values}]

@@ -56,7 +56,7 @@ def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "s
     values: dict[str, Any] = {"name": name} | dict(content)
     if "tracks" not in values:
         raise SettingsError("tracks: expected track files, or seeds of generated tracks, found none")
-    for key in ("tracks", "seeds", "estimators", "metrics"):
+    for key in ("tracks", "seeds", "estimators", "metrics", "columns"):
         if key in values:
             values[key] = (ALL,) if values[key] == ALL else tuple(_list(key, values[key]))
     for key in ("name", "question"):

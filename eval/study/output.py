@@ -10,6 +10,7 @@ import pandas as pd
 from pathspace_graph.eval.figures.files import SUFFIXES, render
 from pathspace_graph.io.files import replacing, write_text
 
+from .by_track import track_tables
 from .frame import times_of, without_times
 from .plot import figures
 from .study import Study
@@ -24,7 +25,7 @@ def write_tables(study: Study, frame: pd.DataFrame, out: Path) -> str:
     for name, table in ((RESULTS, without_times(frame)), (TIMES, times_of(frame))):
         with replacing(out / name) as temporary:
             table.to_csv(temporary, index=False, lineterminator="\n")
-    tables, told = summary_tables(study, frame), caption(study, frame)
+    tables, told = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
     text = as_text(tables, told)
     write_text(out / "summary.txt", text)
     write_text(out / "summary.md", as_markdown(tables, told))

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 FORMAT: Final = "pathspace-study/1"
 STUDY_FILE: Final = "study.json"
-_PRESENTATION: Final = ("question", "metrics")
+_PRESENTATION: Final = ("question", "metrics", "columns")
 """What a study may change without becoming another one: no cell depends on it."""
 
 Told = Callable[[int, int], None]
@@ -62,6 +62,8 @@ class Plan:
             "variants": {name: asdict(settings) for name, settings in study.points.items()},
             "baseline": {"variant": study.baseline_variant, "estimator": study.baseline.estimator},
             "metrics": study.metrics,
+            "columns": study.columns,
+            **({"yardsticks": True} if study.yardsticks else {}),
         }
 
 
@@ -75,7 +77,7 @@ def make_plan(study: Study) -> Plan:
         for seed in study.seeds
     ]
     cells = [
-        Cell(drive, estimator, variant, settings)
+        Cell(drive, estimator, variant, settings, study.yardsticks)
         for drive in drives
         for estimator in study.estimators
         for variant, settings in points.items()

@@ -11,7 +11,7 @@ from typing import Any, Final
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.eval.harness.attempts import known_estimators
-from pathspace_graph.eval.metrics.measures import METRICS
+from pathspace_graph.eval.metrics.measures import METRICS, Metric
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings
 
@@ -19,8 +19,26 @@ from .overrides import Overrides, override
 
 DEFAULT: Final = "default"
 """The variant without any override, which is part of every study."""
+EVERY_LAP: Final = "all"
+"""A column `rmse@all` is the mean over all laps."""
+LATER_LAPS: Final = "later"
+"""A column `rmse@later` is the mean over the laps from the second on."""
 ALL: Final = "all"
 """In place of estimators: every one that there is."""
+
+
+def column_of(text: str) -> tuple[Metric, str]:
+    """Returns the metric and the laps of a column, such as `rmse`, `rmse@1`, `rmse@later` or `rmse@all`.
+
+    Without laps it is the last lap's value. SettingsError where the metric or the laps are unknown.
+    """
+    key, _, laps = text.partition("@")
+    check_name(key, METRICS, "columns: expected a known metric")
+    if laps and laps not in (EVERY_LAP, LATER_LAPS) and not laps.isdecimal():
+        raise SettingsError(
+            f"columns: expected a lap's number, '{LATER_LAPS}' or '{EVERY_LAP}' after @, found '{text}'"
+        )
+    return METRICS[key], laps
 
 
 @dataclass(frozen=True)
@@ -58,7 +76,11 @@ class Study:
     baseline: Baseline = field(default_factory=Baseline)
     """What the others are compared with."""
     metrics: tuple[str, ...] = ("rmse", "missed", "size", "ms_mean")
-    """Columns of the results that the summary tells of."""
+    """The summary compares these metrics with the baseline."""
+    columns: tuple[str, ...] = ()
+    """The summary has a table by track of these: `rmse` is the last lap's, `rmse@1` that of lap 1."""
+    yardsticks: bool = False
+    """The limit of every run is computed, which takes a landmark batch with oracle associations."""
 
     def __post_init__(self) -> None:
         """SettingsError where anything is unknown, empty, named twice or out of its range."""
@@ -71,12 +93,16 @@ class Study:
             check_name(name, known_estimators(), "estimators: expected a known estimator")
         for name in self.metrics:
             check_name(name, METRICS, "metrics: expected a known metric")
+        for column in self.columns:
+            column_of(column)
+        if not isinstance(self.yardsticks, bool):
+            raise SettingsError(f"yardsticks: expected true or false, found {self.yardsticks!r}")
         self._check_settings()
         self._check_baseline()
 
     def _normalize(self) -> None:
         """Lists are tuples, and texts among the tracks are files."""
-        for name in ("tracks", "seeds", "estimators", "metrics", "grids"):
+        for name in ("tracks", "seeds", "estimators", "metrics", "columns", "grids"):
             value = getattr(self, name)
             object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
         tracks = tuple(Path(track) if isinstance(track, str) else track for track in self.tracks)

@@ -18,34 +18,34 @@ from pathspace_graph.eval.study.study import Study
 from pathspace_graph.progress import progress
 
 CELLS_FAILED: Final = 3
-"""Exit code of a study that is written, but some of whose cells failed."""
+"""This is the exit code of a study that is written, but some of whose cells failed."""
 LINES: Final = 20
 """A whole study writes about this many lines of progress where there is no terminal."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ablate:
-    """Run a study, or what is left of it, and write its results, its summary and its figures."""
+    """Runs a study, or what remains of it, and writes its results, its summary and its figures."""
 
     study: Positional[Path]
-    """Study to run: a TOML file, or the name of one that comes with the package."""
+    """The study is read from this TOML file, or is one that comes with the package, by its name."""
     out: Path
-    """The study's folder; one that was begun before goes on where it was."""
+    """The study is written to this folder; a study that was begun there is continued."""
     jobs: int = -1
-    """Processes at a time; -1 for every core."""
+    """This number of processes runs at a time, -1 being one for each core."""
     cluster: str | None = None
-    """Address of a Dask scheduler (tcp://HOST:8786) on whose workers the study runs instead."""
+    """The study runs on the workers of the Dask scheduler with this address (tcp://HOST:8786) instead."""
     retry_failed: bool = False
-    """Run the cells again that failed before."""
+    """Cells that failed before are run again."""
     tracks: tuple[str, ...] = ()
-    """In place of the study's own: track files, and seeds of generated tracks."""
+    """These track files, and seeds of generated tracks, replace the study's own."""
     seeds: tuple[int, ...] = ()
-    """In place of the study's own."""
+    """These seeds replace the study's own."""
     laps: int | None = None
-    """In place of the study's own."""
+    """This number of laps replaces the study's own."""
 
     def run(self) -> None:
-        """Check everything, run, write, and say what came out; exit code 3 where cells failed."""
+        """Checks, runs, writes and reports the study; the exit code is 3 where cells failed."""
         check_jobs(self.jobs)
         study = self._study()
         plan = make_plan(study)

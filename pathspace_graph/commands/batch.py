@@ -1,4 +1,4 @@
-"""`batch`: a whole log optimized at once, the ground reference."""
+"""`batch`: a whole log is optimized at once, as the ground reference."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .online import report
 
 NOT_CONVERGED: Final = 3
-"""Exit code of a run whose result is written, but isn't the optimum."""
+"""This is the exit code of a run whose result is written, but is not the optimum."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
-    """Optimize a whole log at once, and write the map, the trajectory, the cycles and a summary."""
+    """Optimizes a whole log at once, and writes the map, the trajectory, the cycles and a summary."""
 
     log: Positional[Path]
-    """Log folder to read."""
+    """The log is read from this folder."""
     out: Path
-    """Map folder to write; an earlier map there is kept as a numbered backup."""
+    """The map is written to this folder; an earlier map there is kept as a numbered backup."""
     estimator: str = DEFAULT_BATCH
-    """Name of the batch estimator."""
+    """This is the name of the batch estimator."""
     start: Start | None = None
     """The optimization begins at an online map, or at odometry alone; by default `batch.start` decides."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
-    """The mapper."""
+    """These settings describe the estimator."""
 
     def run(self) -> None:
-        """Read, optimize, write, and say what came out; exit code 3 where it did not converge."""
+        """Reads, optimizes, writes and reports; the exit code is 3 if it did not converge."""
         check_batch(self.estimator)
         if self.start == "odometry" and self.estimator != DEFAULT_BATCH:
             raise SettingsError(f"--start: expected online for {self.estimator}, found {self.start}")
@@ -69,7 +69,7 @@ class Batch:
 
 
 def summarize_batch(result: BatchRun, log: Log, start: Start) -> dict[str, Any]:
-    """What `summarize` says, how the optimization ended, and its gap from the online run it began at."""
+    """Returns the summary of a run, how its optimization ended, and its gap from its online start."""
     summary = summarize(result, log) | {"start": start, "converged": result.converged}
     if not isinstance(result, BatchResult):
         return summary

@@ -1,4 +1,4 @@
-"""`compare`: every estimator on one log or many, the paper's table and all that is measured besides."""
+"""`compare`: every estimator on one log or many, the paper's table, and all further metrics."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from pathspace_graph.eval.compare.comparison import Comparison, choose, choose_reference, compare, read_logs
-from pathspace_graph.eval.compare.gap import with_gaps
+from pathspace_graph.eval.compare.differences import with_gaps
 from pathspace_graph.eval.compare.output import MARKER, tables, write_comparison
 from pathspace_graph.eval.harness.workers import check_jobs
 from pathspace_graph.eval.metrics.ghosts import GhostSettings
@@ -19,37 +19,39 @@ from pathspace_graph.progress import progress
 from pathspace_graph.settings.mapper import MapperSettings
 
 FAILED: Final = 3
-"""Exit code of a comparison that is written, but in which an estimator failed."""
+"""This is the exit code of a comparison that is written, but in which an estimator failed."""
 FILE_WIDTH: Final = 160
-"""Characters in a line of a table that doesn't go to a terminal."""
+"""A line of a table that is not printed on a terminal has this number of characters."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Compare:
-    """Run every estimator on a log, or on a folder of logs; write tables, figures and all maps.
+    """Runs every estimator on a log, or on a folder of logs, and writes tables, figures and all maps.
 
-    Of several logs the tables have means, and differences to the reference, paired over the logs, with their
-    95 % confidence interval. An estimator that fails is reported and doesn't stop the others; the exit code
-    is 3 then.
+    For several logs the tables have means, and differences from the reference, paired over the logs, with
+    their 95 % confidence interval. An estimator that fails is reported and does not stop the others; the exit
+    code is 3 then.
     """
 
     log: Positional[Path]
-    """Log folder to read, or a folder of log folders."""
+    """The log is read from this folder, or each log from a folder in it."""
     out: Path
-    """Folder for tables, figures and maps; an earlier comparison there is kept as a numbered backup."""
+    """Tables, figures and maps are written to this folder; an earlier comparison there is kept as a numbered
+    backup."""
     estimators: tuple[str, ...] = ()
-    """Names of the estimators, online and batch ones; all where none is named."""
+    """These are the names of the estimators, online and batch ones; all of them run where none is named."""
     reference: str | None = None
-    """The estimator that the others are held against: fixed-lag where it is compared, else the first."""
+    """The others are compared with this estimator: fixed-lag where it runs, otherwise the first."""
     jobs: int = 1
-    """Runs at a time, -1 for every core. The times of updates are comparable with 1 job only."""
+    """This number of runs goes on at a time, -1 being one for each core. The times of updates are comparable
+    with 1 job only."""
     ghosts: GhostSettings = field(default_factory=GhostSettings)
-    """What counts as a ghost."""
+    """These settings say what counts as a ghost."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
-    """Of every estimator."""
+    """These settings hold for every estimator."""
 
     def run(self) -> None:
-        """Check everything, run, write, and say what came out; exit code 3 where an estimator failed."""
+        """Checks everything, runs, writes and reports; the exit code is 3 where an estimator failed."""
         estimators = choose(self.estimators)
         reference = choose_reference(self.reference, estimators)
         check_jobs(self.jobs)

@@ -27,7 +27,7 @@ from .online import map_online, outline
 from .simulate import describe, generated_track
 
 RIVAL: Final = "landmark-fixed-lag"
-"""The estimator whose table stands beside ours."""
+"""The table of this estimator stands beside the spline graph's."""
 PICTURE: Final = "track.png"
 PICTURE_DPI: Final = 150.0
 """The picture has this resolution (dots per inch), which suits a web page."""
@@ -35,17 +35,18 @@ PICTURE_DPI: Final = 150.0
 
 @dataclass(frozen=True, kw_only=True)
 class Demo:
-    """Simulate a track, map it online: the paper's table beside the landmark graph's, and a picture."""
+    """Simulates a track and maps it online: the paper's table beside the landmark graph's, and a picture."""
 
     out: Path = field(default_factory=lambda: Path("pathspace-demo"))
-    """Folder for the log, the map and the picture; an earlier demo there is kept as a numbered backup."""
+    """The log, the map and the picture are written to this folder; an earlier demo there is kept as a
+    numbered backup."""
     seed: int = 0
-    """Seed of the track and of all noise."""
+    """The track and all noise are drawn from this seed."""
     laps: int = 5
-    """Laps driven."""
+    """The vehicle drives this number of laps."""
 
     def run(self) -> None:
-        """Simulate, map, draw, and say where it is."""
+        """Simulates, maps, draws and reports."""
         check_target(self.out, PICTURE)
         with progress("driving"):
             log = simulate(generated_track(self.seed), SimulationSettings(laps=self.laps), self.seed)
@@ -63,7 +64,7 @@ class Demo:
 
 
 def map_with_both(log: Log) -> tuple[RunResult, RunResult]:
-    """The log mapped by us, with progress, and meanwhile, in a process of its own, by the landmark graph."""
+    """Returns the spline graph's result and the landmark graph's, which runs in another process."""
     settings = MapperSettings()
     with parallel_config(backend="loky", inner_max_num_threads=1):
         # with one job it would be run here, and first
@@ -74,7 +75,7 @@ def map_with_both(log: Log) -> tuple[RunResult, RunResult]:
 
 
 def write_demo(out: Path, log: Log, result: RunResult) -> None:
-    """The log, the map and its picture, all of them or none."""
+    """Writes the log, the map and its picture: all of them, or on failure nothing."""
     with progress("writing"), atomic_folder(out, PICTURE) as folder:
         write_log(log, folder / "log")
         write_result(folder / "map", result, summarize(result, log))

@@ -1,4 +1,4 @@
-"""`online`: a log mapped cycle by cycle, never reading ahead."""
+"""`online`: a log is mapped cycle by cycle, without reading ahead."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 @dataclass(frozen=True, kw_only=True)
 class Online:
-    """Map a log online, cycle by cycle, and write the map, the trajectory, the cycles and a summary."""
+    """Maps a log online, cycle by cycle, and writes the map, the trajectory, the cycles and a summary."""
 
     log: Positional[Path]
-    """Log folder to read."""
+    """The log is read from this folder."""
     out: Path
-    """Map folder to write; an earlier map there is kept as a numbered backup."""
+    """The map is written to this folder; an earlier map there is kept as a numbered backup."""
     estimator: str = DEFAULT
-    """Name of the online estimator."""
+    """This is the name of the online estimator."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
-    """The mapper."""
+    """These settings describe the estimator."""
 
     def run(self) -> None:
-        """Read, map, write, and say what came out."""
+        """Reads, maps, writes and reports."""
         check_online(self.estimator)
         check_target(self.out, MAP_FILE)
         log = read_log(self.log)
@@ -48,7 +48,7 @@ class Online:
 
 
 def map_online(log: Log, settings: MapperSettings, estimator: str = DEFAULT) -> RunResult:
-    """Map a log with progress; maps are kept from the end of each true lap where there is truth."""
+    """Maps a log with progress; the map at the end of each true lap is kept where there is truth."""
     with progress("mapping", len(log.cycles)) as advance:
         return run_online(
             log,
@@ -60,7 +60,8 @@ def map_online(log: Log, settings: MapperSettings, estimator: str = DEFAULT) -> 
 
 
 def report(result: RunResult, log: Log) -> None:
-    """The paper's table where there is truth, the run in a line; on standard error what was not mapped."""
+    """Prints the run in a line, the paper's table where there is truth, and what was not mapped as an
+    error."""
     console = Console()
     laps = laps_of(result, log)
     if laps:
@@ -72,7 +73,7 @@ def report(result: RunResult, log: Log) -> None:
 
 
 def outline(result: RunResult) -> str:
-    """The run in one line."""
+    """Returns the run in one line."""
     laps = f"{result.laps} lap{'' if result.laps == 1 else 's'}"
     loop = "loop closed" if result.map.closed else "loop not closed"
     sizes = [f"{NAMES[label]} {boundary.size}" for label, boundary in sorted(result.map.boundaries.items())]
@@ -80,7 +81,7 @@ def outline(result: RunResult) -> str:
 
 
 def laps_table(laps: list[LapMetrics]) -> Table:
-    """The paper's Table 1, a row per lap."""
+    """Returns the paper's Table 1 with a row for each lap."""
     table = Table("lap", "rmse [m]", "missed [%]", "size")
     for column in table.columns:
         column.justify = "right"

@@ -1,26 +1,32 @@
-"""The options of a command from its dataclass, and what is wrong with them in one line."""
+"""The options of a command, made from its dataclass, and what is wrong with them in one line."""
 
 from __future__ import annotations
 
 import io
 import re
 from contextlib import redirect_stderr
-from typing import Any, Final
+from dataclasses import fields, is_dataclass
+from types import MappingProxyType
+from typing import Any, Final, get_type_hints
 
+import docstring_parser
 import tyro
 
 from pathspace_graph.errors import SettingsError
 
+_HELP: Final = ("-h", "--help")
 _ANSI: Final = re.compile(r"\x1b\[[0-9;]*m")
 _FRAME: Final = " │\t"
 _RULE: Final = "─╭╮╰╯"
 
 
 def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
-    """The command, made from its options; None where it was asked for help, which is printed by then.
+    """Returns the command, made from its options, or None where its help was asked for and printed.
 
-    SettingsError on bad usage.
+    It raises a SettingsError on bad usage.
     """
+    if not set(_HELP).isdisjoint(arguments):
+        _set_help(command)
     complaint = io.StringIO()
     try:
         with redirect_stderr(complaint):
@@ -31,8 +37,20 @@ def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
     raise SettingsError(f"{one_line(complaint.getvalue())} (see {program} --help)")
 
 
+def _set_help(settings: type[Any]) -> None:
+    """Gives tyro the text of each field as one paragraph; it would break lines where the source does."""
+    texts = {
+        text.arg_name: text.description or "" for text in docstring_parser.parse_from_object(settings).params
+    }
+    for entry in fields(settings):
+        entry.metadata = MappingProxyType({"help": " ".join(texts.get(entry.name, "").split())})
+    for hint in get_type_hints(settings).values():
+        if isinstance(hint, type) and is_dataclass(hint):
+            _set_help(hint)
+
+
 def one_line(box: str) -> str:
-    """What the first part of tyro's framed message says, on one line."""
+    """Returns the first part of tyro's framed message as one line."""
     words: list[str] = []
     for line in _ANSI.sub("", box).splitlines():
         text = line.strip(_FRAME)

@@ -1,4 +1,4 @@
-"""`scale`: the time of an update against the size of the map, its readings and the laps."""
+"""`scale`: the time of an update against the size of the map, its detections and the laps."""
 
 from __future__ import annotations
 
@@ -20,31 +20,34 @@ from pathspace_graph.progress import progress
 from pathspace_graph.settings.mapper import MapperSettings
 
 FILE_WIDTH: Final = 160
-"""Characters in a line of a table that doesn't go to a terminal."""
+"""A line of a table that is not printed on a terminal has this number of characters."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """Time every online estimator on ever larger maps and ever more readings; fit and draw the slopes.
+    """Times every online estimator on ever larger maps and ever more detections, and fits and draws the
+    slopes.
 
-    All run in this one process, cycle for cycle in turn, so that whatever else the machine does slows all
+    All run in this one process, cycle for cycle in turn, so that other work of the machine slows all of them
     alike. An estimator that takes longer than the budget is stopped there, and the table says so. Memory is
-    what tracemalloc sees, Python and numpy, while the first lap of the closed road is mapped.
+    measured by tracemalloc, for Python and numpy, while the first lap of the closed road is mapped.
     """
 
     out: Path
-    """Folder for points, slopes and figures; an earlier one there is kept as a numbered backup."""
+    """Points, slopes and figures are written to this folder; earlier ones there are kept as a numbered
+    backup."""
     estimators: tuple[str, ...] = ()
-    """Names of the online estimators; all where none is named."""
+    """These are the names of the online estimators; all of them run where none is named."""
     quick: bool = False
-    """Less than a minute, to see that everything works: small maps, few laps. Takes no other `scaling`."""
+    """The measurement takes less than a minute, with small maps and few laps, to see that everything works.
+    It goes with no other `scaling` option."""
     scaling: ScalingSettings = field(default_factory=ScalingSettings)
-    """What is measured."""
+    """These settings describe what is measured."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
-    """Of every estimator."""
+    """These settings hold for every estimator."""
 
     def run(self) -> None:
-        """Check everything, simulate, time, write, and say what came out."""
+        """Checks everything, simulates, times, writes and reports."""
         names = tuple(dict.fromkeys(self.estimators or ONLINE))
         for name in names:
             check_online(name)

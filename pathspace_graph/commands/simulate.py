@@ -22,23 +22,23 @@ from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate:
-    """Drive a track and write the log of it, with truth; a seed gives the same log to the byte."""
+    """Drives a track and writes the log of it, with truth; a seed gives the same log to the byte."""
 
     out: Path
-    """Log folder to write; an earlier log there is kept as a numbered backup."""
+    """The log is written to this folder; an earlier log there is kept as a numbered backup."""
     track: Path | None = None
-    """Track file: PacSim or fssim YAML, EUFS or TUM CSV."""
+    """The track is read from this file: PacSim or fssim YAML, EUFS or TUM CSV."""
     generate: int | None = None
-    """Seed of a generated Formula Student track, where no track file is given."""
+    """Where no track file is given, a Formula Student track is generated from this seed."""
     seed: int = 0
-    """Seed of the drive's wander and of all noise."""
+    """The drive's wander and all noise are drawn from this seed."""
     settings: Annotated[SimulationSettings, arg(name="")] = field(default_factory=SimulationSettings)
-    """The drive."""
+    """These settings describe the drive."""
     generator: TrackGeneratorSettings = field(default_factory=TrackGeneratorSettings)
-    """Rules of a generated track."""
+    """These settings are the rules of a generated track."""
 
     def run(self) -> None:
-        """Simulate and write."""
+        """Simulates and writes."""
         check_target(self.out, LOG_FILE)
         with progress("driving"):
             log = simulate(self._track(), self.settings, self.seed)
@@ -54,14 +54,14 @@ class Simulate:
 
 
 def generated_track(seed: int, settings: TrackGeneratorSettings | None = None) -> Track:
-    """The generated track of a seed."""
+    """Returns the generated track of a seed."""
     if seed < 0:
         raise SettingsError(f"seed of a generated track: expected at least 0, found {seed}")
     return generate_track(np.random.default_rng(seed), settings)
 
 
 def describe(log: Log) -> str:
-    """How long the log is, in words."""
-    readings = sum(len(cycle.labels) for cycle in log.cycles)
+    """Returns the length of the log in words."""
+    detections = sum(len(cycle.labels) for cycle in log.cycles)
     seconds = log.odometry.t[-1] - log.odometry.t[0]
-    return f"{seconds:.1f} s, {len(log.cycles)} perception cycles, {readings} readings"
+    return f"{seconds:.1f} s, {len(log.cycles)} perception cycles, {detections} detections"

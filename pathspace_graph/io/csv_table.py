@@ -18,29 +18,29 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Table:
-    """The rows below a CSV header, as text, column by column."""
+    """Holds the rows below a CSV header, as text, column by column."""
 
     file: Path
-    """Where it was read from."""
+    """The table was read from this file."""
     columns: dict[str, list[str]]
-    """Text of each column by its name, as it stands in the file."""
+    """Each column has its texts under its name, as they stand in the file."""
     lines: list[int]
-    """Line of the file that each row stands on (the header is line 1)."""
+    """Each row stands on this line of the file; the header is line 1."""
 
     def __len__(self) -> int:
         return len(self.lines)
 
     def fail(self, index: int, message: str) -> NoReturn:
-        """Raise the InputError of the row with this index."""
+        """Raises the InputError of the row with this index."""
         raise InputError(self.file, message, self.lines[index])
 
     def require(self, good: NDArray[np.bool_], message: str) -> None:
-        """Raise an InputError for the first row that isn't good; `good` is (rows,)."""
+        """Raises an InputError for the first row that is not good; `good` is (rows,)."""
         if not good.all():
             self.fail(int(np.argmin(good)), message)
 
     def numbers(self, name: str) -> FloatArray:
-        """The column as finite numbers (rows,); a word, NaN or infinity is an InputError."""
+        """Returns the column as finite numbers (rows,); a word, NaN or infinity is an InputError."""
         texts = self.columns[name]
         try:
             values = np.array(list(map(float, texts)), dtype=float)
@@ -54,12 +54,12 @@ class Table:
         return values
 
     def stack(self, names: Sequence[str]) -> FloatArray:
-        """The named columns side by side (rows, names)."""
+        """Returns the named columns side by side (rows, names)."""
         return np.column_stack([self.numbers(name) for name in names])
 
 
 def read_table(file: Path, required: Sequence[str], comment: str = "") -> Table:
-    """A CSV file with a header that holds at least the required columns, in any order.
+    """Reads a CSV file with a header that holds at least the required columns, in any order.
 
     Quotes, blanks around fields, empty lines, Windows line ends and a byte-order mark are tolerated;
     `comment` is stripped from the front of the header. A file that is missing or empty, a missing column, or

@@ -13,10 +13,10 @@ from pathspace_graph.errors import OutputError
 
 @contextmanager
 def atomic_folder(target: Path | str, marker: str) -> Iterator[Path]:
-    """Yield a temporary folder beside `target` that takes its place on success and is removed on failure.
+    """Yields a temporary folder beside `target` that takes its place on success and is removed on failure.
 
-    An empty folder at `target` is used; an earlier result, known by the file `marker` in it, is kept as a
-    numbered backup `NAME.~1~`; anything else there is an OutputError.
+    An empty folder at `target` is used. An earlier result, known by the file `marker` in it, is kept as a
+    numbered backup `NAME.~1~`. Anything else there is an OutputError.
     """
     final = Path(target).absolute()
     check_target(final, marker)
@@ -35,7 +35,7 @@ def atomic_folder(target: Path | str, marker: str) -> Iterator[Path]:
 
 @contextmanager
 def atomic_file(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, of the same suffix, that takes its place on success.
+    """Yields a temporary path beside `path`, of the same suffix, that takes its place on success.
 
     A file that is there already is kept as a numbered backup `NAME.~1~`; on failure nothing is left behind.
     """
@@ -73,7 +73,7 @@ def write_text(file: Path, text: str) -> None:
 
 
 def check_target(target: Path | str, marker: str) -> None:
-    """Raise an OutputError where `atomic_folder` couldn't write `target` without losing something foreign."""
+    """Raises an OutputError where `atomic_folder` would lose something foreign at `target`, or fail."""
     target = Path(target).absolute()
     _check_parents(target)
     if not target.exists() and not target.is_symlink():
@@ -91,7 +91,7 @@ def check_target(target: Path | str, marker: str) -> None:
 
 
 def check_file_target(path: Path | str) -> None:
-    """Raise an OutputError where `atomic_file` couldn't write `path`."""
+    """Raises an OutputError where `atomic_file` could not write `path`."""
     path = Path(path).absolute()
     _check_parents(path)
     if path.is_dir():

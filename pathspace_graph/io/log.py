@@ -1,4 +1,4 @@
-"""A log: odometry, perception cycles and, where known, the truth; read from and written to a folder."""
+"""A log: odometry, perception cycles and, where known, the truth; it is read from and written to a folder."""
 
 from __future__ import annotations
 
@@ -31,22 +31,23 @@ TRUTH_CONES_FILE: Final = "truth_cones.csv"
 TRUTH_ASSOCIATIONS_FILE: Final = "truth_associations.csv"
 
 MAX_HOLD: Final = 1.0
-"""The last twist may be held for so long (s): a perception cycle later than that has no odometry."""
+"""The last twist may be held for this time (s); a perception cycle later than that has no odometry."""
 MIN_RELATIVE_DETERMINANT: Final = 1e-12
 """A covariance with det <= this * xx * yy is singular to double precision, so not positive definite."""
 
 
 @dataclass(frozen=True, eq=False)
 class Odometry:
-    """Readings of the body twist, each held until the next."""
+    """Holds the measured body twists, each of which is held until the next."""
 
     t: FloatArray
-    """Stamps (N,), s, strictly increasing."""
+    """These are the stamps (N,) in s, strictly increasing."""
     twist: FloatArray
-    """[vx, vy, wz] (N, 3), m/s, m/s, rad/s, vehicle frame."""
+    """Each row is a twist [vx, vy, wz] (N, 3) in m/s, m/s, rad/s, vehicle frame."""
 
     def between(self, start: float, end: float) -> Odometry:
-        """The twists in force from `start` to `end` (s): the first from `start`, the last held until `end`.
+        """Returns the twists in force from `start` to `end` (s): the first from `start`, the last held until
+        `end`.
 
         Before the first row nothing moves; where no time passes there are no rows.
         """
@@ -58,68 +59,70 @@ class Odometry:
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """The boundary points detected in one perception cycle."""
+    """Holds the boundary points detected in one perception cycle."""
 
     t: float
-    """Stamp, s."""
+    """This is the stamp of the cycle (s)."""
     points_vehicle: FloatArray
-    """Detected points (m, 2), m, vehicle frame."""
+    """Each row is a detected point (m, 2) in m, vehicle frame."""
     covariances: FloatArray
-    """Covariance of each point (m, 2, 2), m^2, vehicle frame."""
+    """Each point has this covariance (m, 2, 2) in m^2, vehicle frame."""
     labels: IntArray
-    """LEFT, RIGHT or UNKNOWN of each point (m,)."""
+    """Each point has the label LEFT, RIGHT or UNKNOWN (m,)."""
 
 
 @dataclass(frozen=True)
 class SensorInfo:
-    """What is known of the sensor; None where the log doesn't say."""
+    """Holds what is known of the sensor; None stands where the log does not say."""
 
     range_max: float | None = None
-    """Greatest range, m."""
+    """This is the greatest range (m)."""
     fov: float | None = None
-    """Field of view, the whole angle, rad."""
+    """This is the field of view, the whole angle (rad)."""
     rate: float | None = None
-    """Perception cycles per second, Hz."""
+    """The sensor gives this number of perception cycles per second (Hz)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a simulator or a survey knows, for evaluation only; what isn't known has no rows."""
+    """Holds what a simulator or a survey knows, for evaluation only; what is not known has no rows."""
 
     pose_t: FloatArray
-    """Stamps of the true poses (N,), s."""
+    """These are the stamps of the true poses (N,) in s."""
     poses: FloatArray
-    """True poses [x, y, theta] (N, 3), m, m, rad, map frame."""
+    """Each row is a true pose [x, y, theta] (N, 3) in m, m, rad, map frame."""
     cones: FloatArray
-    """True cones (M, 2), m, map frame."""
+    """Each row is a true cone (M, 2) in m, map frame."""
     cone_labels: IntArray
-    """LEFT, RIGHT or UNKNOWN of each true cone (M,)."""
+    """Each true cone has the label LEFT, RIGHT or UNKNOWN (M,)."""
     associations: IntArray | None = None
-    """True cone of each detection in file order (R,), -1 for a false positive; None where not known."""
+    """Each detection, in file order, is of the true cone with this index (R,), and of none at -1; None means
+    not known."""
 
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """All that a vehicle recorded on one drive."""
+    """Holds all that a vehicle recorded on one drive."""
 
     odometry: Odometry
-    """Readings of the body twist."""
+    """These are the measured body twists."""
     cycles: tuple[Detections, ...]
-    """Perception cycles in order of time."""
+    """These are the perception cycles in order of time."""
     odometry_sigma: FloatArray
-    """Standard deviation of one twist reading (3,), m/s, m/s, rad/s, white from sample to sample."""
+    """These are the standard deviations (3,) of a measured twist in m/s, m/s, rad/s, white from sample to
+    sample."""
     sensor: SensorInfo = SensorInfo()
-    """What is known of the sensor."""
+    """This is known of the sensor."""
     source: Mapping[str, str] = field(default_factory=dict)
-    """Free text on where the log comes from."""
+    """These free texts say where the log comes from."""
     truth: Truth | None = None
-    """The truth where there is any."""
+    """This is the truth where there is any."""
 
 
 def read_log(folder: Path | str) -> Log:
-    """Read and check a log folder (FORMATS: A log).
+    """Reads and checks a log folder (FORMATS: A log).
 
-    What is wrong is an InputError that names the file, the row and what was expected.
+    Anything wrong is an InputError that names the file, the row and what was expected.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -139,10 +142,10 @@ def read_log(folder: Path | str) -> Log:
 
 
 def write_log(log: Log, folder: Path | str) -> None:
-    """Write a log folder that `read_log` gives back exactly.
+    """Writes a log folder that `read_log` gives back exactly.
 
-    A cycle without detections has no row in the file, so is left out. The folder appears as a whole or not at
-    all; an earlier log there is kept as a numbered backup.
+    A cycle without detections has no row in the file, so it is left out. The folder appears as a whole or not
+    at all; an earlier log there is kept as a numbered backup.
     """
     with atomic_folder(folder, LOG_FILE) as target:
         (target / LOG_FILE).write_text(_toml(log), encoding="utf-8", newline="\n")
@@ -203,7 +206,7 @@ def _is_positive(value: object) -> bool:
 def _read_odometry(file: Path) -> Odometry:
     table = read_table(file, ("t", "vx", "vy", "wz"))
     if not len(table):
-        raise InputError(file, "expected at least one reading, found a header only", 2)
+        raise InputError(file, "expected at least one row, found a header only", 2)
     return Odometry(_increasing_times(table), table.stack(("vx", "vy", "wz")))
 
 
@@ -219,8 +222,8 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
         return ()
     t = table.numbers("t")
     table.require(np.append(True, np.diff(t) >= 0), "expected a time not earlier than the row before")
-    table.require(t >= t_first, f"expected a time not before the first odometry reading ({t_first:g} s)")
-    late = f"expected a time at most {MAX_HOLD:g} s after the last odometry reading ({t_last:g} s)"
+    table.require(t >= t_first, f"expected a time not before the first odometry row ({t_first:g} s)")
+    late = f"expected a time at most {MAX_HOLD:g} s after the last odometry row ({t_last:g} s)"
     table.require(t <= t_last + MAX_HOLD, late)
     points = table.stack(("x", "y"))
     covariances = _covariances(table)

@@ -22,40 +22,41 @@ FORMAT = "pathspace-map/1"
 MAP_FILE = "map.json"
 
 _SYMMETRY_TOLERANCE = 1e-9
-"""|P - P^T| <= tolerance * max|P|: what rounding leaves of a covariance's symmetry."""
+"""A covariance is symmetric to rounding where |P - P^T| <= tolerance * max|P|."""
 _NEGATIVE_TOLERANCE = 1e-9
-"""smallest eigenvalue >= -tolerance * largest: what rounding leaves of its positive semidefiniteness."""
+"""A covariance is positive semidefinite to rounding where min eigenvalue >= -tolerance * max eigenvalue."""
 
 
 @dataclass(frozen=True, eq=False)
 class SplineBoundary:
-    """A boundary as a B-spline."""
+    """Holds a boundary as a B-spline."""
 
     spline: BSpline
-    """The curve, map frame, in the direction of travel."""
+    """The curve is in the map frame, in the direction of travel."""
 
     covariance: Array
-    """(2m, 2m) m^2, joint covariance of the m distinct control points over x0, y0, x1, y1 ..."""
+    """This is the joint covariance (2m, 2m) in m^2 of the m distinct control points, in the order x0, y0, x1,
+    y1 and so on."""
 
     @property
     def size(self) -> int:
-        """The number m of distinct control points."""
+        """Returns the number m of distinct control points."""
         return self.spline.size
 
 
 @dataclass(frozen=True, eq=False)
 class PointBoundary:
-    """A boundary as points: the landmarks of an estimator that doesn't know they form a curve."""
+    """Holds a boundary as points: the landmarks of an estimator that does not know that they form a curve."""
 
     points: Array
-    """(m, 2) m, map frame, in no particular order."""
+    """Each row is a point (m, 2) in m, map frame, in no particular order."""
 
     covariance: Array
-    """(2m, 2m) m^2, joint covariance over x0, y0, x1, y1 ..."""
+    """This is the joint covariance (2m, 2m) in m^2 of the points, in the order x0, y0, x1, y1 and so on."""
 
     @property
     def size(self) -> int:
-        """The number m of points."""
+        """Returns the number m of points."""
         return len(self.points)
 
 
@@ -64,17 +65,17 @@ MapBoundary = SplineBoundary | PointBoundary
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """What was mapped of a track."""
+    """Holds what was mapped of a track."""
 
     closed: bool
-    """Whether the track was found to be a loop."""
+    """The track was found to be a loop where this is true."""
 
     boundaries: Mapping[int, MapBoundary]
-    """By label, LEFT and RIGHT; a boundary that could not be mapped is absent."""
+    """Each boundary stands under its label, LEFT or RIGHT; a boundary that could not be mapped is absent."""
 
     @property
     def size(self) -> int:
-        """The number of control points or landmarks on both boundaries together."""
+        """Returns the number of control points or landmarks on both boundaries together."""
         return sum(boundary.size for boundary in self.boundaries.values())
 
 
@@ -82,7 +83,7 @@ class Map:
 
 
 def map_to_json(track: Map) -> dict[str, Any]:
-    """The content of `map.json`, of plain Python types; every number to full precision."""
+    """Returns the content of `map.json` in plain Python types, every number to full precision."""
     boundaries = {
         NAMES[label]: _boundary_to_json(track.boundaries[label]) for label in sorted(track.boundaries)
     }
@@ -104,7 +105,7 @@ def _boundary_to_json(boundary: MapBoundary) -> dict[str, Any]:
 
 
 def map_from_json(content: Any, file: Path | str = MAP_FILE) -> Map:
-    """The map of a `map.json`'s content; InputError, naming `file`, where it is not what FORMATS says."""
+    """Returns the map of a `map.json`'s content; an InputError names `file` and what breaks FORMATS."""
     reader = _Reader(Path(file))
     top = reader.object(content, "the file")
     if top.get("format") != FORMAT:
@@ -125,7 +126,7 @@ def map_from_json(content: Any, file: Path | str = MAP_FILE) -> Map:
 
 @dataclass(frozen=True)
 class _Reader:
-    """Takes values out of parsed JSON, checked; `where` is the dotted path that an error names."""
+    """Takes values out of parsed JSON and checks them; `where` is the dotted path that an error names."""
 
     file: Path
 
@@ -153,7 +154,7 @@ class _Reader:
         return value
 
     def array(self, value: Any, where: str, columns: int | None = None) -> Array:
-        """Finite numbers: a list (columns None), or rows of `columns` values."""
+        """Returns finite numbers: a list where `columns` is None, or rows of `columns` values."""
         expected = "a list of finite numbers" if columns is None else f"rows of {columns} finite numbers"
         try:
             array = np.asarray(value, dtype=float)
@@ -210,6 +211,6 @@ def _is_covariance(P: Array) -> bool:
 
 
 def read_map(folder: Path | str) -> Map:
-    """The map of a folder that follows FORMATS, as `write_result`'s do; InputError where it doesn't."""
+    """Returns the map of a folder that follows FORMATS, as those of `write_result` do."""
     file = Path(folder) / MAP_FILE
     return map_from_json(read_json(file, "a map"), file)

@@ -5,38 +5,91 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from math import nan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .files import atomic_folder
 from .json_file import write_json
 from .map import MAP_FILE, Map, map_to_json
+from .trajectory import TRAJECTORY_FILE, write_trajectory
+
+Array = NDArray[np.float64]
 
 _CYCLE_COLUMNS = ("cycle", "t", "seconds", "size_left", "size_right", "readings", "lap")
+
+
+@dataclass(frozen=True)
+class CycleRecord:
+    """Holds one row of `cycles.csv` (FORMATS)."""
+
+    cycle: int
+    """This is the number of the perception cycle, from 0."""
+    t: float
+    """This is the stamp of the cycle (s)."""
+    seconds: float
+    """The whole update took this wall time (s)."""
+    size_left: int
+    """The left boundary has this number of control points or landmarks."""
+    size_right: int
+    """The right boundary has this number of control points or landmarks."""
+    readings: int
+    """This is the number of the cycle's detections that were used."""
+    lap: int
+    """The estimated trajectory is in this lap, counted from 1."""
+    stages: Mapping[str, float] = field(default_factory=dict)
+    """Each stage of the update took this time (s), by the stage's name."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunResult:
+    """Holds what a run of an estimator over a log gives."""
+
+    estimator: str
+    """This is the name of the estimator (FORMATS)."""
+    settings: dict[str, Any]
+    """These are all settings of the estimator, as plain values."""
+    map: Map
+    """This is the map at the end of the log."""
+    trajectory_t: Array
+    """These are the stamps of the perception cycles (n,) in s."""
+    trajectory: Array
+    """Each row is a pose [x, y, theta] (n, 3), map frame; an online estimator gives it as it stood at that
+    cycle."""
+    cycles: tuple[CycleRecord, ...]
+    """Each perception cycle has a record."""
+    laps: int
+    """The estimated trajectory has this number of complete laps, with a last one that ends just before the
+    line."""
+    lap_maps: tuple[tuple[int, Map], ...] = ()
+    """Each complete lap of the estimated trajectory has its number and the map as it stood at its end."""
+    snapshots: tuple[Map, ...] = ()
+    """The map is kept as it stood at each of the times that were asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class BatchRun(RunResult):
+    """Holds what a batch estimator gives; its maps of the laps are all the one of the whole log."""
+
+    converged: bool = True
+    """The optimization ended at an optimum where this is true."""
+    cost: float = nan
+    """This is the cost at its end, half the sum of squared whitened residuals, where it is known."""
 
 
 def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, Any]) -> None:
     """Writes map.json, trajectory.tum, cycles.csv and summary.json: all of them, or on failure nothing.
 
-    An earlier result in `folder` is kept as a numbered backup; OutputError where anything else stands there.
+    An earlier result in `folder` is kept as a numbered backup; anything else there is an OutputError.
     """
     with atomic_folder(Path(folder), marker=MAP_FILE) as temporary:
         write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
-        write_trajectory(temporary / "trajectory.tum", result.trajectory_t, result.trajectory)
+        write_trajectory(temporary / TRAJECTORY_FILE, result.trajectory_t, result.trajectory)
         _write_cycles(temporary / "cycles.csv", result.cycles)
         write_json(temporary / "summary.json", summary)
-
-
-def write_trajectory(file: Path, t: ArrayLike, poses: ArrayLike) -> None:
-    """TUM trajectory format, `t tx ty tz qx qy qz qw`; t: (n,) s, poses: (n, 3) [x, y, theta] map frame."""
-    rows = np.column_stack([np.asarray(t, dtype=float), np.asarray(poses, dtype=float).reshape(-1, 3)])
-    with file.open("w", encoding="utf-8", newline="\n") as out:
-        for stamp, x, y, theta in rows.tolist():
-            qz, qw = float(np.sin(theta / 2)), float(np.cos(theta / 2))
-            out.write(f"{stamp!r} {x!r} {y!r} 0.0 0.0 0.0 {qz!r} {qw!r}\n")
 
 
 def _write_cycles(file: Path, cycles: Iterable[CycleRecord]) -> None:
@@ -49,60 +102,3 @@ def _write_cycles(file: Path, cycles: Iterable[CycleRecord]) -> None:
 def _cycle_row(record: CycleRecord) -> list[float | int]:
     values = (getattr(record, column) for column in _CYCLE_COLUMNS)
     return [value.item() if isinstance(value, np.generic) else value for value in values]
-
-
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class CycleRecord:
-    """One row of `cycles.csv` (FORMATS)."""
-
-    cycle: int
-    """Number of the perception cycle, from 0."""
-    t: float
-    """Stamp, s."""
-    seconds: float
-    """Wall time of the whole update, s."""
-    size_left: int
-    """Control points or landmarks of the left boundary."""
-    size_right: int
-    """The same of the right boundary."""
-    readings: int
-    """How many of the cycle's readings were used."""
-    lap: int
-    """The lap being driven, from 1, by the estimated trajectory."""
-    stages: Mapping[str, float] = field(default_factory=dict)
-    """Time (s) that each stage of the update took, by its name."""
-
-
-@dataclass(frozen=True, eq=False)
-class RunResult:
-    """What a run of an estimator over a log gives."""
-
-    estimator: str
-    """Name of the estimator (FORMATS)."""
-    settings: dict[str, Any]
-    """Its settings in full, as plain values."""
-    map: Map
-    """The map at the end of the log."""
-    trajectory_t: Array
-    """Stamps of the perception cycles (n,), s."""
-    trajectory: Array
-    """Poses [x, y, theta] (n, 3), map frame; of an online estimator as they stood at that cycle."""
-    cycles: tuple[CycleRecord, ...]
-    """A record of each perception cycle."""
-    laps: int
-    """Complete laps by the estimated trajectory, one that ends just short of the line included."""
-    lap_maps: tuple[tuple[int, Map], ...] = ()
-    """(lap, map as it stood at its end) of each complete lap by the estimated trajectory."""
-    snapshots: tuple[Map, ...] = ()
-    """The map as it stood at each of the times that were asked for."""
-
-
-@dataclass(frozen=True, eq=False)
-class BatchRun(RunResult):
-    """What a batch estimator gives; its maps of the laps are all the same one, that of the whole log."""
-
-    converged: bool = True
-    """Whether it ended at an optimum."""

@@ -293,8 +293,10 @@ class OdometrySettings(Positive):
 
 @dataclass(frozen=True)
 class FarSettings(Positive):
-    """Describes the inactive part of the map, which is not solved for in every cycle: this changes speed, not
-    results."""
+    """Describes the inactive part of the map, which is not solved for in every cycle.
+
+    These settings change speed, not results.
+    """
 
     stretch: float = 12.0
     """Control points of an open curve become inactive in stretches of at least this length behind the vehicle

@@ -113,7 +113,7 @@ def cell(row: int, column: str, value: str) -> Change:
     [
         ("odometry.csv", cell(4, "t", "0.05"), "row 4: expected a time later"),
         ("odometry.csv", cell(4, "t", "0.1"), "row 4: expected a time later"),
-        ("odometry.csv", lambda text: text.splitlines()[0] + "\n", "expected at least one reading"),
+        ("odometry.csv", lambda text: text.splitlines()[0] + "\n", "expected at least one row"),
         ("truth_poses.csv", cell(3, "t", "0.0"), "row 3: expected a time later"),
         ("detections.csv", cell(4, "t", "0.05"), "row 4: expected a time"),
         ("detections.csv", cell(2, "t", "-1"), "row 2: expected a time"),

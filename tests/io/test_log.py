@@ -139,7 +139,7 @@ def test_missing_folder(tmp_path: Path) -> None:
 
 
 BAD_ROWS = [
-    ("odometry.csv", "t,vx,vy,wz\n", 2, "at least one reading"),
+    ("odometry.csv", "t,vx,vy,wz\n", 2, "at least one row"),
     ("odometry.csv", "t,vx,vy\n0,1,0\n", 1, "column 'wz'"),
     ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.5,fast,0,0\n", 3, "number in column 'vx', found 'fast'"),
     ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.5,1,nan,0\n", 3, "finite number in column 'vy'"),
