@@ -49,12 +49,12 @@ class Belief:
 
     @property
     def pose(self) -> Array:
-        """Returns the mean pose (3,), a view of the mean; theta is not wrapped."""
+        """This is the mean pose (3,), a view of the mean; theta is not wrapped."""
         return self.mean[:POSE]
 
     @property
     def points(self) -> Array:
-        """Returns the mean points (m, 2), a view of the mean."""
+        """Returns a view of the mean points (m, 2)."""
         return self.mean[HEAD:].reshape(-1, POINT)
 
     def predict(self, odometry: IntegratedOdometry) -> None:
