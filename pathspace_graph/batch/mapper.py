@@ -112,18 +112,15 @@ class BatchMapper:
 
     def _solve(self, log: Log, start: Start, on_round: Callable[[], None] | None) -> BatchResult:
         settings, batch, watch = own_settings(self.settings), self.settings.batch, Stopwatch()
-        if start == "online" and self.online is None:
-            raise SettingsError("start online: expected an online mapper to begin with, found none")
         chain = integrate_log(log, self.odometry_sigma, settings.odometry)
         detections = DetectionTable.of(log.cycles)
         system = BatchSystem(detections, chain, settings, Biweight(batch.loose_gate))
         optimizer = Optimizer(system, batch)
         watch.lap("integrate")
-        online = None
-        if start == "online" and self.online is not None:
-            state, online = start_online(log, self.online(self.settings, self.odometry_sigma))
+        if start == "odometry":
+            state, online = start_odometry(chain, detections, settings), None
         else:
-            state = start_odometry(chain, detections, settings)
+            state, online = self._start_online(log)
         watch.lap("start")
         state = optimizer.align_poses(state, batch.pose_steps, batch.loose_gate)
         watch.lap("poses")
@@ -155,6 +152,12 @@ class BatchMapper:
             system=system,
             optimum=at,
         )
+
+    def _start_online(self, log: Log) -> tuple[State, RunResult]:
+        """Returns the start from an online run of the log, and the run."""
+        if self.online is None:
+            raise SettingsError("start online: expected an online mapper to begin with, found none")
+        return start_online(log, self.online(self.settings, self.odometry_sigma))
 
 
 def _optimum(

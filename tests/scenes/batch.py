@@ -14,7 +14,7 @@ from pathspace_graph.batch.knots import boundary_of
 from pathspace_graph.batch.mapper import own_settings
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.io.log import Log
+from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
@@ -130,16 +130,8 @@ def course_log(laps: float, speed: float = 6.0) -> Log:
     return exact_log(twists, cones, np.repeat([LEFT, RIGHT], len(middle)).astype(np.intp))
 
 
-def detections_of(cycle: IntArray, points_vehicle: Array, labels: IntArray, sigma: float) -> DetectionTable:
-    """Returns detections (m, 2) with isotropic sigma (m), none of them used."""
-    m = len(cycle)
-    return DetectionTable(
-        cycle=cycle,
-        point=points_vehicle,
-        covariance=np.tile(sigma**2 * np.eye(2), (m, 1, 1)),
-        label=labels,
-        boundary=labels.copy(),
-        u=np.zeros(m),
-        used=np.zeros(m, bool),
-        changed=np.zeros(m, bool),
-    )
+def detections_of(points_vehicle: Array, labels: IntArray, sigma: float) -> DetectionTable:
+    """Returns the detections (m, 2) of cycle 0 with isotropic sigma (m), none of them used."""
+    covariances, table = np.tile(sigma**2 * np.eye(2), (len(labels), 1, 1)), DetectionTable()
+    table.append(Detections(0.0, points_vehicle, covariances, labels), 0)
+    return table
