@@ -19,12 +19,10 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.landmark.batch import LandmarkBatch
-from pathspace_graph.landmark.oracle import solve_landmarks
+from pathspace_graph.landmark.oracle import solve_landmarks, start_oracle
 from pathspace_graph.landmark.reassociation import remove_rare
-from pathspace_graph.landmark.start import as_landmark_detections, start_oracle
 from pathspace_graph.landmark.state import LandmarkState
 from pathspace_graph.landmark.system import LandmarkSystem
-from pathspace_graph.mapping.measurements import integrate_log
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -103,10 +101,8 @@ def test_what_it_is_not_told_it_finds(log: Log) -> None:
 def told_system(log: Log, cycles: int) -> tuple[LandmarkSystem, LandmarkState]:
     short, associations = part_of(log, cycles)
     settings = MapperSettings()
-    detections = as_landmark_detections(short)
-    chain = integrate_log(short, log.odometry_sigma, settings.odometry)
-    state = start_oracle(detections, chain, associations)
-    return LandmarkSystem(detections, chain, settings), state
+    system = LandmarkSystem.of_log(short, settings, log.odometry_sigma)
+    return system, start_oracle(system, associations)
 
 
 def whole_system(system: LandmarkSystem, state: LandmarkState) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
+from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.vehicle import integrate
@@ -43,7 +43,10 @@ def straight(seconds: float = 6.0, smoothness: float = SMOOTHNESS) -> tuple[Batc
     cones, labels = corridor(60.0)
     log = exact_log(ahead(6.0, seconds), cones, labels)
     settings = own_settings(whole)
-    chain, detections = integrate_log(log, log.odometry_sigma, settings.odometry), collect_detections(log)
+    chain, detections = (
+        integrate_log(log, log.odometry_sigma, settings.odometry),
+        DetectionTable.of(log.cycles),
+    )
     state = start_odometry(chain, detections, settings)
     system = BatchSystem(detections, chain, settings, Biweight(LEAST_SQUARES))
     system.begin(state)
@@ -58,7 +61,7 @@ def settled(system: BatchSystem, state: State, steps: int = 4) -> State:
     for _ in range(steps):
         at = system.evaluate(state)
         for projected in at.projected.values():
-            system.detections.u[projected.rows] = projected.foot.u
+            system.detections.refine(projected.rows, projected.foot.u)
         problem = system.eliminated(at)
         state = moved(state, problem.step(np.zeros(problem.map.size)))
     return state
@@ -84,7 +87,7 @@ def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, A
     return noisy, calibration
 
 
-def _with_errors(chain: Chain, local: Array) -> Chain:
+def _with_errors(chain: LogOdometry, local: Array) -> LogOdometry:
     """Returns the chain with errors (P - 1, 3), each in the frame of the end of its interval."""
     odometry = copy(chain.odometry)
     moved_ends = to_map(local[:, :2], odometry.deltas)
