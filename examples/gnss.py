@@ -1,7 +1,7 @@
-"""Your own factors on poses: a GNSS receiver beside the cones.
+"""Adds factors of your own on poses: a GNSS receiver measures the position beside the cones.
 
-The mapper takes any GTSAM factor with a cycle. Here a receiver gives the vehicle's position once a second, in
-the map frame, and each fix is a `gtsam.PoseTranslationPrior2D` on the pose of its cycle.
+The mapper takes any GTSAM factor together with a cycle. Here a receiver gives the vehicle's position in the
+map frame once a second. Each fix is a `gtsam.PoseTranslationPrior2D` on the pose of its cycle.
 
     python examples/gnss.py
 """
@@ -20,19 +20,19 @@ from pathspace_graph.sim.track_generator import generate_track
 Array = NDArray[np.float64]
 
 SIGMA_GNSS = 0.3
-"""Standard deviation of a fix in each direction (m)."""
+"""A fix has this standard deviation (m) in each direction."""
 EVERY = 10
-"""A fix comes with every so many perception cycles: once a second."""
+"""A fix comes with every tenth perception cycle, which is once a second."""
 
 
 def build_log(laps: int = 1, seed: int = 0) -> Log:
-    """A simulated drive on a generated track."""
+    """Simulates a drive on a generated track."""
     track = generate_track(np.random.default_rng(seed))
     return simulate(track, SimulationSettings(laps=laps), seed)
 
 
 def true_positions(log: Log) -> Array:
-    """(n, 2) where the vehicle was at each perception cycle, map frame, m: what the receiver measures."""
+    """Returns the true position (n, 2) of the vehicle at each perception cycle, in m, map frame."""
     assert log.truth is not None
     stamps = [cycle.t for cycle in log.cycles]
     truth = log.truth
@@ -40,14 +40,14 @@ def true_positions(log: Log) -> Array:
 
 
 def gnss_factor(key: int, fix: Array) -> gtsam.NonlinearFactor:
-    """A fix (2,) of a pose, map frame, m; Huber's loss, as a receiver has outliers."""
+    """Returns the factor of a fix (2,) in m, map frame. Huber's loss allows for outliers."""
     gaussian = gtsam.noiseModel.Isotropic.Sigma(2, SIGMA_GNSS)
     robust = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(1.345), gaussian)
     return gtsam.PoseTranslationPrior2D(key, fix, robust)
 
 
 def drive(log: Log, fixes: Array | None) -> Array:
-    """(n, 2) estimated positions, cycle by cycle, with fixes (n, 2) or without."""
+    """Returns the estimated position (n, 2) of each cycle, with fixes (n, 2) or without."""
     mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
     positions = []
     for cycle, (odometry, detections) in enumerate(split_odometry(log)):
@@ -59,11 +59,11 @@ def drive(log: Log, fixes: Array | None) -> Array:
 
 
 def main(laps: int = 1, seed: int = 0) -> tuple[float, float]:
-    """Root mean square error of the position (m) without and with the receiver."""
+    """Returns the root mean square error of the position (m) without and with the receiver."""
     log = build_log(laps, seed)
     truth = true_positions(log)
     fixes = truth + np.random.default_rng(seed).normal(0.0, SIGMA_GNSS, truth.shape)
-    errors = [np.sqrt(((drive(log, own) - truth) ** 2).sum(axis=1).mean()) for own in (None, fixes)]
+    errors = [np.sqrt(((drive(log, chosen) - truth) ** 2).sum(axis=1).mean()) for chosen in (None, fixes)]
     return float(errors[0]), float(errors[1])
 
 

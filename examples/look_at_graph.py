@@ -1,8 +1,7 @@
-"""Look at the graph: print it, its errors by kind of factor, uncertainties by GTSAM's own classes, and a
-picture.
+"""Looks at the graph: its factors and their errors, uncertainties by GTSAM's own classes, and a picture.
 
-`mapper.graph()` is the window as a `gtsam.NonlinearFactorGraph`, and `mapper.values()` its estimate: whatever
-GTSAM does with a graph works on it.
+`mapper.graph()` is the window as a `gtsam.NonlinearFactorGraph`, and `mapper.values()` is its estimate.
+Whatever GTSAM does with a graph works on them.
 
     python examples/look_at_graph.py
 """
@@ -26,7 +25,7 @@ POSE, CALIBRATION = ord("x"), ord("b")
 
 
 def build_mapper(cycles: int = 150, seed: int = 0) -> FixedLagMapper:
-    """A mapper after so many cycles on a generated track."""
+    """Returns a mapper after a number of cycles on a generated track."""
     log = simulate(generate_track(np.random.default_rng(seed)), SimulationSettings(laps=1), seed)
     mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
     for number, (odometry, detections) in enumerate(split_odometry(log)):
@@ -37,7 +36,7 @@ def build_mapper(cycles: int = 150, seed: int = 0) -> FixedLagMapper:
 
 
 def kind(factor: gtsam.NonlinearFactor) -> str:
-    """What a factor of the mapper says, by its class and keys."""
+    """Returns the kind of a factor of the mapper, which its class and its keys tell."""
     letters = {gtsam.symbolChr(key) for key in list(factor.keys())}
     if isinstance(factor, gtsam.CustomFactor):
         return "odometry" if CALIBRATION in letters else "spline projection"
@@ -49,7 +48,7 @@ def kind(factor: gtsam.NonlinearFactor) -> str:
 
 
 def errors_by_kind(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> dict[str, tuple[int, float]]:
-    """Number of factors of each kind, and the sum of their errors (half squared sigmas)."""
+    """Returns the number of factors of each kind, and the sum of their errors (half the squared sigmas)."""
     found: defaultdict[str, tuple[int, float]] = defaultdict(lambda: (0, 0.0))
     for index in range(graph.size()):
         factor = graph.at(index)
@@ -59,23 +58,25 @@ def errors_by_kind(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> d
 
 
 def draw(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, axes: Axes) -> None:
-    """Poses and control points, and a line from the pose of each projection factor to its points."""
-    where = {
+    """Draws poses and control points, and a line from the pose of each projection factor to its points."""
+    positions = {
         key: _position(values, key) for key in list(values.keys()) if gtsam.symbolChr(key) != CALIBRATION
     }
     for index in range(graph.size()):
         factor = graph.at(index)
         if kind(factor) == "spline projection":
-            pose, *points = factor.keys()
-            for point in points:
-                axes.plot(*np.array([where[pose], where[point]]).T, color="0.85", linewidth=0.5, zorder=0)
+            pose, *controls = factor.keys()
+            for point in controls:
+                axes.plot(
+                    *np.array([positions[pose], positions[point]]).T, color="0.85", linewidth=0.5, zorder=0
+                )
     for letter, colour, name in (
         ("l", "tab:blue", "left"),
         ("r", "goldenrod", "right"),
         ("x", "0.2", "poses"),
     ):
-        own = np.array([place for key, place in where.items() if gtsam.symbolChr(key) == ord(letter)])
-        axes.plot(*own.T, "o-", color=colour, markersize=4, linewidth=0.8, label=name)
+        points = np.array([place for key, place in positions.items() if gtsam.symbolChr(key) == ord(letter)])
+        axes.plot(*points.T, "o-", color=colour, markersize=4, linewidth=0.8, label=name)
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
     axes.legend()
 
@@ -88,7 +89,7 @@ def _position(values: gtsam.Values, key: int) -> np.ndarray:
 
 
 def main(folder: Path = Path(), cycles: int = 150) -> dict[str, tuple[int, float]]:
-    """Write `graph.dot` and `graph.png` to a folder; gives the errors by kind of factor."""
+    """Writes `graph.dot` and `graph.png` to a folder and returns the errors by kind of factor."""
     mapper = build_mapper(cycles)
     graph, values = mapper.graph(), mapper.values()
     graph.saveGraph(str(folder / "graph.dot"), values)

@@ -1,8 +1,8 @@
-"""Your own factors on control points: a boundary that must pass through a surveyed point.
+"""Adds factors of your own on control points: a boundary must pass through a surveyed point.
 
-Somebody has measured where one cone of the left boundary stands, to a few centimetres. As soon as the curve
-has grown past it, a factor on the control points there tells the mapper. It stays nonlinear while these are
-active, and is part of the map's prior afterwards.
+Somebody has measured the position of one cone of the left boundary to a few centimetres. As soon as the curve
+has grown past it, a factor on the control points there tells the mapper. The factor stays nonlinear while
+these control points are active, and is a part of the map's prior afterwards.
 
     python examples/surveyed_point.py
 """
@@ -23,21 +23,21 @@ from pathspace_graph.sim.track_generator import generate_track
 Array = NDArray[np.float64]
 
 SIGMA_SURVEY = 0.02
-"""Standard deviation of the surveyed point (m)."""
+"""The surveyed point has this standard deviation (m)."""
 REACH = 3.0
-"""Half the stretch of the curve (m along it) in which the point's foot point is looked for."""
+"""The foot point of the surveyed point is searched this far (m) along the curve to both sides."""
 AWAY = 5.0
-"""A curve farther from the point than this (m) has not grown past it yet."""
+"""A curve that is farther from the point than this (m) has not grown past it yet."""
 
 
 def build_log(laps: int = 1, seed: int = 0) -> Log:
-    """A simulated drive on a generated track."""
+    """Simulates a drive on a generated track."""
     track = generate_track(np.random.default_rng(seed))
     return simulate(track, SimulationSettings(laps=laps), seed)
 
 
 def survey(log: Log, share: float = 0.4) -> Array:
-    """(2,) the left cone that stands this share of the way around the track, map frame, m."""
+    """Returns the left cone (2,) nearest to the vehicle after a share of the drive, in m, map frame."""
     assert log.truth is not None
     cones = log.truth.cones[log.truth.cone_labels == LEFT]
     pose = log.truth.poses[int(share * len(log.truth.poses)), :2]
@@ -45,7 +45,7 @@ def survey(log: Log, share: float = 0.4) -> Array:
 
 
 def survey_factor(mapper: FixedLagMapper, point: Array) -> gtsam.NonlinearFactor | None:
-    """The factor that holds the left boundary on a point (2,); None where the curve is not beside it yet."""
+    """Returns a factor that holds the left boundary on a point (2,), or None while the curve is not there."""
     if LEFT not in mapper.boundaries:
         return None
     boundary, points = mapper.boundaries[LEFT], mapper.control_points(LEFT)
@@ -64,25 +64,25 @@ def survey_factor(mapper: FixedLagMapper, point: Array) -> gtsam.NonlinearFactor
 
 
 def drive(log: Log, point: Array | None) -> FixedLagMapper:
-    """The mapper after a log, told of a surveyed point (2,) or not."""
+    """Maps a log, with a surveyed point (2,) or without, and returns the mapper."""
     mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
-    told = point is None
+    added = False
     for odometry, detections in split_odometry(log):
-        factor = None if told or point is None else survey_factor(mapper, point)
-        told = told or factor is not None
+        factor = None if added or point is None else survey_factor(mapper, point)
+        added = added or factor is not None
         mapper.update(odometry, detections, [] if factor is None else [factor])
     return mapper
 
 
 def distance(mapper: FixedLagMapper, point: Array) -> float:
-    """Distance (m) of the left boundary from a point (2,)."""
+    """Returns the distance (m) of the left boundary from a point (2,)."""
     boundary, points = mapper.boundaries[LEFT], mapper.control_points(LEFT)
     curve = boundary.evaluate(points, np.linspace(boundary.tables.low, boundary.tables.high, 4000))
     return float(np.hypot(*(curve - point).T).min())
 
 
 def main(laps: int = 1, seed: int = 0) -> tuple[float, float]:
-    """Distance (m) of the boundary from the surveyed point, without and with the factor."""
+    """Returns the distance (m) of the boundary from the surveyed point, without and with the factor."""
     log = build_log(laps, seed)
     point = survey(log)
     return distance(drive(log, None), point), distance(drive(log, point), point)

@@ -37,18 +37,14 @@ ARROWS: dict[str, set[str]] = {
     **dict.fromkeys(ESTIMATORS, BELOW_ESTIMATORS),
     "estimators": BELOW_ESTIMATORS | ESTIMATORS,
     "eval.metrics": BELOW_EVAL,
-    "eval.tables": BELOW_EVAL | {"eval.metrics"},
     "eval.figures": BELOW_EVAL | {"eval.metrics"},
     "eval.harness": BELOW_EVAL | {"eval.metrics"},
-    "eval.study": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures"},
-    "eval.compare": BELOW_EVAL
-    | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures", "eval.study"},
-    "eval.scaling": BELOW_EVAL
-    | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures", "eval.study"},
-    "eval.benchmark": BELOW_EVAL
-    | {"eval.metrics", "eval.harness", "eval.tables", "eval.figures", "eval.study"},
+    "eval.study": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures"},
+    "eval.compare": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
+    "eval.scaling": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
+    "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "commands": BELOW_EVAL
-    | {f"eval.{room}" for room in ("metrics", "harness", "tables", "figures", "study", "compare", "scaling")},
+    | {f"eval.{room}" for room in ("metrics", "harness", "figures", "study", "compare", "scaling")},
     "cli": {"commands"},
     "__main__": {"cli"},
 }

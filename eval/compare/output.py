@@ -1,4 +1,4 @@
-"""What a comparison leaves on disk: tables, tidy results, figures, and the maps themselves."""
+"""The files of a comparison: tables, tidy results, figures, and the maps themselves."""
 
 from __future__ import annotations
 
@@ -19,29 +19,30 @@ from pathspace_graph.io.results import write_result
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .comparison import Comparison, NamedLog, Outcome
-from .paired import paired_frame, paired_table
+from .differences import paired_frame, paired_table
 from .plot import plot_blind_spot, plot_maps
 from .table import final_table, paper_frame, paper_table
 
 FORMAT: Final = "pathspace-comparison/1"
 MARKER: Final = "comparison.json"
-"""The file that a comparison's folder is known by."""
+"""A comparison's folder is recognized by this file."""
 
 
 def tables(comparison: Comparison) -> dict[str, TextTable]:
-    """All that is printed, by the name of its files; differences where there are several to tell apart."""
-    found = {"table": paper_table(comparison), "metrics": final_table(comparison)}
+    """Returns the printed tables by the name of their files, differences only where runs can be paired."""
+    printed = {"table": paper_table(comparison), "metrics": final_table(comparison)}
     if comparison.paired:
-        found["paired"] = paired_table(comparison, paired_frame(comparison))
-    return found
+        printed["paired"] = paired_table(comparison, paired_frame(comparison))
+    return printed
 
 
 def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings, jobs: int) -> None:
-    """All of it, or nothing; an earlier comparison in `out` is kept as a numbered backup.
+    """Writes all files of a comparison, or on failure none.
 
-    `table.*` is the paper's Table 1, `metrics.*` everything (its CSV a tidy row per run and lap), `times.csv`
-    the stages of the cycles, `paired.*` the differences. Of each log `maps.*`, `blind_spot.*` and a map
-    folder per estimator, in a folder of the log's own where there are several.
+    `table.*` is the paper's Table 1. `metrics.*` has every metric; its CSV has a tidy row for each run and
+    lap. `times.csv` has the stages of the cycles, `paired.*` the differences. Each log has `maps.*`,
+    `blind_spot.*` and a map folder for each estimator, in a folder of its own where there are several logs.
+    An earlier comparison in `out` is kept as a numbered backup.
     """
     with atomic_folder(out, MARKER) as folder:
         for name, table in tables(comparison).items():
@@ -64,7 +65,7 @@ def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings
 
 
 def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
-    """Maps and figures of one log."""
+    """Writes the maps and figures of one log."""
     outcomes = comparison.of(named.name)
     for outcome in outcomes:
         if outcome.result is not None:
@@ -77,7 +78,10 @@ def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
 
 
 def blind_spot_figure(outcomes: list[Outcome], named: NamedLog, reference: str) -> Figure | None:
-    """The reference beside the first landmark map that misses cones; None without truth or such a map."""
+    """Returns the reference beside the first landmark map that misses cones, or None.
+
+    It is None without truth, or where no landmark map misses cones that the reference passes.
+    """
     maps = {o.estimator: o.result.map for o in outcomes if o.result is not None}
     truth = named.log.truth
     points = [

@@ -28,8 +28,8 @@ from pathspace_graph.eval.figures.style import (
     set_frame,
 )
 from pathspace_graph.eval.metrics.blind_spot import BlindSpot
+from pathspace_graph.eval.metrics.curves import mapped_points
 from pathspace_graph.eval.metrics.measures import PAPER
-from pathspace_graph.eval.metrics.true_curve import mapped_points
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 

@@ -1,4 +1,4 @@
-"""The tables of a comparison: the paper's Table 1, and every metric at the end."""
+"""The tables of a comparison: the paper's Table 1, and every metric at the end of the logs."""
 
 from __future__ import annotations
 
@@ -15,36 +15,37 @@ from pathspace_graph.eval.metrics.text_table import TextTable
 
 from .comparison import Comparison
 
-NO_TRUTH: Final = "the log has no true cones: only what needs none is told"
-"""What a table says that lacks the paper's columns."""
+NO_TRUTH: Final = "the log has no true cones, which rmse, missed and most other metrics need"
+"""A title says so where the columns of the paper are missing."""
 FAILED: Final = "failed"
-_AT_END: Final = "end"
-"""In place of a lap, where none was completed."""
+"""An estimator that failed on every log has this in place of a lap."""
+AT_END: Final = "end"
+"""An estimator that completed no lap has this in place of a lap."""
 _SPACE: Final = "   "
-"""Between figures that share a column."""
+"""Figures that share a column are this far apart."""
 
 
 def paper_frame(comparison: Comparison) -> pd.DataFrame:
-    """A row per estimator and lap: rmse (m), missed (share) and size, mean over `logs` logs that have it.
+    """Returns rmse (m), missed (share) and size of each estimator and lap, means over `logs` logs.
 
-    An estimator that completed no lap on any log has its maps at the end of the logs, without a lap.
+    An estimator that completed no lap on any log has a row without a lap, of its maps at the end of the logs.
     """
-    names = [metric.key for metric in PAPER]
-    frame = comparison.frame().reindex(columns=["log", "estimator", "scope", "lap", *names])
-    found = []
+    keys = [metric.key for metric in PAPER]
+    frame = comparison.frame().reindex(columns=["log", "estimator", "scope", "lap", *keys])
+    rows = []
     for estimator in comparison.estimators:
         own = frame[frame["estimator"] == estimator]
         laps = own[own["scope"] == "lap"]
-        for lap, of in laps.groupby("lap") if len(laps) else [(np.nan, own)]:
-            means = {name: of[name].astype(float).mean() for name in names}
-            found.append({"estimator": estimator, "lap": lap, "logs": len(of)} | means)
-    table = pd.DataFrame(found)
+        for lap, over_logs in laps.groupby("lap") if len(laps) else [(np.nan, own)]:
+            means = {key: over_logs[key].astype(float).mean() for key in keys}
+            rows.append({"estimator": estimator, "lap": lap, "logs": len(over_logs)} | means)
+    table = pd.DataFrame(rows)
     table["lap"] = table["lap"].astype("Int64")
     return table
 
 
 def paper_table(comparison: Comparison) -> TextTable:
-    """The paper's Table 1, lap by lap; without truth its sizes alone."""
+    """Returns the paper's Table 1, lap by lap; without truth it has the sizes only."""
     frame = paper_frame(comparison)
     known = PAPER if has_truth(comparison) else (METRICS["size"],)
     several = len(comparison.logs) > 1
@@ -64,7 +65,7 @@ def paper_table(comparison: Comparison) -> TextTable:
 
 
 def final_table(comparison: Comparison) -> TextTable:
-    """Every metric of the whole logs: a row per metric, a column per estimator, means over the logs."""
+    """Returns the means over the logs of every metric of whole logs, with a column for each estimator."""
     frame = comparison.frame()
     final = frame[frame["scope"] == "log"]
     known = [m for m in METRICS.values() if m.key in frame and not final[m.key].astype(float).isna().all()]
@@ -81,9 +82,9 @@ def final_table(comparison: Comparison) -> TextTable:
 
 
 def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
-    """The paper's Table 1 as the paper has it: a row per lap, the estimators beside each other.
+    """Returns the paper's Table 1 in the paper's form: a row per lap, the estimators beside each other.
 
-    rmse, missed and size of an estimator are one column, so that its name stands over all three.
+    The rmse, missed and size of an estimator share a column, so that its name stands above all three.
     """
     titles = _SPACE.join(metric.heading for metric in PAPER)
     header = ("lap", *(f"{name}\n{titles}" for name in laps))
@@ -96,12 +97,12 @@ def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
 
 
 def _three(row: LapMetrics | None) -> str:
-    """The paper's three figures of a lap, each as wide as its title."""
+    """Returns the paper's three figures of a lap, each as wide as its title."""
     return _SPACE.join(_cell(metric, row).rjust(len(metric.heading)) for metric in PAPER)
 
 
 def has_truth(comparison: Comparison) -> bool:
-    """Whether any log has true cones that a map can be held against."""
+    """Returns whether any log has true cones."""
     return any(n.log.truth is not None and has_cones(n.log.truth) for n in comparison.logs)
 
 
@@ -115,11 +116,11 @@ def _title(comparison: Comparison, when: str) -> str:
 def _lap(row: Any) -> str:
     if not pd.isna(row["lap"]):
         return str(int(row["lap"]))
-    return _AT_END if row["logs"] else FAILED
+    return AT_END if row["logs"] else FAILED
 
 
 def _cell(metric: Metric, row: Any) -> str:
-    """Of a row of a frame, of a lap's metrics, or of nothing."""
+    """Returns the text of a metric in a row of a frame, in a lap's metrics, or without either."""
     if row is None:
         return metric.text(float("nan"))
     value = getattr(row, metric.key) if isinstance(row, LapMetrics) else row[metric.key]

@@ -10,12 +10,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from pathspace_graph.ckf.expansion import AT_END, proximity_chain
+from pathspace_graph.ckf.expansion import beyond_end, proximity_chain
 from pathspace_graph.ckf.fit import fit_detections
 from pathspace_graph.factors.bspline import end_change_matrix
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.settings.comparison import CkfSettings
-from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import fit_spline
 
 from .marks import draw_band, draw_control_points, draw_curve, draw_ellipses, draw_points
@@ -82,26 +81,16 @@ def expansion(scene: ExpansionScene | None = None) -> Expansion:
     before = _known_curve(scene)
     detections = _on_bend(scene, np.array(scene.detections_along), np.array(scene.detections_inside))
     covariances = np.tile(scene.sigma_detection**2 * np.eye(2), (len(detections), 1, 1))
-    expands = expanding(before.spline, detections, scene.threshold, scene.separation)
+    spline, high = before.spline, before.spline.domain[1]
+    foot_u = spline.foot_points(detections).u
+    settings = CkfSettings(threshold=scene.threshold, separation=scene.separation)
+    expands = beyond_end(detections, foot_u, high, spline.control_points, settings)
     beyond = np.flatnonzero(expands)
-    end = before.spline.evaluate(np.array([before.spline.domain[1]]))[0]
-    order = beyond[proximity_chain(detections[beyond], end)]
+    order = beyond[proximity_chain(detections[beyond], spline.control_points[-1])]
     extended = extend(before, detections[order[-1]], covariances[order[-1]])
     others = np.arange(len(detections)) != order[-1]
     updated = update(extended, detections[others], covariances[others])
     return Expansion(detections, scene.sigma_detection, expands, order, before, extended, updated)
-
-
-def expanding(spline: BSpline, detections: Array, threshold: float, separation: float) -> Bools:
-    """Returns which detections (m, 2) meet the paper's three conditions of an expansion (m,).
-
-    The closest point is S(1), and the detection is beyond a threshold from C_n and from C_(n-1), in m.
-    """
-    foot = spline.foot_points(detections)
-    last_but_one, last = spline.control_points[-2:]
-    far_from_last = np.linalg.norm(detections - last, axis=1) > threshold
-    far_from_last_but_one = np.linalg.norm(detections - last_but_one, axis=1) > separation
-    return np.asarray((foot.u >= spline.domain[1] - AT_END) & far_from_last & far_from_last_but_one)
 
 
 def extend(boundary: SplineBoundary, detection: Array, covariance: Array) -> SplineBoundary:
@@ -190,6 +179,5 @@ def _draw_step(axes: Axes, data: Expansion, boundary: SplineBoundary, expands: B
 
 def _draw_chain(axes: Axes, data: Expansion) -> None:
     """Draws the proximity chain, from the end of the curve on."""
-    spline = data.before.spline
-    chain = np.concatenate([spline.evaluate(np.array([spline.domain[1]])), data.detections[data.order]])
+    chain = np.concatenate([data.before.spline.control_points[-1:], data.detections[data.order]])
     axes.plot(*chain.T, color=RED, linewidth=0.8, linestyle=":", zorder=2, label="proximity chain")

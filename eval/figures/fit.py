@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from pathspace_graph.ckf.fit import SplineMeasurement, fit_detections
 from pathspace_graph.mapping.cubature import cubature_points, square_root
@@ -16,15 +17,7 @@ from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.sim.geometry import left_normals, unit
 from pathspace_graph.spline.bspline import BSpline
 
-from .marks import (
-    curve_parameters,
-    draw_control_points,
-    draw_curve,
-    draw_ellipses,
-    draw_points,
-    normals,
-    point_blocks,
-)
+from .marks import draw_control_points, draw_curve, draw_ellipses, draw_points, normals, point_blocks
 from .style import (
     BLUE,
     DARK,
@@ -122,11 +115,8 @@ def _ray_covariances(rays: Array, sigmas: tuple[float, float]) -> Array:
 
 def _sigma_points(detections: Array, covariances: Array) -> Array:
     """Returns the cubature points (4 m, m, 2) of all detections (m, 2), (m, 2, 2) together."""
-    m = len(detections)
-    joint = np.zeros((m, 2, m, 2))
-    joint[np.arange(m), :, np.arange(m), :] = covariances
-    root = square_root(joint.reshape(2 * m, 2 * m))
-    return cubature_points(detections.ravel(), root).reshape(-1, m, 2)
+    root = square_root(block_diag(*covariances))
+    return cubature_points(detections.ravel(), root).reshape(-1, *detections.shape)
 
 
 # --- figure ----------------------------------------------------------------------------------------------
@@ -191,7 +181,7 @@ def _draw_fitted(axes: Axes, data: Fit) -> None:
 
 def _draw_basis(axes: Axes, data: Fit) -> None:
     """Draws the basis functions over the parameter, and marks their values at the detections."""
-    u = curve_parameters(data.curve)
+    u = np.linspace(*data.curve.domain, 400)
     for j, values in enumerate(data.curve.basis_matrix(u).T):
         color = PURPLE if data.basis[:, j].sum() > _INVISIBLE else LIGHT
         axes.plot(np.where(values > _INVISIBLE, u, np.nan), values, color=color, linewidth=0.9, zorder=2)

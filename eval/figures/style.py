@@ -41,9 +41,14 @@ DARK: Final = "#4D4D4D"
 GREY: Final = "#8C8C8C"
 LIGHT: Final = "#B0B0B0"
 # every kind of colour vision tells blue from orange, and so does a print without colours
+PALETTE: Final = (BLUE, ORANGE, RED, PURPLE, GREEN, DARK)
+"""Things that are compared have these colours, one after the other."""
+MARKERS: Final = "os^Dv*<>PXphd"
+"""Things that are compared have these shapes, one after the other."""
 
 _RC: Final = {
     "font.size": FONT_SIZE,
+    "figure.labelsize": FONT_SIZE,
     "axes.titlesize": FONT_SIZE,
     "axes.titlelocation": "left",
     "axes.linewidth": 0.6,

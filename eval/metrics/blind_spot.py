@@ -1,4 +1,4 @@
-"""A blind spot: the stretch where a landmark map misses most cones that a spline passes by."""
+"""A blind spot: the stretch where a landmark map misses most of the cones that a spline passes."""
 
 from __future__ import annotations
 
@@ -18,36 +18,37 @@ from .table1 import MISSED_DISTANCE, cone_distances
 Array = NDArray[np.float64]
 
 DISTANCES: Final = (MISSED_DISTANCE, 2.0, 1.0)
-"""A blind spot is looked for at each of these (m)."""
-_SEVERAL: Final = 2
-"""Cones in a row that make a better example than one alone."""
-_FAR: Final = 10.0
-"""A cone farther (m) than this from any landmark is as good as one at this distance."""
+"""A cone is missed if nothing is mapped within this distance (m); the distances are tried in this order."""
+_MIN_CONES: Final = 2
+"""A stretch is a good example if at least this many cones are missed there."""
+_MAX_WEIGHT: Final = 10.0
+"""Cones farther than this (m) from any landmark all have the same weight."""
 
 
 @dataclass(frozen=True, eq=False)
 class BlindSpot:
-    """A stretch of the track, and the true cones in it that maps miss."""
+    """A blind spot holds a stretch of the track, and the true cones in it that maps miss."""
 
     centre: Array
-    """(2,) m, map frame."""
+    """The centre of the stretch is at (x, y) in m, map frame."""
     half_size: tuple[float, float]
-    """Half width and half height (m)."""
+    """The stretch has this half width and half height (m)."""
     distance: float
-    """A cone with nothing mapped within this (m) is missed."""
+    """A cone is missed if nothing is mapped within this distance (m)."""
     cones: int
-    """True cones in sight."""
+    """The stretch has this many true cones."""
     missed: tuple[Array, ...]
-    """Of each map, the missed cones in sight (k, 2)."""
+    """Each map has the positions (k, 2) of the cones that it misses in the stretch."""
 
 
 def find_blind_spot(
     truth: Truth, spline_map: Map, landmark_map: Map, half_size: tuple[float, float] = (17.0, 13.0)
 ) -> BlindSpot | None:
-    """Where the landmark map misses the most cones that the spline map doesn't; None where it misses none.
+    """Returns the stretch where the landmark map misses the most cones that the spline map doesn't.
 
-    Missed: d > 3 m as in the paper's table, 2 m or 1 m, the farthest at which several are in sight at once,
-    or any at all. Of equals the one where the cones are farthest from their nearest landmark in sum.
+    The cones are missed at the largest of `DISTANCES` at which a stretch misses several cones, else at the
+    largest at which any cone is missed. It is None where none is missed at any. Among equal stretches the one
+    is chosen whose cones have the largest total distance from their nearest landmarks.
     """
     cones = truth.cones[np.isin(truth.cone_labels, BOUNDARIES)]
     distances = [cone_distances(track, truth) for track in (spline_map, landmark_map)]
@@ -55,21 +56,21 @@ def find_blind_spot(
     for distance in DISTANCES:
         bridged = (distances[0] <= distance) & (distances[1] > distance)
         if bridged.any():
-            centre = _densest(cones[bridged], np.minimum(distances[1][bridged], _FAR), half_size)
+            centre = _densest(cones[bridged], np.minimum(distances[1][bridged], _MAX_WEIGHT), half_size)
             spot = _spot(cones, distances, centre, half_size, distance)
-            if len(spot.missed[1]) >= _SEVERAL:
+            if len(spot.missed[1]) >= _MIN_CONES:
                 return spot
             best = best or spot
     return best
 
 
 def _densest(points: Array, weights: Array, half_size: tuple[float, float]) -> Array:
-    """Middle (2,) of the points (k, 2) in sight from that one which sees most of them, then most weight."""
+    """Returns the centre (2,) of the points (k, 2) around the one with most neighbours, then most weight."""
     scaled = points / np.array(half_size)
-    seen = KDTree(scaled).query_ball_point(scaled, 1.0, p=np.inf)
-    best = max(seen, key=lambda members: (len(members), float(weights[members].sum())))
-    together: Array = points[best]
-    return np.asarray(0.5 * (together.min(axis=0) + together.max(axis=0)))
+    neighbours = KDTree(scaled).query_ball_point(scaled, 1.0, p=np.inf)
+    best = max(neighbours, key=lambda members: (len(members), float(weights[members].sum())))
+    chosen: Array = points[best]
+    return np.asarray(0.5 * (chosen.min(axis=0) + chosen.max(axis=0)))
 
 
 def _spot(

@@ -17,8 +17,8 @@ from pathspace_graph.factors.gauge import greville
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 
+from .curves import true_curve
 from .table1 import MISSED_DISTANCE, closest_points
-from .true_curve import true_curve
 
 Array = NDArray[np.float64]
 

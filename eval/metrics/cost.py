@@ -1,4 +1,4 @@
-"""How long the cycles of a run took, and each of their stages."""
+"""What a run costs: the time of its cycles and their stages, and the memory of its map."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import CycleRecord
 
 WHOLE: Final = "whole"
-"""What the whole cycle is called beside its stages."""
+"""The whole cycle has this name among its stages."""
 _TAIL: Final = 0.99
 
 
 @dataclass(frozen=True, slots=True)
 class StageTime:
-    """Wall time of one stage over many cycles, s."""
+    """Holds the wall time (s) of one stage over many cycles; every figure is NaN without cycles."""
 
     stage: str
-    """Name, or `whole`."""
+    """The stage has this name; the whole cycle is called `whole`."""
     mean: float
-    """NaN of no cycles, as the others."""
+    """This is the mean over the cycles (s)."""
     median: float
-    """Half of the cycles take longer, ..."""
+    """Half of the cycles take longer than this (s)."""
     p99: float
-    """... and one in a hundred longer than this."""
+    """One cycle in a hundred takes longer than this (s)."""
     share: float
-    """Of the whole's mean."""
+    """The stage's mean is this share of the whole cycle's mean."""
 
 
 def stage_times(cycles: Sequence[CycleRecord]) -> list[StageTime]:
-    """The whole cycle first, then its stages as they come; a stage that a cycle hasn't took no time in it."""
+    """Returns the whole cycle and then its stages; a stage that a cycle lacks took no time in it."""
     names = dict.fromkeys(name for record in cycles for name in record.stages)
     whole = [record.seconds for record in cycles]
     columns = {WHOLE: whole} | {name: [r.stages.get(name, 0.0) for r in cycles] for name in names}
@@ -48,22 +48,22 @@ def _stage(name: str, values: Sequence[float], whole: Sequence[float]) -> StageT
     return StageTime(name, mean, float(np.median(values)), float(np.quantile(values, _TAIL)), share)
 
 
-NUMBER: Final = 8
-"""Bytes of a double."""
+DOUBLE_BYTES: Final = 8
+"""A double has this many bytes."""
 
 
 def map_bytes(track: Map) -> int:
-    """8 (2 m + knots) of a spline: distinct control points, one period of its knots; 8 (2 m) of landmarks."""
+    """Returns 8 (2 m + knots) bytes for each spline, with one period of its knots, 8 (2 m) for landmarks."""
     numbers = 0
     for boundary in track.boundaries.values():
         numbers += 2 * boundary.size
         if isinstance(boundary, SplineBoundary):
             spline = boundary.spline
             numbers += len(spline.breaks) if spline.periodic else len(spline.knots)
-    return NUMBER * numbers
+    return DOUBLE_BYTES * numbers
 
 
 def covariance_bytes(track: Map) -> int:
-    """8 n (n + 1) / 2 of each boundary's joint covariance, n = 2 m, whose halves are the same."""
+    """Returns 8 n (n + 1) / 2 bytes for each boundary's symmetric joint covariance, n = 2 m."""
     sizes = [2 * boundary.size for boundary in track.boundaries.values()]
-    return NUMBER * sum(n * (n + 1) // 2 for n in sizes)
+    return DOUBLE_BYTES * sum(n * (n + 1) // 2 for n in sizes)

@@ -1,4 +1,4 @@
-"""Ghosts: what is mapped where no boundary is, and what is mapped more than once."""
+"""Ghosts, which are mapped where no true boundary is, and landmarks that are mapped more than once."""
 
 from __future__ import annotations
 
@@ -12,69 +12,69 @@ from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.settings.checked import Positive
 
-from .true_curve import mapped_points, true_curve
+from .curves import mapped_points, true_curve
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class GhostSettings(Positive):
-    """What counts as a ghost."""
+    """Holds what counts as a ghost."""
 
     distance: float = 2.0
-    """Something mapped farther (m) than this from the true boundary of its own colour is a ghost: more than
-    the drift of a map whose loop is closed, less than the width of the narrowest lane (3 m)."""
+    """A mapped point farther than this (m) from the true boundary of its own colour is a ghost. The default
+    exceeds the drift of a map whose loop is closed, but not the width of the narrowest lane (3 m)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ghosts:
-    """What is mapped but isn't there, of both boundaries together."""
+    """Holds what is mapped but doesn't exist, on both boundaries together."""
 
     landmarks: int
-    """Mapped landmarks with no true boundary near."""
+    """This many landmarks have no true boundary near."""
     metres: float
-    """Length (m) of the mapped curves with no true boundary near."""
+    """Mapped curves have no true boundary near over this length (m)."""
     share: float
-    """The same as a share of all landmarks and all mapped length; NaN where nothing is mapped."""
+    """Ghosts are this share of all landmarks and points of curves; it is NaN where nothing is mapped."""
     duplicates: int
-    """Landmarks beyond the first of each true cone: one cone mapped more than once."""
+    """This many landmarks are nearest to a true cone that already has one."""
 
 
 def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> Ghosts:
-    """Landmarks p, and the length of curve, with min_q |p - q| > distance, q on the true curve of its colour.
+    """Returns the landmarks p and the length of curve with min_q |p - q| > distance, q on the true curve.
 
-    A boundary that has no true cones at all is a ghost as a whole.
+    The true curve is that of the same boundary. A boundary without any true cone is a ghost as a whole.
     """
     settings = settings or GhostSettings()
     landmarks = duplicates = 0
-    metres, shares = 0.0, []
+    metres, all_ghosts = 0.0, []
     for label, boundary in track.boundaries.items():
-        away = _away(mapped_points(boundary), true_curve(truth, label), settings.distance)
-        shares.append(away)
+        is_ghost = _is_ghost(mapped_points(boundary), true_curve(truth, label), settings.distance)
+        all_ghosts.append(is_ghost)
         if isinstance(boundary, SplineBoundary):
-            metres += float(np.mean(away)) * boundary.spline.length()
+            metres += float(np.mean(is_ghost)) * boundary.spline.length()
         else:
-            landmarks += int(away.sum())
+            landmarks += int(is_ghost.sum())
             duplicates += _duplicates(boundary, truth.cones[truth.cone_labels == label], settings.distance)
-    return Ghosts(landmarks, metres, _share(shares), duplicates)
+    return Ghosts(landmarks, metres, _share(all_ghosts), duplicates)
 
 
-def _away(points: Array, true: Array, distance: float) -> NDArray[np.bool_]:
-    """Which points (k, 2) are ghosts."""
-    if len(true) == 0 or len(points) == 0:
+def _is_ghost(points: Array, curve_true: Array, distance: float) -> NDArray[np.bool_]:
+    """Returns which points (k, 2) are ghosts."""
+    if len(curve_true) == 0 or len(points) == 0:
         return np.ones(len(points), dtype=bool)
-    return np.asarray(KDTree(true).query(points)[0] > distance)
+    return np.asarray(KDTree(curve_true).query(points)[0] > distance)
 
 
-def _share(away: list[NDArray[np.bool_]]) -> float:
-    together = np.concatenate([np.zeros(0, dtype=bool), *away])
-    return float(np.mean(together)) if len(together) else float("nan")
+def _share(all_ghosts: list[NDArray[np.bool_]]) -> float:
+    pooled = np.concatenate([np.zeros(0, dtype=bool), *all_ghosts])
+    return float(np.mean(pooled)) if len(pooled) else float("nan")
 
 
 def _duplicates(boundary: PointBoundary, cones: Array, distance: float) -> int:
-    """Landmarks within `distance` of their nearest cone whose cone has another one already."""
+    """Returns how many landmarks within `distance` of their nearest cone share it with an earlier one."""
     if len(cones) == 0 or boundary.size == 0:
         return 0
-    apart, nearest = KDTree(cones).query(boundary.points)
-    near = np.asarray(nearest)[np.asarray(apart) <= distance]
-    return int(len(near) - len(np.unique(near)))
+    distances, nearest = KDTree(cones).query(boundary.points)
+    matched = np.asarray(nearest)[np.asarray(distances) <= distance]
+    return int(len(matched) - len(np.unique(matched)))

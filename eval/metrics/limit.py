@@ -1,4 +1,4 @@
-"""The limit of a run: the error that is left where associations are told and curves fitted to the truth."""
+"""The limit of a run: the error that remains with oracle association and curves fitted to the truth."""
 
 from __future__ import annotations
 
@@ -6,49 +6,48 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.landmark.oracle import LandmarkSolution, solve_landmarks
-from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.settings.knots import FitSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import fit_spline
 
+from .curves import driving_order
 from .table1 import closest_points, root_mean_square
 
 Array = NDArray[np.float64]
 
-PATH_STEP = 0.1
-"""Distance (m) between the points of the true path that cones are ordered along."""
-
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """The least error that a run could have been expected to have."""
+    """Holds the least error that a run can be expected to reach."""
 
     l: float  # noqa: E741 - the issue's and the paper's tables call it so
-    """m, rmse in the plane of the landmark batch that is told every association."""
+    """This is the rmse (m) in the plane of the landmark batch with oracle association."""
 
     f: float
-    """m, rmse of the true cones to splines of the mapped size that are fitted to them."""
+    """This is the rmse (m) of the true cones to splines of the mapped size that are fitted to them."""
 
     @property
     def total(self) -> float:
-        """sqrt(l^2 + f^2), m."""
+        """Returns sqrt(l^2 + f^2) in m."""
         return float(np.hypot(self.l, self.f))
 
 
 def limit(log: Log, track: Map) -> Limit:
-    """sqrt(l^2 + f^2) of a simulated log and the map that was made of it."""
+    """Returns the limit of a simulated log and a map of it; ValueError without truth or associations."""
     truth = _truth(log)
     return Limit(l=landmark_rmse(solve_oracle_landmarks(log), truth), f=fit_rmse(track, truth))
 
 
 def solve_oracle_landmarks(log: Log, *, with_covariance: bool = False) -> LandmarkSolution:
-    """The landmark batch that is *told* which true cone every reading saw; landmark ids are true cones."""
+    """Returns the landmark batch with oracle association: each detection knows its true cone.
+
+    Landmark ids are indices of true cones.
+    """
     truth = _truth(log)
     if truth.associations is None:
         raise ValueError("expected a simulated log, whose associations are known, found one without")
@@ -56,16 +55,17 @@ def solve_oracle_landmarks(log: Log, *, with_covariance: bool = False) -> Landma
 
 
 def landmark_rmse(solution: LandmarkSolution, truth: Truth) -> float:
-    """sqrt(mean |l_j - cone_j|^2) over the cones of a boundary that were seen at least once, m."""
+    """Returns sqrt(mean |l_j - cone_j|^2) in m over the cones of a boundary that were ever detected."""
     counted = np.isin(truth.cone_labels[solution.landmark_ids], BOUNDARIES)
     errors = solution.landmarks - truth.cones[solution.landmark_ids]
     return root_mean_square(np.linalg.norm(errors[counted], axis=1))
 
 
 def fit_rmse(track: Map, truth: Truth) -> float:
-    """sqrt(mean d^2), m, of the mapped boundaries' true cones to splines of the mapped size fitted to them.
+    """Returns sqrt(mean d^2) in m, d from true cones to splines of the mapped size that are fitted to them.
 
-    A boundary mapped as points, or with a control point for every cone, can be exact: its distances are 0.
+    A boundary of points, or with a control point for every cone, can be exact: its distances are 0.
+    Boundaries that aren't mapped don't count.
     """
     distances = [np.zeros(0)]
     for label, boundary in track.boundaries.items():
@@ -78,41 +78,13 @@ def fit_rmse(track: Map, truth: Truth) -> float:
 
 
 def fit_distances(cones: Array, size: int, like: BSpline) -> Array:
-    """(k,) m: from cones (k, 2) in driving order to the spline of `size` control points fitted to them.
+    """Returns the distances (k,) in m of cones (k, 2), in driving order, from a spline fitted to them.
 
-    Degree and closedness are those of `like`; knots follow the curvature (paper: Simplification).
+    The spline has `size` control points, and the degree and periodicity of `like`. Its knots follow the
+    curvature (paper, section Simplification).
     """
     fitted = fit_spline(cones, size, like.periodic, FitSettings(degree=like.degree))
     return np.asarray(np.linalg.norm(cones - closest_points(fitted, cones).position, axis=1))
-
-
-def driving_order(truth: Truth, label: int) -> Array:
-    """The true cones (k, 2) of one boundary in driving order.
-
-    By their station on the first lap of the true path, or as the file lists them where that makes the shorter
-    way (stations tie on the inside of a hairpin) or where there is no true path.
-    """
-    cones: Array = truth.cones[truth.cone_labels == label]
-    if len(truth.poses) < 2 or len(cones) == 0:
-        return cones
-    station: NDArray[np.intp] = np.asarray(KDTree(_first_lap(truth)).query(cones)[1])
-    by_station: Array = cones[np.argsort(station, kind="stable")]
-    return by_station if _way_around(by_station) < _way_around(cones) else cones
-
-
-def _first_lap(truth: Truth) -> Array:
-    """Points (n, 2) of the true path up to the end of lap 1, PATH_STEP apart at most."""
-    ends = lap_end_indices(truth.poses)
-    path = truth.poses[: ends[0] + 1 if len(ends) else None, :2]
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    driven = np.concatenate([[0.0], np.cumsum(steps)])
-    stations = np.linspace(0.0, driven[-1], int(np.ceil(driven[-1] / PATH_STEP)) + 1)
-    return np.stack([np.interp(stations, driven, coordinate) for coordinate in path.T], axis=1)
-
-
-def _way_around(points: Array) -> float:
-    """Length (m) of the closed polygon through the points."""
-    return float(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
 
 
 def _truth(log: Log) -> Truth:

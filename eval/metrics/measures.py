@@ -15,18 +15,12 @@ from pathspace_graph.labels import BOUNDARIES
 
 from .consistency import map_nees, normal_errors, with_marginals
 from .cost import covariance_bytes, map_bytes, stage_times
-from .curve_distance import curve_distance
+from .curves import curve_distance
 from .ghosts import GhostSettings, ghosts
 from .limit import limit
 from .summary import has_cones, lap_times
-from .table1 import (
-    capped_rmse,
-    cone_distances,
-    lap_metrics,
-    missed_share,
-    root_mean_square,
-    trajectory_errors,
-)
+from .table1 import capped_rmse, cone_distances, lap_metrics, missed_share, root_mean_square
+from .trajectory import position_rms, trajectory_errors
 
 FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3}
 """Columns hold shares and bytes, which these factors turn into the units of the tables."""
@@ -109,6 +103,7 @@ _ALL: Final = (
     Metric("normalized_error_marginals", "the same by variance of the marginals", digits=2, better="none"),
     Metric("closed", "loop closed", "%", 0, better="higher"),
     Metric("converged", "batch converged", "%", 0, better="higher", scope="run"),
+    Metric("cost", "cost of the batch", digits=1, scope="run"),
     Metric("bytes", "map", "kB", 2),
     Metric("bytes_covariance", "its covariance", "kB", 1),
     Metric("ms_mean", "update, mean", "ms", 2, time=True),
@@ -155,7 +150,7 @@ def measure(
     values = _map_values(run.map, log.truth, ghost_settings, marginals)
     values |= _drive_values(run, log.truth, -np.inf, np.inf)
     if isinstance(run, BatchRun):
-        values["converged"] = run.converged
+        values |= {"converged": run.converged, "cost": run.cost}
     if yardsticks:
         least = limit(log, run.map)
         values |= {"l": least.l, "f": least.f, "limit": least.total}
@@ -250,7 +245,7 @@ def _drive_values(run: RunResult, truth: Truth | None, begin: float, end: float)
     if truth is not None and len(truth.poses):
         inside = (run.trajectory_t > begin) & (run.trajectory_t <= end)
         errors = trajectory_errors(run.trajectory_t[inside], run.trajectory[inside], truth)
-        values["ate"] = root_mean_square(np.linalg.norm(errors[:, :2], axis=1))
+        values["ate"] = position_rms(errors)
         values["along"], values["across"] = (root_mean_square(column) for column in errors[:, :2].T)
     cycles = online_cycles(run, begin, end)
     if cycles:

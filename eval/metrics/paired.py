@@ -1,4 +1,4 @@
-"""Means over runs, differences between runs that are paired, and what of them may be chance."""
+"""Means over runs, differences between paired runs, and whether a difference may be chance."""
 
 from __future__ import annotations
 
@@ -7,81 +7,81 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import t as student
+from scipy import stats
 
 Array = NDArray[np.float64]
 
 LEVEL: Final = 0.95
-"""Of the intervals; a difference is significant where its p is below what is left of 1."""
+"""Intervals have this confidence level; a difference is significant where its p is below 1 - LEVEL."""
 CORRECTION: Final = "Holm"
-"""Correction for multiple comparisons."""
-_FEWEST: Final = 2
-"""Runs that have an interval."""
+"""Multiple comparisons are corrected by this method."""
+_MIN_RUNS: Final = 2
+"""An interval and a test need at least this many runs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A mean and its 95 % interval, Student's t over runs."""
+    """Holds a mean and its 95 % interval by Student's t over runs."""
 
     mean: float
-    """NaN of nothing."""
+    """The mean is NaN without runs."""
     half: float
-    """Half the interval; NaN of fewer than two runs."""
+    """This is half the width of the interval; it is NaN for fewer than two runs."""
     count: int
-    """Runs, or pairs of them."""
+    """The mean is over this many runs, or pairs of runs."""
 
     @property
     def low(self) -> float:
-        """The interval is from here ..."""
+        """Returns the lower end of the interval."""
         return self.mean - self.half
 
     @property
     def high(self) -> float:
-        """... to here."""
+        """Returns the upper end of the interval."""
         return self.mean + self.half
 
     @property
     def significant(self) -> bool:
-        """Whether 0 is outside of the interval."""
+        """Returns whether 0 is outside of the interval."""
         return bool(self.low > 0.0 or self.high < 0.0)
 
 
 def estimate(values: Array) -> Estimate:
-    """mean -+ t(0.975, n - 1) s / sqrt(n) of the values (n,)."""
+    """Returns the mean of the values (n,) and its interval, mean -+ t(0.975, n - 1) s / sqrt(n)."""
     n = len(values)
-    if n < _FEWEST:
+    if n < _MIN_RUNS:
         return Estimate(float(values[0]) if n else float("nan"), float("nan"), n)
-    return Estimate(float(np.mean(values)), float(student.ppf(0.5 + LEVEL / 2, n - 1)) * _error(values), n)
+    half = float(stats.t.ppf(0.5 + LEVEL / 2, n - 1) * stats.sem(values))
+    return Estimate(float(np.mean(values)), half, n)
 
 
 def difference(values: ArrayLike, reference: ArrayLike) -> Estimate:
-    """The estimate of values - reference (n,), pair by pair where both are finite."""
+    """Returns the estimate of values - reference (n,) over the pairs of which both are finite."""
     own, others = np.asarray(values, dtype=float), np.asarray(reference, dtype=float)
-    both = np.isfinite(own) & np.isfinite(others)
-    return estimate(own[both] - others[both])
+    finite = np.isfinite(own) & np.isfinite(others)
+    return estimate(own[finite] - others[finite])
 
 
 def paired_p(differences: Array) -> float:
-    """Two-sided p of the paired t-test that the mean difference is 0; NaN of fewer than two pairs."""
-    n = len(differences)
-    if n < _FEWEST:
+    """Returns the two-sided p of the paired t-test that the mean of the differences (n,) is 0.
+
+    It is NaN for fewer than two pairs. Without any spread it is 1 where all differences are 0, else 0.
+    """
+    if len(differences) < _MIN_RUNS:
         return float("nan")
-    mean, error = float(np.mean(differences)), _error(differences)
-    if error == 0.0:
-        return 1.0 if mean == 0.0 else 0.0
-    return float(2.0 * student.sf(abs(mean) / error, n - 1))
+    if np.ptp(differences) == 0.0:
+        return float(differences[0] == 0.0)
+    return float(stats.ttest_1samp(differences, 0.0).pvalue)
 
 
 def holm(p: Array) -> Array:
-    """p of each comparison after Holm: `max over j <= i of (m - j) p_(j)`, j from 0, at most 1; NaN stays."""
+    """Returns p (m,) corrected by Holm's method: `max over j <= i of (m - j) p_(j)`, j from 0, at most 1.
+
+    NaN isn't counted and stays NaN. (scipy.stats corrects the false discovery rate only.)
+    """
     corrected = np.full(len(p), np.nan)
     known = np.flatnonzero(~np.isnan(p))
     order = known[np.argsort(p[known], kind="stable")]
     factors = len(order) - np.arange(len(order))
     corrected[order] = np.minimum(np.maximum.accumulate(factors * p[order]), 1.0)
     return corrected
-
-
-def _error(values: Array) -> float:
-    """s / sqrt(n), the standard error of the mean."""
-    return float(np.std(values, ddof=1) / np.sqrt(len(values)))

@@ -1,4 +1,4 @@
-"""What `summary.json` says of a run (FORMATS)."""
+"""The content of a run's `summary.json` (docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -16,24 +16,17 @@ from pathspace_graph.io.results import BatchRun, RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
 
 from .consistency import normal_errors
-from .table1 import (
-    LapMetrics,
-    ate,
-    lap_end_times,
-    lap_metrics,
-    laps_metrics,
-    root_mean_square,
-    trajectory_errors,
-)
+from .table1 import LapMetrics, lap_end_times, lap_metrics, laps_metrics, root_mean_square
+from .trajectory import ate, trajectory_errors
 
 Array = NDArray[np.float64]
 
 LIBRARIES: Final = ("pathspace-graph", "gtsam", "numpy", "scipy")
-"""Whose versions are told."""
+"""The versions of these libraries are recorded."""
 
 
 def summarize(result: RunResult, log: Log) -> dict[str, Any]:
-    """Estimator, settings, versions, laps, timing, and, where the log has truth, the paper's metrics."""
+    """Returns the estimator, settings, versions, laps and timing, and with truth the paper's metrics."""
     summary: dict[str, Any] = {
         "estimator": result.estimator,
         "settings": result.settings,
@@ -50,22 +43,22 @@ def summarize(result: RunResult, log: Log) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Of Python and the libraries that a result depends on."""
+    """Returns the versions of Python and the libraries that a result depends on."""
     return {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}}
 
 
 def lap_times(log: Log) -> Array:
-    """When each true lap ends (s); empty where there is no true path."""
+    """Returns the stamps (s) at which true laps end; without a true path there are none."""
     if log.truth is None or len(log.truth.poses) == 0:
         return np.zeros(0)
     return lap_end_times(log.truth)
 
 
 def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
-    """The paper's table: at the end of each true lap, or of each estimated one where there is no true path.
+    """Returns the paper's table: a row at the end of each true lap.
 
-    Empty where there are no true cones. `result` has its snapshots at `lap_times`. A batch has one map, that
-    of all laps: one row.
+    Without a true path the laps are the estimated ones, without true cones there is no row. The snapshots of
+    `result` are those at `lap_times`. A batch has one map for all laps, and so one row.
     """
     if log.truth is None or not has_cones(log.truth):
         return []
@@ -76,7 +69,7 @@ def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
 
 
 def not_mapped(track: Map, log: Log) -> list[str]:
-    """A line for each boundary that the map lacks, with the reason."""
+    """Returns a line for each boundary that the map lacks, with the reason."""
     labels = np.concatenate([np.zeros(0, dtype=int), *(cycle.labels for cycle in log.cycles)])
     lines = []
     for label in BOUNDARIES:
@@ -88,7 +81,7 @@ def not_mapped(track: Map, log: Log) -> list[str]:
 
 
 def has_cones(truth: Truth) -> bool:
-    """Whether any true cone is of a boundary."""
+    """Returns whether any true cone belongs to a boundary."""
     return bool(np.isin(truth.cone_labels, BOUNDARIES).any())
 
 
@@ -104,7 +97,7 @@ def _timing(result: RunResult) -> dict[str, float] | None:
 
 
 def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:
-    """`laps`, and the same of the map at the end of the log, wherever in a lap that is."""
+    """Returns `laps`, and as `final` the same of the map at the end of the log."""
     if not has_cones(truth):
         return {}
     final = asdict(lap_metrics(result.map, truth, result.laps))
@@ -117,7 +110,7 @@ def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:
 
 
 def _trajectory_errors(result: RunResult, truth: Truth) -> dict[str, float]:
-    """`ate`, and the root mean square error along (m), across (m) and in heading (rad)."""
+    """Returns `ate`, and the root mean square error along (m), across (m) and in heading (rad)."""
     if len(truth.poses) == 0 or len(result.trajectory) == 0:
         return {}
     errors = trajectory_errors(result.trajectory_t, result.trajectory, truth)

@@ -17,31 +17,16 @@ from matplotlib.ticker import (
     StrMethodFormatter,
 )
 
-from pathspace_graph.eval.figures.style import (
-    BLUE,
-    DARK,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    RED,
-    WIDTH,
-    figure_context,
-    shared_legend,
-)
+from pathspace_graph.eval.figures.style import MARKERS, PALETTE, WIDTH, figure_context, shared_legend
 
 from .points import CONES, LAPS, READINGS, Scaling, Sweep
 
 _HEIGHT: Final = 3.1
 """A figure is this high (in)."""
-_COLORS: Final = (BLUE, ORANGE, RED, PURPLE, GREEN, DARK)
-"""Estimators have these colours, one after the other."""
-_MARKERS: Final = "os^Dv*"
-"""The estimators' points have these shapes."""
 _MARKER_SIZE: Final = 3.6
 """The estimators' points have this size (pt)."""
 _CONES_TICKS: Final = (50, 100, 200, 500, 1000, 2000)
 """The axis of cones is labelled here, as far as it reaches."""
-_LEGEND_COLUMNS: Final = 4
 _TITLES: Final[dict[Sweep, tuple[str, str]]] = {
     CONES: ("cones seen", "(a) map size"),
     READINGS: ("detections per update", "(b) detections"),
@@ -65,7 +50,7 @@ def plot_scaling(scaling: Scaling) -> Figure:
         cones.set_ylabel("mean update (ms)")
         _label_ticks(cones, tuple(t for t in _CONES_TICKS if t <= scaling.settings.cones_max))
         _label_ticks(detections, scaling.settings.readings)
-        shared_legend(figure, min(len(scaling.estimators), _LEGEND_COLUMNS))
+        shared_legend(figure, columns=min(len(scaling.estimators), 4))
     return figure
 
 
@@ -77,13 +62,13 @@ def plot_laps(scaling: Scaling) -> Figure:
         _draw_sweep(axes, scaling, LAPS, linestyle="-")
         axes.set_ylabel("mean update (ms)")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        shared_legend(figure, min(len(scaling.estimators), _LEGEND_COLUMNS))
+        shared_legend(figure, columns=2)
     return figure
 
 
 def _draw_sweep(axes: Axes, scaling: Scaling, sweep: Sweep, linestyle: str = "none") -> dict[str, str]:
     """Draws the points of every estimator that has some, and returns the colours by name."""
-    looks = zip(scaling.estimators, cycle(_COLORS), cycle(_MARKERS), strict=False)
+    looks = zip(scaling.estimators, cycle(PALETTE), cycle(MARKERS), strict=False)
     drawn = {name: (color, marker) for name, color, marker in looks if scaling.of(sweep, name)}
     for name, (color, marker) in drawn.items():
         at, milliseconds = np.array([(p.at, 1e3 * p.seconds) for p in scaling.of(sweep, name)]).T

@@ -1,9 +1,9 @@
-"""Cells of a study: one estimator with one set of settings on one log."""
+"""Cells of a study: each is one estimator with one set of settings on one log."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Final
 
 from pathspace_graph.eval.harness.attempts import Attempt, attempt
@@ -17,30 +17,34 @@ from pathspace_graph.settings.mapper import MapperSettings
 FORMAT: Final = "pathspace-cell/1"
 
 Record = dict[str, Any]
-"""What is kept of a cell: JSON's types only."""
+"""It has the types of JSON only."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """One run."""
+    """A cell is one run."""
 
     drive: Drive
-    """Its log."""
+    """The run is on the log of this drive."""
     estimator: str
-    """Name of the estimator."""
+    """This is the name of the estimator."""
     variant: str
-    """Name of its settings."""
+    """This is the name of the settings."""
     settings: MapperSettings
-    """Everything it is told."""
+    """The estimator has these settings."""
+    yardsticks: bool = False
+    """The limit of the run is computed, too."""
 
     @cached_property
     def id(self) -> str:
-        """The same for the same run: everything that its result depends on, but for the code."""
-        return identity(drive=self.drive.id, estimator=self.estimator, settings=asdict(self.settings))
+        """Is the same for the same run: it depends on everything that the result depends on, except
+        the code."""
+        parts = {"drive": self.drive.id, "estimator": self.estimator, "settings": asdict(self.settings)}
+        return identity(**parts, **({"yardsticks": True} if self.yardsticks else {}))
 
     @property
     def names(self) -> dict[str, Any]:
-        """What tells it from the others of its study."""
+        """Returns what distinguishes it from the other cells of its study."""
         drive = self.drive
         shared = {"track": drive.track.name, "seed": drive.seed, "noise": drive.noise}
         return shared | {"estimator": self.estimator, "variant": self.variant}
@@ -50,12 +54,13 @@ class Cell:
 
 
 def run_cell(cell: Cell, log: Log) -> Record:
-    """Runs the cell's estimator on its log; a failure is a record as well."""
-    return record_of(cell, attempt(cell.estimator, cell.settings, log, lap_rows))
+    """Runs the cell's estimator on its log; a failure gives a record, too."""
+    measured = partial(lap_rows, yardsticks=cell.yardsticks)
+    return record_of(cell, attempt(cell.estimator, cell.settings, log, measured))
 
 
 def record_of(cell: Cell, what: Attempt[list[dict[str, Any]]]) -> Record:
-    """Returns what is kept of an attempt at a cell."""
+    """Returns the record of an attempt at a cell."""
     return {
         "format": FORMAT,
         "id": cell.id,
@@ -72,11 +77,11 @@ def failed(cell: Cell, error: BaseException) -> Record:
     return record_of(cell, Attempt.failed(error))
 
 
-def lap_rows(run: RunResult, log: Log, seconds: float) -> list[dict[str, Any]]:
+def lap_rows(run: RunResult, log: Log, seconds: float, *, yardsticks: bool = False) -> list[dict[str, Any]]:
     """Returns a row for each lap, with the metrics of the whole run beside its own.
 
     A run that completed no lap has one row, that of the whole run as lap 1.
     """
-    *laps, whole = measure(run, log, seconds, marginals=True)
+    *laps, whole = measure(run, log, seconds, marginals=True, yardsticks=yardsticks)
     shared = {key: value for key, value in whole.values.items() if METRICS[key].scope == "run"}
     return [{"lap": row.lap, **row.values, **shared} for row in laps] or [{"lap": 1, **whole.values}]

@@ -1,4 +1,4 @@
-"""A study's results as a data frame: a row per run and lap."""
+"""The results of a study as a data frame with a row for each run and lap."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from .overrides import leaves
 from .study import Study
 
 COMBINATION: Final = ("noise", "estimator", "variant")
-"""What is compared."""
+"""These columns name a combination, which is compared with others."""
 RUN: Final = ("track", "seed")
-"""What is paired: the same drive, the same noise."""
+"""These columns name a drive; combinations are paired on the same drive and noise."""
 SIMULATION: Final = "simulation."
 """Columns with settings of the simulation have this prefix."""
 TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
@@ -25,7 +25,10 @@ TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
 
 
 def frame_of(study: Study, cells: Sequence[tuple[Cell, Record | None]]) -> pd.DataFrame:
-    """A row per run and lap, one without figures for a run that failed; every varied setting is a column."""
+    """Returns a row for each run and lap, and one without metrics for a run that failed.
+
+    Every varied setting is a column.
+    """
     rows = []
     for cell, record in cells:
         assert record is not None, "every cell has been run by now"
@@ -50,16 +53,16 @@ def _cell(value: Any) -> Any:
 
 
 def without_times(frame: pd.DataFrame) -> pd.DataFrame:
-    """What comes out the same whenever and wherever the study is run."""
+    """Returns the columns that are the same whenever the study is run."""
     return frame.drop(columns=[name for name in TIMES if name in frame])
 
 
 def times_of(frame: pd.DataFrame) -> pd.DataFrame:
-    """Wall times, by the same rows."""
+    """Returns the wall times, in the same rows."""
     return frame[["study", *RUN, *COMBINATION, "lap", *(name for name in TIMES if name in frame)]]
 
 
 def last_laps(frame: pd.DataFrame) -> pd.DataFrame:
-    """The last row of each run that finished."""
+    """Returns the last row of each run that finished."""
     finished = frame[frame["failure"] == ""]
     return finished.groupby([*RUN, *COMBINATION], sort=False).tail(1)

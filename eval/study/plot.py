@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 from pathspace_graph.eval.figures.style import (
     BLUE,
     DARK,
-    FONT_SIZE,
     GREY,
+    MARKERS,
+    PALETTE,
     WIDTH,
     figure_context,
     shared_legend,
@@ -43,8 +44,6 @@ _PAIR_SIZE: Final = 3.5
 _JITTER: Final = 0.22
 """Single pairs are scattered vertically by up to this share of a row, so that they can be told apart."""
 _JITTER_SEED: Final = 0
-_MARKERS: Final = "osD^v<>PXphd*"
-"""Combinations have these shapes, one after the other, together with the colours."""
 
 
 def figures(study: Study, frame: pd.DataFrame) -> dict[str, Figure]:
@@ -78,7 +77,7 @@ def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
     all_axes[0].set_yticks(range(len(rows)), [_row_name(study, panels[0][i]) for i in rows])
     all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
     caption = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
-    figure.supxlabel(caption, fontsize=FONT_SIZE)
+    figure.supxlabel(caption)
     return figure
 
 
@@ -162,8 +161,8 @@ def _draw_point(axes: Axes, across: Contrast, up: Contrast, index: int, label: s
         y.factor * up.value.mean,
         xerr=_bar(x.factor * across.value.half),
         yerr=_bar(y.factor * up.value.half),
-        fmt=_MARKERS[index % len(_MARKERS)],
-        color=DARK if across.difference is None else f"C{index % 10}",
+        fmt=MARKERS[index % len(MARKERS)],
+        color=DARK if across.difference is None else PALETTE[index % len(PALETTE)],
         markersize=_MEAN_SIZE,
         elinewidth=0.6,
         label=label,

@@ -1,4 +1,4 @@
-"""What differs from a study's baseline by more than chance."""
+"""Contrasts of a study: each combination beside its baseline, tested over paired runs."""
 
 from __future__ import annotations
 
@@ -14,44 +14,45 @@ from .frame import COMBINATION, RUN, last_laps
 from .study import Study
 
 Runs = dict[tuple[Any, ...], dict[tuple[Any, ...], float]]
+"""Each combination has the values of its runs, by track and seed."""
 
 
 @dataclass(frozen=True)
 class Contrast:
-    """One metric of one combination, and its difference from the baseline on the same runs."""
+    """A contrast holds one metric of one combination, and its difference from the baseline, run by run."""
 
     noise: str
-    """Name of the noise."""
+    """The noise has this name."""
     estimator: str
-    """Name of the estimator."""
+    """The estimator has this name."""
     variant: str
-    """Name of the settings."""
+    """The settings have this name."""
     metric: str
-    """Column of the results."""
+    """The metric has this key."""
     value: Estimate
-    """At the end of the last lap."""
+    """This is the mean over all runs, each at the end of its last lap."""
     difference: Estimate | None
-    """Paired; None of the baseline itself."""
+    """This is the mean over the pairs; it is None for the baseline itself."""
     differences: tuple[float, ...] = ()
-    """Of each pair."""
+    """Each pair of runs has its difference here."""
     p: float = float("nan")
-    """Of the paired t-test, corrected."""
+    """This is p of the paired t-test, corrected for all comparisons of the metric."""
 
     @property
     def name(self) -> str:
-        """Of the estimator and its settings."""
+        """Returns the names of the estimator and its settings."""
         return f"{self.estimator}: {self.variant}"
 
     @property
     def significant(self) -> bool:
-        """Whether chance alone rarely makes such a difference anywhere in the study."""
+        """Returns whether chance alone rarely makes such a difference anywhere in the study."""
         return bool(self.p < 1.0 - LEVEL)
 
 
 def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
-    """Every combination against the baseline of its noise, in the study's order.
+    """Returns every combination against the baseline of its noise, in the study's order.
 
-    p is corrected after Holm over all comparisons of the metric in the study.
+    p is corrected by Holm's method over all comparisons of the metric in the study.
     """
     runs = _runs(last_laps(frame), metric)
     found = []
@@ -66,7 +67,7 @@ def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
 
 
 def _runs(last: pd.DataFrame, metric: str) -> Runs:
-    """The metric of every run, by combination and then by track and seed; NaN is none."""
+    """Returns the metric of every run, by combination and then by track and seed, without NaN."""
     runs: Runs = {}
     names = [last[name] for name in (*COMBINATION, *RUN)]
     for *key, value in zip(*names, last[metric].astype(float), strict=True):

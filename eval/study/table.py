@@ -1,4 +1,4 @@
-"""A study's summary: every combination beside its difference from the baseline, to read and to print."""
+"""The summary of a study: every combination beside its difference from the baseline, as text."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from .statistics import Contrast, contrasts
 from .study import Study
 
 SMALLEST_P: Final = 0.001
-"""A p below it is only told to be."""
+"""A p below this is shown as smaller than it."""
 FIGURES: Final = ("runs", "mean", "95 %", "difference", "95 %", "p", "")
-"""Columns of every table, after those that name the combination."""
+"""Every table has these columns after those that name the combination."""
 
 
 def summary_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
-    """A table for each metric of the study that its runs have."""
+    """Returns a table for each metric of the study that its runs have."""
     return [_table(study, frame, metric) for metric in study.metrics if metric in frame]
 
 
 def caption(study: Study, frame: pd.DataFrame) -> str:
-    """What the tables tell, and how it was tested."""
+    """Returns what the tables show, and how it was tested."""
     base = study.baseline
     against = f"{base.estimator}: {study.baseline_variant}" if base.estimator else study.baseline_variant
     runs = frame.groupby([*RUN, *COMBINATION], sort=False)["failure"].first()
@@ -37,7 +37,7 @@ def caption(study: Study, frame: pd.DataFrame) -> str:
         f"{study.name}: {study.question} "
         f"{len(runs)} runs ({int((runs != '').sum())} failed) of {study.laps} laps, at the end of the last. "
         f"Mean and {100 * LEVEL:g} % interval (Student's t) over track x seed; difference from {against} "
-        f"paired over track and seed; p of the paired t-test, corrected after {CORRECTION} over all "
+        f"paired over track and seed; p of the paired t-test, corrected by {CORRECTION}'s method over all "
         f"comparisons of the metric; * where p < {1 - LEVEL:.2f}."
     )
 
@@ -75,17 +75,17 @@ def _figures(estimated: Estimate, factor: float, digits: int, sign: str) -> tupl
     return mean, half
 
 
-def as_text(tables: Sequence[TextTable], told: str) -> str:
-    """Columns aligned by blanks."""
-    return "\n\n".join([told, *(f"{table.title}\n{table.text()}" for table in tables)]) + "\n"
+def as_text(tables: Sequence[TextTable], caption: str) -> str:
+    """Returns the caption and the tables for a text file."""
+    return "\n\n".join([caption, *(f"{table.title}\n{table.text()}" for table in tables)]) + "\n"
 
 
-def as_markdown(tables: Sequence[TextTable], told: str) -> str:
-    """For a README or an issue."""
+def as_markdown(tables: Sequence[TextTable], caption: str) -> str:
+    """Returns the caption and the tables in Markdown."""
     bold = (replace(table, title=f"**{table.title}**") for table in tables)
-    return "\n".join([told.replace("*", r"\*") + "\n", *(table.markdown() for table in bold)])
+    return "\n".join([caption.replace("*", r"\*") + "\n", *(table.markdown() for table in bold)])
 
 
-def as_latex(tables: Sequence[TextTable], told: str) -> str:
-    """A `table` for each metric, each with its own caption."""
-    return "\n".join(replace(table, title=f"{table.title}. {told}").latex() for table in tables)
+def as_latex(tables: Sequence[TextTable], caption: str) -> str:
+    """Returns a `table` environment for each metric, each with the whole caption."""
+    return "\n".join(replace(table, title=f"{table.title}. {caption}").latex() for table in tables)

@@ -146,6 +146,7 @@ class BatchMapper:
             cycles=records,
             laps=laps,
             converged=convergence.converged,
+            cost=convergence.cost,
             convergence=convergence,
             map_covariance=joint,
             calibration=at.state.calibration.copy(),

@@ -7,12 +7,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.candidates import SIDES, Candidates, End, chain
 from pathspace_graph.mapping.path import PathAhead
 from pathspace_graph.mapping.tentative import TentativeTracks
+from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .state import CurveState
@@ -99,19 +100,11 @@ class Expansion:
         return indices[votes >= 0.0]
 
     def _beyond(self, state: CurveState, label: int, found: Candidates, end: End) -> NDArray[np.bool_]:
-        """Returns which candidates (m,) meet the paper's three conditions, and lie ahead of the end.
-
-        The foot point is the end of the curve, the end is farther than the growth threshold, and so is
-        `C_{n-1}` than the separation.
-        """
-        settings, curve = self.settings.ckf, state.curves[label]
-        high = np.full(len(found.points), curve.domain[1])
+        """Returns which candidates (m,) meet the paper's three conditions, and lie ahead of the end."""
         foot = state.foot_points(label, found.points, *_last_stretch(state, label, len(found.points)))
-        at_end = foot.u >= high - AT_END
-        far = np.hypot(*(found.points - end.position).T) > settings.threshold
-        apart = np.hypot(*(found.points - state.control_points(label)[-2]).T) > settings.separation
+        high, control_points = state.curves[label].domain[1], state.control_points(label)
         ahead = found.stations > end.station + self.settings.growth.station_margin
-        return np.asarray(at_end & far & apart & ahead)
+        return ahead & beyond_end(found.points, foot.u, high, control_points, self.settings.ckf)
 
     def _begin(self, state: CurveState, label: int, detections: Detections, found: Candidates) -> None:
         """Begins a curve along at least two candidates."""
@@ -158,10 +151,23 @@ class Expansion:
         point = path_ahead.beside(path_ahead.driven - settings.stranded_left * settings.stranded, side)
         if np.hypot(*(point - end.position)) < settings.min_carry:
             return False
-        c, s = np.cos(state.pose[2]), np.sin(state.pose[2])
-        point_vehicle = (point - state.pose[:2]) @ np.array([[c, -s], [s, c]])
+        point_vehicle = (point - state.pose[:2]) @ rotation(state.pose[2])
         state.extend(label, point_vehicle, self.settings.ckf.sigma_carry**2 * np.eye(2))
         return True
+
+
+def beyond_end(
+    points: Array, u: Array, high: float, control_points: Array, settings: CkfSettings
+) -> NDArray[np.bool_]:
+    """Returns which points (m, 2) with foot points at u (m,) meet the paper's three conditions (m,).
+
+    The foot point is the end of the curve, at the parameter `high`; the point is farther from `C_n` than the
+    growth threshold, and farther from `C_{n-1}` than the separation.
+    """
+    at_end = u >= high - AT_END
+    far = np.hypot(*(points - control_points[-1]).T) > settings.threshold
+    apart = np.hypot(*(points - control_points[-2]).T) > settings.separation
+    return np.asarray(at_end & far & apart)
 
 
 def proximity_chain(points: Array, start: Array) -> IntArray:

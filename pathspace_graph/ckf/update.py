@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 
 from pathspace_graph.factors.bspline import scatter
 from pathspace_graph.factors.projection import project
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
@@ -145,7 +145,6 @@ def _fit(state: CurveState, label: int, detections: Detections, on: OnCurve) -> 
 
 def _widened(state: CurveState, covariances: Array, tangents: Array) -> Array:
     """Returns `K + sigma_model^2 I + sigma_along^2 t t'` (m, 2, 2), vehicle frame, of map tangents (m, 2)."""
-    c, s = np.cos(state.pose[2]), np.sin(state.pose[2])
-    t = tangents @ np.array([[c, -s], [s, c]])
+    t = tangents @ rotation(state.pose[2])
     along = state.settings.ckf.sigma_along**2 * t[:, :, None] * t[:, None, :]
     return np.asarray(covariances + state.settings.ckf.sigma_model**2 * np.eye(POINT) + along)

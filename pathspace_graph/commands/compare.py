@@ -10,7 +10,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from pathspace_graph.eval.compare.comparison import Comparison, choose, choose_reference, compare, read_logs
-from pathspace_graph.eval.compare.gap import with_gaps
+from pathspace_graph.eval.compare.differences import with_gaps
 from pathspace_graph.eval.compare.output import MARKER, tables, write_comparison
 from pathspace_graph.eval.harness.workers import check_jobs
 from pathspace_graph.eval.metrics.ghosts import GhostSettings

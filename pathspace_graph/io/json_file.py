@@ -18,9 +18,8 @@ from .files import write_text
 def to_plain(value: Any) -> Any:
     """Returns the value in the types of strict JSON.
 
-    Arrays and tuples become lists, numpy's scalars become numbers, and paths become texts. JSON has no
-    numbers for what is not finite: NaN becomes null, since it is no value, and infinity becomes the text
-    "inf".
+    Arrays and tuples become lists, numpy's scalars become numbers, and paths become texts. JSON has no number
+    that is not finite: NaN becomes null, since it is no value, and infinity becomes the text "inf".
     """
     if isinstance(value, Mapping):
         return {str(key): to_plain(item) for key, item in value.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,8 @@ class BatchRun(RunResult):
 
     converged: bool = True
     """The optimization ended at an optimum where this is true."""
+    cost: float = nan
+    """This is the cost at its end, half the sum of squared whitened residuals, where it is known."""
 
 
 def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, Any]) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, lapack
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
+from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.settings.mapper import OdometrySettings
 
@@ -65,7 +66,7 @@ class Belief:
 
         def drive(x: Array) -> Array:
             error = x[:, HEAD:] - x[:, POSE:HEAD] @ drift.T
-            return compose_rows(compose_rows(x[:, :POSE], odometry.delta), error)
+            return compose(compose(x[:, :POSE], odometry.delta), error)
 
         moved = transform(drive, np.append(self.mean[:HEAD], np.zeros(POSE)), augmented)
         cross = moved.slope[:, :HEAD] @ self.covariance[:HEAD, POSE:]
@@ -135,15 +136,6 @@ class Belief:
 def point_columns(points: IntArray) -> IntArray:
     """Returns the entries (2 k,) of points (k,) in x."""
     return (HEAD + POINT * points[:, None] + np.arange(POINT)).ravel()
-
-
-def compose_rows(poses: Array, deltas: Array) -> Array:
-    """Returns `pose * delta` on SE(2), row by row: (k, 3), deltas (k, 3) or (3,); theta is not wrapped."""
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    dx, dy = deltas[..., 0], deltas[..., 1]
-    return np.column_stack(
-        [poses[:, 0] + c * dx - s * dy, poses[:, 1] + s * dx + c * dy, poses[:, 2] + deltas[..., 2]]
-    )
 
 
 def to_map_rows(poses: Array, detections: Array) -> Array:

@@ -19,9 +19,10 @@ class RecurrenceSettings(Positive, group="batch.recurrence"):
     smoothing: float = 3.0
     """The curvature is averaged over this length (m)."""
     correlation_share: float = 0.8
-    """The shortest lag whose correlation reaches this share of the best one's is about a lap."""
+    """The curvature is correlated with itself a lag later. A lap is about the shortest lag whose correlation
+    is at least this share of the largest one."""
     min_overlap: float = 5.0
-    """The path must go on for this length (m) after a lap, or the lap isn't found."""
+    """The path must go on for this length (m) after a lap, or else the lap isn't found."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +32,13 @@ class LapCorrespondenceSettings(Positive, group="batch.laps"):
     reference_step: float = 8.0
     """The reference poses that every lap passes are this distance (m) apart."""
     sigma_position: float = 1.5
-    """The position at which a lap passes a reference pose scatters by this (m, one sigma): laps differ."""
+    """The position of a lap differs from a reference pose that it passes by this (m, one sigma)."""
     sigma_heading: float = 0.15
-    """The heading with which a lap passes a reference pose scatters by this (rad, one sigma)."""
+    """The heading of a lap differs from that of a reference pose that it passes by this (rad, one sigma)."""
     max_steps: int = 8
-    """At most this number of Gauss-Newton steps brings the laps together."""
+    """The laps are brought together by this number of Gauss-Newton steps at most."""
     tolerance: float = 1e-6
-    """The steps end with the first one that moves nothing farther than this (m, rad)."""
+    """The laps are brought together when a Gauss-Newton step moves nothing farther than this (m, rad)."""
 
     @property
     def sigmas(self) -> tuple[float, float, float]:
@@ -50,22 +51,24 @@ class ConeSettings(Positive, group="batch.cones"):
     """Describes how the detections along a curve are clustered to cones."""
 
     density_step: float = 0.1
-    """The density of the detections along a curve is sampled at this step (m)."""
+    """Cones are peaks of the density of detections along a curve, which is sampled at this step (m)."""
     separation: float = 0.6
     """Two cones are at least this share of `growth.merge_radius` apart along a curve. It is less than 1, as
     the inner curve of a bend is shorter than the distances of its cones add up to."""
     bandwidth: float = 0.4
-    """The density is smoothed with a Gaussian whose standard deviation is this share of that distance."""
+    """The density is smoothed with a Gaussian. Its standard deviation is this share of the least distance
+    that `separation` sets."""
     min_share: float = 0.1
     """A cluster with fewer detections than this share of the median cluster's is no cone."""
     min_share_beside: float = 0.3
-    """A cluster beside a curve, whose detections aren't used, is no cone below this share."""
+    """A cluster beside a curve, whose detections aren't used, is no cone if it has fewer detections than this
+    share of the median cluster's."""
     min_count: int = 4
     """A curve is fitted to no fewer cones than this, and no cone is removed where there are fewer."""
     fold_cosine: float = 0.5
-    """The row of cones folds back at a cone where the cosine of its turn is below the negative of this."""
+    """The row of cones folds back at a cone where the cosine of its turn is less than minus this value."""
     fold_distance: float = 1.5
-    """A cone where the row folds back is a duplicate if its nearer neighbour is closer than this (m)."""
+    """A cone at which the row folds back is a duplicate if its nearer neighbour is closer than this (m)."""
 
 
 @dataclass(frozen=True)
@@ -80,14 +83,17 @@ class AssociationSettings(Positive, group="batch.association"):
 
 @dataclass(frozen=True)
 class FootPointSettings(Positive, group="batch.foot_points"):
-    """Describes how foot points are computed: more exactly than online, as an optimum needs it."""
+    """Describes how foot points are computed: more exactly than online, since an optimum needs it."""
 
     refine_room: float = 8.0
-    """A foot point is followed this far (m along the curve) in a step, instead of `spline.refine_room`."""
+    """A foot point is followed this far (m along the curve) in an optimization step. The batch uses this
+    instead of `spline.refine_room`."""
     refine_iterations: int = 2
-    """A step takes this number of Newton steps at a foot point, instead of `spline.refine_iterations`."""
+    """A foot point is refined by this number of Newton steps in an optimization step. The batch uses this
+    instead of `spline.refine_iterations`."""
     search_iterations: int = 4
-    """A global search takes this number of Newton steps, instead of `spline.search_iterations`."""
+    """A global search for a foot point ends with this number of Newton steps. The batch uses this instead of
+    `spline.search_iterations`."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +175,7 @@ class BatchSettings(Positive):
     tolerance_pose: float = 2e-3
     """At convergence, no pose moved farther than this in a round (m, and rad)."""
     min_size_share: float = 0.6
-    """The fewest control points that the map's curves are tried with, as a share of the most."""
+    """The map's curves are tried with at least this share of the largest number of control points."""
     curve_samples: int = 2
     """The movement of a curve is measured at this number of points in each knot interval."""
     recurrence: RecurrenceSettings = field(default_factory=RecurrenceSettings)

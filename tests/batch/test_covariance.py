@@ -1,4 +1,4 @@
-"""The batch's covariances against Monte Carlo: many draws of the noise on one small drive."""
+"""The covariances of the batch against Monte Carlo: many draws of the noise on one small drive."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Array = NDArray[np.float64]
 
 DRAWS = 200
 SITES = np.arange(5.0, 33.0, 9.0)
-"""Parameters (m) of the points on each curve at which errors are looked at."""
+"""The errors of each curve are taken at these parameters (m)."""
 
 
 @cache
 def errors() -> tuple[Array, Array, Array, Array]:
-    """Errors of the curves across themselves (d, 2 k) and of the last pose (d, 3), and what is claimed."""
+    """Returns errors of the curves across themselves (d, 2 k), of the last pose (d, 3), and covariances."""
     system, truth = straight()
     claimed = system.eliminated(system.evaluate(truth))
     rng = np.random.default_rng(7)
@@ -43,7 +43,7 @@ def errors() -> tuple[Array, Array, Array, Array]:
 
 
 def across(state: State, truth: State) -> Array:
-    """(2 k,) how far to the left both curves are."""
+    """Returns (2 k,) how far both curves are to the left of the true ones."""
     offsets = [
         boundary.evaluate(state.control_points(b), SITES) - boundary.evaluate(truth.control_points(b), SITES)
         for b, boundary in truth.boundaries.items()
@@ -52,6 +52,7 @@ def across(state: State, truth: State) -> Array:
 
 
 def curve_covariance(truth: State, claimed: Elimination) -> Array:
+    """Returns the covariance (2 k, 2 k) of the curves across themselves."""
     joint = claimed.joint(truth.map_keys)
     rows = []
     for b, boundary in truth.boundaries.items():
@@ -63,7 +64,7 @@ def curve_covariance(truth: State, claimed: Elimination) -> Array:
 
 
 def mean_nees(samples: Array, covariance: Array) -> float:
-    """Mean of `e' P^-1 e` per degree of freedom."""
+    """Returns the mean of `e' P^-1 e` per degree of freedom."""
     return float(np.mean(np.einsum("di,ij,dj->d", samples, np.linalg.inv(covariance), samples))) / len(
         covariance
     )
@@ -76,7 +77,7 @@ def test_both_curves_together_err_as_much_as_claimed() -> None:
 
 
 def test_the_two_curves_err_together() -> None:
-    """The heading of the whole map is in both: without the cross terms the difference would seem larger."""
+    """Both contain the heading of the whole map. Without the cross terms the difference would seem larger."""
     curves, _, claimed, _ = errors()
     k = len(SITES)
     difference = curves[:, k - 1] - curves[:, 2 * k - 1]

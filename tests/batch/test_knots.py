@@ -1,70 +1,79 @@
-"""The map's curves of few knots, and their covariance, from those of the optimum."""
+"""Knots of the batch's curves: how many there are, and what follows from the settings."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.knots import reknot
-from pathspace_graph.batch.simplification import new_from_old, simplify
-from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.state import State
+from pathspace_graph.batch.knots import boundary_of, dense_fit_through, fit_through, reknot, size_share
+from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.batch import settled, straight
+from ..scenes.batch import ring, straight
 
 Array = NDArray[np.float64]
 
+SETTINGS = MapperSettings()
 
-def dense_scene() -> tuple[State, DetectionTable, MapperSettings]:
-    """A straight drive beside curves of nearly a control point for each cone."""
+
+def zigzag_ring(count: int) -> Array:
+    """Returns cones (count, 2) that lie in turn 0.2 m outside and inside of a circle."""
+    return ring(20.0, count) * (1.0 + 0.01 * (-1.0) ** np.arange(count))[:, None]
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5])
+def test_a_fit_has_at_most_its_share_of_control_points(share: float) -> None:
+    """It has at least the settings' share of that number."""
+    spline = fit_through(zigzag_ring(60), True, SETTINGS, share)
+    assert int(SETTINGS.batch.min_size_share * int(share * 60)) <= spline.size <= int(share * 60)
+    assert spline.periodic
+
+
+def test_a_fit_has_the_least_size_where_there_are_few_cones() -> None:
+    assert fit_through(ring(8.0, 12), True, SETTINGS, 0.3).size == SETTINGS.spline.min_size
+
+
+def test_a_dense_fit_meets_its_cones() -> None:
+    cones = zigzag_ring(40)
+    spline = dense_fit_through(cones, True, SETTINGS)
+    assert spline.size == 40
+    assert np.abs(spline.foot_points(cones).distance).max() < 0.02
+
+
+def test_a_closed_curve_begins_at_the_cone_nearest_to_the_start() -> None:
+    """So it doesn't matter with which cone the row begins."""
+    cones = zigzag_ring(40) + np.array([20.0, 0.0])
+    one, other = (dense_fit_through(np.roll(cones, k, axis=0), True, SETTINGS) for k in (0, 7))
+    np.testing.assert_allclose(one.knots, other.knots)
+    np.testing.assert_allclose(one.control_points, other.control_points)
+
+
+def test_a_fixed_size_is_shared_by_the_cones_of_both_boundaries() -> None:
+    cones = {LEFT: 30, RIGHT: 50}
+    assert size_share(cones, SETTINGS.batch) == SETTINGS.batch.size_share
+    assert size_share(cones, replace(SETTINGS.batch, size=20)) == 0.25
+    assert size_share({}, replace(SETTINGS.batch, size=20)) == SETTINGS.batch.size_share
+
+
+def test_a_boundary_of_a_curve_is_that_curve_all_of_it_confirmed() -> None:
+    """Its foot points are those of the batch."""
+    spline = fit_through(np.column_stack([np.arange(0.0, 40.0, 2.0), np.zeros(20)]), False, SETTINGS, 0.5)
+    boundary, points = boundary_of(spline, SETTINGS)
+    u = np.linspace(*spline.domain, 30)
+    np.testing.assert_allclose(boundary.evaluate(points, u), spline.evaluate(u), atol=1e-9)
+    assert boundary.confirmed_end == boundary.tables.high
+    own = SETTINGS.batch.foot_points
+    assert boundary.settings.refine_room == own.refine_room
+    assert boundary.settings.search_iterations == own.search_iterations
+
+
+def test_new_knots_leave_the_poses_and_the_given_state_as_they_are() -> None:
     system, state = straight()
-    state = reknot(state, system.detections, system.settings, dense=True)
-    system.begin(state)
-    return settled(system, state), system.detections, system.settings
-
-
-def by_shift(state: State, axis: int) -> Array:
-    """(n,) derivative of all control points by a shift of the map."""
-    return np.tile(np.eye(2)[axis], len(state.map_points))
-
-
-def by_turn(state: State) -> Array:
-    """(n,) the same by a turn about the origin."""
-    return np.column_stack([-state.map_points[:, 1], state.map_points[:, 0]]).ravel()
-
-
-def test_the_drive_stays_and_the_curves_have_fewer_control_points_on_the_same_lines() -> None:
-    state, detections, settings = dense_scene()
-    thin, _ = simplify(state, np.eye(state.map_points.size), detections, settings)
-    np.testing.assert_array_equal(thin.poses, state.poses)
-    np.testing.assert_array_equal(thin.calibration, state.calibration)
-    for label, boundary in thin.boundaries.items():
-        assert boundary.size < state.boundaries[label].size
-        u = np.linspace(boundary.tables.low, boundary.tables.high, 50)
-        y = boundary.evaluate(thin.control_points(label), u)[:, 1]
-        np.testing.assert_allclose(np.abs(y), 2.0, atol=1e-3)
-
-
-def test_a_map_that_is_uncertain_as_a_whole_stays_so() -> None:
-    """`F 1 = 1`, and F takes the control points of a line to those of the same line."""
-    state, detections, settings = dense_scene()
-    for direction in (lambda s: by_shift(s, 0), lambda s: by_shift(s, 1), by_turn):
-        dense = direction(state)
-        thin, covariance = simplify(state, np.outer(dense, dense), detections, settings)
-        expected = direction(thin)
-        across = np.arange(1, thin.map_points.size, 2)
-        np.testing.assert_allclose(
-            covariance[np.ix_(across, across)],
-            np.outer(expected, expected)[np.ix_(across, across)],
-            atol=0.05,
-        )
-
-
-def test_a_curve_on_its_own_knots_is_itself() -> None:
-    state, _, _ = dense_scene()
-    for label, boundary in state.boundaries.items():
-        points = state.control_points(label)
-        np.testing.assert_allclose(
-            new_from_old(boundary, points, boundary, points), np.eye(boundary.size), atol=1e-6
-        )
+    sizes = {label: boundary.size for label, boundary in state.boundaries.items()}
+    dense = reknot(state, system.detections, system.settings, dense=True)
+    np.testing.assert_array_equal(dense.poses, state.poses)
+    for label, boundary in dense.boundaries.items():
+        assert boundary.size > sizes[label] == state.boundaries[label].size

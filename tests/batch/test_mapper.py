@@ -1,4 +1,4 @@
-"""The batch from end to end: both starts, open tracks, broken-off logs, logs that hold nothing."""
+"""The batch from end to end: both starts, open tracks, logs that break off, logs without detections."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 
 def noisy(log: Log, seed: int, sigma: float = 0.1) -> Log:
-    """The log with noise on its readings."""
+    """Returns the log with noise on its detections."""
     rng = np.random.default_rng(seed)
     cycles = tuple(
         replace(c, points_vehicle=c.points_vehicle + rng.normal(0.0, sigma, c.points_vehicle.shape))
@@ -38,7 +38,7 @@ def noisy(log: Log, seed: int, sigma: float = 0.1) -> Log:
 
 @cache
 def bean() -> Log:
-    """A lap and a half of a small closed track."""
+    """Returns a lap and a half of a small closed track."""
     return noisy(lap_log(bean_track(), overrun=50.0), seed=1)
 
 
@@ -51,7 +51,7 @@ def solved(start: str) -> BatchResult:
 
 
 def broken_off(log: Log, share: float) -> Log:
-    """Only the first cycles of a log."""
+    """Returns the log with only the first share of its cycles."""
     cycles = log.cycles[: int(share * len(log.cycles))]
     return replace(log, cycles=cycles)
 
@@ -117,7 +117,7 @@ def test_a_log_that_stops_in_the_middle_of_a_lap(share: float) -> None:
 
 
 def test_several_laps_that_stop_in_the_middle_of_one() -> None:
-    """Two and a half: the map is closed, and every lap's poses stand beside the same curves."""
+    """After two laps and a half the map is closed, and the poses of every lap are beside the same curves."""
     log = noisy(lap_log(bean_track(), overrun=160.0), seed=4)
     result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log, "odometry")
     assert result.convergence.converged
@@ -129,7 +129,7 @@ def test_several_laps_that_stop_in_the_middle_of_one() -> None:
     assert np.abs(errors[:, :2]).max() < 0.25
 
 
-def test_a_log_without_readings_is_its_odometry() -> None:
+def test_the_map_of_a_log_without_detections_is_its_odometry() -> None:
     log = bean()
     empty = replace(
         log,
@@ -164,7 +164,7 @@ def test_the_command_writes_its_result(tmp_path: Path) -> None:
     assert read_map(tmp_path / "map").closed
 
 
-def test_what_did_not_converge_is_written_and_told(tmp_path: Path) -> None:
+def test_a_run_that_did_not_converge_is_written_and_reported(tmp_path: Path) -> None:
     write_log(bean(), tmp_path / "log")
     arguments = ["batch", str(tmp_path / "log"), "--out", str(tmp_path / "map"), "--start", "odometry"]
     with pytest.raises(SystemExit) as end:

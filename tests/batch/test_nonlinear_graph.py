@@ -1,4 +1,4 @@
-"""The whole log's problem as GTSAM's nonlinear factors, and its optimum by GTSAM's own optimizer."""
+"""The problem of a whole log as GTSAM's nonlinear factors, and its optimum by GTSAM's own optimizer."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 @cache
 def solved() -> BatchResult:
-    """A short straight drive between two rows of cones, whose readings are noisy."""
+    """Returns the result of a short straight drive between two rows of cones, with noisy detections."""
     cones, labels = corridor(60.0)
     log = exact_log(ahead(6.0, 5.0), cones, labels)
     rng = np.random.default_rng(1)
@@ -38,8 +38,8 @@ def solved() -> BatchResult:
     return BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log, "odometry")
 
 
-def turns(state: State) -> Array:
-    """(N, N) from GTSAM's tangents, a pose's in its own frame, to changes in the map frame."""
+def rotations(state: State) -> Array:
+    """Returns (N, N) that takes GTSAM's tangents, a pose's in its own frame, to changes in the map frame."""
     layout = state.variables.layout
     matrix = np.eye(layout.size)
     for start, pose in zip(layout.starts[are_poses(layout.keys)], state.poses, strict=True):
@@ -48,7 +48,7 @@ def turns(state: State) -> Array:
 
 
 def vector_of(values: gtsam.Values, state: State) -> Array:
-    """(N,) values in the order of the state's."""
+    """Returns the values (N,) in the order of the state's."""
     keys = state.variables.keys
     return np.concatenate(
         [
@@ -59,7 +59,7 @@ def vector_of(values: gtsam.Values, state: State) -> Array:
 
 
 def at_optimum() -> tuple[BatchResult, Evaluation]:
-    """A result, and its problem some steps nearer to its optimum than the batch's own tolerances ask for."""
+    """Returns a result, and its problem some steps nearer to the optimum than the tolerances ask for."""
     result = solved()
     system = result.system
     at = system.evaluate(settled(system, result.optimum.state, 12))
@@ -74,7 +74,7 @@ def test_its_linearization_is_ours() -> None:
     ordering = state.variables.layout.ordering
     information, vector = theirs.hessian(ordering)
     expected, negative_gradient = ours.hessian(ordering)
-    turn = turns(state)
+    turn = rotations(state)
     size = np.sqrt(np.diagonal(expected))
     np.testing.assert_allclose(
         turn @ information @ turn.T / np.outer(size, size), expected / np.outer(size, size), atol=1e-7
@@ -83,7 +83,7 @@ def test_its_linearization_is_ours() -> None:
 
 
 def test_its_gradient_vanishes_at_the_optimum() -> None:
-    """Each entry in units of its own sigma."""
+    """Each entry is in units of its own sigma."""
     result, at = at_optimum()
     variables = at.state.variables
     graph, values = nonlinear_graph(result.system, at), variables.gtsam_values(variables.keys)
@@ -115,13 +115,13 @@ def test_gtsam_has_the_same_covariances() -> None:
 
 
 def test_a_result_can_be_pickled() -> None:
-    """Also after all has been asked of it: it holds arrays, and makes GTSAM's objects anew."""
+    """That holds after all of it has been used: it keeps arrays, and makes GTSAM's objects anew."""
     result = solved()
     assert len(result.pose_covariances) == len(result.trajectory)
     assert result.graph().size() == pickle.loads(pickle.dumps(result)).graph().size()
 
 
-def test_it_can_be_looked_at(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_it_can_be_drawn_and_printed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     graph, values = solved().graph(), solved().values()
     graph.saveGraph(str(tmp_path / "graph.dot"), values)
     assert "x0" in (tmp_path / "graph.dot").read_text()
@@ -130,7 +130,7 @@ def test_it_can_be_looked_at(tmp_path: Path, capfd: pytest.CaptureFixture[str]) 
 
 
 def test_levenberg_marquardt_finds_the_same_optimum() -> None:
-    """From where the curves began, a tenth of a metre away."""
+    """It begins where the curves began, a tenth of a metre away."""
     exact, begun = straight(4.0, MapperSettings().batch.sigma_smoothness)
     system, _ = drawn(exact, np.random.default_rng(3))
     system.begin(begun)

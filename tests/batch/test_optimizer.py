@@ -1,26 +1,137 @@
-"""Steps of the batch's optimizer."""
+"""The batch's optimizer: its schedule of gates, its end, its damping, and the steps that it lengthens."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from pathspace_graph.batch.optimizer import extrapolation_factor
+from pathspace_graph.batch.optimizer import Optimizer, Schedule, extrapolation_factor, unit_damping
+from pathspace_graph.batch.system import BatchSystem
+from pathspace_graph.graph.keys import CALIBRATION_KEY
+from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
+
+from ..scenes.batch import drawn, straight
+
+Array = NDArray[np.float64]
 
 BATCH = MapperSettings().batch
 
 
+def noisy() -> tuple[BatchSystem, State]:
+    """Returns a straight drive that was measured with noise, and the truth of it."""
+    exact, truth = straight(4.0, BATCH.sigma_smoothness)
+    return drawn(exact, np.random.default_rng(3))[0], truth
+
+
+# --- rounds ----------------------------------------------------------------------------------------------
+
+
+def test_the_gate_shrinks_by_its_factor_to_its_last_value() -> None:
+    """Only with the last gate may the optimization end, however little has changed before."""
+    system, state = noisy()
+    gates: list[float] = []
+    schedule = Schedule(gate=8.0, rounds=12, tolerance=1e9)
+    _, convergence = Optimizer(system, BATCH).run(state, schedule, lambda: gates.append(system.kernel.gate))
+    expected = [8.0 * BATCH.gate_factor**k for k in range(2)] + [BATCH.gate]
+    np.testing.assert_allclose(gates, expected)
+    assert convergence.converged
+    assert convergence.rounds == len(gates)
+
+
+def test_it_ends_where_nothing_changes_any_more() -> None:
+    """The gradient is small there, and another run changes neither cost nor curves."""
+    system, state = noisy()
+    at, convergence = Optimizer(system, BATCH).run(state, Schedule(BATCH.gate, 40))
+    assert convergence.converged
+    assert convergence.cost == at.cost
+    assert convergence.steps >= convergence.rounds
+    again, _ = Optimizer(system, BATCH).run(at.state, Schedule(BATCH.gate, 40))
+    np.testing.assert_allclose(again.cost, at.cost, rtol=1e-4)
+    np.testing.assert_allclose(again.state.poses, at.state.poses, atol=5e-3)
+
+
+def test_a_tolerance_ends_it_sooner() -> None:
+    rounds = []
+    for tolerance in (1.0, 100.0):
+        system, state = noisy()
+        _, convergence = Optimizer(system, BATCH).run(state, Schedule(BATCH.gate, 40, tolerance))
+        rounds.append(convergence.rounds)
+    assert rounds[1] < rounds[0]
+
+
+def test_without_rounds_left_it_has_not_converged() -> None:
+    system, state = noisy()
+    _, convergence = Optimizer(system, BATCH).run(state, Schedule(gate=8.0, rounds=2))
+    assert not convergence.converged
+    assert convergence.rounds == 2
+    assert convergence.reason == "no round left"
+
+
+def test_the_cost_never_grows_in_a_step() -> None:
+    """The associations of the first round are those of the last one here, so costs can be compared."""
+    system, state = noisy()
+    start = Optimizer(system, BATCH).align_poses(state, 1, BATCH.gate)
+    costs = []
+    for rounds in (1, 2, 4, 8):
+        at, _ = Optimizer(system, BATCH).run(start, Schedule(BATCH.gate, rounds))
+        costs.append(at.cost)
+    assert (np.diff(costs) < 1e-3).all()
+
+
+def test_a_damping_that_is_too_large_leaves_the_map_where_it_is() -> None:
+    """The poses are free, though, as they aren't damped."""
+    system, state = noisy()
+    damped = replace(BATCH, damping=1e12, damping_most=1e13, damping_least=1e12)
+    at, _ = Optimizer(system, damped).run(state, Schedule(BATCH.gate, 1))
+    np.testing.assert_allclose(at.state.map_points, state.map_points, atol=1e-6)
+    assert np.abs(at.state.poses - state.poses).max() > 1e-3
+
+
+def test_where_no_damping_is_allowed_nothing_moves() -> None:
+    system, state = noisy()
+    refused = replace(BATCH, damping=1.0, damping_most=0.1)
+    at, _ = Optimizer(system, refused).run(state, Schedule(BATCH.gate, 1))
+    np.testing.assert_array_equal(at.state.variables.values, state.variables.values)
+
+
+def test_the_poses_alone_are_aligned_beside_the_map() -> None:
+    """They come back from a shift across the track, and nothing else moves."""
+    system, truth = straight(4.0)
+    shifted = truth.copy()
+    shifted.variables.poses[1:, 1] += 0.3
+    aligned = Optimizer(system, BATCH).align_poses(shifted, 3, BATCH.loose_gate)
+    np.testing.assert_array_equal(aligned.map_points, truth.map_points)
+    np.testing.assert_array_equal(aligned.calibration, truth.calibration)
+    np.testing.assert_allclose(aligned.poses[:, 1], truth.poses[:, 1], atol=0.02)
+
+
+# --- steps -----------------------------------------------------------------------------------------------
+
+
+def test_the_calibration_is_not_damped() -> None:
+    _, state = straight(4.0)
+    layout = state.variables.layout
+    unit = unit_damping(layout)
+    free = layout.entries(np.array([CALIBRATION_KEY]))
+    np.testing.assert_array_equal(np.flatnonzero(unit == 0.0), free)
+
+
 @pytest.mark.parametrize("share", [0.4, 0.7, 0.9])
-def test_steps_that_shrink_by_one_share_lead_home_at_once(share: float) -> None:
-    """x_k = x + r^k d: the second step, lengthened, ends at x."""
-    home, off = np.array([1.0, -2.0, 3.0]), np.array([0.5, 0.1, -0.3])
-    points = [home + share**k * off for k in range(3)]
+def test_steps_that_shrink_by_one_share_lead_to_their_limit_at_once(share: float) -> None:
+    """With x_k = x + r^k d, the second step ends at x if it is made longer."""
+    limit, off = np.array([1.0, -2.0, 3.0]), np.array([0.5, 0.1, -0.3])
+    points = [limit + share**k * off for k in range(3)]
     before, step = points[1] - points[0], points[2] - points[1]
-    np.testing.assert_allclose(points[1] + extrapolation_factor(step, before, BATCH) * step, home, atol=1e-12)
+    np.testing.assert_allclose(
+        points[1] + extrapolation_factor(step, before, BATCH) * step, limit, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("step", [[0.0, 1.0], [-0.5, 0.0], [1.2, 0.0], [0.1, 0.0]])
-def test_a_step_that_does_not_go_on_is_left_as_it_is(step: list[float]) -> None:
+def test_other_steps_are_left_as_they_are(step: list[float]) -> None:
     assert extrapolation_factor(np.array(step), np.array([1.0, 0.0]), BATCH) == 1.0
     assert extrapolation_factor(np.array(step), np.zeros(2), BATCH) == 1.0

@@ -1,4 +1,4 @@
-"""The whole log's problem: its losses, gradients against the cost, steps and covariances against GTSAM's."""
+"""The problem of a whole log: its loss, its gradient against its cost, and its steps against GTSAM's."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ KERNEL = Biweight(4.0)
 
 @cache
 def small_system() -> tuple[BatchSystem, State]:
-    """An exact lap with some noise on its readings, linearized beside the optimum."""
+    """Returns an exact lap with some noise on its detections, linearized beside the optimum."""
     log = lap_log(bean_track())
     settings = own_settings(MapperSettings())
     chain = integrate_log(log, log.odometry_sigma, settings.odometry)
@@ -64,7 +64,7 @@ def test_the_gradient_is_that_of_the_cost() -> None:
 
 
 def test_the_step_is_that_of_gtsam() -> None:
-    """A map of 30 to 40 control points and some hundred poses as one Gaussian factor graph."""
+    """The map has 30 to 40 control points and some hundred poses."""
     system, state = small_system()
     at, keys = system.evaluate(state), state.variables.keys.tolist()
     problem = system.eliminated(at)

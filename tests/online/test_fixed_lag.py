@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.metrics.table1 import ate, cone_distances, lap_metrics
+from pathspace_graph.eval.metrics.table1 import cone_distances, lap_metrics
+from pathspace_graph.eval.metrics.trajectory import ate
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, SplineBoundary

@@ -1,4 +1,4 @@
-"""A short straight drive as the batch's problem, for tests of its optimum and of its covariance."""
+"""Small problems of the batch: a short straight drive, and curves with poses and detections made by hand."""
 
 from __future__ import annotations
 
@@ -8,28 +8,36 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.association import associate, locate_poses
+from pathspace_graph.batch.association import add_drive, associate, locate_poses
 from pathspace_graph.batch.dead_reckoning import start_odometry
+from pathspace_graph.batch.knots import boundary_of
 from pathspace_graph.batch.mapper import own_settings
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved
+from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.io.log import Log
+from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.vehicle import integrate
+from pathspace_graph.spline.knots import fit_spline
 
-from .drives import ahead, corridor, exact_log
+from .drives import DT, ahead, corridor, exact_log
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 
 LEAST_SQUARES = 1e3
-"""Gate (sigmas) so wide that the loss is the square."""
-
-
+"""This gate (sigmas) is so wide that the loss is the square."""
 SMOOTHNESS = 20.0
-"""Where errors are looked at, the curves' smoothness must not help: the truth is smoother than noise."""
+"""The prior of smoothness is so weak that it doesn't reduce errors: the truth is smoother than the noise."""
+COURSE = 120.0
+"""This is the length of the closed course (m)."""
 
 
 def straight(seconds: float = 6.0, smoothness: float = SMOOTHNESS) -> tuple[BatchSystem, State]:
-    """An exact drive of 6 m/s between two rows of cones, at the curves through them; every reading in use."""
+    """Returns an exact drive at 6 m/s between two rows of cones at its optimum, every detection used."""
     whole = MapperSettings()
     whole = replace(whole, batch=replace(whole.batch, sigma_smoothness=smoothness))
     cones, labels = corridor(60.0)
@@ -46,7 +54,7 @@ def straight(seconds: float = 6.0, smoothness: float = SMOOTHNESS) -> tuple[Batc
 
 
 def settled(system: BatchSystem, state: State, steps: int = 4) -> State:
-    """After some Gauss-Newton steps."""
+    """Returns the state after some Gauss-Newton steps."""
     for _ in range(steps):
         at = system.evaluate(state)
         for projected in at.projected.values():
@@ -57,7 +65,7 @@ def settled(system: BatchSystem, state: State, steps: int = 4) -> State:
 
 
 def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, Array]:
-    """The same drive measured with noise as the problem has it; also the calibration (2,) that it hides."""
+    """Returns the same drive measured with the problem's own noise, and the calibration (2,) in it."""
     detections, chain = system.detections, system.chain
     odometry = system.settings.odometry
     calibration = rng.normal(0.0, [odometry.sigma_scale, odometry.sigma_bias])
@@ -69,17 +77,66 @@ def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, A
     first = rng.multivariate_normal(chain.first, np.linalg.inv(chain.first_information))
     noisy = BatchSystem(
         replace(detections, point=points, u=detections.u.copy()),
-        _turned(replace(chain, first=first), local),
+        _with_errors(replace(chain, first=first), local),
         system.settings,
         system.kernel,
     )
     return noisy, calibration
 
 
-def _turned(chain: Chain, local: Array) -> Chain:
-    """With errors (P - 1, 3) in the frame of each motion's end."""
+def _with_errors(chain: Chain, local: Array) -> Chain:
+    """Returns the chain with errors (P - 1, 3), each in the frame of the end of its interval."""
     odometry = copy(chain.odometry)
-    c, s = np.cos(odometry.deltas[:, 2]), np.sin(odometry.deltas[:, 2])
-    turned = np.column_stack([c * local[:, 0] - s * local[:, 1], s * local[:, 0] + c * local[:, 1]])
-    odometry.deltas = odometry.deltas + np.column_stack([turned, local[:, 2]])
+    moved_ends = to_map(local[:, :2], odometry.deltas)
+    odometry.deltas = np.column_stack([moved_ends, odometry.deltas[:, 2] + local[:, 2]])
     return replace(chain, odometry=odometry)
+
+
+def state_of(curves: dict[int, Array], poses: Array, periodic: bool = False) -> State:
+    """Returns a state with a curve through ordered points (k, 2) for each label, and poses (P, 3)."""
+    settings, state = MapperSettings(), State()
+    for label, points in curves.items():
+        spline = fit_spline(points, len(points) // 2, periodic)
+        state.add_boundary(label, *boundary_of(spline, settings))
+    add_drive(state, poses, np.zeros(2), settings.batch.association)
+    return state
+
+
+def ring(radius: float, count: int = 80) -> Array:
+    """Returns points (count, 2) on a counterclockwise circle about the origin."""
+    phi = 2.0 * np.pi * np.arange(count) / count
+    return radius * np.column_stack([np.cos(phi), np.sin(phi)])
+
+
+def course_curvature(s: Array) -> Array:
+    """Returns the curvature (m,) of a closed course of length COURSE at path lengths (m,), in 1/m.
+
+    Its bends have two axes of symmetry, so that it closes, and are short, so that a lap is well defined.
+    """
+    phase = 2.0 * np.pi * s / COURSE
+    return 2.0 * np.pi / COURSE * (1.0 + 0.8 * np.cos(2.0 * phase) + 0.8 * np.sin(6.0 * phase))
+
+
+def course_log(laps: float, speed: float = 6.0) -> Log:
+    """Returns an exact drive around the course, between cones 1.8 m to both sides of it."""
+    s = np.arange(0.0, laps * COURSE, speed * DT)
+    twists = np.column_stack([np.full(len(s), speed), np.zeros(len(s)), speed * course_curvature(s)])
+    middle = integrate(twists[: round(COURSE / (speed * DT))], DT)[::25]
+    normal = np.column_stack([-np.sin(middle[:, 2]), np.cos(middle[:, 2])])
+    cones = np.concatenate([middle[:, :2] + 1.8 * normal, middle[:, :2] - 1.8 * normal])
+    return exact_log(twists, cones, np.repeat([LEFT, RIGHT], len(middle)).astype(np.intp))
+
+
+def detections_of(cycle: IntArray, points_vehicle: Array, labels: IntArray, sigma: float) -> DetectionTable:
+    """Returns detections (m, 2) with isotropic sigma (m), none of them used."""
+    m = len(cycle)
+    return DetectionTable(
+        cycle=cycle,
+        point=points_vehicle,
+        covariance=np.tile(sigma**2 * np.eye(2), (m, 1, 1)),
+        label=labels,
+        boundary=labels.copy(),
+        u=np.zeros(m),
+        used=np.zeros(m, bool),
+        changed=np.zeros(m, bool),
+    )

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.ckf.expansion import beyond_end
 from pathspace_graph.cli import main
-from pathspace_graph.eval.figures.expansion import ExpansionScene, expanding, expansion, extend
+from pathspace_graph.eval.figures.expansion import ExpansionScene, expansion, extend
 from pathspace_graph.eval.figures.fit import FitScene, fit
 from pathspace_graph.eval.figures.isolated import FIGURES, MARKER
 from pathspace_graph.eval.figures.simplification import simplification
 from pathspace_graph.eval.figures.uncertainty import UncertaintyScene, uncertainty
 from pathspace_graph.mapping.cubature import cubature_points, square_root
+from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit
 
@@ -47,7 +49,7 @@ def test_the_curve_is_least_certain_where_nothing_was_seen() -> None:
 # --- expansion -------------------------------------------------------------------------------------------
 
 
-def test_readings_beyond_the_end_expand_and_the_last_of_their_chain_is_interpolated() -> None:
+def test_detections_beyond_the_end_expand_and_the_last_of_their_chain_is_interpolated() -> None:
     data = expansion()
     np.testing.assert_array_equal(data.expands, [False, False, True, True, True])
     np.testing.assert_array_equal(data.order, [2, 3, 4])
@@ -58,8 +60,14 @@ def test_readings_beyond_the_end_expand_and_the_last_of_their_chain_is_interpola
 def test_the_three_conditions_of_an_expansion() -> None:
     straight = BSpline.clamped_from(np.array([0.0, 6.0]), np.array([[0.0, 0], [2, 0], [4, 0], [6, 0]]))
     detections = np.array([[3.0, 1.0], [7.0, 0.0], [6.5, 2.5], [9.0, 0.0]])
-    np.testing.assert_array_equal(expanding(straight, detections, 2.0, 4.0), [False, False, False, True])
-    np.testing.assert_array_equal(expanding(straight, detections, 0.5, 1.0), [False, True, True, True])
+    u = straight.foot_points(detections).u
+
+    def expands(threshold: float, separation: float) -> list[bool]:
+        settings = CkfSettings(threshold=threshold, separation=separation)
+        return beyond_end(detections, u, 6.0, straight.control_points, settings).tolist()
+
+    assert expands(2.0, 4.0) == [False, False, False, True]
+    assert expands(0.5, 1.0) == [False, True, True, True]
 
 
 def test_extension_leaves_the_curve_and_its_uncertainty_as_they_were() -> None:
@@ -76,8 +84,8 @@ def test_extension_leaves_the_curve_and_its_uncertainty_as_they_were() -> None:
 
 def test_the_covariance_of_an_extension_is_that_of_extended_samples() -> None:
     data, rng = expansion(), np.random.default_rng(4)
-    reading, scene = data.detections[4], ExpansionScene()
-    extended = extend(data.before, reading, scene.sigma_detection**2 * np.eye(2))
+    detection, scene = data.detections[4], ExpansionScene()
+    extended = extend(data.before, detection, scene.sigma_detection**2 * np.eye(2))
     drawn = rng.multivariate_normal(data.before.spline.control_points.ravel(), data.before.covariance, 4000)
     knots = extended.spline.knots
     lengthened = []
@@ -91,7 +99,7 @@ def test_the_covariance_of_an_extension_is_that_of_extended_samples() -> None:
     assert np.abs(sampled - own).max() < 0.08 * np.abs(own).max()
 
 
-def test_the_update_draws_the_curve_to_the_readings_and_makes_it_surer() -> None:
+def test_the_update_draws_the_curve_to_the_detections_and_makes_it_surer() -> None:
     data = expansion()
     before, after = (
         np.abs(boundary.spline.foot_points(data.detections[:4]).distance)
@@ -123,7 +131,7 @@ def test_each_spline_is_the_ridge_regression_of_its_sigma_point() -> None:
     np.testing.assert_allclose(spread.T @ spread / len(spread), data.measurement.covariance, atol=1e-9)
 
 
-def test_the_fit_lies_between_the_curve_and_the_readings_and_moves_what_the_basis_touches() -> None:
+def test_the_fit_lies_between_the_curve_and_the_detections_and_moves_what_the_basis_touches() -> None:
     data = fit()
     before = data.curve.foot_points(data.detections).distance
     after = data.fitted.foot_points(data.detections).distance

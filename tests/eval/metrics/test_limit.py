@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.limit import (
-    Limit,
-    driving_order,
-    fit_rmse,
-    landmark_rmse,
-    limit,
-    solve_oracle_landmarks,
-)
-from pathspace_graph.eval.metrics.table1 import ate, root_mean_square
+from pathspace_graph.eval.metrics.limit import Limit, fit_rmse, landmark_rmse, limit, solve_oracle_landmarks
+from pathspace_graph.eval.metrics.table1 import root_mean_square
+from pathspace_graph.eval.metrics.trajectory import ate
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
@@ -191,18 +185,6 @@ def test_unknown_cones_are_not_counted() -> None:
     told = Truth(log.truth.pose_t, log.truth.poses, log.truth.cones, some)
     errors = np.linalg.norm(solution.landmarks - log.truth.cones, axis=1)[:16]
     assert landmark_rmse(solution, told) == pytest.approx(root_mean_square(errors))
-
-
-@pytest.mark.parametrize("with_path", [True, False])
-def test_cones_are_put_in_driving_order(with_path: bool) -> None:
-    t = np.linspace(0.0, 2 * np.pi * RADIUS / SPEED, 40)
-    in_order = np.roll(ring(RADIUS - 1.5, 16), -3, axis=0)
-    shuffled = np.random.default_rng(0).permutation(in_order) if with_path else in_order
-    poses = circle_poses(t) if with_path else np.zeros((0, 3))
-    truth = Truth(t if with_path else np.zeros(0), poses, shuffled, np.zeros(16, dtype=int))
-    found = driving_order(truth, LEFT)
-    start = int(np.argmin(np.linalg.norm(found - in_order[0], axis=1)))
-    np.testing.assert_array_equal(np.roll(found, -start, axis=0), in_order)
 
 
 def test_a_log_without_truth_has_no_limit() -> None:

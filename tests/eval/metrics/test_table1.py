@@ -8,17 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.consistency import normal_errors
 from pathspace_graph.eval.metrics.table1 import (
-    ate,
     boundary_distances,
+    capped_rmse,
     cone_distances,
-    interpolate_poses,
     lap_end_times,
     lap_metrics,
     laps_metrics,
-    trajectory_errors,
-    two_way_distance,
+    missed_share,
 )
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
@@ -103,41 +100,6 @@ def test_the_closest_point_is_no_farther_than_any_sample(seed: int) -> None:
     np.testing.assert_allclose(distances, sampled, atol=0.02)
 
 
-def test_normal_errors_carry_sign_and_the_joint_covariance() -> None:
-    """All control points move together: sigma is 0.2 everywhere, which marginals alone wouldn't give."""
-    across = np.tile([0.0, 1.0], 4)
-    track = Map(False, {LEFT: straight(2.0, 0.2**2 * np.outer(across, across))})
-    true = truth([(2, 2.3, LEFT), (5, 1.5, LEFT), (8, 2.39, LEFT), (5, 0.0, RIGHT), (5, 2.0, UNKNOWN)])
-    found = normal_errors(track, true)
-    np.testing.assert_allclose(found.errors, [0.3, -0.5, 0.39], atol=1e-12)
-    np.testing.assert_allclose(found.sigmas, 0.2, atol=1e-12)
-    assert found.share_inside() == pytest.approx(2 / 3)
-    assert found.share_inside(3.0) == 1.0
-    assert np.isnan(normal_errors(Map(False, {LEFT: landmarks((0, 0))}), true).share_inside())
-
-
-def test_trajectory_errors_are_along_and_across_the_true_heading() -> None:
-    """Due north at 1 m/s: 0.3 m too far north is along, 0.4 m too far west is across (left positive)."""
-    t = np.array([0.0, 10.0])
-    true = truth([], np.array([[0.0, 0.0, np.pi / 2], [0.0, 10.0, np.pi / 2]]), t)
-    stamps = np.array([-1.0, 2.0, 5.0, 10.0, 11.0])
-    poses = np.array(
-        [[9, 9, 0], [0, 2.3, 1.6], [-0.4, 5, np.pi / 2], [0, 10, np.pi / 2], [9, 9, 0]], dtype=float
-    )
-    errors = trajectory_errors(stamps, poses, true)
-    expected = [[0.3, 0, 1.6 - np.pi / 2], [0, 0.4, 0], [0, 0, 0]]
-    np.testing.assert_allclose(errors, expected, atol=1e-12)
-    assert ate(stamps, poses, true) == pytest.approx(np.sqrt((0.3**2 + 0.4**2) / 3))
-
-
-def test_headings_are_interpolated_the_short_way_and_wrap() -> None:
-    poses = np.array([[0.0, 0.0, np.pi - 0.1], [2.0, 0.0, -np.pi + 0.1]])
-    between = interpolate_poses(np.array([0.0, 2.0]), poses, np.array([0.5, 1.0, 1.5]))
-    np.testing.assert_allclose(between[:, 0], [0.5, 1.0, 1.5])
-    np.testing.assert_allclose(np.abs(between[:, 2]), [np.pi - 0.05, np.pi, np.pi - 0.05])
-    assert between[2, 2] < 0.0 < between[0, 2]
-
-
 def test_lap_ends_of_the_true_path_are_times() -> None:
     angle = np.arange(0.0, 2.5 * 2 * np.pi, 0.02)
     wrapped = np.arctan2(np.sin(angle), np.cos(angle))
@@ -146,9 +108,9 @@ def test_lap_ends_of_the_true_path_are_times() -> None:
     np.testing.assert_allclose(times, 3.0 * 2 * np.pi * np.array([1.0, 2.0]), atol=0.06)
 
 
-def test_two_way_distance_of_parallels_and_of_a_part() -> None:
-    x = np.linspace(0.0, 10.0, 1001)
-    line = np.column_stack([x, np.zeros_like(x)])
-    assert two_way_distance(line, line + np.array([0.0, 0.7])) == pytest.approx(0.7)
-    # half of it: 0 from the half to the whole, and back 0 on one half and 2.5 m on average on the other
-    assert two_way_distance(line[:501], line) == pytest.approx(0.5 * 1.25, abs=0.01)
+def test_missed_at_a_distance_and_rmse_with_a_missed_cone_as_three_metres() -> None:
+    distances = np.array([0.0, 0.9, 1.5, 2.5, 4.0, np.inf])
+    assert [missed_share(distances, d) for d in (1.0, 2.0, 3.0)] == [4 / 6, 3 / 6, 2 / 6]
+    assert missed_share(np.array([2.0]), 2.0) == 0.0
+    assert capped_rmse(distances) == pytest.approx(np.sqrt((0.81 + 2.25 + 6.25 + 9 + 9) / 6))
+    assert np.isnan(missed_share(np.zeros(0))) and np.isnan(capped_rmse(np.zeros(0)))

@@ -12,16 +12,11 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.errors import OutputError, SettingsError
-from pathspace_graph.eval.metrics.consistency import normal_errors, with_marginals
 from pathspace_graph.eval.study import run as study_run
 from pathspace_graph.eval.study.frame import TIMES, without_times
 from pathspace_graph.eval.study.output import write_figures, write_tables
 from pathspace_graph.eval.study.run import make_plan, run_study
 from pathspace_graph.eval.study.study import Study
-from pathspace_graph.io.log import Truth
-from pathspace_graph.io.map import Map, SplineBoundary
-from pathspace_graph.labels import LEFT
-from pathspace_graph.spline.bspline import BSpline
 
 from ...scenes.pretenders import Fragile, Pretender, contents, register, write_round_track
 
@@ -190,32 +185,6 @@ def test_a_folder_of_another_study_is_refused(study: Study, tmp_path: Path) -> N
     with pytest.raises(OutputError, match=r"study\.json"):
         run_study(study, tmp_path / "thesis")
     assert [file.name for file in (tmp_path / "thesis").iterdir()] == ["thesis.tex"]
-
-
-# --- metrics ---------------------------------------------------------------------------------------------
-
-
-def test_marginals_are_the_squared_basis_of_the_paper() -> None:
-    """sigma_n^2 = sum_j beta_j(u)^2 n' Sigma_jj n, against the curve's normal sigma with no cross terms."""
-    rng = np.random.default_rng(0)
-    points = np.stack([np.arange(8.0) * 4, rng.normal(0.0, 0.5, 8)], axis=1)
-    spline = BSpline(np.arange(12.0), points, 3)
-    half = rng.normal(size=(16, 16))
-    joint = half @ half.T
-    track = Map(False, {LEFT: SplineBoundary(spline, joint)})
-    cones = spline.evaluate(np.linspace(3.5, 7.5, 9)) + 0.1
-    poses = np.zeros((2, 3))
-    truth = Truth(np.arange(2.0), poses, cones, np.full(9, LEFT), np.zeros(0, dtype=int))
-    found = normal_errors(with_marginals(track), truth)
-    u = np.linspace(3.0, 8.0, 20001)
-    nearest = np.argmin(np.linalg.norm(cones[:, None] - spline.evaluate(u), axis=2), axis=1)
-    basis = spline.basis_matrix(u[nearest])
-    tangent = spline.tangent_unit(u[nearest])
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    blocks = joint.reshape(8, 2, 8, 2)[np.arange(8), :, np.arange(8), :]
-    expected = np.einsum("kj,kj,ka,jab,kb->k", basis, basis, normal, blocks, normal)
-    np.testing.assert_allclose(found.sigmas**2, expected, rtol=1e-2)
-    assert not np.allclose(normal_errors(track, truth).sigmas, found.sigmas, rtol=0.1)
 
 
 def test_a_study_that_cannot_be_planned_leaves_no_folder(

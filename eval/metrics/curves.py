@@ -1,0 +1,149 @@
+"""The true boundaries as curves, and the distance of the mapped ones from them and from each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import Akima1DInterpolator
+from scipy.spatial import KDTree
+
+from pathspace_graph.io.log import Truth
+from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.laps import lap_end_indices
+
+from .table1 import boundary_distances
+
+Array = NDArray[np.float64]
+
+PATH_STEP: Final = 0.1
+"""The cones are ordered along points of the true path that are at most this far (m) apart."""
+TRUE_STEP: Final = 0.02
+"""Points of a true curve are at most this far (m) apart: a distance of 0.1 m is at most 0.5 mm too long."""
+MAPPED_STEP: Final = 0.1
+"""Distances are measured from points of a curve that are at most this far (m) apart."""
+ROUND_OFF: Final = 1e-9
+"""A length that exceeds whole steps by less than this share of a step gets no further step."""
+_OVERLAP: Final = 3
+"""Akima's tangents of a closed curve need this many cones beyond the seam."""
+_CACHED: Final = 16
+"""This many true curves are cached, since every map of a log is compared with the same ones several times."""
+_MIN_CONES: Final = 2
+"""A curve needs at least this many cones."""
+
+
+# --- points on curves ------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=_CACHED)
+def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
+    """Returns points (k, 2) in m, at most `step` apart, on the curve through the true cones of a boundary.
+
+    The curve is Akima's cubic over chord lengths, in driving order. It passes through every cone and, unlike
+    a natural spline, it doesn't overshoot where the spacing of the cones changes. It is closed where the true
+    path completes a lap. One cone gives one point, no cone none. Callers must not write to the array, because
+    it is cached.
+    """
+    cones = driving_order(truth, label)
+    if len(cones) < _MIN_CONES:
+        return cones
+    closed = len(cones) > _OVERLAP and len(truth.poses) > 0 and len(lap_end_indices(truth.poses)) > 0
+    nodes = np.concatenate([cones[-_OVERLAP:], cones, cones[: _OVERLAP + 1]]) if closed else cones
+    nodes = nodes[np.append(True, np.linalg.norm(np.diff(nodes, axis=0), axis=1) > 0.0)]
+    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1)))
+    low, high = (length[_OVERLAP], length[-_OVERLAP - 1]) if closed else (length[0], length[-1])
+    samples = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
+    return np.asarray(Akima1DInterpolator(length, nodes)(samples), dtype=float)
+
+
+def driving_order(truth: Truth, label: int) -> Array:
+    """Returns the true cones (k, 2) of one boundary in driving order.
+
+    They are sorted by the nearest point of the true path's first lap. The order of the file is kept where it
+    gives the shorter polygon (on the inside of a hairpin several cones have the same nearest point), or where
+    there is no true path.
+    """
+    cones: Array = truth.cones[truth.cone_labels == label]
+    if len(truth.poses) < 2 or len(cones) == 0:
+        return cones
+    nearest: NDArray[np.intp] = np.asarray(KDTree(_first_lap(truth)).query(cones)[1])
+    by_path: Array = cones[np.argsort(nearest, kind="stable")]
+    return by_path if _perimeter(by_path) < _perimeter(cones) else cones
+
+
+def _first_lap(truth: Truth) -> Array:
+    """Returns points (n, 2) of the true path up to the end of lap 1, at most PATH_STEP apart."""
+    ends = lap_end_indices(truth.poses)
+    path = truth.poses[: ends[0] + 1 if len(ends) else None, :2]
+    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
+    samples = np.linspace(0.0, length[-1], int(np.ceil(length[-1] / PATH_STEP)) + 1)
+    return np.stack([np.interp(samples, length, coordinate) for coordinate in path.T], axis=1)
+
+
+def _perimeter(points: Array) -> float:
+    """Returns the length (m) of the closed polygon through the points."""
+    return float(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
+
+
+def mapped_points(boundary: MapBoundary, step: float = MAPPED_STEP) -> Array:
+    """Returns points (k, 2) in m on a curve, equal lengths of at most `step` apart, or the landmarks."""
+    if not isinstance(boundary, SplineBoundary):
+        return boundary.points
+    spline = boundary.spline
+    length = spline.length()
+    count = max(int(np.ceil(length / step - ROUND_OFF)), 1)
+    return spline.evaluate(spline.parameters_at((np.arange(count) + 0.5) * length / count))
+
+
+# --- distances -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CurveDistance:
+    """Holds the mean distances (m) between the mapped and the true boundaries, both boundaries together."""
+
+    mapped_to_truth: float
+    """This distance, from the mapped curve to the true one, is large where something false is mapped."""
+    truth_to_mapped: float
+    """This distance, from the true curve to the mapped one, is large where something true isn't mapped."""
+
+    @property
+    def two_way(self) -> float:
+        """Returns the mean of both."""
+        return 0.5 * (self.mapped_to_truth + self.truth_to_mapped)
+
+
+def curve_distance(track: Map, truth: Truth) -> CurveDistance:
+    """Returns mean_p min_q |p - q| over mapped points p, and mean_q min_p |q - p| over true ones q.
+
+    Points of the true curve and of a mapped spline are equal lengths apart. Landmarks are points with nothing
+    in between, so the second distance charges them for the gaps, in contrast to the error at the cones. It is
+    infinite where a boundary isn't mapped. Either is NaN where there is nothing to measure from.
+    """
+    forth, back = [np.zeros(0)], [np.zeros(0)]
+    for label in BOUNDARIES:
+        curve_true = true_curve(truth, label)
+        if len(curve_true) == 0:
+            continue
+        if label not in track.boundaries:
+            back.append(np.full(1, np.inf))
+            continue
+        boundary = track.boundaries[label]
+        forth.append(np.asarray(KDTree(curve_true).query(mapped_points(boundary))[0]))
+        back.append(boundary_distances(boundary, true_curve(truth, label, MAPPED_STEP)))
+    return CurveDistance(_mean(np.concatenate(forth)), _mean(np.concatenate(back)))
+
+
+def two_way_distance(first: MapBoundary, second: MapBoundary) -> float:
+    """Returns the same two-way distance (m) between two mapped boundaries."""
+    forth = boundary_distances(second, mapped_points(first))
+    back = boundary_distances(first, mapped_points(second))
+    return 0.5 * (_mean(forth) + _mean(back))
+
+
+def _mean(distances: Array) -> float:
+    return float(np.mean(distances)) if len(distances) else float("nan")

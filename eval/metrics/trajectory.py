@@ -1,0 +1,51 @@
+"""The error of a trajectory, by the truth or by another run's trajectory."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.se2 import wrap_angle
+from pathspace_graph.io.log import Truth
+
+from .table1 import root_mean_square
+
+Array = NDArray[np.float64]
+
+
+def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
+    """Returns poses (n, 3) [x, y, theta] at the stamps t (n,), linear between poses (N, 3) at pose_t (N,).
+
+    Headings turn the shorter way.
+    """
+    columns = (poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2]))
+    x, y, theta = (np.interp(t, pose_t, column) for column in columns)
+    return np.stack([x, y, wrap_angle(theta)], axis=1)
+
+
+def pose_errors(t: Array, poses: Array, reference_t: Array, reference: Array) -> Array:
+    """Returns [along, across, heading] (k, 3) in m, m, rad: the error of each pose in its reference's frame.
+
+    t is (n,), poses is (n, 3). Nothing is aligned. Stamps outside those of the reference are left out, so
+    k <= n.
+    """
+    inside = (t >= reference_t[0]) & (t <= reference_t[-1])
+    expected = interpolate_poses(reference_t, reference, t[inside])
+    dx, dy, turn = (poses[inside] - expected).T
+    c, s = np.cos(expected[:, 2]), np.sin(expected[:, 2])
+    return np.stack([c * dx + s * dy, c * dy - s * dx, wrap_angle(turn)], axis=1)
+
+
+def trajectory_errors(t: Array, poses: Array, truth: Truth) -> Array:
+    """Returns `pose_errors` by the true path."""
+    return pose_errors(t, poses, truth.pose_t, truth.poses)
+
+
+def ate(t: Array, poses: Array, truth: Truth) -> float:
+    """Returns the absolute trajectory error sqrt(mean |p - p_true|^2) in m, without alignment."""
+    return position_rms(trajectory_errors(t, poses, truth))
+
+
+def position_rms(errors: Array) -> float:
+    """Returns the root mean square distance (m) of pose errors (k, 3)."""
+    return root_mean_square(np.linalg.norm(errors[:, :2], axis=1))

@@ -1,0 +1,136 @@
+"""The start from odometry alone: lap correspondences by hand, and a drift that they take out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.batch.dead_reckoning import align_laps, lap_correspondences, start_odometry
+from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
+from pathspace_graph.graph.keys import pose_keys
+from pathspace_graph.io.log import Log
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
+from pathspace_graph.settings.mapper import MapperSettings
+
+from ..scenes.batch import course_log
+from ..scenes.drives import ahead, corridor, exact_log, true_poses
+
+Array = NDArray[np.float64]
+
+SETTINGS = MapperSettings()
+LAPS = SETTINGS.batch.laps
+SIGMAS = np.array(LAPS.sigmas)
+SCALE, BIAS = 0.004, 0.004
+"""The odometry has this scale error [-] and this bias of the yaw rate (rad/s)."""
+
+
+@cache
+def drifting() -> tuple[Log, Chain]:
+    """Returns laps of a closed course whose odometry drifts."""
+    log = course_log(2.6)
+    twists = log.odometry.twist * [1.0 + SCALE, 1.0 + SCALE, 1.0] + [0.0, 0.0, BIAS]
+    log = replace(log, odometry=replace(log.odometry, twist=twists))
+    return log, integrate_log(log, log.odometry_sigma, SETTINGS.odometry)
+
+
+# --- correspondences -------------------------------------------------------------------------------------
+
+
+def by_hand() -> Recurrence:
+    """Returns a pose each 3 m along 39 m of a course of 15 m, which turns once to the left in a lap."""
+    return Recurrence(np.arange(0.0, 40.0, 3.0), 15.0, 6.1)
+
+
+def test_each_lap_passes_every_reference_pose_once() -> None:
+    """Reference poses stand at 0 and 7.5 m of each lap, and poses at 0, 3, 6 ... m."""
+    found = lap_correspondences(by_hand(), LAPS)
+    np.testing.assert_array_equal(found.cycles * 3.0, [0.0, 9.0, 15.0, 24.0, 30.0, 39.0])
+    np.testing.assert_array_equal(found.reference, [0, 1, 0, 1, 0, 1])
+    np.testing.assert_allclose(found.turns, 2.0 * np.pi * np.array([0, 0, 1, 1, 2, 2]))
+
+
+def test_reference_poses_begin_at_the_first_pose_that_passes_them() -> None:
+    """The heading is counted without the whole laps before."""
+    found, poses = lap_correspondences(by_hand(), LAPS), np.random.default_rng(0).normal(size=(14, 3))
+    np.testing.assert_array_equal(found.references_at(poses), poses[[0, 3]])
+    later = replace(
+        found, cycles=found.cycles[2:], reference=found.reference[2:], turns=found.turns[2:]
+    ).references_at(poses)
+    np.testing.assert_allclose(later, poses[[5, 8]] - [0.0, 0.0, 2.0 * np.pi])
+
+
+def test_the_rows_are_whitened_differences_and_their_derivatives() -> None:
+    found, rng = lap_correspondences(by_hand(), LAPS), np.random.default_rng(1)
+    poses, references = rng.normal(size=(14, 3)), rng.normal(size=(2, 3))
+    rows, h = found.rows(poses, references), 1e-6
+    expected = (poses[5] - references[0] - [0.0, 0.0, 2.0 * np.pi]) / SIGMAS
+    np.testing.assert_allclose(rows.residual[6:9], expected)
+    np.testing.assert_array_equal(rows.keys[6], pose_keys(np.array([5, 14])))
+    for k in range(3):
+        step = h * np.eye(3)[k]
+        by_pose = (found.rows(poses + step, references).residual - rows.residual) / h
+        by_reference = (found.rows(poses, references + step).residual - rows.residual) / h
+        np.testing.assert_allclose(rows.jacobian[:, k], by_pose, atol=1e-6)
+        np.testing.assert_allclose(rows.jacobian[:, 3 + k], by_reference, atol=1e-6)
+
+
+# --- drift -----------------------------------------------------------------------------------------------
+
+
+def test_the_drift_of_the_odometry_is_taken_out() -> None:
+    """Dead reckoning ends metres away, the aligned laps within decimetres. The bias has a prior."""
+    log, chain = drifting()
+    reckoned, truth = chain.dead_reckoned(np.zeros(2)), true_poses(log)
+    poses, calibration = align_laps(chain, find_recurrence(reckoned, SETTINGS), LAPS)
+    assert np.hypot(*(reckoned - truth)[-1, :2]) > 2.0
+    assert np.hypot(*(poses - truth)[:, :2].T).max() < 0.7
+    np.testing.assert_allclose(calibration[1], BIAS, rtol=0.3)
+
+
+def test_what_is_aligned_is_a_minimum_of_odometry_and_correspondences() -> None:
+    """The gradient by every pose is that of the odometry alone where a pose has no correspondence."""
+    _, chain = drifting()
+    recurrence = find_recurrence(chain.dead_reckoned(np.zeros(2)), SETTINGS)
+    poses, calibration = align_laps(chain, recurrence, LAPS)
+    free = np.setdiff1d(np.arange(1, len(poses) - 1), lap_correspondences(recurrence, LAPS).cycles)
+    h = 1e-5
+    for k in free[:: len(free) // 8]:
+        for axis in range(3):
+            costs = []
+            for sign in (1.0, -1.0):
+                moved = poses.copy()
+                moved[k, axis] += sign * h
+                costs.append(0.5 * (chain.terms(moved, calibration)[0] ** 2).sum())
+            curvature = (costs[0] + costs[1] - (chain.terms(poses, calibration)[0] ** 2).sum()) / h**2
+            slope = (costs[0] - costs[1]) / (2.0 * h)
+            assert abs(slope) < 1e-3 * np.sqrt(curvature)
+
+
+def test_the_curves_of_a_closed_course_stand_beside_its_path() -> None:
+    log, chain = drifting()
+    state = start_odometry(chain, collect_detections(log), SETTINGS)
+    assert set(state.boundaries) == set(BOUNDARIES)
+    assert log.truth is not None
+    for label, boundary in state.boundaries.items():
+        assert boundary.periodic
+        u = np.linspace(boundary.tables.low, boundary.tables.high, 200)
+        curve = boundary.evaluate(state.control_points(label), u)
+        cones = log.truth.cones[log.truth.cone_labels == label]
+        distance = np.hypot(*(cones[:, None] - curve).transpose(2, 0, 1)).min(axis=1)
+        assert distance.max() < 1.0
+
+
+def test_a_path_that_does_not_recur_is_dead_reckoned() -> None:
+    cones, labels = corridor(60.0)
+    log = exact_log(ahead(6.0, 5.0), cones, labels)
+    chain = integrate_log(log, log.odometry_sigma, SETTINGS.odometry)
+    state = start_odometry(chain, collect_detections(log), SETTINGS)
+    np.testing.assert_array_equal(state.poses, chain.dead_reckoned(np.zeros(2)))
+    np.testing.assert_array_equal(state.calibration, 0.0)
+    for label, y in ((LEFT, 2.0), (RIGHT, -2.0)):
+        assert not state.boundaries[label].periodic
+        np.testing.assert_allclose(state.control_points(label)[:, 1], y, atol=1e-6)

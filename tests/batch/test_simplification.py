@@ -1,0 +1,93 @@
+"""The map's curves on few knots with their covariance, and the scatter of cones about them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.batch.knots import reknot
+from pathspace_graph.batch.simplification import Scatter, cross_validated, new_from_old, simplify
+from pathspace_graph.labels import LEFT
+from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.state import State
+from pathspace_graph.settings.mapper import MapperSettings
+
+from ..scenes.batch import settled, straight
+
+Array = NDArray[np.float64]
+
+SETTINGS = MapperSettings()
+
+
+def dense_scene() -> tuple[State, DetectionTable, MapperSettings]:
+    """Returns a straight drive beside curves with about one control point for each cone."""
+    system, state = straight()
+    state = reknot(state, system.detections, system.settings, dense=True)
+    system.begin(state)
+    return settled(system, state), system.detections, system.settings
+
+
+def by_shift(state: State, axis: int) -> Array:
+    """Returns the derivative (n,) of all control points by a shift of the map."""
+    return np.tile(np.eye(2)[axis], len(state.map_points))
+
+
+def by_turn(state: State) -> Array:
+    """Returns the derivative (n,) of all control points by a turn of the map about the origin."""
+    return np.column_stack([-state.map_points[:, 1], state.map_points[:, 0]]).ravel()
+
+
+def test_the_poses_stay_and_the_curves_have_fewer_control_points_on_the_same_lines() -> None:
+    state, detections, settings = dense_scene()
+    simplified, _ = simplify(state, np.eye(state.map_points.size), detections, settings)
+    np.testing.assert_array_equal(simplified.poses, state.poses)
+    np.testing.assert_array_equal(simplified.calibration, state.calibration)
+    for label, boundary in simplified.boundaries.items():
+        assert boundary.size < state.boundaries[label].size
+        u = np.linspace(boundary.tables.low, boundary.tables.high, 50)
+        y = boundary.evaluate(simplified.control_points(label), u)[:, 1]
+        np.testing.assert_allclose(np.abs(y), 2.0, atol=1e-3)
+
+
+def test_a_map_that_is_uncertain_as_a_whole_stays_so() -> None:
+    """`F 1 = 1`, and F maps the control points of a line to those of the same line."""
+    for direction in (lambda s: by_shift(s, 0), lambda s: by_shift(s, 1), by_turn):
+        state, detections, settings = dense_scene()
+        dense = direction(state)
+        simplified, covariance = simplify(state, np.outer(dense, dense), detections, settings)
+        expected = direction(simplified)
+        across = np.arange(1, simplified.map_points.size, 2)
+        np.testing.assert_allclose(
+            covariance[np.ix_(across, across)],
+            np.outer(expected, expected)[np.ix_(across, across)],
+            atol=0.05,
+        )
+
+
+def test_a_curve_on_its_own_knots_is_itself() -> None:
+    state, _, _ = dense_scene()
+    for label, boundary in state.boundaries.items():
+        points = state.control_points(label)
+        np.testing.assert_allclose(
+            new_from_old(boundary, points, boundary, points), np.eye(boundary.size), atol=1e-6
+        )
+
+
+def test_scatter_grows_from_seen_to_unseen() -> None:
+    scatter = Scatter(0.1, 0.4, {LEFT: np.arange(0.0, 40.0, 4.0)}, {LEFT: 40.0})
+    sigma = scatter.sigma(LEFT, np.array([8.0, 10.0, 39.0, 36.0]))
+    np.testing.assert_allclose(sigma[[0, 3]], 0.1)
+    np.testing.assert_allclose(sigma[1] ** 2, 0.01 + 0.25 * 0.15)
+    np.testing.assert_allclose(sigma[2] ** 2, 0.01 + 0.0625 * 0.15)
+    gap = Scatter(0.1, 0.4, {LEFT: np.array([0.0, 4.0, 8.0, 16.0, 20.0])}, {LEFT: np.inf})
+    np.testing.assert_allclose(gap.sigma(LEFT, np.array([12.0])), 0.4)
+
+
+def test_a_cone_that_is_left_out_shows_how_far_unseen_cones_lie() -> None:
+    """That is hardly anything on a circle of exact cones, and far more where they zigzag."""
+    phi = 2.0 * np.pi * np.arange(40) / 40
+    circle = 20.0 * np.column_stack([np.cos(phi), np.sin(phi)])
+    zigzag = circle * (1.0 + 0.02 * (-1.0) ** np.arange(40))[:, None]
+    assert len(cross_validated(circle, True, SETTINGS, 0.43)) == 40
+    assert np.abs(cross_validated(circle, True, SETTINGS, 0.43)).max() < 0.05
+    assert np.sqrt(np.mean(cross_validated(zigzag, True, SETTINGS, 0.43) ** 2)) > 0.3

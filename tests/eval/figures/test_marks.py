@@ -1,0 +1,108 @@
+"""Bands and ellipses are as wide as they say, wherever they are drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+
+from pathspace_graph.eval.figures.marks import (
+    curve_parameters,
+    draw_band,
+    draw_control_points,
+    draw_ellipses,
+    point_blocks,
+    uncertainty_band,
+)
+from pathspace_graph.io.map import SplineBoundary
+from pathspace_graph.spline.bspline import BSpline
+
+from ...scenes.shifted_ring import SIGMA, shifted_ring
+
+
+@pytest.mark.parametrize("scale", [1.0, 5.0])
+def test_the_band_is_two_sigma_to_either_side_along_the_normal(scale: float) -> None:
+    ring = shifted_ring(18.0)
+    u = curve_parameters(ring.spline, 7)
+    left, right = uncertainty_band(ring, u, scale)
+    centre = ring.spline.evaluate(u)
+    np.testing.assert_allclose(np.linalg.norm(left - centre, axis=1), 2 * SIGMA * scale, rtol=1e-9)
+    np.testing.assert_allclose(left + right, 2 * centre, atol=1e-12)
+    # left of the direction of travel is inside of an anticlockwise ring
+    middle = np.array([0.0, 20.0])
+    assert (np.linalg.norm(left - middle, axis=1) < np.linalg.norm(right - middle, axis=1)).all()
+
+
+def drawn_band(boundary: SplineBoundary) -> PathPatch:
+    axes = Figure().subplots()
+    draw_band(axes, boundary, "black", "band")
+    (band,) = axes.patches
+    assert isinstance(band, PathPatch)
+    return band
+
+
+def area(band: PathPatch) -> float:
+    """The area of its polygons, those that run clockwise taken as negative."""
+    return sum(
+        0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
+        for x, y in (np.asarray(polygon).T for polygon in band.get_path().to_polygons())
+    )
+
+
+def test_the_band_of_a_closed_curve_is_a_ring_and_reaches_as_far() -> None:
+    ring = shifted_ring(22.0)
+    band, curve = drawn_band(ring), ring.spline.evaluate(curve_parameters(ring.spline))
+    extents = band.get_path().get_extents()
+    assert extents.x1 == pytest.approx(curve[:, 0].max() + 2 * SIGMA, abs=1e-3)
+    assert extents.y0 == pytest.approx(curve[:, 1].min() - 2 * SIGMA, abs=1e-3)
+    # the inner edge runs the other way, so the areas subtract
+    assert abs(area(band)) == pytest.approx(4 * SIGMA * ring.spline.length(), rel=1e-3)
+
+
+def test_the_band_of_an_open_curve_is_one_polygon() -> None:
+    """A straight of 6 m whose control points have 0.1 m each, all of them moving as one: 6 m by 0.4 m."""
+    points = np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.0], [6.0, 0.0]])
+    straight = BSpline.clamped_from(np.array([0.0, 6.0]), points)
+    together = np.tile(np.eye(2), (4, 1))
+    band = drawn_band(SplineBoundary(straight, 0.01 * together @ together.T))
+    assert len(band.get_path().to_polygons()) == 1
+    assert abs(area(band)) == pytest.approx(6.0 * 0.4)
+
+
+def test_every_span_is_sampled_from_end_to_end() -> None:
+    spline = BSpline.clamped_from(np.array([0.0, 1.0, 1.5, 9.0]), np.zeros((6, 2)))
+    u = curve_parameters(spline, 4)
+    assert (u[0], u[-1], len(u)) == (0.0, 9.0, 13)
+    assert set(spline.breaks) <= set(u)
+
+
+def test_an_ellipse_lies_along_the_axes_of_its_covariance() -> None:
+    """Standard deviations of 0.3 m at 30 degrees and 0.1 m across it; the whole ellipse is four of each."""
+    c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
+    axes_of_it = np.array([[c, -s], [s, c]])
+    covariance = axes_of_it @ np.diag([0.09, 0.01]) @ axes_of_it.T
+    axes = Figure().subplots()
+    draw_ellipses(axes, np.array([[5.0, 1.0]]), covariance[None], "black", scale=2.0)
+    (ellipses,) = axes.collections
+    assert isinstance(ellipses, EllipseCollection)
+    (width,), (height,), (angle,) = ellipses.get_widths(), ellipses.get_heights(), ellipses.get_angles()
+    # eigenvalues ascend, so the width is that of the short axis
+    assert (width, height) == pytest.approx((0.8, 2.4))
+    assert angle % 180.0 == pytest.approx(120.0)
+    np.testing.assert_array_equal(ellipses.get_offsets(), [[5.0, 1.0]])
+
+
+def test_a_points_own_covariance_is_a_block_of_the_joint_one() -> None:
+    joint = np.arange(36.0).reshape(6, 6)
+    np.testing.assert_array_equal(point_blocks(joint)[1], joint[2:4, 2:4])
+    assert point_blocks(np.zeros((0, 0))).shape == (0, 2, 2)
+
+
+def test_a_control_polygon_is_drawn_if_asked_for() -> None:
+    axes = Figure().subplots()
+    draw_control_points(axes, np.zeros((3, 2)), "black", polygon=False)
+    assert len(axes.lines) == 1
+    draw_control_points(axes, np.zeros((3, 2)), "black")
+    assert len(axes.lines) == 3

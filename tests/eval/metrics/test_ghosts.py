@@ -1,0 +1,42 @@
+"""Ghosts and duplicates, on maps whose answer is known by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.metrics.ghosts import GhostSettings, ghosts
+from pathspace_graph.io.map import Map
+from pathspace_graph.labels import LEFT, RIGHT
+
+from ...scenes.straight_maps import landmarks, line, row, truth
+
+
+def test_ghost_landmarks_and_duplicates() -> None:
+    """One 2.5 m off the row, one of the wrong colour, and a second one beside the cone at 5 m."""
+    true = truth(row(2.0), row(-2.0))
+    track = Map(
+        False,
+        {
+            LEFT: landmarks((0, 2.1), (5, 2), (5.4, 2.1), (10, 2), (2.5, 4.5), (5, -2)),
+            RIGHT: landmarks((2.5, -2)),
+        },
+    )
+    found = ghosts(track, true)
+    assert (found.landmarks, found.duplicates, found.metres) == (2, 1, 0.0)
+    assert found.share == pytest.approx(2 / 7)
+    assert ghosts(track, true, GhostSettings(distance=3.0)).landmarks == 1
+
+
+def test_ghost_curve_is_the_length_with_no_boundary_near() -> None:
+    """20 m of curve over 10 m of truth: what is more than 2 m past its end has no boundary near."""
+    found = ghosts(Map(False, {LEFT: line(2.0, end=20.0)}), truth(row(2.0)))
+    assert found.metres == pytest.approx(8.0, abs=0.1)
+    assert found.share == pytest.approx(0.4, abs=0.005)
+    assert (found.landmarks, found.duplicates) == (0, 0)
+    whole = ghosts(Map(False, {LEFT: line(2.0)}), truth(np.zeros((0, 2))))
+    assert whole.metres == pytest.approx(10.0)
+    assert np.isnan(ghosts(Map(False, {}), truth(row(2.0))).share)
+    with pytest.raises(SettingsError):
+        GhostSettings(distance=0.0)
