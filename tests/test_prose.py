@@ -65,9 +65,9 @@ def kind_of(parent: ast.AST, before: ast.AST | None) -> Kind | None:
         return None
     if isinstance(parent, ast.Module):
         return "module"
-    return (
-        "class" if isinstance(parent, ast.ClassDef) else "function" if isinstance(parent, Function) else None
-    )
+    if isinstance(parent, Function):
+        return "function" if parent.name != "__init__" else "class"
+    return "class" if isinstance(parent, ast.ClassDef) else None
 
 
 def faults(text: Text) -> Iterator[str]:
