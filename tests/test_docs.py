@@ -99,6 +99,7 @@ OUTSIDE = {
     "figures/",
     "captions.md",
     "table.md",
+    "summary.md",
     "pacsim/",
     "fssim/",
     "eufs/",

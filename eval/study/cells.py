@@ -37,8 +37,7 @@ class Cell:
 
     @cached_property
     def id(self) -> str:
-        """Is the same for the same run: it depends on everything that the result depends on, except
-        the code."""
+        """Returns an identity of everything that the result depends on, except the code."""
         parts = {"drive": self.drive.id, "estimator": self.estimator, "settings": asdict(self.settings)}
         return identity(**parts, **({"yardsticks": True} if self.yardsticks else {}))
 

@@ -1,5 +1,5 @@
-"""The engine: keys, values, finished linear factors, the fixed-lag window, the inactive map and submaps.
+"""The engine: keys, values, linear factors, the fixed-lag window, the inactive map and submaps.
 
-GTSAM holds the graphs, eliminates, and marginalizes. The engine knows curves and points only as variables and
-rows. Everything outside it names a variable by its key.
+GTSAM holds the graphs, eliminates and marginalizes. The engine knows curves and points only as variables and
+rows. All other code names a variable by its key.
 """

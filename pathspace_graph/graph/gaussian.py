@@ -1,11 +1,14 @@
-"""Gaussian graphs: their normal equations, what is eliminated from them, and the factor that remains.
+"""Gaussian graphs: their normal equations, elimination of variables, and the factors that remain.
 
-Traps of the binding that this file is the place for. `hessian(ordering)` leaves out a key that no factor
-holds, and `optimizeDensely()` gives numbers for a singular system: both raise here. `R()`, `S()`, `d()`,
-`getA()`, `getb()` and `linearTerm()` are views of memory that nobody owns: no function gives one away.
+This file stands between the engine and three traps of GTSAM's binding. `hessian(ordering)` leaves out a key
+that no factor holds, and `optimizeDensely()` gives numbers for a singular system: both raise here. `R()`,
+`S()`, `d()`, `getA()`, `getb()` and `linearTerm()` are views of memory that nobody owns, so none is returned.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
 
 import gtsam
 import numpy as np
@@ -15,7 +18,7 @@ from scipy.linalg import lapack
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.gtsam_factors import linear_factor
 
-from .keys import name, sizes
+from .keys import POINT, names, sizes
 from .variables import Layout
 
 Array = NDArray[np.float64]
@@ -24,16 +27,15 @@ IntArray = NDArray[np.intp]
 GraphPart = (
     gtsam.GaussianFactor | gtsam.GaussianFactorGraph | gtsam.GaussianBayesNet | gtsam.GaussianBayesTree
 )
-"""What can be pushed into a graph."""
-NEGLIGIBLE = 1e-6
-"""Information (1/m^2) that is as good as none, and keeps a pivot from being zero."""
-
-RANK_TOLERANCE = 1e-12
-"""Information below this share of the diagonal's is none."""
+"""A graph can be extended by each of these types."""
+NEGLIGIBLE: Final = 1e-6
+"""This information (1/m^2) is negligible, but keeps a pivot from being zero."""
+RANK_TOLERANCE: Final = 1e-12
+"""Information below this share of the diagonal's counts as zero."""
 
 
 def graph_of(*factors: GraphPart) -> gtsam.GaussianFactorGraph:
-    """A graph of factors, and of the factors of graphs, nets and trees; it shares them."""
+    """Returns a graph that shares the given factors, and the factors of the given graphs, nets and trees."""
     graph = gtsam.GaussianFactorGraph()
     for factor in factors:
         graph.push_back(factor)
@@ -41,39 +43,46 @@ def graph_of(*factors: GraphPart) -> gtsam.GaussianFactorGraph:
 
 
 def factors_of(graph: gtsam.GaussianFactorGraph) -> list[gtsam.GaussianFactor]:
-    """The factors of a graph, or the conditionals of a Bayes tree that was pushed into one."""
+    """Returns the factors of a graph; a Bayes tree in it has given its conditionals."""
     return [graph.at(i) for i in range(graph.size())]
 
 
 def keys_of(graph: gtsam.GaussianFactorGraph) -> IntArray:
-    """(k,) keys of a graph, ascending."""
+    """Returns the keys (k,) of a graph, ascending."""
     return np.array(list(graph.keyVector()), np.intp)
 
 
-def normal_equations(graph: gtsam.GaussianFactorGraph, layout: Layout) -> tuple[Array, Array]:
-    """`H` (n, n) and `g` (n,) of `1/2 d' H d - g' d`, on the columns of a layout.
+# --- normal equations ------------------------------------------------------------------------------------
 
-    H is laid out by columns. SingularSystemError where no factor holds one of the keys, which GTSAM leaves
-    out in silence, and ValueError where a factor holds another key.
+
+def require_keys(graph: gtsam.GaussianFactorGraph, layout: Layout) -> None:
+    """Raises SingularSystemError where no factor holds a key of the layout, and ValueError for a foreign key.
+
+    GTSAM gives a smaller system in the first case, without an error.
     """
     held = keys_of(graph)
-    if not np.array_equal(held, layout.keys):
-        foreign, missing = np.setdiff1d(held, layout.keys), np.setdiff1d(layout.keys, held)
-        if len(foreign):
-            raise ValueError(f"expected factors on {len(layout.keys)} keys, found others: {_names(foreign)}")
-        raise SingularSystemError(f"expected a factor on every variable, found none on {_names(missing)}")
+    if np.array_equal(held, layout.keys):
+        return
+    foreign, missing = np.setdiff1d(held, layout.keys), np.setdiff1d(layout.keys, held)
+    if len(foreign):
+        raise ValueError(f"expected factors on {len(layout.keys)} keys, found others: {names(foreign)}")
+    raise SingularSystemError(f"expected a factor on every variable, found none on {names(missing)}")
+
+
+def normal_equations(graph: gtsam.GaussianFactorGraph, layout: Layout) -> tuple[Array, Array]:
+    """Returns H (n, n) and g (n,) of `1/2 d' H d - g' d`, on the columns of a layout.
+
+    H is stored by columns. Raises as `require_keys` does.
+    """
+    require_keys(graph, layout)
     hessian, vector = graph.hessian(layout.ordering)
     return hessian, vector
 
 
-def _names(keys: IntArray) -> str:
-    return ", ".join(name(key) for key in keys[:3].tolist())
-
-
 def cholesky(hessian: Array) -> Array:
-    """Lower factor `L L' = H`, its upper triangle not cleared; SingularSystemError where there is none.
+    """Returns the lower factor of `L L' = H`, whose upper triangle is not cleared.
 
-    It takes the place of an H that is laid out by columns.
+    It overwrites an H that is stored by columns. SingularSystemError where H is not positive definite.
     """
     factor, info = lapack.dpotrf(hessian, lower=1, clean=0, overwrite_a=1)
     if info != 0:
@@ -82,45 +91,58 @@ def cholesky(hessian: Array) -> Array:
 
 
 def solve(factor: Array, vector: Array) -> Array:
-    """`H^-1 g` from the lower factor of H; g (n,) or (n, k)."""
+    """Returns `H^-1 g` from the lower factor of H, for g (n,) or (n, k)."""
     solution, _ = lapack.dpotrs(factor, vector, lower=1)
     return np.asarray(solution)
 
 
 def half_solve(factor: Array, columns: Array) -> Array:
-    """`L^-1 G` (n, k), so that `half' half = G' H^-1 G`; it may take the place of G."""
+    """Returns `L^-1 G` (n, k), so that `half' half = G' H^-1 G`; it may overwrite G."""
     half, _ = lapack.dtrtrs(factor, columns, lower=1, overwrite_b=1)
     return np.asarray(half)
 
 
-def covariance(graph: gtsam.GaussianFactorGraph, layout: Layout, keys: IntArray) -> Array:
-    """(q, q) joint covariance of keys (k,), all others marginalized out, in the order of the keys."""
-    return covariance_of(cholesky(normal_equations(graph, layout)[0]), layout, keys)
+@dataclass(frozen=True, eq=False)
+class FactoredSystem:
+    """Holds the Cholesky factor of normal equations."""
+
+    layout: Layout
+    """These are the columns of the system's variables."""
+    factor: Array
+    """This is the lower Cholesky factor (n, n); its upper triangle is not cleared."""
+
+    def covariance(self, keys: IntArray) -> Array:
+        """Returns the joint covariance (q, q) of keys (k,), in their order, all others marginalized out."""
+        entries = self.layout.entries(keys)
+        unit = np.zeros((self.layout.size, len(entries)), order="F")
+        unit[entries, np.arange(len(entries))] = 1.0
+        half = half_solve(self.factor, unit)
+        return np.asarray(half.T @ half)
 
 
-def covariance_of(factor: Array, layout: Layout, keys: IntArray) -> Array:
-    """The same from the lower factor of the normal equations."""
-    entries = layout.entries(keys)
-    unit = np.zeros((layout.size, len(entries)), order="F")
-    unit[entries, np.arange(len(entries))] = 1.0
-    half = half_solve(factor, unit)
-    return np.asarray(half.T @ half)
+def factorize(graph: gtsam.GaussianFactorGraph, layout: Layout) -> FactoredSystem:
+    """Returns the factored normal equations of a graph. Raises as `require_keys` and `cholesky` do."""
+    return FactoredSystem(layout, cholesky(normal_equations(graph, layout)[0]))
 
 
 # --- factors ---------------------------------------------------------------------------------------------
 
 
 def jacobian_factor(keys: IntArray, A: Array, b: Array) -> gtsam.GaussianConditional:
-    """`1/2 |A d - b|^2` on any number of keys (k,): A (m, n) whitened, b (m,)."""
+    """Returns the factor `1/2 |A d - b|^2` on any number of keys (k,), with whitened A (m, n), b (m,)."""
     return linear_factor(keys.tolist(), sizes(keys).tolist(), A, b)
 
 
-def square_root_form(information: Array, vector: Array) -> tuple[Array, Array]:
-    """`A` (r, n) and `b` (r,) with `A'A = L` and `A'b = g`: as many rows as L (n, n), which may be singular,
-    has rank.
+def as_hessian_factor(graph: gtsam.GaussianFactorGraph) -> gtsam.HessianFactor:
+    """Returns one factor on all keys of a graph, which is the sum of its factors."""
+    return gtsam.HessianFactor(graph)
 
-    By a Cholesky factor with pivots, of L scaled to a diagonal of ones: a direction of which less is known
-    than `RANK_TOLERANCE` of that has no row.
+
+def square_root_form(information: Array, vector: Array) -> tuple[Array, Array]:
+    """Returns A (r, n) and b (r,) with `A'A = L` and `A'b = g`, where L (n, n) has rank r.
+
+    A is a Cholesky factor with pivoting, of L scaled to a diagonal of ones. A direction whose information is
+    below `RANK_TOLERANCE` of that has no row.
     """
     scale = np.sqrt(np.diagonal(information))
     scale = np.where(scale > 0.0, scale, 1.0)
@@ -132,33 +154,28 @@ def square_root_form(information: Array, vector: Array) -> tuple[Array, Array]:
     return root * scale, np.asarray(right)
 
 
-def as_hessian_factor(graph: gtsam.GaussianFactorGraph) -> gtsam.HessianFactor:
-    """All factors of a graph as one, on all of their keys."""
-    return gtsam.HessianFactor(graph)
-
-
 # --- elimination -----------------------------------------------------------------------------------------
 
 
 def eliminate(
     graph: gtsam.GaussianFactorGraph, keys: IntArray
 ) -> tuple[gtsam.GaussianConditional, gtsam.GaussianFactorGraph]:
-    """`p(x) = p(keys | rest) p(rest)`: the conditional of all keys (k,) together, and the graph that remains.
+    """Returns the conditional of all keys (k,) together, and the graph of the others.
 
-    Only the factors that hold one of the keys are combined; the others remain as they are.
+    It splits `p(x) = p(keys | others) p(others)`. Factors that hold none of the keys stay as they are.
     """
-    leaving, factors = frozenset(keys.tolist()), factors_of(graph)
-    holding = [factor for factor in factors if not leaving.isdisjoint(factor.keys())]
-    others = [factor for factor in factors if leaving.isdisjoint(factor.keys())]
-    dense = graph_of(as_hessian_factor(graph_of(*holding)))  # one factor, hence one clique
+    eliminated, factors = frozenset(keys.tolist()), factors_of(graph)
+    holding = [factor for factor in factors if not eliminated.isdisjoint(factor.keys())]
+    others = [factor for factor in factors if eliminated.isdisjoint(factor.keys())]
+    dense = graph_of(as_hessian_factor(graph_of(*holding)))  # one factor gives one clique
     tree, remaining = dense.eliminatePartialMultifrontal(gtsam.Ordering(keys.tolist()))
     return tree.roots()[0].conditional(), graph_of(*others, remaining)
 
 
 def marginalize(graph: gtsam.GaussianFactorGraph, keys: IntArray) -> gtsam.GaussianFactorGraph:
-    """The graph without some variables (k,), one after the other; factors that hold none remain as they are.
+    """Returns the graph with variables (k,) marginalized out, one after the other.
 
-    A variable that no factor holds is none of the graph's, and stays out.
+    Factors that hold none of them stay as they are. Keys that no factor holds are ignored.
     """
     held = keys[np.isin(keys, keys_of(graph))] if len(keys) > 1 else keys
     if len(held) == 0:
@@ -170,21 +187,36 @@ def marginalize(graph: gtsam.GaussianFactorGraph, keys: IntArray) -> gtsam.Gauss
 def remove_information(
     graph: gtsam.GaussianFactorGraph, layout: Layout, values: Array
 ) -> gtsam.GaussianFactorGraph:
-    """A graph that knows nothing of a layout's keys any more, and of the others no less than before.
+    """Returns the graph without a layout's variables; the information about all others is kept.
 
-    It may know a part of them only: a negligible information about `values` (n,) of d makes them regular.
+    The graph need not determine these variables: `NEGLIGIBLE` information about `values` (n,) of their
+    unknowns makes them regular.
     """
     root = np.sqrt(NEGLIGIBLE) * np.eye(layout.size)
     weak = jacobian_factor(layout.keys, root, root @ values)
     return eliminate(graph_of(graph, weak), layout.keys)[1]
 
 
+def condition(
+    graph: gtsam.GaussianFactorGraph, layout: Layout, fixed: int, value: Array
+) -> tuple[Array, Array]:
+    """Returns the normal equations on a layout, given the value of the unknown of one more key, `fixed`."""
+    joint = Layout(np.sort(np.append(layout.keys, fixed)))
+    hessian, vector = normal_equations(graph, joint)
+    free, known = joint.entries(layout.keys), joint.entries(np.array([fixed]))
+    return hessian[np.ix_(free, free)], vector[free] - hessian[np.ix_(free, known)] @ value
+
+
+# --- changes of variables --------------------------------------------------------------------------------
+
+
 def merge_variables(
     graph: gtsam.GaussianFactorGraph, gone: IntArray, kept: IntArray, offset: Array
 ) -> gtsam.GaussianFactorGraph:
-    """A graph where `d_gone = d_kept + offset`: keys `gone` (k,) of it have become `kept` (k,), offset (n,).
+    """Returns the graph where each key of `gone` (k,) is replaced by that of `kept` (k,).
 
-    Exact: with `d_old = E d_new + e` it is `E' L E` and `E' (g - L e)`.
+    The unknowns satisfy `d_gone = d_kept + offset` (n,). This is exact: with `d_old = E d_new + e`, the
+    information becomes `E' L E` and the vector `E' (g - L e)`.
     """
     old = Layout(keys_of(graph))
     becomes, places = old.keys.copy(), old.positions(gone)
@@ -198,11 +230,21 @@ def merge_variables(
     return graph_of(as_hessian_factor(graph_of(jacobian_factor(new.keys, root, right))))
 
 
-def conditioned(
-    graph: gtsam.GaussianFactorGraph, layout: Layout, held: int, value: Array
-) -> tuple[Array, Array]:
-    """Normal equations on a layout's keys where one other variable is held at a value of its unknown."""
-    everything = Layout(np.sort(np.append(layout.keys, held)))
-    hessian, vector = normal_equations(graph, everything)
-    own, known = everything.entries(layout.keys), everything.entries(np.array([held]))
-    return hessian[np.ix_(own, own)], vector[own] - hessian[np.ix_(own, known)] @ value
+def substitute_points(
+    graph: gtsam.GaussianFactorGraph,
+    old: IntArray,
+    new: IntArray,
+    change: Array,
+    offset: Array,
+    sigma: float,
+) -> gtsam.GaussianFactorGraph:
+    """Returns the graph where points `new` (k,) replace points `old` (n,), as one factor and an elimination.
+
+    The unknowns satisfy `d_old = (E x I) d_new + offset + N(0, sigma^2)`, with E the matrix `change` (n, k)
+    and `offset` (2 n,). The information about the old points is carried over, reduced by a shift of sigma
+    (m).
+    """
+    E = np.kron(change, np.eye(POINT))
+    A = np.concatenate([np.eye(len(E)), -E], axis=1) / sigma
+    substitution = jacobian_factor(np.append(old, new), A, offset / sigma)
+    return eliminate(graph_of(graph, substitution), old)[1]

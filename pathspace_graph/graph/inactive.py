@@ -1,13 +1,13 @@
-"""The inactive map: variables that nothing in the window touches, conditional on the active ones.
+"""The inactive map: variables on which the window has no factor, given the active ones.
 
-`p(active, inactive) = p(active) p(inactive | active)`: what the window measures changes the active part only,
-and the inactive part follows through its conditional when it is asked for. That is exact, and a cycle costs
-no more on a longer track. It is one path of a Bayes tree (Kaess et al. 2012), or a compressed filter (Guivant
-and Nebot 2001).
+The joint is split as `p(active, inactive) = p(active) p(inactive | active)`. Measurements in the window
+change the first factor only, and the inactive variables follow from their conditional when they are needed.
+That is exact, and a cycle costs no more on a longer track. It is one path of a Bayes tree (Kaess et al.
+2012), or a compressed filter (Guivant and Nebot 2001).
 
-A conditional needs the oldest pose of the window as it was when its variables left, since what the two sides
-know of each other they know through it. That pose, its anchor, stays active until the next ones leave with
-it.
+A conditional depends on the pose that was the oldest of the window when its variables were deactivated: it
+separates them from the rest of the drive. This pose, the anchor, stays active as a keyframe until the next
+variables are deactivated, together with it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from .gaussian import as_hessian_factor, eliminate, graph_of, keys_of
 from .keys import are_poses
-from .variables import Variables, spread
+from .variables import Layout, Variables, spread
 
 IntArray = NDArray[np.intp]
 
@@ -28,51 +28,65 @@ _NO_KEYS: IntArray = np.zeros(0, np.intp)
 
 
 class InactiveMap:
-    """A Bayes net: each conditional hangs on what left after it, and the last one on active variables."""
+    """Holds a Bayes net: each conditional depends on variables deactivated later, or on active ones."""
 
     def __init__(self) -> None:
         self.net = gtsam.GaussianBayesNet()
-        """The conditionals, the first to leave first."""
+        """These are the conditionals, in the order of their deactivation."""
         self.keys: IntArray = _NO_KEYS
-        """(k,) the variables that are inactive, ascending."""
+        """These are the keys (k,) of the inactive variables, ascending."""
         self.members: frozenset[int] = frozenset()
-        """The same as a set."""
+        """This is the set of the same keys."""
         self.anchors: IntArray = _NO_KEYS
-        """(a,) poses that the last conditional hangs on, which have to stay active."""
-        self._gone: IntArray = _NO_KEYS  # anchors of earlier conditionals, which left with the next ones
-        self._given: IntArray = _NO_KEYS  # what the conditionals hang on and is neither inactive nor gone
+        """The last conditional depends on these poses (a,), which must stay active."""
+        self._old_anchors: IntArray = _NO_KEYS  # they were eliminated with the next conditional
+        self._given: IntArray = _NO_KEYS  # active variables that the conditionals depend on
         self._shared: list[gtsam.GaussianFactor] = []
+        self._active: tuple[Layout, Layout] | None = None  # layouts of all and of the active variables
 
     def __len__(self) -> int:
         return int(self.net.size())
 
+    def active(self, layout: Layout) -> Layout:
+        """Returns the layout of the active variables, given that of all variables."""
+        if len(self.keys) == 0:
+            return layout
+        if self._active is None or self._active[0] is not layout:
+            active = np.ones(len(layout.keys), bool)
+            active[layout.positions(self.keys)] = False
+            self._active = layout, Layout(layout.keys[active])
+        return self._active[1]
+
     def push(
         self,
         prior: gtsam.GaussianFactorGraph,
-        leaving: IntArray,
+        keys: IntArray,
         keyframes: IntArray,
         shared: Sequence[gtsam.GaussianFactor],
     ) -> gtsam.GaussianFactorGraph:
-        """Variables (k,) and the keyframes leave a prior; gives the prior of what stays.
+        """Moves variables (k,) and the keyframes from a prior to the net, and returns the remaining prior.
 
-        `shared`: other factors that leave with them, and come back by themselves: weak priors between them
-        and with the rest, and the user's own.
+        The factors `shared` are moved with them. They are weak priors on these variables and the user's
+        factors, which their owners add again once all variables are active.
         """
         graph = graph_of(prior, *shared)
-        frontals = np.intersect1d(np.append(leaving, keyframes), keys_of(graph))
+        frontals = np.intersect1d(np.append(keys, keyframes), keys_of(graph))
         conditional, remaining = eliminate(graph, frontals)
         self.net.push_back(conditional)
-        self.keys = np.union1d(self.keys, leaving)
+        self.keys = np.union1d(self.keys, keys)
         self.members = frozenset(self.keys.tolist())
-        self._gone = np.union1d(self._gone, keyframes)
+        self._old_anchors = np.union1d(self._old_anchors, keyframes)
         separator = np.array(list(conditional.keys()), np.intp)[len(frontals) :]
         self.anchors = separator[are_poses(separator)]
-        self._given = np.setdiff1d(np.union1d(self._given, separator), np.append(self.keys, self._gone))
+        self._given = np.setdiff1d(
+            np.union1d(self._given, separator), np.append(self.keys, self._old_anchors)
+        )
         self._shared += shared
+        self._active = None
         return remaining
 
     def refresh(self, variables: Variables) -> None:
-        """Bring the inactive variables up to date: back-substitution, given the active ones."""
+        """Updates the inactive variables by back-substitution, given the active ones."""
         if len(self) == 0:
             return
         given, places = gtsam.VectorValues(), variables.layout.positions(self._given)
@@ -84,13 +98,14 @@ class InactiveMap:
         entries = variables.layout.entries(self.keys)
         variables.values[entries] = variables.reference[entries] + solution.vector(self.keys.tolist())
 
-    def joined(self, prior: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:
-        """The prior as if nothing had left, without what had left beside it and comes back by itself.
+    def joint_prior(self, prior: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:
+        """Returns the prior of active and inactive variables, without the `shared` factors of `push`.
 
-        A conditional is a factor. The anchors that are no variables any more are eliminated.
+        A conditional is a factor, so the joint is the product of the prior and the net. Anchors that are no
+        longer variables are eliminated.
         """
         if len(self) == 0:
             return prior
         negative = [factor.negate() for factor in self._shared]
-        whole = graph_of(as_hessian_factor(graph_of(prior, self.net, *negative)))
-        return eliminate(whole, self._gone)[1] if len(self._gone) else whole
+        joint = graph_of(as_hessian_factor(graph_of(prior, self.net, *negative)))
+        return eliminate(joint, self._old_anchors)[1] if len(self._old_anchors) else joint

@@ -1,4 +1,4 @@
-"""Odometry between poses by key: rows of the graph, and uncertainty carried to the pose that comes next."""
+"""Odometry between poses by key: rows of the graph, and the uncertainty of the predicted pose."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, odometry_residuals
-from pathspace_graph.factors.se2 import compose
+from pathspace_graph.factors.se2 import compose, rotation
 
 from .keys import CALIBRATION_KEY, POSE, pose_key, pose_keys
 from .rows import Rows
@@ -21,43 +21,43 @@ IntArray = NDArray[np.intp]
 
 
 class OdometryChain:
-    """What leads from each pose to the next, stacked: m intervals in the order of the drive."""
+    """Holds the odometry from each pose to the next: m stacked intervals, in the order of the drive."""
 
     def __init__(self, intervals: Sequence[IntegratedOdometry] = ()) -> None:
         self.deltas: Array = np.array([one.delta for one in intervals]).reshape(-1, POSE)
-        """(m, 3) relative poses."""
+        """These are the relative poses (m, 3), in m, m and rad."""
         self.whiteners: Array = np.array([one.whitener for one in intervals]).reshape(-1, POSE, POSE)
-        """(m, 3, 3) W with `W' W` the inverse of their covariance, in the frame of the end."""
+        """Each W (m, 3, 3) has `W' W` equal to the inverse covariance, in the frame of the end pose."""
         by_calibration = np.array([one.calibration_jacobian for one in intervals])
         self.by_calibration: Array = by_calibration.reshape(-1, POSE, CALIBRATION_SIZE)
-        """(m, 3, 2) derivative of the end by the calibration, in the frame of the end."""
+        """These are the derivatives G (m, 3, 2) of the end pose, in its own frame, by the calibration."""
 
     def __len__(self) -> int:
         return len(self.deltas)
 
     @property
     def intervals(self) -> list[IntegratedOdometry]:
-        """Each interval by itself."""
+        """Returns the intervals one by one."""
         covariances = np.linalg.inv(self.whiteners.transpose(0, 2, 1) @ self.whiteners)
         stacked = zip(self.deltas, covariances, self.by_calibration, self.whiteners, strict=True)
         return [IntegratedOdometry(*interval) for interval in stacked]
 
     def append(self, interval: IntegratedOdometry) -> None:
-        """The next interval."""
+        """Appends the next interval."""
         self.deltas = np.concatenate([self.deltas, interval.delta[None]])
         self.whiteners = np.concatenate([self.whiteners, interval.whitener[None]])
         self.by_calibration = np.concatenate([self.by_calibration, interval.calibration_jacobian[None]])
 
     def drop_first(self) -> None:
-        """The oldest interval is known no more."""
+        """Removes the oldest interval."""
         self.deltas, self.whiteners = self.deltas[1:], self.whiteners[1:]
         self.by_calibration = self.by_calibration[1:]
 
     def terms(self, slots: IntArray | slice, poses: Array, calibration: Array) -> tuple[Array, Array]:
-        """`W_k (Log(delta_k^-1 x_k^-1 x_{k+1}) + G_k b)` of some intervals k (m,) between poses (P, 3).
+        """Returns `W_k (Log(delta_k^-1 x_k^-1 x_{k+1}) + G_k b)` (m, 3) of some intervals k, and derivatives.
 
-        G is `by_calibration`. Gives residuals (m, 3) and derivatives (m, 3, 8) by [calibration | pose |
-        next].
+        The poses x (P, 3) are in the map frame, and b (2,) is the calibration. The derivatives (m, 3, 8) are
+        by [calibration | pose | next pose].
         """
         whiteners, by_calibration = self.whiteners[slots], self.by_calibration[slots]
         start, end = poses[:-1][slots], poses[1:][slots]
@@ -67,10 +67,10 @@ class OdometryChain:
         return (whiteners @ residual[:, :, None])[:, :, 0], jacobian
 
     def rows(self, variables: Variables, cycles: IntArray) -> list[Rows]:
-        """The terms from the poses of some cycles (m,) to the next as rows; each cycle owns its own.
+        """Returns the rows from the poses of some cycles (m,) to the next poses; each cycle owns its rows.
 
-        The chain leads from each pose of the window to the next; the newest pose, from which it does not lead
-        on, has no rows.
+        The first interval begins at the window's oldest pose. The newest pose has no rows, since no interval
+        begins there.
         """
         slots = cycles - variables.first_cycle
         slots = slots[slots < len(self)]
@@ -81,7 +81,7 @@ class OdometryChain:
 
 
 def odometry_rows(cycles: IntArray, terms: tuple[Array, Array], owner: IntArray) -> Rows:
-    """What `OdometryChain.terms` gives, as rows of the cycles (m,) it is of, with owners (m,)."""
+    """Returns the result of `OdometryChain.terms` for cycles (m,) as rows with these owners (m,)."""
     residual, jacobian = terms
     keys = np.stack([np.full(len(cycles), CALIBRATION_KEY), pose_keys(cycles), pose_keys(cycles + 1)], axis=1)
     flat = jacobian.reshape(residual.size, CALIBRATION_SIZE + 2 * POSE)
@@ -89,7 +89,7 @@ def odometry_rows(cycles: IntArray, terms: tuple[Array, Array], owner: IntArray)
 
 
 def odometry_factor(cycle: int, interval: IntegratedOdometry) -> gtsam.CustomFactor:
-    """The odometry from the pose of a cycle to the next one, with its calibration."""
+    """Returns the factor of the odometry, with its calibration, from the pose of a cycle to the next pose."""
     return calibrated_odometry_factor(pose_key(cycle), pose_key(cycle + 1), CALIBRATION_KEY, interval)
 
 
@@ -99,14 +99,15 @@ def calibrated_delta(odometry: IntegratedOdometry, calibration: Array) -> Array:
 
 
 def through_odometry(by_pose: Array, poses: Array, odometry: OdometryChain) -> tuple[Array, Array, Array]:
-    """Rows on a pose that is reached by the last odometry only, on what it is reached from.
+    """Returns the derivatives of rows on a predicted pose by the variables that the prediction depends on.
 
-    by_pose (m, 3) derivatives by the newer of two poses (2, 3), map frame. Gives the derivatives by the older
-    pose (m, 3) and by the calibration (m, 2), `-g R G`, and whitened rows (m, 3) of the odometry's own noise.
+    by_pose g (m, 3) are the derivatives by the newer of two poses (2, 3) in the map frame, which the last
+    interval predicts. The result is the derivatives by the older pose (m, 3) and by the calibration (m, 2),
+    `-g R G`, and N (m, 3), with `N N'` the covariance of the rows from the odometry's own noise.
     """
     dx, dy = poses[1, :2] - poses[0, :2]
-    by_last = by_pose.copy()
-    by_last[:, 2] += by_pose[:, 1] * dx - by_pose[:, 0] * dy
-    c, s = np.cos(poses[1, 2]), np.sin(poses[1, 2])
-    local = by_pose @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return by_last, -local @ odometry.by_calibration[-1], local @ np.linalg.inv(odometry.whiteners[-1])
+    by_older = by_pose.copy()
+    by_older[:, 2] += by_pose[:, 1] * dx - by_pose[:, 0] * dy
+    local = by_pose.copy()
+    local[:, :2] = by_pose[:, :2] @ rotation(poses[1, 2])
+    return by_older, -local @ odometry.by_calibration[-1], local @ np.linalg.inv(odometry.whiteners[-1])

@@ -1,8 +1,8 @@
-"""Finished linear rows on keys, and the GTSAM factors that they make.
+"""Whitened linear rows on keys, and the GTSAM factors that are made of them.
 
-The kernels give whitened rows of a whole window at once. The binding's own constructors stop at three keys
-and take one factor at a time from Python, so the rows of all factors are written into one buffer, of which
-each factor is a view that a Gaussian conditional, which is a Jacobian factor, takes over.
+The residual functions give whitened rows of a whole window at once. The binding's constructors take at most
+three keys and one factor at a time. So the rows of all factors are written into one buffer, and each factor
+is made of a view of it by way of a Gaussian conditional, which is a Jacobian factor.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .keys import FIRST_POSE, POINT, POSE, name
+from .keys import FIRST_POSE, POINT, POSE, names
 from .variables import UNKNOWN, Layout, Variables
 
 Array = NDArray[np.float64]
@@ -25,34 +25,35 @@ IntArray = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Whitened linear rows `J_i . dx + r_i`, dx the change from where they were linearized.
+    """Holds whitened linear rows `J_i . dx + r_i`, with dx the change from the linearization point.
 
-    All rows of a group have equally many keys, of the same letters in the same order, none of them twice.
+    All rows of a group have the same number of keys, with the same letters in the same order. No row has a
+    key twice.
     """
 
     keys: IntArray
-    """(m, k) variables of each row."""
+    """These are the keys (m, k) of each row's variables."""
     jacobian: Array
-    """(m, n) whitened derivatives by the entries of these, one key after the other."""
+    """These are the whitened derivatives (m, n) by the entries of the variables, one key after the other."""
     residual: Array
-    """(m,) whitened residuals where they were linearized."""
+    """These are the whitened residuals (m,) at the linearization point."""
     owner: IntArray
-    """(m,) number of the factor that each row belongs to; numbers are near each other, as cycles are."""
+    """Each row (m,) belongs to the factor with this number; numbers are close together, as cycles are."""
 
     def __len__(self) -> int:
         return len(self.residual)
 
     def where(self, chosen: NDArray[np.bool_] | IntArray) -> Rows:
-        """Some of the rows."""
+        """Returns some of the rows."""
         return Rows(self.keys[chosen], self.jacobian[chosen], self.residual[chosen], self.owner[chosen])
 
     @property
     def pattern(self) -> tuple[IntArray, IntArray]:
-        """(n,) which of a row's keys each derivative is by, and by which of its entries."""
+        """Returns which of a row's keys each derivative (n,) is by, and which entry of its variable."""
         return _pattern(tuple((self.keys[0] >= FIRST_POSE).tolist()))
 
     def columns(self, layout: Layout) -> IntArray:
-        """(m, n) column of each derivative; UNKNOWN where a key is not in the layout."""
+        """Returns the column (m, n) of each derivative, which is UNKNOWN where a key is not in the layout."""
         key, entry = self.pattern
         starts = layout.columns(self.keys)[:, key]
         return np.where(starts == UNKNOWN, UNKNOWN, starts + entry)
@@ -66,27 +67,29 @@ def _pattern(poses: tuple[bool, ...]) -> tuple[IntArray, IntArray]:
 
 @dataclass(frozen=True, eq=False)
 class LinearFactor:
-    """A Jacobian factor, and its keys."""
+    """Holds a Jacobian factor and its keys."""
 
     keys: frozenset[int]
+    """These are the keys of the factor."""
     linear: gtsam.GaussianConditional
+    """This is the factor as GTSAM takes it."""
 
 
 def jacobian_factors(groups: Sequence[Rows], variables: Variables) -> dict[int, LinearFactor]:
-    """A factor `1/2 |A d - b|^2` for each owner, d = value - reference: `A = J`, `b = J d_now - r`.
+    """Returns a factor `1/2 |A d - b|^2` by owner, with d = value - reference, `A = J` and `b = J d_now - r`.
 
-    The rows were linearized at the variables' values. Gives the factors by their owner.
+    The rows must have been linearized at the variables' values, d_now from the reference.
     """
     groups = [rows for rows in groups if len(rows)]
     if not groups:
         return {}
-    plan = _Plan(groups, variables.layout)
-    buffer = plan.write(groups, variables)
-    return {owner: plan.factor(f, buffer) for f, owner in enumerate(plan.owners)}
+    blocks = _FactorBlocks(groups, variables.layout)
+    buffer = blocks.write(groups, variables)
+    return {owner: blocks.factor(f, buffer) for f, owner in enumerate(blocks.owners)}
 
 
-class _Plan:
-    """Where each derivative goes in the buffer of all factors, each of which lies there by columns."""
+class _FactorBlocks:
+    """Says where each derivative goes in the buffer of all factors, each of which is stored by columns."""
 
     def __init__(self, groups: Sequence[Rows], layout: Layout) -> None:
         owner = np.concatenate([rows.owner for rows in groups])
@@ -101,14 +104,14 @@ class _Plan:
         held = np.zeros(len(layout.keys), bool)
         for place in places:
             held[place] = True
-        number, self.held = held.cumsum() - 1, held.nonzero()[0]  # of few keys where the map is large
+        number, self.held = held.cumsum() - 1, held.nonzero()[0]  # factors hold few keys of a large map
         self.member, self.places = member, [number[place] for place in places]
         touched = np.zeros((len(owners), len(self.held)), bool)
         for place, own in zip(self.places, self.slices, strict=True):
             touched[member[own, None], place] = True
         widths = layout.widths[self.held]
         ending = (touched * widths).cumsum(axis=1)
-        self.begin = ending - widths  # column of each key in the factors that hold it
+        self.begin = ending - widths  # the column of each key in the factors that hold it
         self.width, self.height = ending[:, -1] + 1, np.bincount(member)
         self.size = self.height * self.width
         self.offset = self.size.cumsum() - self.size
@@ -123,7 +126,7 @@ class _Plan:
         self._blocks = list(zip(ends[:-1], ends[1:], self.height.tolist(), strict=True))
 
     def write(self, groups: Sequence[Rows], variables: Variables) -> Array:
-        """The buffer with all blocks `[A b]`."""
+        """Returns the buffer with the blocks `[A b]` of all factors."""
         buffer = np.zeros(int(self.size.sum()))
         change, starts = variables.values - variables.reference, variables.layout.starts[self.held]
         for rows, place, own in zip(groups, self.places, self.slices, strict=True):
@@ -139,7 +142,7 @@ class _Plan:
         return buffer
 
     def factor(self, f: int, buffer: Array) -> LinearFactor:
-        """The factor of one owner."""
+        """Returns the factor of one owner."""
         own, (begin, end, height) = slice(self._bounds[f], self._bounds[f + 1]), self._blocks[f]
         keys, block = self._keys[own], buffer[begin:end].reshape((height, -1), order="F")
         matrix = gtsam.VerticalBlockMatrix([*self._widths[own], 1], block, False)
@@ -147,15 +150,15 @@ class _Plan:
 
 
 def _places(keys: IntArray, layout: Layout) -> IntArray:
-    """Place of each key in a layout; ValueError where one is not there."""
+    """Returns the index of each key in a layout; ValueError where the layout does not hold it."""
     places = layout.keys.searchsorted(keys)
     known = layout.keys.take(places, mode="clip") == keys
     if not known.all():
-        raise ValueError(f"expected rows on known variables, found {name(int(keys[~known][0]))}")
+        raise ValueError(f"expected rows on known variables, found {names(keys[~known])}")
     return places
 
 
-def one_factor(groups: Sequence[Rows], variables: Variables) -> list[gtsam.GaussianConditional]:
-    """All rows as one factor; none where there are no rows."""
-    together = [Rows(r.keys, r.jacobian, r.residual, np.zeros(len(r), np.intp)) for r in groups]
-    return [factor.linear for factor in jacobian_factors(together, variables).values()]
+def stacked_factor(groups: Sequence[Rows], variables: Variables) -> list[gtsam.GaussianConditional]:
+    """Returns a list of one factor that holds all rows, or an empty list where there are no rows."""
+    stacked = [Rows(r.keys, r.jacobian, r.residual, np.zeros(len(r), np.intp)) for r in groups]
+    return [factor.linear for factor in jacobian_factors(stacked, variables).values()]

@@ -1,4 +1,4 @@
-"""Values by key in one flat vector, in the order of the keys."""
+"""Variables: values by key in one flat vector, in the order of the keys."""
 
 from __future__ import annotations
 
@@ -9,98 +9,110 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .keys import CALIBRATION_LETTER, POSE, POSE_LETTER, are_poses, letter_keys, name, pose_key, sizes
+from .keys import CALIBRATION_LETTER, FIRST_POSE, POINT, POSE, are_poses, letter_keys, name, pose_key, sizes
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 T = TypeVar("T", bound=NDArray[np.generic])
 
 UNKNOWN = -1
-"""Column of a key that a layout does not hold."""
+"""This is the column of a key that a layout does not hold."""
 
 
 class Layout:
-    """Which columns of a flat vector belong to which key; keys are in ascending order."""
+    """A layout assigns the columns of a flat vector to keys in ascending order."""
 
     def __init__(self, keys: IntArray) -> None:
         self.keys = keys
-        """(K,) ascending."""
+        """The keys (K,) are in ascending order."""
         self.widths: IntArray = sizes(keys)
-        """(K,) entries of each."""
+        """Each key has this number of columns (K,)."""
         ends = self.widths.cumsum()
         self.starts: IntArray = ends - self.widths
-        """(K,) first column of each."""
+        """Each key begins at this column (K,)."""
         self.size = int(ends[-1]) if len(keys) else 0
-        """Columns of all."""
+        """This is the number of all columns."""
         self._blocks: dict[str, slice] = {}
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:
-        """The keys as GTSAM has an ordering."""
+        """Returns the keys as an ordering of GTSAM."""
         return gtsam.Ordering(self.keys.tolist())
 
     def positions(self, keys: IntArray) -> IntArray:
-        """Place of each key among the keys, UNKNOWN where it is not there; any shape."""
+        """Returns the index of each key, in any shape; it is UNKNOWN for a key that is not in the layout."""
         if len(self.keys) == 0:
             return np.full(np.shape(keys), UNKNOWN)
         places = np.minimum(self.keys.searchsorted(keys), len(self.keys) - 1)
         return np.where(self.keys[places] == keys, places, UNKNOWN)
 
     def columns(self, keys: IntArray) -> IntArray:
-        """First column of each key, UNKNOWN where it is not there; any shape."""
+        """Returns the first column of each key, in any shape; UNKNOWN for a key that is not in the layout."""
         places = self.positions(keys)
         return np.where(places >= 0, self.starts[places], UNKNOWN) if len(self.keys) else places
 
     def entries(self, keys: IntArray) -> IntArray:
-        """(n,) every column of the given keys (k,), one key after the other; all must be there."""
+        """Returns all columns (n,) of keys (k,), one key after the other; the layout must hold them."""
         return spread(self.columns(keys), sizes(keys))
 
     def block(self, letter: str) -> slice:
-        """Columns of all keys of a letter; kept for next time."""
+        """Returns the columns of all keys of a letter."""
         if letter not in self._blocks:
             self._blocks[letter] = slice(*(self.begin(key) for key in letter_keys(letter)))
         return self._blocks[letter]
 
     def begin(self, key: int) -> int:
-        """First column of a key, or where it would be."""
+        """Returns the first column of a key, or where it would be if the layout held the key."""
         place = int(self.keys.searchsorted(key))
         return int(self.starts[place]) if place < len(self.keys) else self.size
 
 
 def spread(starts: IntArray, widths: IntArray) -> IntArray:
-    """(n,) the columns `start, start + 1, ...` of blocks (k,) of these widths, one after the other."""
+    """Returns the columns (n,) of blocks (k,) with these first columns and widths, one after the other."""
     ends = np.cumsum(widths)
     total = int(ends[-1]) if len(ends) else 0
     return np.repeat(starts - (ends - widths), widths) + np.arange(total)
 
 
+def rotation_blocks(size: int, columns: IntArray, angles: Array) -> Array:
+    """Returns the identity (size, size) with R(angle) in the two columns from each of `columns` (k,) on."""
+    matrix, c, s = np.eye(size), np.cos(angles), np.sin(angles)
+    matrix[columns, columns], matrix[columns, columns + 1] = c, -s
+    matrix[columns + 1, columns], matrix[columns + 1, columns + 1] = s, c
+    return matrix
+
+
 def _inserted(array: T, at: int, values: T) -> T:
-    """An array with values put in before an index; `np.insert` takes ten times as long."""
+    """Returns an array with values inserted before an index; `np.insert` takes ten times as long."""
     return cast(T, np.concatenate([array[:at], values, array[at:]]))
 
 
 class Variables:
-    """A value for each key, and the reference that its unknown is counted from.
+    """Holds a value for each key, and the reference that its unknown is measured from.
 
-    Linear factors are functions of `value - reference`, where a variable's reference is its first value and
-    never changes. So a factor of the prior holds however far its variables have moved, and is never shifted.
+    Linear factors are functions of `value - reference`. The reference of a variable is its first value and
+    never changes, so the factors of the prior need no shift when their variables move.
     """
 
     def __init__(self) -> None:
         self.layout = Layout(np.zeros(0, np.intp))
-        """Which entries of the values are whose."""
+        """The layout says which entries belong to which key."""
         self.values: Array = np.zeros(0)
-        """(n,) poses (m, m, rad), points (m), calibration."""
+        """These are the values (n,): calibration, points (m) and poses (m, m, rad)."""
         self.reference: Array = np.zeros(0)
-        """(n,) the first value of each."""
+        """These are the first values (n,)."""
         self.linearized: Array = np.zeros(0)
-        """(n,) the value of each when the factors that it is in were linearized last."""
+        """These are the linearization points (n,): the values when the factors were linearized last."""
         self.first_cycle = 0
-        """Perception cycle of the oldest pose of the window; older poses are keyframes."""
-        self._first_pose = self.layout, -1, 0  # where the window's poses begin; they are the last of all
+        """This is the perception cycle of the window's oldest pose; older poses are keyframes."""
+        self._first_pose = (
+            self.layout,
+            -1,
+            0,
+        )  # layout, first cycle, and column where the window's poses begin
 
     def copy(self) -> Variables:
-        """The same keys with values of their own."""
+        """Returns variables with the same keys and copies of the values."""
         other = Variables()
         other.layout, other.reference = self.layout, self.reference
         other.values, other.linearized = self.values.copy(), self.linearized.copy()
@@ -109,13 +121,14 @@ class Variables:
 
     @property
     def keys(self) -> IntArray:
-        """(K,) all keys, ascending."""
+        """Returns all keys (K,), ascending."""
         return self.layout.keys
 
     def insert(self, keys: IntArray, values: Array, reference: Array | None = None) -> None:
-        """New variables: ascending keys (k,) that are not there yet, values (n,) one after the other.
+        """Inserts variables: ascending, new keys (k,), and their values (n,) one after the other.
 
-        `reference`: what their unknowns are counted from where they were known before; else the values.
+        Their references are the values, unless `reference` (n,) is given for variables that come back.
+        ValueError where a key is known already.
         """
         reference = values if reference is None else reference
         if len(keys) == 0:
@@ -123,7 +136,7 @@ class Variables:
         if (self.layout.positions(keys) >= 0).any():
             raise ValueError(f"expected new keys, found {name(int(keys[0]))} or a later one of them known")
         place = int(self.layout.keys.searchsorted(keys[0]))
-        if place != self.layout.keys.searchsorted(keys[-1]):  # the new keys lie between known ones
+        if place != self.layout.keys.searchsorted(keys[-1]):  # known keys lie between the new ones
             half = len(keys) // 2
             width = int(sizes(keys[:half]).sum())
             self.insert(keys[:half], values[:width], reference[:width])
@@ -136,41 +149,41 @@ class Variables:
         self.linearized = _inserted(self.linearized, at, values)
 
     def remove(self, keys: IntArray) -> None:
-        """Variables (k,) that are known no more."""
-        kept = np.ones(self.layout.size, bool)
-        kept[self.layout.entries(keys)] = False
-        stays = np.ones(len(self.layout.keys), bool)
-        stays[self.layout.positions(keys)] = False
-        self.layout = Layout(self.layout.keys[stays])
-        self.values, self.reference = self.values[kept], self.reference[kept]
-        self.linearized = self.linearized[kept]
+        """Removes variables (k,)."""
+        kept_entries = np.ones(self.layout.size, bool)
+        kept_entries[self.layout.entries(keys)] = False
+        kept_keys = np.ones(len(self.layout.keys), bool)
+        kept_keys[self.layout.positions(keys)] = False
+        self.layout = Layout(self.layout.keys[kept_keys])
+        self.values, self.reference = self.values[kept_entries], self.reference[kept_entries]
+        self.linearized = self.linearized[kept_entries]
 
     def of(self, keys: IntArray) -> Array:
-        """(n,) values of keys (k,), one after the other: a copy."""
+        """Returns a copy of the values (n,) of keys (k,), one after the other."""
         return self.values[self.layout.entries(keys)]
 
     def change(self, columns: IntArray) -> Array:
-        """`value - reference` of some entries."""
+        """Returns `value - reference`, the unknowns, at some entries."""
         return np.asarray(self.values[columns] - self.reference[columns])
 
     def block(self, letter: str) -> Array:
-        """(n,) values of all keys of a letter: a view."""
+        """Returns a view of the values (n,) of all keys of a letter."""
         return self.values[self.layout.block(letter)]
 
     @property
     def calibration(self) -> Array:
-        """(scale error [-], yaw-rate bias [rad/s]) of the odometry: a view."""
+        """Returns a view of the odometry's calibration: scale error (-) and yaw-rate bias (rad/s)."""
         return self.block(CALIBRATION_LETTER)
 
     @property
     def keyframes(self) -> IntArray:
-        """Keys of the poses that are older than the window, oldest first."""
-        first, last = self.keys.searchsorted([letter_keys(POSE_LETTER)[0], pose_key(self.first_cycle)])
+        """Returns the keys of the poses that are older than the window, oldest first."""
+        first, last = self.keys.searchsorted([FIRST_POSE, pose_key(self.first_cycle)])
         return self.keys[first:last]
 
     @property
     def poses(self) -> Array:
-        """Poses (P, 3) of the window, oldest first: a view."""
+        """Returns a view of the window's poses (P, 3), oldest first."""
         known = self._first_pose
         if known[0] is not self.layout or known[1] != self.first_cycle:
             begin = self.layout.begin(pose_key(self.first_cycle))
@@ -178,16 +191,16 @@ class Variables:
         return self.values[known[2] :].reshape(-1, POSE)
 
     def poses_at(self, cycles: IntArray) -> Array:
-        """(m, 3) the window's poses at perception cycles (m,)."""
+        """Returns the window's poses (m, 3) at perception cycles (m,)."""
         return self.poses[cycles - self.first_cycle]
 
     def gtsam_values(self, keys: IntArray) -> gtsam.Values:
-        """Values of keys (k,) as GTSAM has them: `Pose2` for a pose, a vector of two for the others."""
+        """Returns the values of keys (k,) for GTSAM: a pose is a `Pose2`, any other variable a `Point2`."""
         values = gtsam.Values()
         starts, poses = self.layout.columns(keys).tolist(), are_poses(keys).tolist()
         for key, start, is_pose in zip(keys.tolist(), starts, poses, strict=True):
             if is_pose:
                 values.insert(key, gtsam.Pose2(*self.values[start : start + POSE]))
             else:
-                values.insert(key, self.values[start : start + 2])
+                values.insert(key, self.values[start : start + POINT])
         return values

@@ -1,7 +1,7 @@
-"""The linear factors of the window: one for each cycle and a few weak priors, made anew where they are stale.
+"""The window's linear factors: one for each cycle and a few weak priors, relinearized where they are stale.
 
-That is fluid relinearization, as iSAM2 has it (Kaess et al. 2012), on a window that is otherwise exact:
-nothing in it is ever frozen.
+This is the fluid relinearization of iSAM2 (Kaess et al. 2012). No linearization point in the window is ever
+frozen.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .gaussian import as_hessian_factor, graph_of
 from .keys import CALIBRATION_LETTER, POSE, POSE_LETTER
 from .odometry import OdometryChain
-from .rows import LinearFactor, Rows, jacobian_factors, one_factor
+from .rows import LinearFactor, Rows, jacobian_factors, stacked_factor
 from .variables import Variables
 
 Array = NDArray[np.float64]
@@ -24,87 +24,94 @@ IntArray = NDArray[np.intp]
 
 
 class MapRows(Protocol):
-    """What the engine has to know about a map: its rows, and what they hang on."""
+    """States what the engine must know about a map: its rows, and the variables that they depend on."""
 
     variables: Variables
-    """Map points, calibration and poses."""
+    """These are the map points, the calibration and the poses."""
     slid: bool
-    """Whether a row that was asked for last should be on an inactive map point, but is not."""
+    """If true, a row of the last call of `rows` should be on an inactive map point, but is not."""
 
     @property
     def structure(self) -> object:
-        """Another object where the weak priors are between other variables than before."""
+        """Returns an object that is replaced by another one when the weak priors get other variables."""
 
     def changed(self) -> IntArray:
-        """(k,) perception cycles whose readings in use have changed since they were linearized last."""
+        """Returns the cycles (k,) whose detections in use have changed since the last linearization."""
 
     def rows(self, cycles: IntArray) -> list[Rows]:
-        """Rows of the readings of some cycles at the variables' values, the pose first; cycles own them."""
+        """Returns rows of the detections of some cycles at the variables' values.
+
+        The pose is the first key of a row, and the cycle is its owner.
+        """
 
     def linearized(self, cycles: IntArray) -> None:
-        """The rows of these cycles are those of the graph from now on."""
+        """Notes that the graph now holds the rows that were returned last, which are of these cycles."""
 
     def gauge(self, whole: bool) -> list[Rows]:
-        """Weak priors between the active map points, or between all."""
+        """Returns the nonlinear weak priors on the active map points, or on all if `whole`."""
 
     def linear_gauge(self, whole: bool) -> list[Rows]:
-        """Those of the weak priors that are linear, so that they are made anew with the structure only."""
+        """Returns the linear weak priors, which are made again only when `structure` changes."""
 
     def all_active(self) -> None:
-        """Every map point is active again."""
+        """Makes every map point active."""
 
     def leave(self, cycle: int) -> None:
-        """The pose of a cycle, the window's oldest, has left."""
+        """Notes that the pose of a cycle, the window's oldest, has been marginalized."""
 
 
 M_co = TypeVar("M_co", bound=MapRows, covariant=True)
 
 
 class WindowFactors(Generic[M_co]):
-    """The factors of the poses in the window and of the map, each with the values that it was linearized at.
+    """Holds the factors of the poses in the window and of the map.
 
-    tolerances: a factor is linearized anew where a map point or a position in it has moved farther than the
-    first (m), or a heading farther than the second (rad).
+    A factor is linearized again where a map point or a position in it has moved farther than the first
+    tolerance (m) since the last linearization, or a heading farther than the second (rad).
     """
 
-    def __init__(self, track: M_co, tolerances: tuple[float, float]) -> None:
-        self.map, self.variables = track, track.variables
+    def __init__(self, map_rows: M_co, tolerances: tuple[float, float]) -> None:
+        self.map, self.variables = map_rows, map_rows.variables
         self.odometry = OdometryChain()
-        """Between each pose of the window and the next."""
+        """This is the odometry between each pose of the window and the next."""
         self.exact = False
-        """Whether all that has moved at all is linearized anew, as if the tolerances were zero."""
+        """If true, the tolerances are zero: factors of all variables that moved are linearized again."""
         self.of_cycle: dict[int, LinearFactor] = {}
-        """Of each perception cycle: its readings, and the odometry to the next."""
+        """Each perception cycle has a factor with its detections and the odometry to the next cycle."""
         self.gauge: dict[int, LinearFactor] = {}
-        """Weak priors, by their owner."""
+        """These are the nonlinear weak priors by owner."""
         self._tolerances = tolerances
         self._linear_gauge = gtsam.GaussianFactorGraph()
         self._structure: object = None
 
     @property
     def linear(self) -> Iterator[gtsam.GaussianFactor | gtsam.GaussianFactorGraph]:
-        """All of them, as they were linearized last."""
+        """Yields all factors as they were linearized last."""
         yield self._linear_gauge
         for factor in (*self.of_cycle.values(), *self.gauge.values()):
             yield factor.linear
 
     def fresh(self, cycles: IntArray, whole: bool) -> list[gtsam.GaussianFactor]:
-        """Those of some cycles, all linearized at the variables' values; what is kept stays as it is.
+        """Returns factors of some cycles and weak priors, linearized at the variables' values.
 
-        `whole`: with the weak priors between all map points, not the active ones alone.
+        The factors that are kept do not change. The weak priors are on the active map points, or on all if
+        `whole`.
         """
         weak = [*self.map.gauge(whole), *self.map.linear_gauge(whole)]
         own = jacobian_factors(self._rows(cycles), self.variables)
-        return [*(factor.linear for factor in own.values()), *one_factor(weak, self.variables)]
+        return [*(factor.linear for factor in own.values()), *stacked_factor(weak, self.variables)]
 
     def weak_on(self, keys: IntArray) -> list[gtsam.GaussianFactor]:
-        """The weak priors that hold any of some active map points (k,), as one factor."""
+        """Returns the weak priors that hold any of some active map points (k,), as one factor."""
         weak = [*self.map.gauge(False), *self.map.linear_gauge(False)]
         touching = [rows.where(np.asarray(np.isin(rows.keys, keys).any(axis=1))) for rows in weak]
-        return [*one_factor(touching, self.variables)]
+        return [*stacked_factor(touching, self.variables)]
 
     def relinearize(self, cycles: IntArray, inactive: frozenset[int]) -> bool:
-        """Make stale factors anew; False, and nothing done, where one would hold an inactive variable."""
+        """Linearizes stale factors again, and returns true.
+
+        Where one of them would hold an inactive variable, it changes nothing and returns false.
+        """
         moved = self._moved()
         stale = self._stale(cycles, moved)
         own = jacobian_factors(self._rows(stale), self.variables)
@@ -118,20 +125,21 @@ class WindowFactors(Generic[M_co]):
         return True
 
     def drop(self, keys: frozenset[int]) -> None:
-        """Forget the factors of cycles that hold any of some keys: they are made anew."""
+        """Drops the factors of cycles that hold any of some keys, so that they are linearized again."""
         self.of_cycle = {cycle: own for cycle, own in self.of_cycle.items() if keys.isdisjoint(own.keys)}
 
     def clear(self) -> None:
-        """Forget every factor: the map has other variables."""
+        """Drops every factor, since the map has other variables."""
         self.of_cycle, self._structure = {}, None
 
     def _rows(self, cycles: IntArray) -> list[Rows]:
+        """Returns the rows of the detections and of the odometry of some cycles."""
         return [*self.map.rows(cycles), *self.odometry.rows(self.variables, cycles)]
 
     def _moved(self) -> IntArray:
-        """Keys of the variables that have moved by more than the tolerance since they were linearized.
+        """Returns the keys of variables that moved by more than the tolerance since their linearization.
 
-        Not the calibration: every row is linear in it.
+        The calibration is never among them, since every row is linear in it.
         """
         layout = self.variables.layout
         tolerance, poses = np.zeros(layout.size), layout.block(POSE_LETTER)
@@ -139,32 +147,32 @@ class WindowFactors(Generic[M_co]):
             tolerance += self._tolerances[0]
             tolerance[poses.start + POSE - 1 : poses.stop : POSE] = self._tolerances[1]
         tolerance[layout.block(CALIBRATION_LETTER)] = np.inf
-        away = np.abs(self.variables.values - self.variables.linearized) > tolerance
-        return layout.keys[np.logical_or.reduceat(away, layout.starts)]
+        moved = np.abs(self.variables.values - self.variables.linearized) > tolerance
+        return layout.keys[np.logical_or.reduceat(moved, layout.starts)]
 
     def _stale(self, cycles: IntArray, moved: IntArray) -> IntArray:
-        """Cycles whose factor is missing, holds a variable that has moved, or other readings than before."""
-        changed, gone = set(self.map.changed().tolist()), frozenset(moved.tolist())
+        """Returns the cycles whose factor is missing, holds a moved variable, or has other detections now."""
+        changed, moved_keys = set(self.map.changed().tolist()), frozenset(moved.tolist())
         return np.array(
             [
                 cycle
                 for cycle in cycles.tolist()
                 if cycle in changed
                 or cycle not in self.of_cycle
-                or not gone.isdisjoint(self.of_cycle[cycle].keys)
+                or not moved_keys.isdisjoint(self.of_cycle[cycle].keys)
             ],
             np.intp,
         )
 
     def _relinearize_gauge(self, moved: IntArray) -> None:
-        """The weak priors, where a map point has moved, or all where they are between others than before."""
-        structure, gone = self.map.structure, frozenset(moved.tolist())
+        """Linearizes weak priors on moved map points again, or all priors if they are on other points now."""
+        structure, moved_keys = self.map.structure, frozenset(moved.tolist())
         if structure is not self._structure:
             self.gauge, self._structure = {}, structure
             linear = jacobian_factors(self.map.linear_gauge(False), self.variables)
-            rows = graph_of(*(factor.linear for factor in linear.values()))
-            self._linear_gauge = graph_of(as_hessian_factor(rows)) if linear else rows
-        kept = [owner for owner, factor in self.gauge.items() if gone.isdisjoint(factor.keys)]
+            graph = graph_of(*(factor.linear for factor in linear.values()))
+            self._linear_gauge = graph_of(as_hessian_factor(graph)) if linear else graph
+        kept = [owner for owner, factor in self.gauge.items() if moved_keys.isdisjoint(factor.keys)]
         if len(kept) == len(self.gauge) > 0:
             return
         stale = self.map.gauge(False)

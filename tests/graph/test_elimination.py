@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SingularSystemError
-from pathspace_graph.graph.elimination import Elimination, linear_graph, map_held, owners
+from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
 from pathspace_graph.graph.gaussian import cholesky
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POINT, POSE, landmark_keys, pose_key, pose_keys
 from pathspace_graph.graph.rows import Rows
@@ -96,10 +96,10 @@ def test_poses_beside_a_map_that_is_held() -> None:
     problem = Elimination(linear_graph(groups, variables), variables.layout)
     matrix, right = dense(groups, variables.layout)
     n = problem.map.size
-    alone = Elimination(linear_graph(map_held(groups), variables), problem.poses)
+    alone = Elimination(linear_graph(fix_map(groups), variables), problem.poses)
     expected = np.linalg.solve(matrix[n:, n:], right[n:])
-    np.testing.assert_allclose(problem.beside(np.zeros(n)), expected, atol=1e-9)
-    np.testing.assert_allclose(alone.beside(np.zeros(0)), expected, atol=1e-9)
+    np.testing.assert_allclose(problem.poses_given(np.zeros(n)), expected, atol=1e-9)
+    np.testing.assert_allclose(alone.poses_given(np.zeros(0)), expected, atol=1e-9)
     last = np.linalg.inv(matrix[n:, n:])[-POSE:, -POSE:]
     np.testing.assert_allclose(alone.pose_marginals[-1], last, atol=1e-9)
 

@@ -13,9 +13,9 @@ from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.graph.gaussian import (
     as_hessian_factor,
     cholesky,
-    conditioned,
-    covariance,
+    condition,
     eliminate,
+    factorize,
     factors_of,
     graph_of,
     half_solve,
@@ -167,10 +167,9 @@ def test_a_singular_system_raises_where_gtsam_s_dense_solver_gives_numbers() -> 
     with pytest.raises(SingularSystemError, match="pivot 2 not positive"):
         cholesky(np.asfortranarray(np.diag([1.0, 0.0])))
     with pytest.raises(SingularSystemError):
-        covariance(
+        factorize(
             graph_of(jacobian_factor(LEFT_KEYS[:1], np.array([[1.0, 0.0]]), np.ones(1))),
             Layout(LEFT_KEYS[:1]),
-            LEFT_KEYS[:1],
         )
 
 
@@ -201,7 +200,7 @@ def test_covariance_is_that_of_the_dense_inverse_in_the_order_of_the_keys() -> N
     keys = np.array([POSE_KEYS[2], LEFT_KEYS[3], KEYS[0], RIGHT_KEYS[1]])
     entries = columns_of(keys, KEYS)
     expected = np.linalg.inv(hessian)[np.ix_(entries, entries)]
-    np.testing.assert_allclose(covariance(graph, LAYOUT, keys), expected, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(factorize(graph, LAYOUT).covariance(keys), expected, rtol=1e-8, atol=1e-10)
 
 
 # --- elimination -----------------------------------------------------------------------------------------
@@ -304,7 +303,7 @@ def test_conditioned_holds_one_variable_where_it_is_told() -> None:
     held, value = int(POSE_KEYS[1]), rng.normal(size=POSE)
     rest = np.setdiff1d(KEYS, [held])
     own, known = columns_of(rest, KEYS), columns_of(np.array([held]), KEYS)
-    information, negative_gradient = conditioned(graph, Layout(rest), held, value)
+    information, negative_gradient = condition(graph, Layout(rest), held, value)
     np.testing.assert_allclose(information, hessian[np.ix_(own, own)], atol=1e-10)
     np.testing.assert_allclose(
         negative_gradient, vector[own] - hessian[np.ix_(own, known)] @ value, atol=1e-10
@@ -351,8 +350,8 @@ def test_no_function_gives_a_view_of_a_factor_away() -> None:
     rest = Layout(np.setdiff1d(KEYS, POSE_KEYS[:1]))
     found = [
         *normal_equations(graph, LAYOUT),
-        *conditioned(graph, rest, int(POSE_KEYS[0]), np.zeros(POSE)),
-        covariance(graph, LAYOUT, LEFT_KEYS),
+        *condition(graph, rest, int(POSE_KEYS[0]), np.zeros(POSE)),
+        factorize(graph, LAYOUT).covariance(LEFT_KEYS),
         keys_of(graph),
     ]
     for array in found:

@@ -64,7 +64,7 @@ def test_what_left_comes_back_as_it_was(weak: bool) -> None:
     whole, left, inactive = two_parts(np.random.default_rng(0), weak)
     assert len(inactive) == 2 and inactive.keys.tolist() == POINTS[:2].tolist()
     assert np.intersect1d(keys_of(left), [*POINTS[:2], *OLD]).size == 0
-    joined = inactive.joined(left)
+    joined = inactive.joint_prior(left)
     rest, information, vector = system(whole, OLD)
     found, found_vector = normal_equations(joined, rest)
     np.testing.assert_allclose(found, information, atol=1e-9 * np.abs(information).max())
@@ -100,7 +100,7 @@ def test_an_empty_inactive_map_changes_nothing() -> None:
     inactive, variables = InactiveMap(), Variables()
     graph, *_ = random_graph(np.random.default_rng(3), [POINTS], POINTS)
     inactive.refresh(variables)
-    assert inactive.joined(graph) is graph
+    assert inactive.joint_prior(graph) is graph
     assert len(inactive) == 0 and len(inactive.anchors) == 0
 
 

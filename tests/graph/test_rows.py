@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.graph.gaussian import graph_of, normal_equations
 from pathspace_graph.graph.keys import POSE, control_keys, pose_keys
-from pathspace_graph.graph.rows import Rows, jacobian_factors, one_factor
+from pathspace_graph.graph.rows import Rows, jacobian_factors, stacked_factor
 from pathspace_graph.graph.variables import UNKNOWN, Layout, Variables
 
 from ..scenes.graph import (
@@ -79,14 +79,14 @@ def test_each_owner_s_factor_holds_its_rows_and_no_other(seed: int, owners: int)
         np.testing.assert_allclose(rows_of(factor.linear), expected, atol=1e-10)
 
 
-def test_one_factor_is_all_rows() -> None:
+def test_stacked_factor_is_all_rows() -> None:
     rng = np.random.default_rng(1)
     variables, groups = random_variables(rng), random_groups(rng)
     J, r, _ = dense_rows(groups, KEYS)
-    (factor,) = one_factor(groups, variables)
+    (factor,) = stacked_factor(groups, variables)
     expected = expected_rows(J, J @ (variables.values - variables.reference) - r)
     np.testing.assert_allclose(rows_of(factor), expected, atol=1e-10)
-    assert one_factor(groups[1:2], variables) == []
+    assert stacked_factor(groups[1:2], variables) == []
 
 
 def test_no_rows_are_no_factor() -> None:

@@ -198,10 +198,10 @@ def drive_on(drive: Drive, groups: list[list[Rows]], interval: float) -> tuple[S
     submaps = Submaps(graph_of(jacobian_factor(known, A, b)), interval)
     for k, own in enumerate(groups):
         graph = graph_of(jacobian_factors(own, variables)[k].linear)
-        submaps.leave(int(drive.poses[k]), graph, variables)
+        submaps.add_pose(int(drive.poses[k]), graph, variables)
         variables.remove(drive.poses[k : k + 1])
         variables.first_cycle = k + 1
-    submaps.cut(variables)
+    submaps.finish(variables)
     return submaps, A, b
 
 
@@ -277,6 +277,6 @@ def test_submaps_forget_map_points_and_go_on() -> None:
 def test_a_drive_without_a_pose_has_no_submap() -> None:
     first = graph_of(jacobian_factor(np.array([CALIBRATION_KEY]), np.eye(2), np.zeros(2)))
     submaps, variables = Submaps(first, 10.0), Variables()
-    submaps.cut(variables)
+    submaps.finish(variables)
     assert submaps.finished == [] and submaps.keyframes == {}
     assert keys_of(submaps.graph(variables)).tolist() == [CALIBRATION_KEY]
