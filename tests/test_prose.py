@@ -15,8 +15,7 @@ from typing import Literal
 
 import pytest
 
-from .scenes.paths import ROOT
-from .scenes.source import modules
+from .scenes.paths import ROOT, modules
 
 DOTS = ("...", "…")
 BEGINS_WELL = re.compile(r"[A-Z0-9`'\"(\[{|<=~+\-\u0370-\u03ff\u2200-\u22ff]")
