@@ -120,7 +120,7 @@ class LandmarkFixedLag:
         return np.asarray(last_detected < self.path.length - self.settings.landmark.unseen)
 
     def _close(self) -> None:
-        """Every few metres, closes the loop if old landmarks are detected; then merges duplicates."""
+        """Closes the loop or, once it has closed, merges duplicates; this is tried every few metres."""
         detections, state, length = self.smoother.map.detections, self.smoother.map.state, self.path.length
         detected = np.unique(detections.landmark[detections.used])
         self._last_detected = np.append(

@@ -55,7 +55,7 @@ class LandmarkMap:
 
     @property
     def structure(self) -> object:
-        """This is another object whenever other landmarks are held together than before."""
+        """Returns another object whenever other landmarks are held together than before."""
         return self.loop_pairs
 
     def gauge(self, whole: bool) -> list[Rows]:

@@ -42,12 +42,12 @@ class LandmarkState:
 
     @property
     def keys(self) -> IntArray:
-        """These are the keys (n,) of the landmarks."""
+        """Returns the keys (n,) of the landmarks."""
         return landmark_keys(self.numbers)
 
     @property
     def landmarks(self) -> Array:
-        """These are the landmarks (n, 2) in the map frame, in m: a view."""
+        """Returns the landmarks (n, 2) in the map frame, in m: a view."""
         return self.variables.block(LANDMARK_LETTER).reshape(-1, POINT)
 
     def positions(self, numbers: IntArray) -> IntArray:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.ckf.expansion import Expansion, proximity_chain
+from pathspace_graph.ckf.expansion import Expansion, beyond_end, proximity_chain
 from pathspace_graph.ckf.state import CurveState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
@@ -16,7 +16,7 @@ from pathspace_graph.mapping.path import DrivenPath, PathAhead
 from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.curves import detections_of, straight_rows
+from .scenes import detections_of, straight_rows
 
 Array = NDArray[np.float64]
 
@@ -58,6 +58,14 @@ def test_the_chain_returns_for_a_point_that_it_has_passed() -> None:
     points = np.array([[4.0, 0.0], [5.0, 0.0], [0.0, 4.5]])
     np.testing.assert_array_equal(proximity_chain(points, np.zeros(2)), [0, 1, 2])
     assert len(proximity_chain(np.zeros((0, 2)), np.zeros(2))) == 0
+
+
+def test_the_papers_three_conditions_by_hand() -> None:
+    """The points are beyond the end, beside the curve, nearer than the threshold, and near `C_{n-1}`."""
+    control_points = np.array([[0.0, 0.0], [4.0, 8.0], [8.0, 0.0]])
+    points, u = np.array([[13.0, 0.0], [13.0, 0.0], [11.0, 0.0], [4.0, 5.0]]), np.array([9.0, 8.0, 9.0, 9.0])
+    found = beyond_end(points, u, 9.0, control_points, CkfSettings(threshold=4.0, separation=4.0))
+    np.testing.assert_array_equal(found, [True, False, False, False])
 
 
 def test_the_curve_is_extended_to_the_last_point_of_the_chain() -> None:
