@@ -156,6 +156,26 @@ def test_after_all_of_it_has_come_back_the_prior_is_that_of_the_whole() -> None:
     np.testing.assert_allclose(ours.variables.values, drive.mean(ours.variables.keys), atol=1e-8)
 
 
+def test_the_active_variables_are_all_others_also_when_more_become_known() -> None:
+    drive = LinearDrive(2)
+    drive.drive(8)
+    smoother = drive.smoother
+    inactive, layout = smoother.inactive, smoother.variables.layout
+    assert inactive.active(layout) is layout
+    drive.deactivate(3)
+    active = inactive.active(smoother.variables.layout)
+    np.testing.assert_array_equal(
+        active.keys, np.setdiff1d(smoother.variables.keys, control_keys(0, np.arange(3)))
+    )
+    assert inactive.active(smoother.variables.layout) is active
+    new = control_keys(1, np.arange(2))
+    smoother.variables.insert(new, np.zeros(4))
+    found = inactive.active(smoother.variables.layout)
+    np.testing.assert_array_equal(found.keys, np.union1d(active.keys, new))
+    drive.deactivate(5)
+    assert not np.isin(control_keys(0, np.arange(5)), smoother.layout.keys).any()
+
+
 # --- in the mapper ---------------------------------------------------------------------------------------
 
 EAGER = MapperSettings(far=FarSettings(stretch=5.0, room=3.0))
@@ -192,6 +212,7 @@ class Checked(FixedLagSmoother[CurveMap]):
         self.checked += 1
 
 
+@pytest.mark.slow
 def test_steps_of_the_active_part_are_the_whole_system_s_steps() -> None:
     """Along two laps: while the curves grow, and all around when they are closed."""
     log = lap_log(bean_track(), overrun=100.0)
@@ -203,7 +224,7 @@ def test_steps_of_the_active_part_are_the_whole_system_s_steps() -> None:
     assert smoother.worst < 1e-8
 
 
-@pytest.mark.parametrize("cycles", [90, 240])
+@pytest.mark.parametrize("cycles", [90, pytest.param(240, marks=pytest.mark.slow)])
 def test_the_map_is_the_same_before_and_after_all_of_it_comes_back(cycles: int) -> None:
     """While the loop is open, in several parts, and when it has closed: map, covariance and calibration."""
     log = lap_log(bean_track(), overrun=100.0)

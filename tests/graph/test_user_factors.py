@@ -221,6 +221,7 @@ def test_a_custom_factor_is_as_good_as_a_native_one() -> None:
     np.testing.assert_allclose(poses[0], poses[1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_loop_closes_with_gnss_too() -> None:
     log = lap_log(bean_track(), overrun=45.0)
     truth = true_poses(log)
@@ -374,6 +375,7 @@ def nearest(mapper: FixedLagMapper, label: int, place: Array) -> Array:
     return np.asarray(points[np.argmin(np.hypot(*(points - place).T))])
 
 
+@pytest.mark.slow
 def test_a_surveyed_point_pulls_after_it_has_become_inactive_and_after_the_loop_has_closed() -> None:
     """The readings say otherwise: the curve gives way beside it, and is the same on the far side."""
     with_factor, place = surveyed(60, RIGHT, 0.5)
