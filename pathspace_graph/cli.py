@@ -33,15 +33,21 @@ class Command:
 
 
 COMMANDS: Final = {
-    "demo": Command("demo", "Demo", "map a generated track online: a table, a map and its picture"),
-    "simulate": Command("simulate", "Simulate", "write the log of a simulated drive, with truth"),
-    "online": Command("online", "Online", "map a log online, cycle by cycle"),
-    "batch": Command("batch", "Batch", "optimize a whole log at once: the ground reference"),
-    "compare": Command("compare", "Compare", "every estimator on one log or many: the paper's table"),
-    "ablate": Command("ablate", "Ablate", "run a study: estimators and settings over many drives"),
-    "figures": Command("figures", "Figures", "the paper's isolated tests as figures"),
-    "scale": Command("scale", "Scale", "time per update against map size, detections and laps"),
-    "plot": Command("plot", "Plot", "draw a map with its uncertainty band"),
+    "demo": Command(
+        "demo", "Demo", "maps a generated track online, and shows a table, a map and its picture"
+    ),
+    "simulate": Command("simulate", "Simulate", "writes the log of a simulated drive, with truth"),
+    "online": Command("online", "Online", "maps a log online, cycle by cycle"),
+    "batch": Command("batch", "Batch", "optimizes a whole log at once, as the ground reference"),
+    "compare": Command(
+        "compare", "Compare", "runs every estimator on one log or many, and gives the paper's table"
+    ),
+    "ablate": Command("ablate", "Ablate", "runs a study of estimators and settings over many drives"),
+    "figures": Command("figures", "Figures", "draws the paper's isolated tests"),
+    "scale": Command(
+        "scale", "Scale", "measures the time of an update against map size, detections and laps"
+    ),
+    "plot": Command("plot", "Plot", "draws a map with its uncertainty band"),
 }
 
 
@@ -79,7 +85,7 @@ def overview() -> str:
     width = max(map(len, COMMANDS)) + 2
     lines = [f"  {name:<{width}}{command.summary}" for name, command in COMMANDS.items()]
     usage = f"usage: {PROGRAM} COMMAND [OPTIONS]"
-    return "\n".join([usage, "", *lines, "", f"{PROGRAM} COMMAND --help explains each."])
+    return "\n".join([usage, "", *lines, "", f"{PROGRAM} COMMAND --help explains each command."])
 
 
 def _parse(name: str, arguments: list[str]) -> Any:

@@ -19,7 +19,20 @@ from .scenes.paths import ROOT
 from .scenes.source import modules, room_of
 
 AT_THE_TOP = {"__init__", "__main__", "cli", "errors", "estimators", "labels", "laps", "progress", "run"}
-ROOMS: set[str] | None = {*AT_THE_TOP, "commands", "factors", "graph", "io", "settings", "sim"}
+ROOMS: set[str] | None = {
+    *AT_THE_TOP,
+    "ckf",
+    "landmark",
+    "commands",
+    "factors",
+    "graph",
+    "io",
+    "mapping",
+    "online",
+    "settings",
+    "sim",
+    "spline",
+}
 """These rooms are held to the rules; `None` means every room."""
 
 DOTS = ("...", "…")
@@ -28,7 +41,7 @@ BEGINS_WELL = re.compile(r"[A-Z0-9`'\"(\[{|<=~+\-\u0370-\u03ff\u2200-\u22ff]")
 BLOCK = re.compile(r" {4}|- |\| ")
 """A line that begins so belongs to a formula, a list or a table, which needs no full stop."""
 FRAGMENT = re.compile(r"(Whether|How|The same|Which) |(Of|What|Where|As) [^,]*$")
-"""A field's text that reads so has no verb of its own."""
+"""The text of a field or a class that reads so has no verb of its own."""
 VERB = re.compile(r"[A-Z][a-z]+s\b")
 """A function's docstring begins with a verb in the third person, the function being its subject."""
 
@@ -77,7 +90,7 @@ def faults(text: Text) -> Iterator[str]:
         yield "begins with dots"
     elif not BEGINS_WELL.match(text.text):
         yield "does not begin with an upper-case letter"
-    elif text.kind == "field" and FRAGMENT.match(text.text):
+    elif text.kind in ("field", "class") and FRAGMENT.match(text.text):
         yield "is a fragment without a verb"
     elif text.kind == "function" and not VERB.match(text.text):
         yield "does not begin with a verb in the third person"
@@ -111,6 +124,7 @@ def test_docstrings_and_texts_of_fields_are_whole_sentences() -> None:
         ("field", "Distance (m) within which it may close, ...", "ends with dots"),
         ("field", "Stamp, s", "full stop"),
         ("class", "the vehicle's pose.", "upper-case"),
+        ("class", "What is known of the sensor.", "fragment"),
         ("field", "Whether the loop has closed.", "fragment"),
         ("function", "The pose at a stamp.", "verb"),
     ],

@@ -29,8 +29,8 @@ def make_log(odometry_t: np.ndarray, cycle_t: np.ndarray, twist: np.ndarray | No
 
 
 @dataclass(frozen=True)
-class Told:
-    """Settings of the estimator below."""
+class Settings:
+    """Holds the settings of the estimator below."""
 
     inner: dict[str, float] = field(default_factory=lambda: {"a": 1.0})
 
@@ -39,7 +39,7 @@ class Counting:
     """An estimator whose map has as many points as there were cycles, and that drives given poses."""
 
     def __init__(self, poses: np.ndarray | None = None) -> None:
-        self.settings = Told()
+        self.settings = Settings()
         self.poses = poses
         self.count = 0
         self.threads: set[int] = set()

@@ -7,7 +7,6 @@ and `--write-baseline` writes that baseline. Only ratios are in it, since times 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
@@ -15,7 +14,6 @@ from typing import Final
 import numpy as np
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.io.files import atomic_file, check_file_target
@@ -26,17 +24,17 @@ from pathspace_graph.sim.track_generator import generate_track
 
 from .baseline import BASELINE, baseline_table, compare, read_baseline, write_baseline
 from .measurement import Measurement, measure, metrics
-from .metric import Metric
+from .metric import metrics_table
 
 WORSE: Final = 1
-"""The exit code where a figure is worse than the baseline."""
+"""This is the exit code where a figure is worse than the baseline."""
 BAD_INPUT: Final = 2
-"""The exit code where a file can't be read or written."""
+"""This is the exit code where a file can't be read or written."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Benchmark:
-    """Time the online mapper on a generated track of 200 cones, and GTSAM's linear algebra on its windows."""
+    """Times the online mapper on a generated track of 200 cones, and GTSAM's own solver on its windows."""
 
     laps: int = 5
     """The track is driven for this many laps."""
@@ -45,9 +43,9 @@ class Benchmark:
     json: Path | None = None
     """The figures are written to this file."""
     compare: bool = False
-    """Say what is worse than the baseline by more than its tolerance; the exit code is 1 then."""
+    """The table says what is worse than the baseline by more than its tolerance; the exit code is 1 then."""
     write_baseline: bool = False
-    """Make the ratios of this run the baseline."""
+    """The ratios of this run become the baseline."""
     baseline: Path = BASELINE
     """The baseline is in this file; by default it is the one that comes with the package."""
 
@@ -64,23 +62,6 @@ class Benchmark:
         track = generate_track(np.random.default_rng(self.seed))
         log = simulate(track, SimulationSettings(laps=self.laps), self.seed)
         return measure(log, MapperSettings())
-
-
-def rich_table(figures: Iterable[Metric]) -> Table:
-    """Returns a table for a terminal: each figure beside its bound."""
-    table = Table("figure")
-    for name in ("value", "unit", "bound"):
-        table.add_column(name, justify="right")
-    for metric in figures:
-        style = None if metric.holds else "red"
-        table.add_row(metric.key, f"{metric.value:.3g}", metric.unit, _bound_text(metric), style=style)
-    return table
-
-
-def _bound_text(metric: Metric) -> str:
-    if metric.bound is None:
-        return ""
-    return f"{'<=' if metric.direction == 'lower' else '>='} {metric.bound:g}"
 
 
 def main() -> None:
@@ -104,7 +85,7 @@ def _run(benchmark: Benchmark) -> bool:
         with atomic_file(benchmark.json) as temporary:
             write_json(temporary, [asdict(metric) for metric in figures])
     console = Console(highlight=False)
-    console.print(rich_table(figures))
+    console.print(metrics_table(figures))
     best = measurement.gtsam
     console.print(f"GTSAM at its best over {best.samples} windows: {best.ordering}")
     found = compare(figures, read_baseline(benchmark.baseline)) if benchmark.compare else ()

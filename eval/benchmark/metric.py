@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
+
+from rich.table import Table
 
 
 @dataclass(frozen=True)
@@ -36,3 +39,20 @@ class Metric:
         if self.direction == "lower":
             return not self.value <= baseline + spare
         return not self.value >= baseline - spare
+
+
+def metrics_table(figures: Iterable[Metric]) -> Table:
+    """Returns a table for a terminal: each figure beside its bound."""
+    table = Table("figure")
+    for name in ("value", "unit", "bound"):
+        table.add_column(name, justify="right")
+    for metric in figures:
+        style = None if metric.holds else "red"
+        table.add_row(metric.key, f"{metric.value:.3g}", metric.unit, _bound_text(metric), style=style)
+    return table
+
+
+def _bound_text(metric: Metric) -> str:
+    if metric.bound is None:
+        return ""
+    return f"{'<=' if metric.direction == 'lower' else '>='} {metric.bound:g}"

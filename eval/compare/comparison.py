@@ -1,4 +1,4 @@
-"""Every estimator on every log: what each makes of it, measured, whatever any of them fails of."""
+"""Every estimator runs on every log and is measured, and a failure of one does not stop the others."""
 
 from __future__ import annotations
 
@@ -24,72 +24,72 @@ from pathspace_graph.settings.mapper import MapperSettings
 Row = dict[str, float | int | str | bool]
 
 RUN: Final = ("log", "estimator")
-"""Columns that name a run."""
+"""These columns identify a run."""
 
 
 @dataclass(frozen=True, eq=False)
 class NamedLog:
-    """A log, and what it is called."""
+    """Holds a log with its name."""
 
     name: str
-    """Its folder's name."""
+    """This is the name of the log's folder."""
     log: Log
-    """What was recorded."""
+    """This is the log."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One estimator on one log."""
+    """A task is one estimator on one log."""
 
     log: int
-    """Which of the logs."""
+    """This is the number of the log."""
     estimator: str
-    """Its name."""
+    """This is the name of the estimator."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What came of it."""
+    """Holds what came of a task."""
 
     log: str
-    """Name of the log."""
+    """This is the name of the log."""
     estimator: str
-    """Name of the estimator."""
+    """This is the name of the estimator."""
     result: RunResult | None = None
-    """None where it failed."""
+    """The run gave this; it is None if the run failed."""
     failure: str = ""
-    """What it failed of; empty where it finished."""
+    """This line names the error; it is empty if there was none."""
     rows: tuple[Row, ...] = ()
-    """Its metrics."""
+    """These are the metrics, a row for each lap and one for the whole run."""
     times: tuple[StageTime, ...] = ()
-    """Of its cycles and their stages; empty of a batch."""
+    """These are the times of the cycles and of their stages; a batch has none."""
 
     @property
     def unsettled(self) -> bool:
-        """Whether it is a batch that did not converge."""
+        """Returns whether the run is a batch that did not converge."""
         return isinstance(self.result, BatchRun) and not self.result.converged
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """All outcomes, log by log, in the order of the estimators."""
+    """Holds all outcomes, log by log, in the order of the estimators."""
 
     logs: tuple[NamedLog, ...]
-    """What was mapped."""
+    """These logs were mapped."""
     estimators: tuple[str, ...]
-    """What mapped it."""
+    """These estimators mapped them."""
     reference: str
-    """The estimator that the others are held against."""
+    """The others are compared with this estimator."""
     outcomes: tuple[Outcome, ...] = field(default=())
-    """One of each estimator on each log."""
+    """There is one for each estimator on each log."""
 
     def frame(self) -> pd.DataFrame:
-        """A tidy row per run and lap, and one per run of the whole log."""
+        """Returns a tidy row per run and lap, and one per run for the whole log."""
         found = [{"log": o.log, "estimator": o.estimator, **row} for o in self.outcomes for row in o.rows]
         return pd.DataFrame(found, columns=None if found else [*RUN, "scope", "lap"])
 
     def times(self) -> pd.DataFrame:
-        """A tidy row per run and stage, s."""
+        """Returns a tidy row per run and stage, in s."""
         names = ["stage", "mean", "median", "p99", "share"]
         found = [
             [o.log, o.estimator, *(getattr(stage, name) for name in names)]
@@ -99,22 +99,23 @@ class Comparison:
         return pd.DataFrame(found, columns=[*RUN, *names])
 
     def of(self, log: str) -> list[Outcome]:
-        """The outcomes on one log."""
+        """Returns the outcomes on one log."""
         return [outcome for outcome in self.outcomes if outcome.log == log]
 
     @property
     def paired(self) -> bool:
-        """Whether there are differences to tell: several estimators on several logs."""
+        """Returns whether there are differences to show: several estimators on several logs."""
         return len(self.logs) > 1 and len({outcome.estimator for outcome in self.outcomes}) > 1
 
     @property
     def failures(self) -> list[Outcome]:
-        """Those that failed."""
+        """Returns the outcomes that failed."""
         return [outcome for outcome in self.outcomes if outcome.failure]
 
 
 def read_logs(folder: Path) -> tuple[NamedLog, ...]:
-    """The log of a log folder, or those of a folder of log folders, by name; InputError without any."""
+    """Returns the log of a log folder, or those of a folder of log folders by name; InputError if there
+    are none."""
     if (folder / LOG_FILE).exists() or not folder.is_dir():
         return (NamedLog(folder.resolve().name, read_log(folder)),)
     inside = sorted(entry for entry in folder.iterdir() if (entry / LOG_FILE).is_file())
@@ -124,7 +125,7 @@ def read_logs(folder: Path) -> tuple[NamedLog, ...]:
 
 
 def choose(names: Sequence[str]) -> tuple[str, ...]:
-    """Estimators by name, all that are known where none is named; SettingsError where one isn't."""
+    """Returns estimators by name, or all that are known if none is named; SettingsError if one is unknown."""
     known = known_estimators()
     for name in names:
         if name not in known:
@@ -133,7 +134,7 @@ def choose(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def choose_reference(name: str | None, estimators: Sequence[str]) -> str:
-    """The one named, else the default estimator where it is compared, else the first."""
+    """Returns the named one, or the default estimator if it is compared, or else the first."""
     if name is None:
         return registry.DEFAULT if registry.DEFAULT in estimators else estimators[0]
     if name not in estimators:
@@ -153,7 +154,8 @@ def compare(
     jobs: int = 1,
     on_run: Callable[[], None] | None = None,
 ) -> Comparison:
-    """Run every estimator on every log, `jobs` at a time, each on one BLAS thread; `on_run` after each."""
+    """Runs every estimator on every log, `jobs` at a time on one BLAS thread each; calls `on_run` after
+    each."""
     check_jobs(jobs)
     settings, ghosts = settings or MapperSettings(), ghosts or GhostSettings()
     tasks = [Task(number, name) for number in range(len(logs)) for name in estimators]
@@ -172,7 +174,7 @@ def compare(
 
 
 def run_task(task: Task, named: NamedLog, settings: MapperSettings, ghosts: GhostSettings) -> Outcome:
-    """Runs and measures; a failure is an outcome as well."""
+    """Runs and measures an estimator; a failure gives an outcome, too."""
     what = attempt(task.estimator, settings, named.log, partial(_measure, ghosts=ghosts))
     return _outcome(task, named, what)
 

@@ -49,7 +49,7 @@ _BAND_ALPHA: Final = 0.35
 
 @dataclass(frozen=True, slots=True)
 class MapStyle:
-    """Line widths and marker sizes (pt), which depend on how much of a track a panel shows."""
+    """Holds line widths and marker sizes (pt), which depend on how much of a track a panel shows."""
 
     curve_width: float = 0.7
     """A boundary has this width."""

@@ -57,7 +57,7 @@ class Drive:
 
     @cached_property
     def id(self) -> str:
-        """Is the same for the same log."""
+        """Returns an identity of everything that the log depends on, except the code."""
         return identity(track=self.track.digest, seed=self.seed, simulation=asdict(self.simulation))
 
     def simulate(self) -> Log:

@@ -1,4 +1,4 @@
-"""Work spread over processes or a cluster, and what becomes of it where a worker dies."""
+"""Work is spread over processes or a cluster, and goes on when a worker dies."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 CONNECT_SECONDS: Final = 20.0
-"""How long a cluster is waited for."""
+"""A cluster may take this time (s) to answer."""
 
 WATCH_SECONDS: Final = 1.0
-"""How often a process of ours looks whether the one that started it is still there."""
+"""A worker checks at this interval (s) whether the process that started it is still there."""
 
 
 class WorkerDiedError(RuntimeError):
-    """The process that did the work ended without a word: killed, out of memory, or crashed."""
+    """Says that the process that did the work was killed, ran out of memory or crashed."""
 
 
 @contextmanager
 def workers(jobs: int, cluster: str | None) -> Iterator[None]:
-    """Processes of this machine with one BLAS thread each, or the workers of a Dask cluster."""
+    """Starts processes on this machine with one BLAS thread each, or connects to a Dask cluster's workers."""
     if cluster is None:
         leave = {"initializer": _end_with, "initargs": (os.getpid(),)}
         with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1, **leave):
@@ -49,7 +49,7 @@ def workers(jobs: int, cluster: str | None) -> Iterator[None]:
 
 
 def _end_with(parent: int) -> None:
-    """End this process soon after its parent: one that was killed can't tell its workers to."""
+    """Ends this process soon after its parent, since a parent that is killed can't end its workers."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -61,7 +61,7 @@ def _end_with(parent: int) -> None:
 
 
 def check_jobs(jobs: int) -> None:
-    """SettingsError unless it is a number of processes."""
+    """Raises SettingsError unless the number of processes is at least 1, or -1."""
     if jobs < 1 and jobs != -1:
         raise SettingsError(f"jobs: expected at least 1, or -1 for every core, found {jobs}")
 
@@ -69,28 +69,28 @@ def check_jobs(jobs: int) -> None:
 def outcomes(
     work: Callable[..., R], items: Sequence[T], load: Callable[[T], tuple[Any, ...]]
 ) -> Iterator[tuple[T, R | WorkerDiedError]]:
-    """(item, `work(item, *load(item))`) as they come; `work` itself doesn't raise.
+    """Yields (item, `work(item, *load(item))`) in the order in which they finish; `work` must not raise.
 
-    Where a worker dies, it isn't known at which item: each of those under way is tried again alone.
+    When a worker dies, nobody knows which item it had, so each item under way is tried again alone.
     """
-    left = dict(enumerate(items))
-    while left:
+    remaining = dict(enumerate(items))
+    while remaining:
         sent: list[int] = []
         try:
-            for index, result in _run(work, _tasks(left, load, sent)):
-                yield left.pop(index), result
+            for index, result in _run(work, _tasks(remaining, load, sent)):
+                yield remaining.pop(index), result
         except _deaths():
             for index in sent:
-                if index in left:
-                    item = left.pop(index)
+                if index in remaining:
+                    item = remaining.pop(index)
                     yield item, _alone(work, item, load(item))
 
 
 def _tasks(
-    left: dict[int, T], load: Callable[[T], tuple[Any, ...]], sent: list[int]
+    remaining: dict[int, T], load: Callable[[T], tuple[Any, ...]], sent: list[int]
 ) -> Iterator[tuple[int, tuple[Any, ...]]]:
-    """The work that is left, taken a little ahead of the workers; `sent` tells how far."""
-    for index, item in list(left.items()):
+    """Yields the remaining work a little ahead of the workers, and notes its indices in `sent`."""
+    for index, item in list(remaining.items()):
         sent.append(index)
         yield index, (item, *load(item))
 
@@ -116,7 +116,7 @@ def _alone(work: Callable[..., R], item: T, loaded: tuple[Any, ...]) -> R | Work
 
 
 def _deaths() -> tuple[type[Exception], ...]:
-    """What is raised where a worker dies."""
+    """Returns the exceptions that mean that a worker died."""
     try:
         from distributed import KilledWorker  # noqa: PLC0415 - an extra
     except ImportError:

@@ -11,7 +11,7 @@ from pathspace_graph.settings.checked import Positive
 
 @dataclass(frozen=True)
 class RoadSettings(Positive):
-    """The shape of the roads and the drives on them."""
+    """Describes the roads and the drives on them."""
 
     gap: float = 5.0
     """The cones of a row are this far apart (m)."""
@@ -37,7 +37,7 @@ class RoadSettings(Positive):
 
 @dataclass(frozen=True)
 class ScalingSettings(Positive):
-    """What is measured."""
+    """Describes what is measured of how time scales."""
 
     cones_min: float = 50.0
     """A point of the sweep over cones has at least this many cones seen."""
@@ -62,7 +62,7 @@ class ScalingSettings(Positive):
     seed: int = 1
     """The drives and the choice of detections have this seed."""
     road: RoadSettings = field(default_factory=RoadSettings)
-    """The shape of the roads and the drives on them."""
+    """These settings describe the roads and the drives on them."""
 
     def __post_init__(self) -> None:
         """Raises SettingsError as well where a range is empty."""

@@ -1,4 +1,4 @@
-"""Cells of a study: one estimator with one set of settings on one log."""
+"""Cells of a study: each is one estimator with one set of settings on one log."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from pathspace_graph.settings.mapper import MapperSettings
 FORMAT: Final = "pathspace-cell/1"
 
 Record = dict[str, Any]
-"""What is kept of a cell: JSON's types only."""
+"""It has the types of JSON only."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """One run."""
+    """A cell is one run."""
 
     drive: Drive
-    """Its log."""
+    """The run is on the log of this drive."""
     estimator: str
-    """Name of the estimator."""
+    """This is the name of the estimator."""
     variant: str
-    """Name of its settings."""
+    """This is the name of the settings."""
     settings: MapperSettings
     """The estimator has these settings."""
     yardsticks: bool = False
@@ -37,13 +37,13 @@ class Cell:
 
     @cached_property
     def id(self) -> str:
-        """The same for the same run: everything that its result depends on, but for the code."""
+        """Returns an identity of everything that the result depends on, except the code."""
         parts = {"drive": self.drive.id, "estimator": self.estimator, "settings": asdict(self.settings)}
         return identity(**parts, **({"yardsticks": True} if self.yardsticks else {}))
 
     @property
     def names(self) -> dict[str, Any]:
-        """What tells it from the others of its study."""
+        """Returns what distinguishes it from the other cells of its study."""
         drive = self.drive
         shared = {"track": drive.track.name, "seed": drive.seed, "noise": drive.noise}
         return shared | {"estimator": self.estimator, "variant": self.variant}
@@ -53,13 +53,13 @@ class Cell:
 
 
 def run_cell(cell: Cell, log: Log) -> Record:
-    """Runs the cell's estimator on its log; a failure is a record as well."""
+    """Runs the cell's estimator on its log; a failure gives a record, too."""
     measured = partial(lap_rows, yardsticks=cell.yardsticks)
     return record_of(cell, attempt(cell.estimator, cell.settings, log, measured))
 
 
 def record_of(cell: Cell, what: Attempt[list[dict[str, Any]]]) -> Record:
-    """Returns what is kept of an attempt at a cell."""
+    """Returns the record of an attempt at a cell."""
     return {
         "format": FORMAT,
         "id": cell.id,

@@ -1,4 +1,4 @@
-"""Studies in TOML files: those that come with the package, and anyone's own."""
+"""Studies in TOML files: those that ship with the package, and a user's own."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from .overrides import flatten
 from .study import ALL, Baseline, Study
 
 SHIPPED: Final = Path(__file__).parents[1] / "studies"
-"""Where the studies are that come with the package."""
+"""The studies that ship with the package lie here."""
 
 _KEYS: Final = tuple("grid" if entry.name == "grids" else entry.name for entry in fields(Study))
 
 
 def shipped_studies() -> list[str]:
-    """The names of the studies that come with the package."""
+    """Returns the names of the studies that ship with the package."""
     return sorted(file.stem for file in SHIPPED.glob("*.toml"))
 
 
 def find_study(name: Path) -> Path:
-    """The file itself, or the study of that name that comes with the package."""
+    """Returns the file itself, or that of the shipped study of this name."""
     if name.is_file():
         return name
     if name.suffix == "" and name.stem in shipped_studies():
@@ -35,7 +35,7 @@ def find_study(name: Path) -> Path:
 
 
 def read_study(file: Path | str) -> Study:
-    """The study of a TOML file, whose relative track files are beside it; InputError names what is wrong."""
+    """Returns the study of a TOML file, with track files relative to it; InputError says what is wrong."""
     file = Path(file)
     try:
         content = tomllib.loads(file.read_text(encoding="utf-8"))
@@ -50,7 +50,7 @@ def read_study(file: Path | str) -> Study:
 
 
 def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "study") -> Study:
-    """The study that a TOML file's content tells."""
+    """Returns the study with the content of a TOML file."""
     for key in content:
         check_name(key, _KEYS, "expected a known key")
     values: dict[str, Any] = {"name": name} | dict(content)

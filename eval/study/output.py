@@ -1,4 +1,4 @@
-"""What a finished study leaves in its folder: tables to load, to read and to print, and figures."""
+"""The tables and figures in the folder of a finished study."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ TIMES: Final = "times.csv"
 
 
 def write_tables(study: Study, frame: pd.DataFrame, out: Path) -> str:
-    """Write `results.csv`, `times.csv` and the summary in three forms; gives its text."""
+    """Writes `results.csv`, `times.csv` and the summary in three forms, and returns its text."""
     for name, table in ((RESULTS, without_times(frame)), (TIMES, times_of(frame))):
         with replacing(out / name) as temporary:
             table.to_csv(temporary, index=False, lineterminator="\n")
-    tables, told = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
-    text = as_text(tables, told)
+    tables, note = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
+    text = as_text(tables, note)
     write_text(out / "summary.txt", text)
-    write_text(out / "summary.md", as_markdown(tables, told))
-    write_text(out / "summary.tex", as_latex(tables, told))
+    write_text(out / "summary.md", as_markdown(tables, note))
+    write_text(out / "summary.tex", as_latex(tables, note))
     return text
 
 
 def write_figures(study: Study, frame: pd.DataFrame, out: Path) -> None:
-    """Write the figures, as a picture to look at and as vectors to print."""
+    """Writes each figure as a picture and as vectors."""
     for name, figure in figures(study, frame).items():
         for suffix in SUFFIXES:
             with replacing(out / "figures" / f"{name}{suffix}") as temporary:

@@ -1,4 +1,4 @@
-"""Dotted fields of a settings tree, such as `spline.degree`: which there are, and how some are changed."""
+"""Dotted fields of a tree of settings, such as `spline.degree`, and overrides of them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathspace_graph.errors import SettingsError, check_name
 
 T = TypeVar("T")
 Overrides = Mapping[str, Any]
-"""New values by dotted field."""
+"""These are new values by dotted field."""
 
 
 def leaves(settings: Any, prefix: str = "") -> dict[str, Any]:
-    """The value of every dotted field of a settings dataclass, in order."""
+    """Returns the value of every dotted field of a settings dataclass, in order."""
     found: dict[str, Any] = {}
     for entry in fields(settings):
         value = getattr(settings, entry.name)
@@ -25,7 +25,7 @@ def leaves(settings: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested tables as dotted names, as TOML's own dotted keys mean them."""
+    """Returns nested tables with dotted names, which mean the same as TOML's dotted keys."""
     flat: dict[str, Any] = {}
     for key, value in table.items():
         name = f"{prefix}{key}"
@@ -34,7 +34,8 @@ def flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def override(settings: T, overrides: Overrides, where: str) -> T:
-    """The settings with some dotted fields changed; SettingsError for an unknown one, or a wrong value."""
+    """Returns the settings with some dotted fields overridden; SettingsError if a field or a value is
+    wrong."""
     known = leaves(settings)
     for name, value in overrides.items():
         check_name(name, known, f"{where}: expected a known setting")
@@ -55,7 +56,7 @@ def _set(settings: Any, path: list[str], value: Any, where: str) -> Any:
 
 
 def as_type(value: Any, hint: Any, where: str) -> Any:
-    """A value of TOML as the type that a field has: a list as a tuple, a whole number as a float."""
+    """Returns a value of TOML in the type of a field: a list as a tuple, a whole number as a float."""
     arguments = get_args(hint)
     if get_origin(hint) is Literal and value in arguments:
         return value

@@ -1,4 +1,4 @@
-"""Runs a study: in parallel, every finished cell kept at once, so that a killed one goes on where it was."""
+"""Runs a study in parallel; every finished cell is kept at once, so that a study that was killed goes on."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ if TYPE_CHECKING:
 FORMAT: Final = "pathspace-study/1"
 STUDY_FILE: Final = "study.json"
 _PRESENTATION: Final = ("question", "metrics", "columns")
-"""What a study may change without becoming another one: no cell depends on it."""
+"""A study may change these without becoming another one, since no cell depends on them."""
 
-Told = Callable[[int, int], None]
-"""Called with how many cells are done, of how many, as they are."""
+OnCell = Callable[[int, int], None]
+"""It is called with the number of cells that are done, and with the number of all cells."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A study with its tracks, and every cell of it."""
+    """A plan is a study with its tracks and all of its cells."""
 
     study: Study
-    """The study."""
+    """This is the study."""
     tracks: tuple[NamedTrack, ...]
-    """Its tracks."""
+    """These are its tracks."""
     cells: tuple[Cell, ...]
-    """Every run, in the order of the results."""
+    """These are its runs, in the order of the results."""
 
     def resolved(self) -> dict[str, Any]:
-        """The content of `study.json`: the study with nothing left to a default."""
+        """Returns the content of `study.json`, which is the study with every default written out."""
         study = self.study
         return {
             "format": FORMAT,
@@ -68,7 +68,7 @@ class Plan:
 
 
 def make_plan(study: Study) -> Plan:
-    """The cells of a study, grouped by the log they share; reads and generates the tracks."""
+    """Reads and generates the tracks, and returns the cells, grouped by the log that they share."""
     tracks, points = tuple(load_tracks(study.tracks)), study.points
     drives = [
         Drive(track, seed, noise, study.simulation(noise))
@@ -92,13 +92,13 @@ def run_study(
     jobs: int = 1,
     cluster: str | None = None,
     retry_failed: bool = False,
-    on_cell: Told | None = None,
+    on_cell: OnCell | None = None,
 ) -> pd.DataFrame:
-    """Run what is left of a study, and give all of its results: a row per run and lap.
+    """Runs the cells of a study that are missing, and returns all of its results, a row per run and lap.
 
-    `out`: folder in which finished cells are kept (none: nothing is); `jobs`: processes, -1 for every core;
-    `cluster`: address of a Dask scheduler whose workers run it instead. OutputError where the folder belongs
-    to another study.
+    Finished cells are kept in the folder `out`, if there is one. The cells run in `jobs` processes (-1:
+    one for each core), or on the workers of the Dask scheduler at the address `cluster`. OutputError if
+    the folder belongs to another study.
     """
     check_jobs(jobs)
     plan = make_plan(study)
@@ -109,22 +109,22 @@ def run_study(
 
 
 def run_plan(
-    plan: Plan, out: Path, jobs: int, cluster: str | None, retry_failed: bool, on_cell: Told | None = None
+    plan: Plan, out: Path, jobs: int, cluster: str | None, retry_failed: bool, on_cell: OnCell | None = None
 ) -> pd.DataFrame:
-    """The same of a plan."""
+    """Does the same for a plan."""
     check_folder(out, plan)
     store = Store(out)
-    left = [cell for cell in plan.cells if _is_left(store.read(cell), retry_failed)]
-    with workers(jobs, cluster) if left else nullcontext():
+    remaining = [cell for cell in plan.cells if _is_missing(store.read(cell), retry_failed)]
+    with workers(jobs, cluster) if remaining else nullcontext():
         write_json(out / STUDY_FILE, plan.resolved(), indent=1)
-        if left:
-            _run_cells(left, store, on_cell or (lambda done, total: None))
+        if remaining:
+            _run_cells(remaining, store, on_cell or (lambda done, total: None))
     store.drop_logs()
     return frame_of(plan.study, [(cell, store.read(cell)) for cell in plan.cells])
 
 
 def check_folder(out: Path, plan: Plan) -> None:
-    """OutputError where the folder can't be this study's: another's, or anything else."""
+    """Raises OutputError if the folder holds another study, or something else."""
     check_target(out, STUDY_FILE)
     file = out / STUDY_FILE
     if not file.is_file():
@@ -147,31 +147,31 @@ def check_folder(out: Path, plan: Plan) -> None:
             )
 
 
-def _is_left(record: Record | None, retry_failed: bool) -> bool:
+def _is_missing(record: Record | None, retry_failed: bool) -> bool:
     return record is None or (retry_failed and bool(record["failure"]))
 
 
 # --- work ------------------------------------------------------------------------------------------------
 
 
-def _run_cells(cells: Sequence[Cell], store: Store, told: Told) -> None:
-    """Simulate the logs they need, each once, then run the cells; whatever is done is kept at once."""
+def _run_cells(cells: Sequence[Cell], store: Store, on_cell: OnCell) -> None:
+    """Simulates each log that is needed once, then runs the cells; every result is kept at once."""
     broken = _simulate(cells, store)
     done = 0
     for cell in cells:
         if cell.drive.id in broken:
             store.write(cell, failed(cell, broken[cell.drive.id]))
             done += 1
-    told(done, len(cells))
+    on_cell(done, len(cells))
     runnable = [cell for cell in cells if cell.drive.id not in broken]
     for cell, record in outcomes(run_cell, runnable, _Logs(store).load):
         store.write(cell, failed(cell, record) if isinstance(record, Exception) else record)
         done += 1
-        told(done, len(cells))
+        on_cell(done, len(cells))
 
 
 def _simulate(cells: Sequence[Cell], store: Store) -> dict[str, Exception]:
-    """Simulate and keep the logs that aren't there; gives the errors of those that can't be."""
+    """Simulates and keeps the missing logs, and returns the errors of those that fail."""
     drives = {cell.drive.id: cell.drive for cell in cells}
     wanted = [drive for drive in drives.values() if not store.has_log(drive)]
     broken: dict[str, Exception] = {}
@@ -184,7 +184,7 @@ def _simulate(cells: Sequence[Cell], store: Store) -> dict[str, Exception]:
 
 
 class _Logs:
-    """Logs from disk, one in memory at a time: cells are in the order of their logs."""
+    """Reads logs from disk and holds one in memory at a time: cells are in the order of their logs."""
 
     def __init__(self, store: Store) -> None:
         self._store = store

@@ -1,4 +1,4 @@
-"""What a study keeps on disk: every cell in a file of its own, and the logs while cells are left to run."""
+"""The files of a study: each cell has one of its own, and logs are kept while cells are missing."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from .cells import FORMAT, Cell, Record
 
 @dataclass(frozen=True)
 class Store:
-    """The cells and logs of a study on disk."""
+    """Keeps the cells and logs of a study on disk."""
 
     folder: Path
-    """The study's own."""
+    """This is the study's folder."""
 
     @property
     def logs(self) -> Path:
-        """Where logs are while cells are left to run."""
+        """Returns the folder of the logs, which is there while cells are missing."""
         return self.folder / "logs"
 
     def read(self, cell: Cell) -> Record | None:
-        """The cell's record; None where there is none, or none that can be read."""
+        """Returns the cell's record, or None if there is none that can be read."""
         try:
             record: Record = json.loads(self._file(cell).read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -36,15 +36,16 @@ class Store:
         return record if record.get("format") == FORMAT and record.get("id") == cell.id else None
 
     def write(self, cell: Cell, record: Record) -> None:
-        """The record as a file of its own, whole or not at all."""
+        """Writes the record as a file of its own, whole or not at all."""
         write_json(self._file(cell), record, indent=1)
 
     def has_log(self, drive: Drive) -> bool:
-        """Whether the drive has been simulated."""
+        """Returns whether the drive has been simulated."""
         return self._log(drive).is_file()
 
     def read_log(self, drive: Drive) -> Log:
-        """The log of a drive; one that can't be read, as of another version, is simulated again."""
+        """Returns the log of a drive; one that can't be read, for example of another version, is
+        simulated again."""
         try:
             log: Log = pickle.loads(self._log(drive).read_bytes())
         except Exception:  # there is no telling what a damaged pickle raises
@@ -52,12 +53,12 @@ class Store:
         return log
 
     def write_log(self, drive: Drive, log: Log) -> None:
-        """A simulated log, whole or not at all."""
+        """Writes a simulated log, whole or not at all."""
         with replacing(self._log(drive)) as temporary:
             temporary.write_bytes(pickle.dumps(log))
 
     def drop_logs(self) -> None:
-        """Remove the logs: they can be simulated again."""
+        """Removes the logs, since they can be simulated again."""
         for file in self.logs.glob("*.pickle"):
             file.unlink()
         if self.logs.is_dir():

@@ -1,4 +1,4 @@
-"""A study: which tracks, seeds, noise, estimators and settings are compared, and with what."""
+"""A study says which tracks, seeds, noise, estimators and settings are compared, and with which baseline."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from pathspace_graph.sim.simulate import SimulationSettings
 from .overrides import Overrides, override
 
 DEFAULT: Final = "default"
-"""The variant without any override, which is part of every study."""
+"""This variant overrides nothing, and it is part of every study."""
 EVERY_LAP: Final = "all"
 """A column `rmse@all` is the mean over all laps."""
 LATER_LAPS: Final = "later"
 """A column `rmse@later` is the mean over the laps from the second on."""
 ALL: Final = "all"
-"""In place of estimators: every one that there is."""
+"""This name stands for all known estimators."""
 
 
 def column_of(text: str) -> tuple[Metric, str]:
@@ -43,38 +43,40 @@ def column_of(text: str) -> tuple[Metric, str]:
 
 @dataclass(frozen=True)
 class Baseline:
-    """What every other combination is compared with, on the same track, seed and noise."""
+    """Names the combination that every other one is compared with, on the same track, seed and noise."""
 
     variant: str = DEFAULT
-    """Its settings."""
+    """The baseline has the settings of this variant."""
     estimator: str | None = None
-    """Its estimator; where not given, each one's own."""
+    """The baseline has this estimator; without one, each estimator is compared with itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """A grid of tracks x seeds x noise x estimators x settings; checked where it is made."""
+    """A study is a grid of tracks x seeds x noise x estimators x settings, which is checked when it is
+    made."""
 
     tracks: tuple[Path | int, ...]
-    """Track files, and seeds of generated tracks."""
+    """The vehicle drives on these track files, and on tracks that are generated from these seeds."""
     seeds: tuple[int, ...] = (0,)
-    """Of each drive and its noise."""
+    """Each of these seeds decides a drive and its noise."""
     laps: int = 5
-    """Laps driven."""
+    """The vehicle drives this number of laps."""
     name: str = "study"
-    """What it is called."""
+    """The study has this name."""
     question: str = ""
-    """What it is to answer."""
+    """The study answers this question."""
     estimators: tuple[str, ...] = (registry.DEFAULT,)
-    """Names of online and batch estimators, or `all` alone."""
+    """These estimators run, online and batch ones; `all` stands for every one."""
     noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
-    """Named changes of the simulation's dotted fields."""
+    """Each noise has a name, and overrides dotted fields of the simulation."""
     variants: Mapping[str, Overrides] = field(default_factory=dict)
-    """Named changes of the settings' dotted fields, beside `default`, which changes none."""
+    """Each variant has a name, and overrides dotted fields of the settings; `default` is always there."""
     grids: tuple[Mapping[str, Sequence[Any]], ...] = ()
-    """Values by dotted field: every combination of them is a variant, called as `lag=1, steps=2`."""
+    """Each grid has values by dotted field; every combination is a variant with a name such as `lag=1,
+    steps=2`."""
     baseline: Baseline = field(default_factory=Baseline)
-    """What the others are compared with."""
+    """The other combinations are compared with this one."""
     metrics: tuple[str, ...] = ("rmse", "missed", "size", "ms_mean")
     """The summary compares these metrics with the baseline."""
     columns: tuple[str, ...] = ()
@@ -83,7 +85,7 @@ class Study:
     """The limit of every run is computed, which takes a landmark batch with oracle associations."""
 
     def __post_init__(self) -> None:
-        """SettingsError where anything is unknown, empty, named twice or out of its range."""
+        """Raises SettingsError if anything is unknown, empty, named twice or out of its range."""
         self._normalize()
         for name in ("tracks", "seeds", "estimators", "noise", "metrics"):
             _check_list(name, getattr(self, name))
@@ -101,7 +103,7 @@ class Study:
         self._check_baseline()
 
     def _normalize(self) -> None:
-        """Lists are tuples, and texts among the tracks are files."""
+        """Turns lists into tuples, and texts among the tracks into files."""
         for name in ("tracks", "seeds", "estimators", "metrics", "columns", "grids"):
             value = getattr(self, name)
             object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
@@ -128,14 +130,14 @@ class Study:
             check_name(self.baseline.estimator, self.estimators, expected)
 
     def simulation(self, noise: str) -> SimulationSettings:
-        """The settings of the drives under a named noise."""
+        """Returns the settings of the drives under a named noise."""
         if "laps" in self.noise[noise]:
             raise SettingsError(f"noise.{noise}.laps: expected laps as a key of the study itself")
         return replace(override(SimulationSettings(), self.noise[noise], f"noise.{noise}"), laps=self.laps)
 
     @property
     def points(self) -> dict[str, MapperSettings]:
-        """The settings to run, by name: of variants that come to the same, the first."""
+        """Returns the settings to run by name; of variants with equal settings the first."""
         distinct: dict[str, MapperSettings] = {}
         for name, settings in self._named().items():
             if settings not in distinct.values():
@@ -144,19 +146,19 @@ class Study:
 
     @property
     def baseline_variant(self) -> str:
-        """The baseline's name among `points`."""
+        """Returns the baseline's name among `points`."""
         wanted = self._named()[self.baseline.variant]
         return next(name for name, settings in self.points.items() if settings == wanted)
 
     @property
     def varied(self) -> tuple[str, ...]:
-        """The dotted settings that any variant changes."""
+        """Returns the dotted settings that any variant overrides."""
         names = [name for overrides in self.variants.values() for name in overrides]
         return tuple(dict.fromkeys([*names, *(name for grid in self.grids for name in grid)]))
 
     @property
     def varied_noise(self) -> tuple[str, ...]:
-        """The dotted simulation settings that any noise changes."""
+        """Returns the dotted settings of the simulation that any noise overrides."""
         return tuple(dict.fromkeys(name for overrides in self.noise.values() for name in overrides))
 
     def _named(self) -> dict[str, MapperSettings]:
@@ -170,7 +172,7 @@ class Study:
 
 
 def _grid(grid: Mapping[str, Sequence[Any]]) -> dict[str, Overrides]:
-    """Every combination of the values, by a name that tells them."""
+    """Returns every combination of the values by its name."""
     for name, values in grid.items():
         if not isinstance(values, list | tuple) or not values:
             raise SettingsError(f"grid.{name}: expected a list of values, found {values!r}")

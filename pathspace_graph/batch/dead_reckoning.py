@@ -16,7 +16,7 @@ from pathspace_graph.graph.variables import Variables
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.candidates import SIDES
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.measurements import Chain
+from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.mapping.path import along_and_across
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.batch import LapCorrespondenceSettings
@@ -32,7 +32,7 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 
-def start_odometry(chain: Chain, detections: DetectionTable, settings: MapperSettings) -> State:
+def start_odometry(chain: LogOdometry, detections: DetectionTable, settings: MapperSettings) -> State:
     """Returns poses by dead reckoning, and curves through the cones that were seen in the first lap.
 
     Where the path recurs, the drift of the odometry is taken out first: every lap passes the same places.
@@ -53,7 +53,7 @@ def start_odometry(chain: Chain, detections: DetectionTable, settings: MapperSet
 
 
 def align_laps(
-    chain: Chain, recurrence: Recurrence, settings: LapCorrespondenceSettings
+    chain: LogOdometry, recurrence: Recurrence, settings: LapCorrespondenceSettings
 ) -> tuple[Array, Array]:
     """Returns the poses (P, 3) and the calibration (2,) at which every lap passes the same reference poses.
 
@@ -76,7 +76,7 @@ def align_laps(
     return variables.poses[:count], variables.calibration
 
 
-def _bias_of_turn(chain: Chain, recurrence: Recurrence) -> Array:
+def _bias_of_turn(chain: LogOdometry, recurrence: Recurrence) -> Array:
     """Returns the calibration (2,) by whose yaw-rate bias the heading changes by whole turns in a lap."""
     laps = recurrence.driven[-1] / recurrence.lap
     seconds = (chain.stamps[-1] - chain.stamps[0]) / laps

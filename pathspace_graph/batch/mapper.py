@@ -19,7 +19,7 @@ from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
+from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import Stopwatch, settings_dict
 from pathspace_graph.settings.batch import Start
@@ -90,7 +90,7 @@ class BatchMapper:
         odometry_sigma: Array | None = None,
         online: Callable[[MapperSettings, Array], CurveMapper] | None = None,
     ) -> None:
-        """`odometry_sigma` (3,) is the standard deviation of a measured twist (m/s, m/s, rad/s).
+        """Keeps the settings, and the standard deviation (3,) of a measured twist (m/s, m/s, rad/s).
 
         `online` makes the online mapper whose map the optimization begins with. A start from odometry needs
         none.
@@ -112,18 +112,15 @@ class BatchMapper:
 
     def _solve(self, log: Log, start: Start, on_round: Callable[[], None] | None) -> BatchResult:
         settings, batch, watch = own_settings(self.settings), self.settings.batch, Stopwatch()
-        if start == "online" and self.online is None:
-            raise SettingsError("start online: expected an online mapper to begin with, found none")
         chain = integrate_log(log, self.odometry_sigma, settings.odometry)
-        detections = collect_detections(log)
+        detections = DetectionTable.of(log.cycles)
         system = BatchSystem(detections, chain, settings, Biweight(batch.loose_gate))
         optimizer = Optimizer(system, batch)
         watch.lap("integrate")
-        online = None
-        if start == "online" and self.online is not None:
-            state, online = start_online(log, self.online(self.settings, self.odometry_sigma))
+        if start == "odometry":
+            state, online = start_odometry(chain, detections, settings), None
         else:
-            state = start_odometry(chain, detections, settings)
+            state, online = self._start_online(log)
         watch.lap("start")
         state = optimizer.align_poses(state, batch.pose_steps, batch.loose_gate)
         watch.lap("poses")
@@ -155,6 +152,12 @@ class BatchMapper:
             system=system,
             optimum=at,
         )
+
+    def _start_online(self, log: Log) -> tuple[State, RunResult]:
+        """Returns the start from an online run of the log, and the run."""
+        if self.online is None:
+            raise SettingsError("start online: expected an online mapper to begin with, found none")
+        return start_online(log, self.online(self.settings, self.odometry_sigma))
 
 
 def _optimum(
@@ -204,7 +207,7 @@ def _map(state: State, joint: Array, scatter: Scatter) -> Map:
 
 
 def _records(
-    state: State, detections: DetectionTable, chain: Chain, seconds: float
+    state: State, detections: DetectionTable, chain: LogOdometry, seconds: float
 ) -> tuple[tuple[CycleRecord, ...], int]:
     """Returns a record of each cycle, with its share of the seconds, and the number of complete laps."""
     left, right = (state.boundaries[b].size if b in state.boundaries else 0 for b in (LEFT, RIGHT))

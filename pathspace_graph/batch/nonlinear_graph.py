@@ -13,7 +13,7 @@ from pathspace_graph.factors.gtsam_factors import pose_array, smoothness_factors
 from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_key, pose_keys
 from pathspace_graph.graph.odometry import odometry_factor
-from pathspace_graph.mapping.measurements import Chain
+from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.spline.boundary import Boundary
 
 from .gauge import CurveGauge
@@ -50,13 +50,13 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     return graph
 
 
-def _odometry(chain: Chain) -> Iterator[gtsam.NonlinearFactor]:
+def _odometry(chain: LogOdometry) -> Iterator[gtsam.NonlinearFactor]:
     """Yields the odometry factor between every two neighbouring cycles."""
     for k, interval in enumerate(chain.odometry.intervals):
         yield odometry_factor(k, interval)
 
 
-def _priors(chain: Chain, heading: float) -> Iterator[gtsam.NonlinearFactor]:
+def _priors(chain: LogOdometry, heading: float) -> Iterator[gtsam.NonlinearFactor]:
     """Yields the priors of the first pose and of the calibration.
 
     GTSAM's tangents of a pose are in its own frame, so the information is rotated by the heading (rad).

@@ -188,7 +188,7 @@ class Optimizer:
     def _keep_foot_points(self, at: Evaluation) -> None:
         """Lets later evaluations refine the foot points from where they are now."""
         for projected in at.projected.values():
-            self.system.detections.u[projected.rows] = projected.foot.u
+            self.system.detections.refine(projected.rows, projected.foot.u)
 
 
 def extrapolation_factor(step: Array, before: Array, settings: BatchSettings) -> float:

@@ -16,7 +16,7 @@ from pathspace_graph.graph.keys import are_poses, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.measurements import Chain
+from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -82,16 +82,16 @@ class Evaluation:
     projected: dict[int, Projected]
     """These are the used detections of each boundary."""
     odometry: tuple[Array, Array]
-    """These are the residuals and derivatives of `Chain.terms`."""
+    """These are the residuals and derivatives of `LogOdometry.terms`."""
     cost: float
     """This is half the sum of squares, with the robust losses of the detections."""
 
 
 class BatchSystem:
-    """Minimizes `1/2 |odometry|^2 + sum rho(detections) + 1/2 |gauge, calibration, first pose|^2`."""
+    """The problem is to minimize `sum rho(detections) + 1/2 |odometry, gauge, calibration, first pose|^2`."""
 
     def __init__(
-        self, detections: DetectionTable, chain: Chain, settings: MapperSettings, kernel: Biweight
+        self, detections: DetectionTable, chain: LogOdometry, settings: MapperSettings, kernel: Biweight
     ) -> None:
         self.detections = detections
         self.chain = chain
@@ -114,8 +114,8 @@ class BatchSystem:
     def evaluate(self, state: State, hold: bool = False) -> Evaluation:
         """Returns the problem at a state; foot points are refined from those that the detections have.
 
-        `hold` sets the sigma of each detection across its curve, which later evaluations keep. No derivative
-        has that the sigma depends on the direction of the curve.
+        `hold` sets the sigma of each detection across its curve, which later evaluations keep. So the
+        derivatives leave out that the sigma depends on the direction of the curve.
         """
         projected = {label: self._project(state, label, hold) for label in state.boundaries}
         odometry = self.chain.terms(state.poses, state.calibration)

@@ -9,8 +9,8 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
-from pathspace_graph.mapping.measurements import integrate_odometry
 from pathspace_graph.mapping.path import DrivenPath
+from pathspace_graph.mapping.prediction import integrate_odometry
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings

@@ -32,7 +32,7 @@ class CurveState:
 
     @property
     def pose(self) -> Array:
-        """This is the pose (3,), x (m), y (m), theta (rad, not wrapped), in the map frame: a view."""
+        """Returns the pose (3,), x (m), y (m), theta (rad, not wrapped), in the map frame: a view."""
         return self.belief.pose
 
     def offset(self, label: int) -> int:

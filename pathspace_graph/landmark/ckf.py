@@ -26,7 +26,7 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns, to_vehicle_rows
-from pathspace_graph.mapping.measurements import integrate_odometry
+from pathspace_graph.mapping.prediction import integrate_odometry
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings

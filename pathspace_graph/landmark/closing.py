@@ -44,12 +44,15 @@ class LoopPairs:
 
 
 class JointCompatibility:
-    """Tests sets of pairs against the joint Gaussian of some recent and some old landmarks."""
+    """Tests sets of pairs against the joint Gaussian of some recent and some old landmarks.
+
+    `scale` multiplies all standard deviations. `sigma` (m) is the standard deviation of the true offset of a
+    pair, since two estimates of one cone may differ a little more than their covariance says.
+    """
 
     def __init__(
         self, smoother: LandmarkSmoother, recent: IntArray, old: IntArray, scale: float, sigma: float
     ) -> None:
-        """`scale` multiplies all standard deviations, and `sigma` (m) is the one of a pair's true offset."""
         state = smoother.map.state
         self.recent, self.old, self.variance = recent, old, sigma**2
         both = np.concatenate([recent, old])

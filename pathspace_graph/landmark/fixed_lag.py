@@ -10,9 +10,8 @@ from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.measurements import integrate_odometry
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import smoother_settings
+from pathspace_graph.mapping.prediction import predict, smoother_settings
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult, Stopwatch
@@ -55,8 +54,7 @@ class LandmarkFixedLag:
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """Processes one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
-        motion = integrate_odometry(odometry, detections.t, self.odometry_sigma)
-        self.path.update(self.smoother.predict(detections.t, motion, self.settings.odometry.sigmas_start))
+        predict(self.smoother, self.path, odometry, detections.t, self.odometry_sigma, self.settings)
         watch.lap("predict")
         new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
         associate_newest(self.smoother, new, self._eligible())
@@ -122,7 +120,7 @@ class LandmarkFixedLag:
         return np.asarray(last_detected < self.path.length - self.settings.landmark.unseen)
 
     def _close(self) -> None:
-        """Every few metres, closes the loop if old landmarks are detected; then merges duplicates."""
+        """Closes the loop or, once it has closed, merges duplicates; this is tried every few metres."""
         detections, state, length = self.smoother.map.detections, self.smoother.map.state, self.path.length
         detected = np.unique(detections.landmark[detections.used])
         self._last_detected = np.append(

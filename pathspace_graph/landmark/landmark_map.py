@@ -46,18 +46,16 @@ class LandmarkMap:
 
     def rows(self, cycles: IntArray) -> list[Rows]:
         """Returns two rows for each detection in use of some cycles."""
-        wanted = np.zeros(len(self.variables.poses), bool)
-        wanted[cycles - self.variables.first_cycle] = True
-        chosen = self.detections.used & wanted[self.detections.cycle - self.variables.first_cycle]
+        chosen = self.detections.used & self.detections.in_cycles(cycles)
         return [landmark_rows(self.state, self.detections, np.flatnonzero(chosen), self.settings.gate.huber)]
 
     def linearized(self, cycles: IntArray) -> None:
         """Notes that the graph holds the present rows of these cycles."""
-        self.detections.changed[:] = False
+        self.detections.mark_linearized()
 
     @property
     def structure(self) -> object:
-        """This is another object whenever other landmarks are held together than before."""
+        """Returns another object whenever other landmarks are held together than before."""
         return self.loop_pairs
 
     def gauge(self, whole: bool) -> list[Rows]:

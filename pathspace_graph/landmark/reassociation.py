@@ -33,7 +33,10 @@ BoolArray = NDArray[np.bool_]
 
 
 class Reassociation:
-    """Repeats the Hungarian assignment of every cycle, and creates landmarks from unassociated detections."""
+    """Repeats the Hungarian assignment of every cycle, and creates landmarks from unassociated detections.
+
+    `problem` is the linear problem at the state, and `stamps` (P,) are those of the cycles (s).
+    """
 
     def __init__(
         self,
@@ -43,7 +46,6 @@ class Reassociation:
         settings: MapperSettings,
         stamps: Array,
     ) -> None:
-        """`problem` is the linear problem at the state, and `stamps` (P,) are those of the cycles (s)."""
         self.state, self.detections, self.problem = state, detections, problem
         self.settings, self.stamps = settings, stamps
         self.gates = Gates.of(settings.landmark)

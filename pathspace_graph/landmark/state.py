@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.graph.keys import LANDMARK_LETTER, POINT, landmark_keys
 from pathspace_graph.graph.variables import Variables
-from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.mapping.detections import DetectionColumns
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -42,12 +42,12 @@ class LandmarkState:
 
     @property
     def keys(self) -> IntArray:
-        """These are the keys (n,) of the landmarks."""
+        """Returns the keys (n,) of the landmarks."""
         return landmark_keys(self.numbers)
 
     @property
     def landmarks(self) -> Array:
-        """These are the landmarks (n, 2) in the map frame, in m: a view."""
+        """Returns the landmarks (n, 2) in the map frame, in m: a view."""
         return self.variables.block(LANDMARK_LETTER).reshape(-1, POINT)
 
     def positions(self, numbers: IntArray) -> IntArray:
@@ -84,59 +84,27 @@ class LandmarkState:
 
 
 @dataclass
-class LandmarkDetections:
-    """Readings, oldest first, and what each is of: columns of equal length."""
+class LandmarkDetections(DetectionColumns):
+    """Holds detections with the landmark that each of them is associated with."""
 
-    cycle: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Perception cycle that each was made in."""
-    point: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    """Reading in the vehicle frame (m)."""
-    covariance: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
-    """Its covariance in the vehicle frame (m^2)."""
-    label: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """What the sensor says: LEFT, RIGHT or UNKNOWN."""
     landmark: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Number of the landmark that it is of; else UNASSOCIATED or AMBIGUOUS."""
-    changed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
-    """Whether it came into use since its cycle was linearized last."""
-
-    def __len__(self) -> int:
-        return len(self.cycle)
+    """Each detection is of the landmark with this number; otherwise it is UNASSOCIATED or AMBIGUOUS."""
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """(m,) whether each is of a landmark, and so a row of the graph."""
+        """Returns (m,) whether each detection has a landmark, and so is a row of the graph."""
         return self.landmark >= 0
 
-    def append(self, detections: Detections, cycle: int) -> slice:
-        """Add the readings of one cycle, of no landmark yet; gives their rows."""
-        start, m = len(self), len(detections.labels)
-        new = LandmarkDetections(
-            np.full(m, cycle, np.intp),
-            np.asarray(detections.points_vehicle, float),
-            np.asarray(detections.covariances, float),
-            np.asarray(detections.labels, np.intp),
-            np.full(m, UNASSOCIATED, np.intp),
-            np.zeros(m, bool),
-        )
-        for column in fields(self):
-            both = [getattr(self, column.name), getattr(new, column.name)]
-            setattr(self, column.name, np.concatenate(both))
-        return slice(start, start + m)
-
-    def keep_from(self, cycle: int) -> None:
-        """Forget the readings of earlier cycles."""
-        first = int(self.cycle.searchsorted(cycle))
-        for column in fields(self):
-            setattr(self, column.name, getattr(self, column.name)[first:])
+    def _clear_associations(self) -> None:
+        self.landmark = np.full(len(self), UNASSOCIATED, np.intp)
 
     def merge(self, gone: IntArray, kept: IntArray) -> None:
-        """Readings of landmarks `gone` (k,), by number, are of `kept` (k,) from now on."""
+        """Associates all detections of landmarks `gone` (k,), by number, with `kept` (k,)."""
         for number, became in zip(gone.tolist(), kept.tolist(), strict=True):
             self.landmark[self.landmark == number] = became
 
     def take(self, rows: IntArray, numbers: IntArray) -> None:
-        """These readings (k,) are of landmarks (k,)."""
+        """Associates detections (k,) with landmarks (k,)."""
         self.landmark[rows], self.changed[rows] = numbers, True
 
 

@@ -13,11 +13,11 @@ from pathspace_graph.graph.keys import CALIBRATION_KEY, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import RIGHT
-from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
+from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .landmark_map import landmark_rows
-from .state import UNASSOCIATED, LandmarkDetections, LandmarkState
+from .state import LandmarkDetections, LandmarkState
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ class LandmarkSystem:
 
     detections: LandmarkDetections
     """These are the detections of the whole log."""
-    chain: Chain
+    chain: LogOdometry
     """This is the odometry of the whole log."""
     settings: MapperSettings
 
@@ -39,7 +39,7 @@ class LandmarkSystem:
     def of_log(cls, log: Log, settings: MapperSettings, odometry_sigma: Array) -> LandmarkSystem:
         """Returns the problem of a log without any association; `odometry_sigma` (3,) is that of a twist."""
         chain = integrate_log(log, odometry_sigma, settings.odometry)
-        return cls(collect_landmark_detections(log), chain, settings)
+        return cls(LandmarkDetections.of(log.cycles), chain, settings)
 
     def cost(self, state: LandmarkState) -> float:
         """Returns half the sum of squares at a state, with Huber's loss of the detections."""
@@ -81,15 +81,6 @@ class LandmarkSystem:
             cost, damping = cost - gain, max(settings.damping_down * damping, settings.damping_least)
             if gain <= self.settings.landmark.tolerance * cost:
                 break
-
-
-def collect_landmark_detections(log: Log) -> LandmarkDetections:
-    """Returns every detection of a log without any association."""
-    plain = collect_detections(log)
-    landmark = np.full(len(plain), UNASSOCIATED, np.intp)
-    return LandmarkDetections(
-        plain.cycle, plain.point, plain.covariance, plain.label, landmark, plain.changed
-    )
 
 
 def insert_drive(state: LandmarkState, calibration: Array, poses: Array) -> None:

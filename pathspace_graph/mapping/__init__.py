@@ -1,1 +1,1 @@
-"""What the estimators share: their state, detections, the path driven, and the rows of the curves."""
+"""What several estimators share: state, detections, tentative tracks, the driven path, and loop closure."""

@@ -54,7 +54,7 @@ class Belief:
 
     @property
     def points(self) -> Array:
-        """These are the mean points (m, 2), a view of the mean."""
+        """Returns a view of the mean points (m, 2)."""
         return self.mean[HEAD:].reshape(-1, POINT)
 
     def predict(self, odometry: IntegratedOdometry) -> None:

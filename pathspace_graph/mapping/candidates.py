@@ -1,4 +1,4 @@
-"""What a boundary may be led through: sightings that are its own, and follow one another along the way."""
+"""Candidates for the extension of a boundary, and the chain of them that the path's order allows."""
 
 from __future__ import annotations
 
@@ -7,34 +7,31 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import GrowthSettings
-
-from .curve_map import CurveSmoother
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 SIDES = {LEFT: 1.0, RIGHT: -1.0}
-"""Sign of the signed distance from the path on which each boundary lies."""
+"""Each boundary lies where the signed distance from the path (left positive) has this sign."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Sightings that a boundary may be led through, in the order of the way."""
+    """Holds the points that a boundary may be extended through."""
 
     points: Array
-    """(n, 2) map frame, m."""
+    """(n, 2) Each row holds a position (x, y) in m, map frame."""
     indices: IntArray
-    """(n,) their indices among the sightings."""
+    """(n,) Each candidate has this index among the tentative tracks, or among a cycle's detections."""
     stations: Array
-    """(n,) path length to each, m."""
+    """(n,) Each candidate lies beside the path at this station (path length, m)."""
     sides: Array
-    """(n,) distance from the path to the boundary's own side, m."""
+    """(n,) Each candidate has this distance from the path (m), positive on the boundary's own side."""
 
     def where(self, chosen: IntArray | NDArray[np.bool_]) -> Candidates:
-        """Some of them."""
+        """Returns the chosen candidates, in the given order if they are chosen by index."""
         return Candidates(
             self.points[chosen], self.indices[chosen], self.stations[chosen], self.sides[chosen]
         )
@@ -42,37 +39,23 @@ class Candidates:
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """The end of a curve, as far as sightings hold it."""
+    """Holds where the confirmed part of a curve ends."""
 
     position: Array
-    """(2,) map frame, m."""
+    """(2,) The end has this position (x, y) in m, map frame."""
     station: float
-    """Path length to it, m."""
+    """The end lies beside the path at this station (m)."""
     side: float
-    """Its distance from the path to the boundary's own side, m."""
-
-
-def undisputed(smoother: CurveSmoother, label: int, points: Array, radius: float) -> NDArray[np.bool_]:
-    """Which places (n, 2) have no more readings of the other boundary's label around them than of their own.
-
-    A sensor that takes a cone for one of the other boundary now and then sees it in its true colour oftener.
-    Readings in the window count, in use or not, within `radius` (m).
-    """
-    detections = smoother.map.detections
-    rows = np.flatnonzero(detections.label != UNKNOWN)
-    seen = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
-    offset = points[:, None] - seen
-    near = offset[:, :, 0] ** 2 + offset[:, :, 1] ** 2 < radius**2
-    votes = near @ np.where(detections.label[rows] == label, 1, -1)
-    return np.asarray(votes >= 0)
+    """The end has this distance from the path (m), positive on the boundary's own side."""
 
 
 def chain(found: Candidates, settings: GrowthSettings, end: End | None) -> IntArray:
-    """Indices of those that follow one another: each not much farther from the path than the last.
+    """Returns the indices of the candidates, sorted by station, that may follow one another.
 
-    `side_i <= side_last + lateral_change + lateral_rate (s_i - s_last)`, from the end of the curve on where
-    there is one; and of those at about the same station the one nearest to the path: what is behind another
-    row belongs to another stretch of the track.
+    A candidate i may follow the last accepted one, or the end of the curve, if
+    `side_i <= side_last + lateral_change + lateral_rate (s_i - s_last)`. Of candidates at about the same
+    station only those nearest to the path remain: a second row behind the first belongs to another stretch of
+    the track.
     """
     chosen: list[int] = []
     last = None if end is None else (end.station, end.side)

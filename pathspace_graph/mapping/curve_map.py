@@ -1,8 +1,9 @@
-"""The curves as the engine sees them: rows of readings (paper: Update) and of weak priors, on keys."""
+"""The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,49 +25,48 @@ from .state import State
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-TOGETHER = 6
-"""Control points in a row whose weak priors are one factor: few factors, and small ones."""
+POINTS_PER_FACTOR = 6
+"""The weak priors of this number of consecutive control points are one factor, so that there are few factors
+and each of them is small."""
 
 
 class CurveMap:
-    """Both boundaries, the readings of the poses in the window, and the rows that both make."""
+    """Holds both boundaries and the detections of the window's poses, and builds their rows."""
 
     def __init__(self, settings: MapperSettings, state: State | None = None) -> None:
         self.settings = settings
         self.state = state or State()
-        """The curves, and all variables."""
+        """The state holds the curves and all variables."""
         self.variables = self.state.variables
         self.detections = DetectionTable()
-        """Readings of the poses in the window."""
+        """The table holds the detections of the poses in the window."""
         self.slid = False
-        """Whether a reading of the rows asked for last has slid to where an open curve is inactive."""
+        """The flag is set when a foot point of the latest `rows` has slid to an inactive part of a curve."""
         self._found: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
 
-    # --- readings ----------------------------------------------------------------------------------------
+    # --- detections --------------------------------------------------------------------------------------
 
     def changed(self) -> IntArray:
-        """(k,) cycles whose readings in use have changed since they were linearized last."""
+        """Returns the cycles (k,) whose associations have changed since they were last linearized."""
         return self.detections.cycle[self.detections.changed]
 
     def rows(self, cycles: IntArray) -> list[Rows]:
-        """`w_i n_i . (R z_i + t - S(u_i)) / sigma_i` of the readings in use of some cycles.
+        """Returns `w_i n_i . (R z_i + t - S(u_i)) / sigma_i` for the detections in use of ascending cycles.
 
-        Keys [pose | control points of the span]; w the root of the Huber weight, zero where the foot point is
-        not interior. The readings are left as they are. Of the residual `point` two rows each.
+        The keys are [pose | control points of the span]; w is the root of the Huber weight, and zero if the
+        foot point is not interior. The residual `point` has two rows for each detection. The refined
+        parameters u are stored in the table only by `linearized`.
         """
         state, detections, settings = self.state, self.detections, self.settings
         if not state.boundaries or len(cycles) == 0:
             return []
-        wanted = np.zeros(int(cycles[-1]) + 1, bool)
-        wanted[cycles] = True
-        rows = np.flatnonzero(detections.used[: detections.cycle.searchsorted(len(wanted))])
-        rows = rows[wanted[detections.cycle[rows]]]
+        rows = np.flatnonzero(detections.used & detections.in_cycles(cycles))
         curves, cycle = state.curves, detections.cycle[rows]
         curve = curves.number(detections.boundary[rows])
         poses = self.variables.poses_at(cycle)
         points = to_map(detections.point[rows], poses)
         foot = curves.refine(state.map_points, points, curve, detections.u[rows])
-        self._found, self.slid = (rows, foot.u), curves.cut_off(curve, foot)
+        self._found, self.slid = (rows, foot.u), curves.reaches_inactive(curve, foot)
         measured = points, detections.covariance[rows], poses, foot, settings
         jacobian, residual = (
             _to_point(*measured) if settings.spline.residual == "point" else _across(*measured)
@@ -76,17 +76,17 @@ class CurveMap:
         return [Rows(np.repeat(keys, doubled, axis=0), jacobian, residual, np.repeat(cycle, doubled))]
 
     def linearized(self, cycles: IntArray) -> None:
-        """The rows that were asked for last, of these cycles, are those of the graph from now on."""
+        """Accepts the latest `rows`, of these cycles: the graph holds them from now on."""
         if len(cycles) and self.state.boundaries:
-            rows, u = self._found
-            self.detections.u[rows], self.detections.changed[:] = u, False
+            self.detections.refine(*self._found)
+            self.detections.mark_linearized()
 
     def all_active(self) -> None:
-        """Every control point is active again."""
-        self.state.narrowed = {}
+        """Makes every control point active."""
+        self.state.active_stretch = {}
 
     def leave(self, cycle: int) -> None:
-        """The pose of a cycle, the window's oldest, has left with its readings."""
+        """Removes the detections of a cycle whose pose, the oldest one, has left the window."""
         self.detections.keep_from(cycle + 1)
         self.state.drop_oldest_pose_u()
 
@@ -94,13 +94,13 @@ class CurveMap:
 
     @property
     def structure(self) -> object:
-        """Another object where the weak priors are between other control points than before."""
+        """Returns an object that is replaced when the weak priors hold other control points than before."""
         return self.state.curves if self.state.boundaries else None
 
     def gauge(self, whole: bool) -> list[Rows]:
-        """Spacing between the active control points, or between all.
+        """Returns the spacing `(|c_{j+1} - c_j| - nominal_j) / (sigma_spacing nominal_j)`.
 
-        `(|c_{j+1} - c_j| - nominal_j) / (sigma_spacing nominal_j)`.
+        The rows hold the active control points, or all of them if `whole`.
         """
         if not self.state.boundaries:
             return []
@@ -117,10 +117,10 @@ class CurveMap:
         return [_stacked(found)]
 
     def linear_gauge(self, whole: bool) -> list[Rows]:
-        """Smoothness and anchor between the active control points, or between all: rows that are linear.
+        """Returns the linear priors: smoothness `D c / (sigma_smoothness spacing)`, and anchors.
 
-        `D c / (sigma_smoothness spacing)`, and an anchor that holds each point where it is, so weakly that it
-        only keeps the system regular.
+        An anchor holds each control point where it is, so weakly that it only keeps the system regular. The
+        rows hold the active control points, or all of them if `whole`.
         """
         smooth, anchors = [], []
         for label, gauge in self._gauges(whole):
@@ -137,16 +137,16 @@ class CurveMap:
             yield label, boundary.gauge_on(boundary.everything if whole else self.state.active(label))
 
     def _rows(self, label: int, points: IntArray, jacobian: Array, residual: Array) -> Rows:
-        """Rows, equally many of each line of points (m, k); those of neighbouring points have one owner."""
+        """Returns rows, equally many for each row of `points` (m, k); neighbouring points share an owner."""
         repeated = np.repeat(points, len(residual) // max(len(points), 1), axis=0)
-        owner = len(CONTROL_LETTERS) * (repeated[:, 0] // TOGETHER) + label
+        owner = len(CONTROL_LETTERS) * (repeated[:, 0] // POINTS_PER_FACTOR) + label
         return Rows(
             control_keys(label, self.state.boundaries[label].first + repeated), jacobian, residual, owner
         )
 
 
 def _stacked(groups: Sequence[Rows]) -> Rows:
-    """Rows of one pattern, one group after the other."""
+    """Concatenates groups of rows that have equally many keys."""
     return Rows(
         keys=np.concatenate([rows.keys for rows in groups]),
         jacobian=np.concatenate([rows.jacobian for rows in groups]),
@@ -156,7 +156,7 @@ def _stacked(groups: Sequence[Rows]) -> Rows:
 
 
 def _by_axis(coefficients: Array) -> Array:
-    """(2 m, 2 k) the same coefficients (m, k) on x and on y of k points, a row each."""
+    """Returns (2 m, 2 k) the coefficients (m, k) of k points, once for x and once for y."""
     both = np.zeros((len(coefficients), 2, coefficients.shape[1], 2))
     both[:, 0, :, 0] = both[:, 1, :, 1] = coefficients
     return both.reshape(2 * len(coefficients), 2 * coefficients.shape[1])
@@ -165,7 +165,7 @@ def _by_axis(coefficients: Array) -> Array:
 def _across(
     points: Array, covariances: Array, poses: Array, foot: FootPoints, settings: MapperSettings
 ) -> tuple[Array, Array]:
-    """Weighted Jacobian (m, 3 + 2 (degree + 1)) and residual (m,) of the distances across the curve."""
+    """Returns the weighted Jacobian (m, 3 + 2 (degree + 1)) and residual (m,) of the signed distances."""
     projected = project(points, covariances, poses, foot, settings.spline.sigma_model)
     whitened = projected.residual / projected.sigma
     weight = np.sqrt(huber_weights(whitened, settings.gate.huber)) * foot.interior / projected.sigma
@@ -177,7 +177,10 @@ def _across(
 def _to_point(
     points: Array, covariances: Array, poses: Array, foot: FootPoints, settings: MapperSettings
 ) -> tuple[Array, Array]:
-    """The same (2 m, ...) and (2 m,) of the offsets from the foot points, a reading's two rows together."""
+    """Returns the weighted Jacobian (2 m, 3 + 2 (degree + 1)) and residual (2 m,) of whitened offsets.
+
+    The offsets lead from the foot points to the detections; both rows of a detection are adjacent.
+    """
     projected = offset_from_foot_point(points, covariances, poses, foot, settings.spline.sigma_model)
     size = np.hypot(projected.residual[:, 0], projected.residual[:, 1])
     weight = np.repeat(np.sqrt(huber_weights(size, settings.gate.huber)) * foot.interior, 2)
@@ -186,5 +189,5 @@ def _to_point(
     return jacobian * weight[:, None], projected.residual.ravel() * weight
 
 
-CurveSmoother = FixedLagSmoother[CurveMap]
-"""The engine on both boundaries' curves."""
+CurveSmoother: TypeAlias = FixedLagSmoother[CurveMap]
+"""This is the fixed-lag engine on both boundaries' curves."""

@@ -1,4 +1,4 @@
-"""The map's curves side by side: foot points of readings on both boundaries in one pass."""
+"""The map's curves side by side, so that detections of both boundaries are projected in one pass."""
 
 from __future__ import annotations
 
@@ -19,27 +19,28 @@ IntArray = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """The active part of every curve, all control points of the map in one array: curve 0, 1 by label."""
+    """Holds the active part of every curve: curves 0 to k - 1 in the order of their labels.
+
+    The control points of all curves are rows of one array, as `State.map_points` has them.
+    """
 
     boundaries: tuple[Boundary, ...]
-    """By label."""
+    """These are the curves."""
     labels: IntArray
-    """(k,) theirs."""
+    """(k,) These are the labels of the curves, ascending."""
     active: tuple[IntArray, ...]
-    """Control points of each that are active."""
+    """These are the active control points of each curve, by index."""
     tables: tuple[SpanPolynomials, ...]
-    """Of the whole of each."""
+    """These are the tables of each whole curve."""
     spans: Spans
-    """Of closed curves all; open ones begin with the first active control point."""
-    cut: Array
-    """(k,) parameter before which an open curve is inactive; minus infinity where nothing of it is."""
+    """All spans of closed curves are included; an open curve begins at its first active control point."""
+    active_from: Array
+    """(k,) An open curve is inactive before this parameter, which is minus infinity if all is active."""
     keys: IntArray
-    """(m,) keys of all control points of the map."""
-    offsets: IntArray
-    """(k,) where each curve's begin among them."""
+    """(m,) These are the keys of all control points."""
 
-    def are(self, boundaries: Mapping[int, Boundary], active: Callable[[int], IntArray]) -> bool:
-        """Whether these are the boundaries, as they are now, and their active control points."""
+    def is_current(self, boundaries: Mapping[int, Boundary], active: Callable[[int], IntArray]) -> bool:
+        """Returns whether these are the boundaries and active control points as they are now."""
         return len(boundaries) == len(self.tables) and all(
             boundary.tables is tables and active(label) is indices
             for (label, boundary), tables, indices in zip(
@@ -48,49 +49,48 @@ class Curves:
         )
 
     def number(self, labels: IntArray) -> IntArray:
-        """(m,) which curve has each of these labels."""
+        """Returns the index (m,) of the curve that has each label (m,)."""
         return self.labels.searchsorted(labels)
 
     def believed(self, curve: IntArray, high: Array) -> Array:
-        """Upper limits of stretches (m,), kept off what open curves only extrapolate."""
+        """Returns upper limits (m,) of stretches, clipped so that they exclude extrapolated ends."""
         trusted = np.array([boundary.trusted for boundary in self.boundaries])
         return np.asarray(np.minimum(high, trusted[curve]))
 
     def find(
         self, control_points: Array, points: Array, curve: IntArray, low: Array, high: Array
     ) -> FootPoints:
-        """Foot points of points (m, 2), each on its own curve (m,) and stretch, searched for globally."""
+        """Searches the foot point of each point (m, 2) on its own curve (m,) and stretch [low, high]."""
         s, high = self.boundaries[0].settings, self.believed(curve, high)
         search = (s.search_step, s.search_iterations)
         return joint_foot_points(self.spans, control_points, points, curve, low, high, *search)
 
     def refine(self, control_points: Array, points: Array, curve: IntArray, u: Array) -> FootPoints:
-        """Foot points of points (m, 2), each on its own curve (m,), near the parameters (m,) they had."""
+        """Refines the foot point of each point (m, 2) on its own curve (m,), starting at u (m,)."""
         s = self.boundaries[0].settings
         low, high = u - s.refine_room, self.believed(curve, u + s.refine_room)
         return refine_joint_foot_points(
             self.spans, control_points, points, curve, u, low, high, s.refine_iterations
         )
 
-    def cut_off(self, curve: IntArray, foot: FootPoints) -> bool:
-        """Whether the foot point of any row, on curve (m,), is where an open curve is inactive."""
-        return not self.spans.periodic and bool((foot.u <= self.cut[curve]).any())
+    def reaches_inactive(self, curve: IntArray, foot: FootPoints) -> bool:
+        """Returns whether any foot point, each on its own curve (m,), is on an inactive part."""
+        return not self.spans.periodic and bool((foot.u <= self.active_from[curve]).any())
 
 
-def side_by_side(boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> Curves:
-    """Some boundaries, at least one, with the control points (k,) of each that are active."""
-    all_of, active_of = tuple(boundaries.values()), tuple(active[label] for label in boundaries)
-    sizes = [boundary.size for boundary in all_of]
+def lay_out_curves(boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> Curves:
+    """Lays out boundaries, at least one, with the active control points (k,) of each."""
+    curves, active_of = tuple(boundaries.values()), tuple(active[label] for label in boundaries)
+    sizes = [boundary.size for boundary in curves]
     offsets = np.cumsum([0, *sizes[:-1]])
-    first = [0 if b.periodic else int(indices[0]) for b, indices in zip(all_of, active_of, strict=True)]
-    tables = [b.tables.tail(start) if start else b.tables for b, start in zip(all_of, first, strict=True)]
+    first = [0 if b.periodic else int(indices[0]) for b, indices in zip(curves, active_of, strict=True)]
+    tables = [b.tables.tail(start) if start else b.tables for b, start in zip(curves, first, strict=True)]
     return Curves(
-        boundaries=all_of,
+        boundaries=curves,
         labels=np.array(list(boundaries), np.intp),
         active=active_of,
-        tables=tuple(boundary.tables for boundary in all_of),
+        tables=tuple(boundary.tables for boundary in curves),
         spans=lay_out(tables, [int(o) + f for o, f in zip(offsets, first, strict=True)], sizes),
-        cut=np.array([t.low if start else -np.inf for t, start in zip(tables, first, strict=True)]),
+        active_from=np.array([t.low if start else -np.inf for t, start in zip(tables, first, strict=True)]),
         keys=np.concatenate([control_keys(label, b.numbers) for label, b in boundaries.items()]),
-        offsets=offsets,
     )

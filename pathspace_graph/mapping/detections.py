@@ -1,8 +1,10 @@
-"""The readings of the poses in the window, row by row."""
+"""Tables of detections: one row for each detected cone, with what an estimator has decided about it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,77 +18,109 @@ BoolArray = NDArray[np.bool_]
 
 
 @dataclass
-class DetectionTable:
-    """Columns of equal length, oldest reading first."""
+class DetectionColumns:
+    """Holds what the sensor measured: columns of equal length, the oldest detection first.
+
+    A subclass adds the columns of its associations; only the table's own methods write to any column.
+    """
 
     cycle: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Perception cycle that each was made in."""
+    """Each detection was made in this perception cycle; the column never decreases."""
     point: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    """Reading in the vehicle frame (m)."""
+    """Each row holds a detected position (x, y) in m, vehicle frame."""
     covariance: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
-    """Its covariance in the vehicle frame (m^2)."""
+    """Each entry is the (2, 2) covariance of the position in m^2, vehicle frame."""
     label: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """What the sensor says: LEFT, RIGHT or UNKNOWN."""
-    boundary: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Boundary whose curve it is held against; UNKNOWN until that is decided."""
-    u: Array = field(default_factory=lambda: np.zeros(0))
-    """Its foot point's parameter on that curve, where used."""
-    used: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
-    """Whether it is a row of the factor graph."""
+    """The sensor assigned this colour: LEFT, RIGHT or UNKNOWN."""
     changed: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
-    """Whether it came into use, or went out of it, since its cycle was linearized last."""
+    """The flag is set when the association has changed since the detection's cycle was last linearized."""
 
     def __len__(self) -> int:
         return len(self.cycle)
 
-    def append(self, detections: Detections, cycle: int) -> slice:
-        """Add the readings of one cycle, none used yet; gives their rows."""
-        m = len(detections.labels)
-        start = len(self)
-        new = DetectionTable(
-            np.full(m, cycle, np.intp),
-            np.asarray(detections.points_vehicle, float),
-            np.asarray(detections.covariances, float),
-            np.asarray(detections.labels, np.intp),
-            np.asarray(detections.labels, np.intp),
-            np.zeros(m),
-            np.zeros(m, bool),
-            np.zeros(m, bool),
+    @classmethod
+    def of(cls, cycles: Sequence[Detections], first: int = 0) -> Self:
+        """Builds the table of consecutive perception cycles, numbered from `first`; nothing is in use."""
+        counts = [len(one.labels) for one in cycles]
+        table = cls(
+            cycle=first + np.repeat(np.arange(len(cycles)), counts),
+            point=np.concatenate([np.zeros((0, 2)), *(one.points_vehicle for one in cycles)]),
+            covariance=np.concatenate([np.zeros((0, 2, 2)), *(one.covariances for one in cycles)]),
+            label=np.concatenate([np.zeros(0, np.intp), *(one.labels for one in cycles)]).astype(np.intp),
+            changed=np.zeros(sum(counts), bool),
         )
+        table._clear_associations()
+        return table
+
+    def _clear_associations(self) -> None:
+        """Fills the subclass's columns as they are before any association."""
+
+    def append(self, detections: Detections, cycle: int) -> slice:
+        """Adds the detections of one cycle, none of them in use; returns their rows."""
+        start, new = len(self), type(self).of([detections], cycle)
         for column in fields(self):
-            setattr(
-                self, column.name, np.concatenate([getattr(self, column.name), getattr(new, column.name)])
-            )
-        return slice(start, start + m)
+            both = [getattr(self, column.name), getattr(new, column.name)]
+            setattr(self, column.name, np.concatenate(both))
+        return slice(start, len(self))
 
     def keep_from(self, cycle: int) -> None:
-        """Forget the readings of earlier cycles."""
+        """Removes the detections of all cycles before `cycle`."""
         first = int(self.cycle.searchsorted(cycle))
         for column in fields(self):
             setattr(self, column.name, getattr(self, column.name)[first:])
 
+    def in_cycles(self, cycles: IntArray) -> BoolArray:
+        """Returns (m,) whether each detection was made in one of the ascending cycles (k,)."""
+        if len(cycles) == 0:
+            return np.zeros(len(self), bool)
+        return np.asarray(cycles.take(cycles.searchsorted(self.cycle), mode="clip") == self.cycle)
+
+    def mark_linearized(self) -> None:
+        """Clears every `changed` flag: the graph holds all associations as they are now."""
+        self.changed[:] = False
+
+
+@dataclass
+class DetectionTable(DetectionColumns):
+    """Holds detections with the boundary curve that each of them is associated with."""
+
+    boundary: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
+    """Each detection is associated with this boundary's curve; it is UNKNOWN until that is decided."""
+    u: Array = field(default_factory=lambda: np.zeros(0))
+    """Each detection in use has its foot point at this parameter of the curve."""
+    used: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
+    """The flag is set when the detection is a row of the factor graph."""
+
+    def _clear_associations(self) -> None:
+        self.boundary, self.u, self.used = self.label.copy(), np.zeros(len(self)), np.zeros(len(self), bool)
+
     def take(self, rows: IntArray, boundary: IntArray | int, u: Array) -> None:
-        """These readings are in use on a boundary, each with its foot point's parameter."""
+        """Puts detections into use on a boundary, with the parameters (m,) of their foot points."""
         self.used[rows], self.boundary[rows], self.u[rows], self.changed[rows] = True, boundary, u, True
 
     def release(self, rows: IntArray) -> None:
-        """These readings are in use no more; the boundary of those without a colour is open again."""
+        """Takes detections out of use; those of unknown colour may join either boundary again."""
         self.used[rows], self.boundary[rows], self.changed[rows] = False, self.label[rows], True
 
+    def refine(self, rows: IntArray, u: Array) -> None:
+        """Stores the refreshed foot points' parameters (m,); the associations do not change."""
+        self.u[rows] = u
+
     def used_on(self, label: int) -> IntArray:
-        """Rows in use on the boundary `label`."""
+        """Returns the rows in use on the boundary `label`."""
         return np.flatnonzero(self.used & (self.boundary == label))
 
     def pending(self, label: int) -> IntArray:
-        """Rows not in use that may belong to the boundary `label`, those of unknown colour included."""
+        """Returns the rows out of use that may join the boundary `label`; unknown colours are included."""
         return np.flatnonzero(~self.used & ((self.label == label) | (self.label == UNKNOWN)))
 
     def open_to(self, label: int, since: int) -> IntArray:
-        """Rows, from one on, that the boundary `label` may take: not in use, or doubtful where they are.
+        """Returns the rows, from `since` on, that the boundary `label` is tested for.
 
-        Of unknown colour are those too that another boundary has in use.
+        These are the rows out of use, and those of unknown colour that the other boundary uses: if both
+        boundaries accept one, it is ambiguous.
         """
-        said, used = self.label[since:], self.used[since:]
-        unknown = said == UNKNOWN
-        open_to = np.where(used, unknown & (self.boundary[since:] != label), unknown | (said == label))
-        return since + np.flatnonzero(open_to)
+        label_since, used = self.label[since:], self.used[since:]
+        unknown = label_since == UNKNOWN
+        is_open = np.where(used, unknown & (self.boundary[since:] != label), unknown | (label_since == label))
+        return since + np.flatnonzero(is_open)

@@ -1,4 +1,4 @@
-"""The way driven, and the way ahead as the current turn predicts it: growth goes along it."""
+"""The driven path, and the path ahead as the current turn predicts it: curves grow along both."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PathAhead:
-    """The path driven and an arc ahead of the vehicle, as one polyline."""
+    """Holds the driven path and an arc ahead of the vehicle as one polyline."""
 
     points: Array
-    """(n, 2) positions, map frame, m."""
+    """(n, 2) Each row holds a position (x, y) in m, map frame."""
     stations: Array
-    """(n,) path length to each, m."""
+    """(n,) Each position has this station: the path length up to it (m)."""
     driven: float
-    """Station of the vehicle, m."""
+    """The vehicle is at this station (m)."""
 
     def locate(self, points: Array) -> tuple[Array, Array]:
-        """Stations (m,) and signed distances (m,), left positive, of points (m, 2)."""
+        """Returns the stations (m,) and the signed distances (m,), left positive, of points (m, 2)."""
         return along_and_across(points, self.points, self.stations)
 
     def since(self, station: float) -> PathAhead:
-        """What of it comes after a station (m), from the last position before that on."""
+        """Returns the path from the last position before a station (m) on."""
         first = max(int(self.stations.searchsorted(station)) - 1, 0)
         return PathAhead(self.points[first:], self.stations[first:], self.driven)
 
     def beside(self, station: float, lateral: float) -> Array:
-        """(2,) the point at about a station, so far to the left of the way."""
+        """Returns the point (2,) near a station (m), at a signed distance (m) to the left of the path."""
         i = int(np.clip(np.searchsorted(self.stations, station), 1, len(self.stations) - 1))
         direction = self.points[i] - self.points[i - 1]
         direction /= max(np.hypot(*direction), np.finfo(float).tiny)
@@ -41,24 +41,24 @@ class PathAhead:
 
 
 class DrivenPath:
-    """Positions driven, a least step apart, with their stations (path length, m); and the present turn."""
+    """The driven path is a polyline that grows with the vehicle; it also tracks the present curvature."""
 
     def __init__(self, settings: PathSettings | None = None) -> None:
         self.settings = settings or PathSettings()
         self.points: Array = np.zeros((0, 2))
-        """(n, 2) positions kept, map frame, m."""
+        """(n, 2) Each row holds a kept position (x, y) in m, map frame; they are at least a step apart."""
         self.stations: Array = np.zeros(0)
-        """(n,) theirs, m."""
+        """(n,) Each kept position has this station: the path length up to it (m)."""
         self.beginning: Array = np.zeros((0, 3))
-        """Poses on the first stretch, as long as the memory."""
+        """(k, 3) These are poses (x, y, theta) on the first stretch, which is as long as the memory."""
         self.length = 0.0
-        """Path driven so far, the station of the last position, m."""
+        """The vehicle is at this station: the length of the driven path (m)."""
         self.curvature = 0.0
-        """Smoothed curvature of the path now, left positive, 1/m."""
+        """This is the smoothed curvature of the present turn (1/m), left positive."""
         self._last: Array = np.zeros(2)
 
     def update(self, pose: Array) -> None:
-        """Drive on to `pose` (3,), map frame."""
+        """Extends the path to `pose` (3,), map frame."""
         self._keep_beginning(pose)
         position = pose[:2]
         if len(self.points) == 0:
@@ -75,7 +75,7 @@ class DrivenPath:
             self.points, self.stations = self.points[keep], self.stations[keep]
 
     def _take_back(self, pose: Array) -> None:
-        """Driving backwards to `pose` (3,) undoes the path that was driven since the vehicle was there."""
+        """Shortens the path if the vehicle drove backwards to `pose` (3,)."""
         heading = np.array([np.cos(pose[2]), np.sin(pose[2])])
         moved = pose[:2] - self._last
         self._last = pose[:2].copy()
@@ -87,6 +87,7 @@ class DrivenPath:
             self.points, self.stations = self.points[:-1], self.stations[:-1]
 
     def _keep_beginning(self, pose: Array) -> None:
+        """Adds a pose to the beginning while the path is shorter than the memory."""
         if self.length > self.settings.memory:
             return
         first = len(self.beginning) == 0
@@ -94,7 +95,7 @@ class DrivenPath:
             self.beginning = np.concatenate([self.beginning, pose[None]])
 
     def steer(self, twists: Array) -> None:
-        """Follow the curvature `w / v` of body twists (k, 3), where they are fast enough to tell."""
+        """Updates the curvature by `w / v` of body twists (k, 3), if the vehicle is fast enough."""
         if len(twists) == 0:
             return
         speed, _, rate = twists.mean(axis=0)
@@ -104,7 +105,7 @@ class DrivenPath:
             self.curvature += self.settings.curvature_gain * (now - self.curvature)
 
     def ahead(self, pose: Array, reach: float) -> PathAhead:
-        """The path driven, and an arc of the current curvature for `reach` metres ahead of `pose` (3,)."""
+        """Returns the driven path, continued from `pose` (3,) by an arc of `reach` metres."""
         step = self.settings.step
         s = np.arange(0.0, reach + step, step)
         angle = 0.5 * self.curvature * s
@@ -116,9 +117,10 @@ class DrivenPath:
 
 
 def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array, Array]:
-    """Station (m,) and signed distance (m,), left positive, of points (m, 2) from a polyline (n, 2), n >= 2.
+    """Returns the station (m,) and signed distance (m,), left positive, of points (m, 2) beside a polyline.
 
-    Past the last position the station runs on along the last segment.
+    The polyline has at least two positions (n, 2) with stations (n,). Beyond the last position the station
+    continues along the last segment.
     """
     (x, y), (ex, ey) = path[:-1].T, np.diff(path, axis=0).T
     length2 = np.maximum(ex**2 + ey**2, np.finfo(float).tiny)
@@ -129,8 +131,8 @@ def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array
     rows = np.arange(len(points))
     ex, ey, dx, dy = ex[best], ey[best], dx[rows, best], dy[rows, best]
     overshoot = np.where(best == len(length2) - 1, (dx * ex + dy * ey) / length2[best] - 1.0, 0.0)
-    at = np.where(overshoot > 0.0, 1.0 + overshoot, share[rows, best])
-    side = ex * dy - ey * dx
-    across = np.sign(side) * np.sqrt(distance2[rows, best])
-    lateral = np.where(overshoot > 0.0, side / np.sqrt(length2[best]), across)
-    return stations[best] + at * (stations[best + 1] - stations[best]), lateral
+    along = np.where(overshoot > 0.0, 1.0 + overshoot, share[rows, best])
+    cross = ex * dy - ey * dx
+    nearest = np.sign(cross) * np.sqrt(distance2[rows, best])
+    lateral = np.where(overshoot > 0.0, cross / np.sqrt(length2[best]), nearest)
+    return stations[best] + along * (stations[best + 1] - stations[best]), lateral

@@ -1,13 +1,47 @@
-"""The prediction of the newest pose (paper: Predict), and the engine's settings."""
+"""The prediction of the newest pose by odometry (paper: Predict)."""
 
 from __future__ import annotations
 
-from pathspace_graph.graph.smoother import SmootherSettings
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
+from pathspace_graph.graph.smoother import FixedLagSmoother, SmootherSettings
+from pathspace_graph.graph.window import MapRows
+from pathspace_graph.io.log import Odometry
 from pathspace_graph.settings.mapper import MapperSettings
+
+from .path import DrivenPath
+
+Array = NDArray[np.float64]
+
+
+def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:
+    """Integrates twists, each held until the next and the last one until a stamp (s).
+
+    sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s).
+    """
+    return integrate_twists(np.diff(np.append(odometry.t, until)), odometry.twist, sigma)
+
+
+def predict(
+    smoother: FixedLagSmoother[MapRows],
+    path: DrivenPath,
+    odometry: Odometry,
+    t: float,
+    sigma: Array,
+    settings: MapperSettings,
+) -> None:
+    """Adds the pose at t (s) by the calibrated odometry since the newest one, and extends the driven path.
+
+    sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s).
+    """
+    path.update(smoother.predict(t, integrate_odometry(odometry, t, sigma), settings.odometry.sigmas_start))
+    path.steer(odometry.twist)
 
 
 def smoother_settings(settings: MapperSettings) -> SmootherSettings:
-    """What the engine is told of the settings."""
+    """Returns the engine's part of an estimator's settings."""
     return SmootherSettings(
         lag=settings.lag,
         tolerances=(settings.relinearize.point, settings.relinearize.heading),

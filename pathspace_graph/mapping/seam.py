@@ -1,4 +1,4 @@
-"""The seam of a curve that closes: where its end lies on its beginning, and its periodic knots."""
+"""The change of an open curve whose end overlaps its beginning to a periodic one (paper: Simplification)."""
 
 from __future__ import annotations
 
@@ -18,43 +18,43 @@ Array = NDArray[np.float64]
 
 
 EXTRAPOLATED = 2
-"""Knot intervals past the last sighting whose parameters are given a place on the closed curve."""
+"""Parameters up to this number of knot intervals past the confirmed end are mapped to the closed curve."""
 
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """Where a curve's end lies on its beginning."""
+    """Holds the correspondence between a curve's end and its beginning."""
 
     period: float
-    """Length of the closed curve in the open one's parameter, m."""
+    """The closed curve has this length in the open curve's parameter (m)."""
     u: Array
-    """(k,) parameters of the open curve from there on, increasing, ..."""
+    """(k,) These are increasing parameters of the open curve's end, from the seam on."""
     w: Array
-    """... and theirs (k,) on the beginning, from 0 on."""
+    """(k,) These are the parameters of the same places on the beginning, from 0 on."""
 
     def new_parameter(self, u: Array) -> Array:
-        """Parameter on the closed curve (not wrapped) of the open curve's."""
+        """Maps parameters of the open curve to those of the closed one, which are not wrapped."""
         return np.where(u < self.u[0], u, self.period + np.interp(u, self.u, self.w))
 
 
 @dataclass(frozen=True, eq=False)
 class PeriodicCurve:
-    """How an open curve becomes periodic."""
+    """Holds the periodic curve that replaces an open one."""
 
     overlap: Overlap
-    """Of its end and its beginning."""
+    """The overlap maps the open curve's parameters to the closed curve's."""
     knots: Array
-    """(m + 2 p + 1,) periodic knots."""
+    """(m + 2 p + 1,) These are the periodic knots."""
     points: Array
-    """(m, 2) control points of the closed curve, map frame, m."""
+    """(m, 2) These are the control points in m, map frame."""
     old_from_new: Array
-    """(n, m) E."""
+    """(n, m) The matrix E changes the variables: `C_old = E C_new`."""
 
 
 def make_periodic(
     boundary: Boundary, control_points: Array, settings: MapperSettings, knots: Knots
 ) -> PeriodicCurve:
-    """The periodic curve nearest to an open one with control points (n, 2)."""
+    """Returns the periodic curve that is nearest to an open one with control points (n, 2)."""
     spline = boundary.spline(control_points)
     overlap = find_overlap(boundary, control_points, settings.closing)
     breaks = _breaks(boundary, control_points, overlap.period, settings, knots)
@@ -66,9 +66,9 @@ def make_periodic(
 def _breaks(
     boundary: Boundary, control_points: Array, period: float, settings: MapperSettings, knots: Knots
 ) -> Array:
-    """(m + 1,) of the closed curve, m a share of the cones that it was led through.
+    """Returns the closed curve's breaks (m + 1,), where m is a share of the number of its cones.
 
-    A cone is where it lies on the curve as that is now.
+    The place of a cone is its parameter on the present curve.
     """
     u = np.array(boundary.cone_parameters)
     u = _apart(u[u < period - settings.closing.seam_margin], settings.growth.merge_radius)
@@ -82,7 +82,7 @@ def _breaks(
 
 
 def _apart(values: Array, distance: float) -> Array:
-    """Of the sorted values (k,) those that are more than `distance` past the last one that is."""
+    """Returns those of the sorted values (k,) that exceed the last returned one by more than `distance`."""
     kept: list[float] = []
     for value in values.tolist():
         if not kept or value - kept[-1] > distance:
@@ -91,9 +91,9 @@ def _apart(values: Array, distance: float) -> Array:
 
 
 def find_overlap(boundary: Boundary, control_points: Array, settings: ClosingSettings) -> Overlap:
-    """The seam is the foot point of the beginning on the end; from there on the end repeats the beginning.
+    """Finds the overlap of a curve's end and beginning; the seam is the beginning's foot point on the end.
 
-    Where the end doesn't reach the beginning, the gap is closed straight.
+    If the end does not reach the beginning, the gap between them counts as straight.
     """
     confirmed_end = boundary.confirmed_end
     late = confirmed_end - settings.beginning - settings.join_margin
@@ -111,7 +111,7 @@ def find_overlap(boundary: Boundary, control_points: Array, settings: ClosingSet
 
 
 def _on_beginning(boundary: Boundary, control_points: Array, u: Array, room: float) -> Array:
-    """Parameters (k,) on the beginning of the end's points at u (k,), from 0 on and never falling."""
+    """Returns parameters (k,) on the beginning of the end's points at u (k,), from 0 and never decreasing."""
     guess = u - u[0]
     points = boundary.evaluate(control_points, u)
     w = boundary.find(control_points, points, np.maximum(guess - room, 0.0), guess + room).u

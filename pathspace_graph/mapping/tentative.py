@@ -1,4 +1,4 @@
-"""Readings that no curve explains yet: kept until they were seen often enough to be believed."""
+"""Tentative tracks: cones that no curve or landmark explains yet, confirmed after enough detections."""
 
 from __future__ import annotations
 
@@ -12,21 +12,24 @@ IntArray = NDArray[np.intp]
 
 
 class TentativeTracks:
-    """Points (n, 2) in the map frame of one label, merged within a radius and counted."""
+    """Holds cones of one label as points, merges detections within a radius, and counts them."""
 
     def __init__(self, settings: GrowthSettings) -> None:
         self.settings = settings
         self.points: Array = np.zeros((0, 2))
-        """Weighted means, m, map frame."""
+        """(n, 2) Each row is the weighted mean of a track's detections in m, map frame."""
         self.weights: Array = np.zeros(0)
-        """Information of each, 1/m^2."""
+        """(n,) Each track has this information (1/m^2): the sum of its detections' inverse variances."""
         self.counts: IntArray = np.zeros(0, np.intp)
-        """Readings merged in each."""
+        """(n,) Each track has this number of detections."""
         self.last_t: Array = np.zeros(0)
-        """When each was last seen, s."""
+        """(n,) Each track was last seen at this stamp (s)."""
 
     def add(self, points: Array, variances: Array, t: float) -> None:
-        """Merge readings (m, 2), each with a scalar variance (m,), into the nearest sighting or a new one."""
+        """Adds detections (m, 2) at t (s), each with a scalar variance (m,), to the nearest or to new tracks.
+
+        Tracks that were not seen for `forget_after` seconds are removed first.
+        """
         self._keep(self.last_t > t - self.settings.forget_after)
         if len(points) == 0:
             return
@@ -44,27 +47,28 @@ class TentativeTracks:
         self.last_t = np.concatenate([self.last_t, np.full(int(new.sum()), t)])
 
     def confirmed(self) -> IntArray:
-        """Indices of the sightings that were seen often enough."""
+        """Returns the indices of the tracks with enough detections."""
         return np.flatnonzero(self.counts >= self.settings.sightings)
 
     def remove(self, indices: IntArray) -> None:
-        """Drop sightings by index."""
+        """Removes tracks by index."""
         keep = np.ones(len(self.counts), bool)
         keep[indices] = False
         self._keep(keep)
 
     def restore(self, points: Array, t: float) -> None:
-        """Points (k, 2) that were sighted often enough, and are to be again, last at a time (s)."""
+        """Adds confirmed tracks at points (k, 2), last seen at t (s)."""
         self.points = np.concatenate([self.points, points])
         self.weights = np.append(self.weights, np.ones(len(points)))
         self.counts = np.append(self.counts, np.full(len(points), self.settings.sightings))
         self.last_t = np.append(self.last_t, np.full(len(points), t))
 
     def clear(self) -> None:
-        """Drop all."""
+        """Removes all tracks."""
         self._keep(np.zeros(len(self.counts), bool))
 
     def _nearest(self, points: Array) -> tuple[IntArray, NDArray[np.bool_]]:
+        """Returns the nearest track of each point (m, 2), and whether it is within the merging radius."""
         if len(self.points) == 0:
             return np.zeros(len(points), np.intp), np.zeros(len(points), bool)
         offset = points[:, None, :] - self.points[None, :, :]

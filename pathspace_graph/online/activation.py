@@ -1,4 +1,4 @@
-"""Which part of the map is active: what the window can touch, and some room for what comes next."""
+"""The active part of the map: what the window can touch, and some room for the next cycles."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ from numpy.typing import NDArray
 
 from pathspace_graph.mapping.curve_map import CurveSmoother
 
-Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
-def narrow(smoother: CurveSmoother) -> None:
-    """Keep what is solved for to the active part of the map; exact, see `graph.inactive`.
+def deactivate_distant(smoother: CurveSmoother) -> None:
+    """Restricts each step to the active part of the map, which changes no result: see `graph.inactive`.
 
-    An open curve's inactive part grows as the vehicle drives on; a closed one's is chosen anew when the
-    active part no longer holds what the window needs.
+    An open curve's inactive part grows as the vehicle drives on. A closed curve's active part is chosen again
+    when it no longer holds what the window needs.
     """
     state, room = smoother.map.state, smoother.map.settings.far.room
     needed = {label: _needed(smoother, label) for label in state.boundaries}
@@ -30,18 +29,18 @@ def narrow(smoother: CurveSmoother) -> None:
     leaving = [np.setdiff1d(state.active(label), indices) for label, indices in active.items()]
     if not any(map(len, leaving)):
         return
-    keys = [state.keys(label)[gone] for label, gone in zip(active, leaving, strict=True)]
+    keys = [state.keys(label)[indices] for label, indices in zip(active, leaving, strict=True)]
     smoother.deactivate(np.concatenate(keys))
-    state.narrowed = active
+    state.active_stretch = active
 
 
 def _holds(active: IntArray, needed: IntArray, size: int) -> bool:
-    """Whether one stretch of control points holds another; on a closed curve of that size they wrap."""
+    """Returns whether one stretch of a boundary's `size` control points holds another; indices may wrap."""
     return int(needed[0] - active[0]) % size + len(needed) <= len(active)
 
 
 def _worthwhile(smoother: CurveSmoother, needed: dict[int, IntArray]) -> bool:
-    """A closed curve that is active all around, or enough behind the vehicle on an open one."""
+    """Returns whether a closed curve is active all around, or an open one has enough behind the vehicle."""
     state, settings = smoother.map.state, smoother.map.settings
     behind = [0]
     for label, indices in needed.items():
@@ -52,7 +51,7 @@ def _worthwhile(smoother: CurveSmoother, needed: dict[int, IntArray]) -> bool:
 
 
 def _needed(smoother: CurveSmoother, label: int, room: float = 0.0) -> IntArray:
-    """Control points (k,) of what the window's poses see in this cycle and the next, and `room` (m) ahead."""
+    """Returns the control points (k,) that the window sees until the next cycle, and `room` (m) ahead."""
     boundary, pose_u = smoother.map.state.boundaries[label], smoother.map.state.pose_u[label]
     gate, slide = smoother.map.settings.gate, smoother.map.settings.spline.refine_room
     low = float(pose_u.min()) - gate.view_behind - slide

@@ -17,37 +17,35 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
-from pathspace_graph.mapping.measurements import integrate_odometry
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import smoother_settings
+from pathspace_graph.mapping.prediction import predict, smoother_settings
 from pathspace_graph.mapping.registration import near_start, register
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
-from .activation import narrow
+from .activation import deactivate_distant
 from .association import associate
-from .closing import apply_correspondences, optimize_loop
+from .closing import apply_correspondences, optimize_loop, simplify
 from .growth import Growth
 from .nonlinear_graph import window_graph
-from .simplification import simplify
 
 Array = NDArray[np.float64]
 
 
 class Solver(Protocol):
-    """Another way to come from the window's factors to an estimate, as `incremental` has one."""
+    """A solver replaces the smoother's own step; `incremental` has one."""
 
     def step(self, smoother: CurveSmoother, sigma_step: float) -> None:
-        """Move the smoother's variables to the estimate; its `last_step` is the window's."""
+        """Moves the smoother's variables to the estimate, and leaves its `last_step` for gating."""
 
 
 class FixedLagMapper:
     """Maps a track's two boundaries cycle by cycle, as splines in one factor graph with the vehicle's poses.
 
-    The last `settings.lag` seconds of poses and every control point are solved for in each cycle; what left
-    the window is a Gaussian prior. `odometry_sigma` (3,): standard deviation of a twist reading (m/s, m/s,
-    rad/s).
+    Each cycle solves for the poses of the last `settings.lag` seconds and for every control point; all
+    earlier information is a Gaussian prior. `odometry_sigma` (3,) is the standard deviation of one measured
+    twist (m/s, m/s, rad/s).
     """
 
     def __init__(
@@ -59,16 +57,16 @@ class FixedLagMapper:
         self.settings = settings or MapperSettings()
         self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), CurveMap(self.settings))
-        """What is estimated, and from what: variables, factors of the window, and the prior."""
+        """The smoother holds the variables, the factors of the window, and the prior."""
         self.smoother.window.exact = True
         self.solver = solver
-        """What takes the place of the smoother's own step."""
+        """The solver replaces the smoother's own step, unless it is None."""
         self.path = DrivenPath(self.settings.path)
-        """The way driven."""
+        """This is the path that the vehicle has driven."""
         self.growth = Growth(self.settings.growth)
-        """What isn't on a curve yet."""
+        """The open curves grow through the tentative tracks that are collected here."""
         self.closed = False
-        """Whether the loop has closed, and the map its final size."""
+        """The flag is set when the loop has closed: the map has its final size."""
         self._grown: frozenset[int] = frozenset()
         self._closing_tried = 0.0
 
@@ -78,23 +76,23 @@ class FixedLagMapper:
         detections: Detections,
         factors: Sequence[gtsam.NonlinearFactor] = (),
     ) -> CycleResult:
-        """One perception cycle: the twists since the last one, and what was detected now.
+        """Processes one perception cycle: the twists since the last cycle, and its detections.
 
-        `factors`: GTSAM factors of your own, on poses in the window (`pose_key`, `next_pose_key`: `Pose2`),
+        `factors` are GTSAM factors of your own on poses in the window (`pose_key`, `next_pose_key`: `Pose2`),
         on control points (`control_keys`: `Point2`) and on the calibration. Each is relinearized at every
-        step until one of its poses leaves the window, and is a part of the prior then; one on control points
-        alone until the loop closes and there are new ones. SettingsError, and nothing done, where a key is
-        not a variable of the graph.
+        step until one of its poses leaves the window; then it is part of the prior. A factor on control
+        points alone is kept until the loop closes, which replaces the control points. If a key is not a
+        variable of the graph, SettingsError is raised and nothing is changed.
         """
         watch = Stopwatch()
         self.smoother.add_factors(factors)
         self._predict(odometry, detections.t)
         watch.lap("predict")
-        self._classify(detections)  # projects and gates: what no curve takes may expand one
+        self._classify(detections)  # detections that no curve explains may expand one
         watch.lap("classify")
         self._expand()
         if self.solver is None:
-            narrow(self.smoother)
+            deactivate_distant(self.smoother)
         watch.lap("expand")
         for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
             self._step()
@@ -109,24 +107,22 @@ class FixedLagMapper:
         return self._result(detections.t, watch.laps)
 
     def _step(self) -> None:
-        """One Gauss-Newton step, relinearized at the current estimate, or what the solver does instead."""
+        """Takes one Gauss-Newton step, relinearized at the current estimate, or the solver's step."""
         if self.solver is None:
             self.smoother.step(self.settings.sigma_step)
         else:
             self.solver.step(self.smoother, self.settings.sigma_step)
 
-    # --- the stages --------------------------------------------------------------------------------------
+    # --- the steps of the paper --------------------------------------------------------------------------
 
     def _predict(self, odometry: Odometry, t: float) -> None:
-        """The newest pose, by the calibrated odometry; and how the way goes on from there."""
-        integrated = integrate_odometry(odometry, t, self.odometry_sigma)
-        self.path.update(self.smoother.predict(t, integrated, self.settings.odometry.sigmas_start))
+        """Adds the pose at t (s) by the calibrated odometry, and extends the driven path."""
+        predict(self.smoother, self.path, odometry, t, self.odometry_sigma, self.settings)
         if self.solver is not None:
-            self.smoother.submaps = None  # nothing of another solver is relinearized when the loop closes
-        self.path.steer(odometry.twist)
+            self.smoother.submaps = None  # another solver's loop closure relinearizes no submap
 
     def _classify(self, detections: Detections) -> None:
-        """Which readings update a curve, and which are sightings of what no curve explains yet."""
+        """Associates detections with the curves; those that no curve uses become tentative tracks."""
         new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
         if self.boundaries:
             associate(self.smoother, self._grown)
@@ -134,14 +130,14 @@ class FixedLagMapper:
             self.growth.observe(self.smoother, new, detections.t)
 
     def _expand(self) -> None:
-        """Lead each open end through the sightings that come next along the way driven."""
+        """Extends each open curve through the confirmed tracks that come next along the path."""
         self._grown = frozenset()
         if not self.closed:
             path_ahead = self.path.ahead(self.poses[-1], self.settings.growth.reach)
             self._grown = self.growth.expand(self.smoother, path_ahead)
 
     def _close(self) -> bool:
-        """Bend the drive so that the newest readings lie on the beginning; True in the cycle that does."""
+        """Closes the loop if the newest detections are registered with the beginning; True if it closes."""
         settings, length = self.settings.closing, self.path.length
         if self.closed or not self.boundaries or not near_start(self.path, self.poses[-1], settings):
             return False
@@ -160,19 +156,20 @@ class FixedLagMapper:
         return True
 
     def _simplify(self) -> None:
-        """Both curves become periodic and have their final size; from now on hardly anything moves."""
+        """Makes both curves periodic; they have their final size then."""
         simplify(self.smoother)
         self.growth.clear()
-        self.smoother.window.exact = False
+        self.smoother.window.exact = False  # hardly anything moves from now on
 
     def _result(self, t: float, stages: dict[str, float]) -> CycleResult:
+        """Returns the newest pose, the sizes of the boundaries, and the cycle's detections in use."""
         detections = self.smoother.map.detections
         used = int(detections.used[detections.cycle.searchsorted(self.smoother.next_cycle - 1) :].sum())
         left, right = (self.boundaries[b].size if b in self.boundaries else 0 for b in (LEFT, RIGHT))
         return CycleResult(t, self.poses[-1].copy(), (left, right), used, self.closed, stages)
 
     def map(self) -> Map:
-        """The map as it stands, with the joint covariance of each boundary's control points."""
+        """Returns a copy of the present map, with the joint covariance of each boundary's control points."""
         boundaries, shape = {}, self.settings.spline.sigma_shape if self.closed else 0.0
         state = self.smoother.map.state
         if not self.boundaries:
@@ -188,11 +185,11 @@ class FixedLagMapper:
     # --- the graph ---------------------------------------------------------------------------------------
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """The window as GTSAM has it: projection, spacing, smoothness, odometry, your own and prior factors.
+        """Returns the window as GTSAM factors: projection, spacing, smoothness, odometry, your own and prior.
 
-        On the keys of `values`: what is active. It shares nothing with the mapper, so optimize it, print its
-        errors, or ask marginals of it with GTSAM's own classes. SettingsError where readings are held against
-        their foot points, for which there is no such factor.
+        The factors hold the active variables, which `values` returns. The graph shares nothing with the
+        mapper: optimize it, print its errors, or compute its marginals with GTSAM's own classes. There is no
+        such factor for `spline.residual` "point", where SettingsError is raised.
         """
         if self.settings.spline.residual != "across":
             raise SettingsError(
@@ -201,14 +198,15 @@ class FixedLagMapper:
         return window_graph(self.smoother)
 
     def values(self) -> gtsam.Values:
-        """The estimate of the window: `Pose2` for poses, points for control points and the calibration."""
+        """Returns the active variables: poses as `Pose2`, control points and the calibration as points."""
         return self.smoother.variables.gtsam_values(self.smoother.layout.keys)
 
     def marginal_covariance(self, keys: Sequence[int]) -> Array:
-        """(q, q) joint covariance of any variables (k,) of the map and the window, in the order of the keys.
+        """Returns the joint covariance (q, q) of any variables (k,), in the order of their keys.
 
-        Control points (m), poses (x, y, theta) in the map frame (m, m, rad), calibration (-, rad/s).
-        SettingsError where a key is no variable: its pose has left the window, or the curve has new knots.
+        Control points are in m, poses (x, y, theta) in m and rad, both in the map frame; the calibration is
+        (-, rad/s). SettingsError is raised for a key that is not a variable: its pose has left the window, or
+        its curve has new knots.
         """
         wanted = np.array(keys, np.intp)
         unknown = wanted[self.smoother.variables.layout.positions(wanted) == UNKNOWN_PLACE]
@@ -222,41 +220,41 @@ class FixedLagMapper:
 
     @staticmethod
     def pose_key(cycle: int) -> int:
-        """GTSAM's key of the pose at a perception cycle, counted from 0."""
+        """Returns GTSAM's key of the pose at a perception cycle, counted from 0."""
         return pose_key(cycle)
 
     @property
     def next_pose_key(self) -> int:
-        """Key of the pose that the next update adds."""
+        """Returns the key of the pose that the next update adds."""
         return pose_key(self.smoother.next_cycle)
 
     def control_keys(self, label: int) -> list[int]:
-        """Keys of a boundary's control points. They stay while it grows, and are new ones when it closes."""
+        """Returns the keys of a boundary's control points, which change only when the loop closes."""
         keys: list[int] = self.smoother.map.state.keys(label).tolist()
         return keys
 
-    # --- what is known -----------------------------------------------------------------------------------
+    # --- the estimate ------------------------------------------------------------------------------------
 
     @property
     def boundaries(self) -> dict[int, Boundary]:
-        """The curves by label, without their control points."""
+        """Returns the curves by label; their control points are in `control_points`."""
         return self.smoother.map.state.boundaries
 
     def control_points(self, label: int) -> Array:
-        """Control points (m, 2) of a boundary, map frame, m: a view."""
+        """Returns a view of a boundary's control points (m, 2) in m, map frame."""
         self.smoother.refresh()
         return self.smoother.map.state.control_points(label)
 
     def pose_parameter(self, label: int) -> float:
-        """Parameter (m) on a boundary of the point beside the newest pose; on a closed one laps add up."""
+        """Returns the parameter (m) of the newest pose's foot point; it increases from lap to lap."""
         return float(self.smoother.map.state.pose_u[label][-1])
 
     @property
     def poses(self) -> Array:
-        """Poses (P, 3) in the window, oldest first, map frame: a view."""
+        """Returns a view of the poses (P, 3) in the window, the oldest first, map frame."""
         return self.smoother.variables.poses
 
     @property
     def calibration(self) -> Array:
-        """(scale error [-], yaw-rate bias [rad/s]) of the odometry: a view."""
+        """Returns a view of the odometry's calibration: (scale error [-], yaw-rate bias [rad/s])."""
         return self.smoother.variables.calibration

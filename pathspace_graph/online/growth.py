@@ -1,4 +1,4 @@
-"""How the curves begin and grow, through what was seen often enough and comes next (paper: Expansion)."""
+"""Growth of the open curves through confirmed tentative tracks ahead of their ends (paper: Expansion)."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.candidates import SIDES, Candidates, End, chain, undisputed
+from pathspace_graph.labels import BOUNDARIES, UNKNOWN
+from pathspace_graph.mapping.candidates import SIDES, Candidates, End, chain
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.path import PathAhead
 from pathspace_graph.mapping.tentative import TentativeTracks
@@ -19,42 +19,43 @@ IntArray = NDArray[np.intp]
 
 
 class Growth:
-    """Sightings of either boundary, and what is made of them."""
+    """Holds the tentative tracks of both boundaries, and begins and extends the curves through them."""
 
     def __init__(self, settings: GrowthSettings) -> None:
         self.settings = settings
         self.tentative = {label: TentativeTracks(settings) for label in BOUNDARIES}
+        """Detections that no curve explains are collected here, by label."""
 
     def observe(self, smoother: CurveSmoother, new: slice, t: float) -> None:
-        """New readings that no curve takes are sightings."""
+        """Adds the new detections that no curve uses to the tentative tracks, seen at t (s)."""
         detections = smoother.map.detections
         rows = np.arange(new.start, new.stop)
         rows = rows[~detections.used[rows]]
         points = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
         variances = np.trace(detections.covariance[rows], axis1=1, axis2=2)
         for label in BOUNDARIES:
-            of = detections.label[rows] == label
-            self.tentative[label].add(points[of], variances[of], t)
+            own = detections.label[rows] == label
+            self.tentative[label].add(points[own], variances[own], t)
 
     def expand(self, smoother: CurveSmoother, path_ahead: PathAhead) -> frozenset[int]:
-        """Begin each boundary, or lead its end on through what comes next; gives those that were led on."""
+        """Begins or extends each boundary; returns the labels of the curves that were extended."""
         grown = set()
         for label in BOUNDARIES:
             if label not in smoother.map.state.boundaries:
                 self._begin(smoother, label, path_ahead)
-            elif self._lead_on(smoother, label, path_ahead):
+            elif self._grow(smoother, label, path_ahead):
                 grown.add(label)
         return frozenset(grown)
 
     def clear(self) -> None:
-        """Forget all sightings."""
+        """Removes all tentative tracks."""
         for tentative in self.tentative.values():
             tentative.clear()
 
     def _candidates(
         self, smoother: CurveSmoother, label: int, path_ahead: PathAhead, end: End | None
     ) -> Candidates:
-        """Trusted sightings within reach that follow one another, from an end on where there is one."""
+        """Returns the chain of confirmed tracks within reach, from the end of the curve if there is one."""
         settings, indices = self.settings, self.tentative[label].confirmed()
         points = self.tentative[label].points[indices]
         if len(points) == 0:
@@ -65,57 +66,57 @@ class Growth:
         if end is None:
             found = found.where(found.sides < settings.max_lateral)
         else:
-            far = np.hypot(*(found.points - end.position).T) > settings.threshold
-            found = found.where(far & (found.stations > end.station + settings.station_margin))
+            beyond = np.hypot(*(found.points - end.position).T) > settings.threshold
+            found = found.where(beyond & (found.stations > end.station + settings.station_margin))
         if len(found.points):
             found = found.where(undisputed(smoother, label, found.points, settings.merge_radius))
         found = found.where(np.argsort(found.stations))
         return found.where(chain(found, settings, end))
 
     def _begin(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> None:
-        """A new curve through the first sightings."""
+        """Begins a curve through the first candidates, if there are at least two."""
         found = self._candidates(smoother, label, path_ahead, None)
         if len(found.points) < 2:
             return
         state, settings = smoother.map.state, smoother.map.settings
-        u = np.append(0.0, np.cumsum(_lengths(found.points)))
+        u = np.append(0.0, np.cumsum(_distances(found.points)))
         boundary = open_boundary(settings.spline, settings.gauge)
         control_points = boundary.grow(np.zeros((0, 2)), u, found.points)
         state.add_boundary(label, boundary, control_points)
         self._consume(smoother, label, found, u)
         state.pose_u[label] = np.zeros(len(state.poses))
-        _stand_again(smoother, label, 0.0)
+        _relocate_poses(smoother, label, 0.0)
 
-    def _lead_on(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> bool:
-        """Extend a curve, from where its cones are in order; True where it has changed."""
+    def _grow(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> bool:
+        """Extends a curve, after it is taken back if its cones are out of order; True if it has changed."""
         boundary, settings = smoother.map.state.boundaries[label], self.settings
-        kept = in_order(boundary, path_ahead, settings)
+        kept = count_in_order(boundary, path_ahead, settings)
         if kept == len(boundary.observed):
             return self._extend(smoother, label, path_ahead, settings.end_behind)
         self._take_back(smoother, label, kept)
         from_u = boundary.confirmed_end
         self._extend(smoother, label, path_ahead, settings.recall)
-        _stand_again(smoother, label, from_u)
+        _relocate_poses(smoother, label, from_u)
         return True
 
     def _extend(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead, behind: float) -> bool:
-        """Extend by every sighting that comes next, or carry a stranded end on; True where it grew.
+        """Extends a curve through all candidates, or extrapolates a stranded end; True if it has grown.
 
-        The end is beside the way since so far (m) behind the vehicle.
+        The end's station is searched on the path from `behind` (m) behind the vehicle on.
         """
         settings = self.settings
         end = _end(smoother, label, path_ahead.since(path_ahead.driven - behind))
         found = self._candidates(smoother, label, path_ahead, end)
         if len(found.points):
-            u = lead(smoother, label, end.position, found.points)
+            u = _extend_through(smoother, label, end.position, found.points)
             self._consume(smoother, label, found, u)
             return True
         if end.station < path_ahead.driven - settings.stranded:
-            return _carry_on(smoother, label, path_ahead, end)
+            return _follow_path(smoother, label, path_ahead, end)
         return False
 
     def _take_back(self, smoother: CurveSmoother, label: int, kept: int) -> None:
-        """Only the first `kept` cones hold a curve: the others are sightings that may lead it on again."""
+        """Shortens a curve to its first `kept` cones; the other cones are tentative tracks again."""
         boundary, detections = smoother.map.state.boundaries[label], smoother.map.detections
         self.tentative[label].restore(np.array(boundary.observed[kept:]), smoother.times[-1])
         boundary.take_back(kept)
@@ -124,12 +125,9 @@ class Growth:
         detections.release(rows[detections.u[rows] > boundary.trusted])
 
     def _consume(self, smoother: CurveSmoother, label: int, found: Candidates, u: Array) -> None:
-        """Sightings that are on the curve, at u (k,), now: their readings update it."""
-        boundary, state, detections = (
-            smoother.map.state.boundaries[label],
-            smoother.map.state,
-            smoother.map.detections,
-        )
+        """Makes candidates part of the curve at u (k,), and puts the window's detections of them into use."""
+        state, detections = smoother.map.state, smoother.map.detections
+        boundary = state.boundaries[label]
         boundary.observed.extend(found.points)
         boundary.cone_parameters.extend(u.tolist())
         self.tentative[label].remove(found.indices)
@@ -145,12 +143,27 @@ class Growth:
         detections.take(rows, label, boundary.find(state.control_points(label), points, low, high).u)
 
 
-def in_order(boundary: Boundary, path_ahead: PathAhead, settings: GrowthSettings) -> int:
-    """How many of the cones that a curve was led through are in the order in which they were passed.
+def undisputed(smoother: CurveSmoother, label: int, points: Array, radius: float) -> NDArray[np.bool_]:
+    """Returns whether places (n, 2) have at least as many detections of `label` around them as of the other.
 
-    What comes next is told from an arc ahead; in a hairpin a row of cones may come back nearer than it goes
-    away, and only when the vehicle is past them all it is known which was which. Of the last `recall` metres
-    of the curve; the first cone of them is left where it is.
+    A sensor that now and then takes a cone for one of the other boundary sees its true colour more often. All
+    coloured detections of the window within `radius` (m) count, in use or not.
+    """
+    detections = smoother.map.detections
+    rows = np.flatnonzero(detections.label != UNKNOWN)
+    seen = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
+    offset = points[:, None] - seen
+    near = offset[:, :, 0] ** 2 + offset[:, :, 1] ** 2 < radius**2
+    votes = near @ np.where(detections.label[rows] == label, 1, -1)
+    return np.asarray(votes >= 0)
+
+
+def count_in_order(boundary: Boundary, path_ahead: PathAhead, settings: GrowthSettings) -> int:
+    """Returns how many of a curve's cones, from its first on, are in the order in which they were passed.
+
+    The order of cones ahead is predicted with an arc. In a hairpin, the row of the way back may be nearer
+    than the row of the way there, and only after the vehicle has passed the cones is their order certain.
+    Only the last `recall` metres of the curve are checked, and the first cone there counts as in order.
     """
     first = int(np.searchsorted(boundary.cone_parameters, boundary.confirmed_end - settings.recall))
     recent = np.array(boundary.observed[first:]).reshape(-1, 2)
@@ -163,10 +176,13 @@ def in_order(boundary: Boundary, path_ahead: PathAhead, settings: GrowthSettings
     return first + 1 + int(wrong[0]) if len(wrong) else len(boundary.observed)
 
 
-def lead(smoother: CurveSmoother, label: int, end: Array, points: Array) -> Array:
-    """Lead a curve from its end (2,) through points (k, 2), parametrized by their distances: u (k,)."""
+def _extend_through(smoother: CurveSmoother, label: int, end: Array, points: Array) -> Array:
+    """Extends a curve from its end (2,) through points (k, 2); returns their parameters (k,).
+
+    The parameters increase by the distances between the points.
+    """
     boundary = smoother.map.state.boundaries[label]
-    u = boundary.confirmed_end + np.cumsum(_lengths(np.concatenate([end[None], points])))
+    u = boundary.confirmed_end + np.cumsum(_distances(np.concatenate([end[None], points])))
     known = smoother.map.state.control_points(label)
     control_points = boundary.grow(known.copy(), u, points)
     known[:] = control_points[: len(known)]
@@ -175,29 +191,30 @@ def lead(smoother: CurveSmoother, label: int, end: Array, points: Array) -> Arra
     return np.asarray(u)
 
 
-def _carry_on(smoother: CurveSmoother, label: int, path_ahead: PathAhead, end: End) -> bool:
-    """The vehicle has passed a stranded end: lead it beside the way nearly as far as the vehicle is."""
+def _follow_path(smoother: CurveSmoother, label: int, path_ahead: PathAhead, end: End) -> bool:
+    """Extrapolates an end that the vehicle has passed: the curve follows the path at the end's distance."""
     settings = smoother.map.settings.growth
     side = max(end.side, settings.min_lateral)
     station = path_ahead.driven - settings.stranded_left * settings.stranded
     point = path_ahead.beside(station, SIDES[label] * side)
     if np.hypot(*(point - end.position)) < settings.min_carry:
         return False
-    lead(smoother, label, end.position, point[None])
+    _extend_through(smoother, label, end.position, point[None])
     return True
 
 
-def _stand_again(smoother: CurveSmoother, label: int, from_u: float) -> None:
-    """Stations, on a curve that was led on anew from `from_u` on, of the poses that were past that."""
+def _relocate_poses(smoother: CurveSmoother, label: int, from_u: float) -> None:
+    """Finds the poses' parameters again on a curve that was changed from `from_u` on."""
     state, boundary = smoother.map.state, smoother.map.state.boundaries[label]
-    stations = state.pose_u[label]
-    late = stations >= from_u
+    pose_u = state.pose_u[label]
+    late = pose_u >= from_u
     poses = state.poses[late, :2]
     low, high = np.full(len(poses), from_u), np.full(len(poses), boundary.confirmed_end)
-    stations[late] = boundary.find(state.control_points(label), poses, low, high).u
+    pose_u[late] = boundary.find(state.control_points(label), poses, low, high).u
 
 
 def _end(smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> End:
+    """Returns the confirmed end of a curve, located beside the path."""
     boundary = smoother.map.state.boundaries[label]
     u = np.array([boundary.confirmed_end])
     position = boundary.evaluate(smoother.map.state.control_points(label), u)
@@ -205,6 +222,6 @@ def _end(smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> End:
     return End(position[0], float(station[0]), SIDES[label] * float(lateral[0]))
 
 
-def _lengths(points: Array) -> Array:
-    """Distances (k - 1,) between neighbouring points (k, 2), m."""
+def _distances(points: Array) -> Array:
+    """Returns the distances (k - 1,) between neighbouring points (k, 2), in m."""
     return np.asarray(np.hypot(*np.diff(points, axis=0).T))

@@ -1,4 +1,4 @@
-"""The window as a nonlinear GTSAM graph, of the factors that anyone's graph can hold."""
+"""The window as a nonlinear GTSAM graph, of factors that can be part of any other graph."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ IntArray = NDArray[np.intp]
 
 
 def window_graph(smoother: CurveSmoother) -> gtsam.NonlinearFactorGraph:
-    """Projection, spacing, smoothness, odometry, the user's own, and prior factors on the active variables.
+    """Returns projection, spacing, smoothness, odometry, user and prior factors on the active variables.
 
-    Linearized at the estimate it is the mapper's own system, in GTSAM's tangents of the poses.
+    Linearized at the estimate, the graph is the mapper's own system in GTSAM's tangents of the poses.
     """
     state, detections, settings = smoother.map.state, smoother.map.detections, smoother.map.settings
     graph = gtsam.NonlinearFactorGraph()
@@ -51,6 +51,7 @@ def window_graph(smoother: CurveSmoother) -> gtsam.NonlinearFactorGraph:
 
 
 def _add(graph: gtsam.NonlinearFactorGraph, factors: Sequence[gtsam.NonlinearFactor]) -> None:
+    """Adds factors to a graph."""
     for factor in factors:
         graph.add(factor)
 
@@ -63,9 +64,9 @@ def detection_factors(
     settings: MapperSettings,
     room: tuple[Array, Array],
 ) -> list[gtsam.CustomFactor]:
-    """A spline-projection factor for each cycle of some readings (m,) on a boundary.
+    """Returns a spline-projection factor for each cycle of some detections (m,) on a boundary.
 
-    `room`: how far before and past its parameter (m,), (m,) each foot point may be.
+    `room` (m,), (m,) limits how far before and past its present parameter each foot point may move.
     """
     u = detections.u[rows]
     return spline_projection_factors(
@@ -82,7 +83,7 @@ def detection_factors(
 
 
 def _room(boundary: Boundary, active: IntArray, u: Array, room: float) -> tuple[Array, Array]:
-    """How far to both sides of parameters (m,) only active control points matter, at most `room`."""
+    """Returns how far before and past parameters (m,) the curve is active, at most `room`."""
     if len(active) == boundary.size:
         return np.full(len(u), room), np.full(len(u), room)
     p, begin = boundary.degree, boundary.knots[active[0] + boundary.degree]
@@ -96,7 +97,7 @@ def _room(boundary: Boundary, active: IntArray, u: Array, room: float) -> tuple[
 def gauge_factors(
     label: int, boundary: Boundary, active: IntArray, settings: GaugeSettings
 ) -> list[gtsam.NonlinearFactor]:
-    """Spacing and smoothness factors between the active control points of a boundary."""
+    """Returns spacing and smoothness factors between the active control points of a boundary."""
     gauge = boundary.gauge_on(active)
     keys = control_keys(label, boundary.first + np.arange(boundary.size)).tolist()
     factors: list[gtsam.NonlinearFactor] = []

@@ -1,4 +1,4 @@
-"""A boundary of the track as the mapper holds it: a spline that grows, and then closes."""
+"""A track boundary as the mappers hold it: an open spline that grows, and is periodic after loop closure."""
 
 from __future__ import annotations
 
@@ -18,75 +18,76 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 ROUND_OFF = 1e-9
-"""Parameters (m) this near to a knot are on it."""
+"""Parameters that differ from a knot by no more than this (m) lie on the knot."""
 SAME_DIRECTION = 0.5
-"""Cosine of the largest angle between a vehicle's heading and the direction of the curve beside it."""
+"""The curve beside a vehicle has a tangent whose cosine with the vehicle's heading is at least this."""
 
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
-    """Weak priors between the control points of a stretch, by their indices."""
+    """Holds the spacing and smoothness priors of a stretch of control points, by their indices."""
 
     points: IntArray
-    """(k,) the control points, in driving order."""
+    """(k,) These are the control points in driving order."""
     pairs: IntArray
-    """(r, 2) each and the next."""
+    """(r, 2) Each row is a control point and the next one."""
     nominal: Array
-    """(r,) nominal distance of these, m."""
+    """(r,) Each pair has this nominal distance (m)."""
     triples: IntArray
-    """(t, 3) three in a row."""
+    """(t, 3) Each row holds three control points that follow one another."""
     bending: Array
-    """(t, 3) coefficients of their second difference in sigmas (1/m)."""
+    """(t, 3) These coefficients give the second difference of a triple in sigmas (1/m)."""
 
 
 class Boundary:
-    """Knots, and what follows from them; the control points are variables of the graph.
+    """A boundary is a B-spline that grows until the loop closes; its control points are graph variables.
 
-    An open boundary has uniform, floating knots whose interval is the spacing of its control points, so that
-    the parameter is roughly a length in metres, from 0 at the first sighting.
+    It holds the knots and what follows from them. An open boundary has uniform, floating (unclamped) knots
+    whose interval is the spacing of its control points, so the parameter is roughly a length in metres. It is
+    0 at the first cone.
     """
 
     def __init__(
         self, knots: Array, periodic: bool, settings: SplineSettings, gauge: GaugeSettings, first: int = 0
     ) -> None:
         self.first = first
-        """Number of the first control point's key: new knots make new keys."""
+        """The first control point's key has this number; new knots have keys with new numbers."""
         self.settings = settings
         self.gauge = gauge
         self.degree = settings.degree
         self.periodic = periodic
         self.confirmed_end = 0.0
-        """Parameter up to which sightings hold the curve; beyond it is extrapolated."""
+        """Confirmed cones support the curve up to this parameter (m); beyond, it is extrapolated."""
         self.observed: list[Array] = []
-        """Every distinct sighting that the curve was led through, (2,), map frame, ..."""
+        """The curve was extended through these cones (2,) in m, map frame, as they were placed then."""
         self.cone_parameters: list[float] = []
-        """... and at which parameter."""
+        """Each of the `observed` cones has this parameter (m) on the curve."""
         self._set_tables(SpanPolynomials(knots, self.degree, periodic))
 
     def _set_tables(self, tables: SpanPolynomials) -> None:
         self.tables, knots = tables, tables.knots
         n = len(knots) - self.degree - 1
         self.size = n - self.degree if self.periodic else n
-        """Distinct control points."""
+        """The curve has this number of distinct control points."""
         self.abscissae = greville(knots, self.degree)[: self.size]
-        """(m,) where each control point acts, in parameter units."""
+        """(m,) Each control point has this Greville abscissa: the parameter about which it acts (m)."""
         following = self.abscissae[1:]
         if self.periodic:
             following = np.append(following, self.abscissae[0] + self.length)
         self.nominal = following - self.abscissae[: len(following)]
-        """Nominal distance to the next control point, m."""
+        """Each control point has this nominal distance to the next one (m)."""
         self.everything = np.arange(self.size)
-        """(m,) indices of all control points."""
+        """(m,) These are the indices of all control points."""
         self._gauge: Gauge | None = None
 
     def gauge_on(self, points: IntArray) -> Gauge:
-        """The gauge between control points (k,), in driving order; the last one asked for is kept."""
+        """Returns the priors between control points (k,) in driving order; the last result is cached."""
         if self._gauge is None or self._gauge.points is not points:
             self._gauge = self._new_gauge(points)
         return self._gauge
 
     def _new_gauge(self, points: IntArray) -> Gauge:
-        """`D / (sigma_smoothness spacing)`, and the neighbours to keep apart."""
+        """Builds the priors: the second differences D are weighted by `1 / (sigma_smoothness spacing)`."""
         whole = self.periodic and len(points) == self.size
         abscissae = self.abscissae[points]
         abscissae = abscissae + self.length * (abscissae < abscissae[:1])  # a stretch past the seam
@@ -103,20 +104,21 @@ class Boundary:
 
     @property
     def numbers(self) -> IntArray:
-        """(m,) numbers of the control points' keys."""
+        """Returns (m,) the numbers of the control points' keys."""
         return self.first + self.everything
 
     @property
     def knots(self) -> Array:
+        """Returns all knots; a periodic curve's continue past both ends of its domain."""
         return self.tables.knots
 
     @property
     def length(self) -> float:
-        """Length of the domain, in parameter units (about metres)."""
+        """Returns the length of the domain in parameter units (about metres)."""
         return self.tables.high - self.tables.low
 
     def extended(self, control_points: Array) -> Array:
-        """Control points (n, 2) as the kernels take them: unwrapped where periodic."""
+        """Returns control points as the kernels take them: those of a periodic curve repeat at the end."""
         return (
             np.concatenate([control_points, control_points[: self.degree]])
             if self.periodic
@@ -124,27 +126,27 @@ class Boundary:
         )
 
     def columns(self, span: IntArray) -> IntArray:
-        """(m, degree + 1) control points that matter on each span."""
+        """Returns (m, degree + 1) the control points that shape the curve on each span (m,)."""
         columns = span[:, None] - self.degree + np.arange(self.degree + 1)
         return columns % self.size if self.periodic else columns
 
     def spline(self, control_points: Array) -> BSpline:
-        """The curve as users have it."""
+        """Returns the curve with control points (m, 2) as a `BSpline`."""
         return BSpline(self.knots, self.extended(control_points), self.degree, self.periodic)
 
     def find(self, control_points: Array, points: Array, low: Array, high: Array) -> FootPoints:
-        """Foot points of points (m, 2) in their stretches, searched for globally."""
+        """Searches the foot points of points (m, 2) in the stretches [low, high], each (m,)."""
         s, spans = self.settings, self._spans_from(float(np.min(low, initial=np.inf)))
         alone, search = np.zeros(len(points), np.intp), (s.search_step, s.search_iterations)
         return joint_foot_points(spans, control_points, points, alone, low, high, *search)
 
     def _spans_from(self, u: float) -> Spans:
-        """The curve's spans; of an open one those from u on, since the others are not looked at."""
+        """Returns the curve's spans; an open curve's spans before u are left out of the search."""
         first = 0 if self.periodic else int(self.tables.locate(np.array([u]))[0][0])
         return lay_out([self.tables.tail(first) if first else self.tables], [first], [self.size])
 
     def refine(self, control_points: Array, points: Array, u: Array) -> FootPoints:
-        """Foot points of points (m, 2) near the parameters (m,) they had."""
+        """Refines the foot points of points (m, 2), starting at the parameters u (m,)."""
         s = self.settings
         low, high = u - s.refine_room, self.believed(u + s.refine_room)
         unwrapped = self.extended(control_points)
@@ -152,30 +154,30 @@ class Boundary:
 
     @property
     def trusted(self) -> float:
-        """Parameter up to which the curve is believed: what an open one only extrapolates isn't."""
+        """Returns the parameter up to which foot points are allowed: an open curve's end is extrapolated."""
         return np.inf if self.periodic else self.confirmed_end + self.settings.confirmed_margin
 
     def believed(self, high: Array) -> Array:
-        """Upper limits of stretches, (m,), kept off what an open curve only extrapolates."""
+        """Returns upper limits (m,) of stretches, clipped so that they exclude the extrapolated end."""
         return np.minimum(high, self.trusted)
 
     def evaluate(self, control_points: Array, u: Array, derivative: int = 0) -> Array:
-        """S(u) or a derivative, (m, 2)."""
+        """Returns S(u) or a derivative of it as (m, 2)."""
         values, span = self.tables.evaluate(np.asarray(u, float), derivative)
         return np.asarray(np.einsum("mj,mjd->md", values[derivative], control_points[self.columns(span)]))
 
     def closed(self, knots: Array) -> Boundary:
-        """The boundary on periodic knots, all of it confirmed, with control points of new keys."""
+        """Returns the boundary on periodic knots: all of it is confirmed, and its keys are new."""
         boundary = Boundary(knots, True, self.settings, self.gauge, self.first + self.size)
         boundary.confirmed_end = boundary.tables.high
         return boundary
 
     def grow(self, control_points: Array, targets_u: Array, targets: Array) -> Array:
-        """Append control points until the domain holds `targets_u` (k,); bend the end to `targets` (k, 2).
+        """Extends the curve through targets (k, 2) at parameters (k,) and returns its control points (n', 2).
 
-        No basis function of the old curve changes; the old control points that act only beyond `confirmed`
-        are placed anew with the new ones. Gives all control points (n', 2); the last target is `confirmed`
-        now.
+        Knots are appended until the domain holds the last parameter, which becomes `confirmed_end`. No basis
+        function of the old curve changes. The old control points that act only beyond `confirmed_end` are
+        placed again with the new ones.
         """
         old, spacing = len(control_points), self.settings.spacing
         missing = int(np.ceil((targets_u[-1] - self.tables.high) / spacing - ROUND_OFF))
@@ -187,16 +189,16 @@ class Boundary:
         return placed
 
     def settled(self, size: int) -> int:
-        """How many of the first `size` control points act before `confirmed`."""
+        """Returns how many of the first `size` control points act before `confirmed_end`."""
         return max(int(np.searchsorted(self.knots[:size], self.confirmed_end - ROUND_OFF)) - 1, 0)
 
     def take_back(self, kept: int) -> None:
-        """Only the first `kept` sightings hold the curve."""
+        """Removes all observed cones but the first `kept`; the curve is confirmed up to the last of these."""
         self.confirmed_end = self.cone_parameters[kept - 1]
         del self.observed[kept:], self.cone_parameters[kept:]
 
     def _place(self, control_points: Array, kept: int, targets_u: Array, targets: Array) -> Array:
-        """Least squares of the control points from index `kept` on, through targets and the kept stretch."""
+        """Fits the control points from index `kept` on to the targets and to the end of the old curve."""
         held_u = np.zeros(0)
         if len(control_points):
             start = max(self.confirmed_end - self.nominal[0], 0.0)
@@ -204,7 +206,7 @@ class Boundary:
         held = self._held(control_points, held_u)
         values, span = self.tables.evaluate(np.concatenate([held_u, targets_u]))
         columns = self.columns(span)
-        first = max(min(int(columns.min()), kept - 2), 0)  # no row before it has a column that is free
+        first = max(min(int(columns.min()), kept - 2), 0)  # rows before this have no free column
         smooth = self.settings.fit_smoothness * smoothness_matrix(self.abscissae[first:], None)
         design = np.zeros((len(span), self.size - first))
         np.put_along_axis(design, columns - first, values[0], axis=1)
@@ -215,7 +217,7 @@ class Boundary:
         return np.concatenate([control_points[:kept], free])
 
     def _held(self, control_points: Array, u: Array) -> Array:
-        """(k, 2) the old curve at u (k,), by the old control points (n, 2) alone."""
+        """Returns (k, 2) the old curve at u (k,), from the old control points (n, 2) alone."""
         if len(u) == 0:
             return np.zeros((0, 2))
         values, span = self.tables.evaluate(u)
@@ -224,17 +226,17 @@ class Boundary:
 
 
 def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
-    """An open boundary of one span, from parameter 0 to the spacing."""
+    """Returns an open boundary of one span, from parameter 0 to the spacing."""
     p = settings.degree
     knots = settings.spacing * np.arange(-p, p + 2, dtype=float)
     return Boundary(knots, False, settings, gauge)
 
 
 def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float) -> float:
-    """Parameter of the nearest point that runs the way of a pose (3,), to 60 degrees.
+    """Returns the parameter of the nearest point whose tangent is within 60 degrees of a pose's heading.
 
-    Anywhere on a closed curve. On an open one, which grows with the vehicle, on its last `room` metres, and
-    its end where nothing there runs that way.
+    A closed curve is searched everywhere. An open one, which grows with the vehicle, is searched on its last
+    `room` metres; its end is returned if no tangent there agrees with the heading.
     """
     low, high = boundary.tables.low, boundary.tables.high
     if not boundary.periodic:

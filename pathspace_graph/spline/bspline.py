@@ -1,4 +1,4 @@
-"""A plane B-spline curve: the representation of one track boundary."""
+"""Plane B-spline curves: evaluation, arc length, exact changes of the ends, and covariance."""
 
 from __future__ import annotations
 
@@ -23,28 +23,31 @@ from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.spans import SpanPolynomials
 
 _PERIODIC_TOLERANCE: Final = 1e-9
-"""A periodic spline repeats where |difference| <= tolerance * (1 + largest value)."""
+"""A periodic spline repeats if |difference| <= tolerance * (1 + largest value)."""
 _GRID_PER_SPAN: Final = 8
-"""Grid points for each span in a foot-point search over the whole curve."""
+"""A foot-point search over the whole curve has this number of grid points on each span."""
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(12)
 _ARC_NEWTON_STEPS: Final = 4
-"""Newton steps that invert the arc length, from a table with `_GRID_PER_SPAN` entries a span."""
+"""The arc length is inverted by this number of Newton steps, from a table with the same grid."""
 _SHORTEST_EXTENSION: Final = 1e-3
-"""An extension's knot interval is at least this share of the mean one, also where the point is the end."""
+"""An extension's knot interval is at least this share of the mean one, even if the point is the old end."""
 
 
 @dataclass(frozen=True, eq=False)
 class BSpline:
-    """S(u) = sum_j N_j^p(u) c_j in the map frame, u in [knots[p], knots[n]], as scipy's BSpline."""
+    """A B-spline is the curve S(u) = sum_j N_j^p(u) c_j in the map frame, u in [knots[p], knots[n]].
+
+    Knots and control points are laid out as in scipy's `BSpline`.
+    """
 
     knots: Floats
-    """Non-decreasing knots (n + p + 1,)."""
+    """(n + p + 1,) The knots never decrease."""
     control_points: Floats
-    """All control points (n, 2), metres, map frame; where periodic the last p repeat the first."""
+    """(n, 2) These are the control points in m, map frame; a periodic curve's last p repeat the first p."""
     degree: int = 3
-    """Degree p >= 1."""
+    """The degree p is at least 1."""
     periodic: bool = False
-    """Closed curve: parameters are taken modulo the domain's length."""
+    """A periodic curve is closed: its parameters are taken modulo the length of the domain."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "knots", np.array(self.knots, dtype=np.float64))
@@ -98,17 +101,17 @@ class BSpline:
     def open_uniform(
         cls, control_points: Floats, degree: int = 3, interval: float = 1.0, start: float = 0.0
     ) -> BSpline:
-        """Equally spaced knots with floating (unclamped) ends; the domain begins at `start`."""
+        """Returns a curve on equally spaced knots with floating (unclamped) ends, which begins at `start`."""
         return cls(uniform_knots(len(control_points), degree, interval, start), control_points, degree)
 
     @classmethod
     def clamped_from(cls, breaks: Floats, control_points: Floats, degree: int = 3) -> BSpline:
-        """Clamped curve on the breaks (k + 1,), with k + p control points."""
+        """Returns a clamped curve on breaks (k + 1,) with k + p control points."""
         return cls(clamped_knots(breaks, degree), control_points, degree)
 
     @classmethod
     def periodic_from(cls, breaks: Floats, control_points: Floats, degree: int = 3) -> BSpline:
-        """Closed curve on one period of breaks (m + 1,), with m distinct control points."""
+        """Returns a closed curve on one period of breaks (m + 1,) with m distinct control points."""
         if len(breaks) != len(control_points) + 1 or len(control_points) <= degree:
             raise SettingsError(
                 f"a periodic spline of m > {degree} distinct control points needs m + 1 breaks, "
@@ -119,86 +122,86 @@ class BSpline:
 
     @property
     def domain(self) -> tuple[float, float]:
-        """[knots[p], knots[n]]."""
+        """Returns the first and the last parameter, knots[p] and knots[n]."""
         return float(self.knots[self.degree]), float(self.knots[len(self.control_points)])
 
     @property
     def size(self) -> int:
-        """Number m of distinct control points."""
+        """Returns the number m of distinct control points."""
         return len(self.control_points) - (self.degree if self.periodic else 0)
 
     @property
     def distinct_control_points(self) -> Floats:
-        """(m, 2): without the repeated ones of a periodic spline."""
+        """Returns (m, 2) the control points without those that a periodic curve repeats."""
         return self.control_points[: self.size]
 
     @property
     def breaks(self) -> Floats:
-        """The distinct knots of the domain, both ends included."""
+        """Returns the distinct knots of the domain, both ends included."""
         return np.unique(self.knots[self.degree : len(self.control_points) + 1])
 
     @cached_property
     def tables(self) -> SpanPolynomials:
-        """The basis as polynomials on each span."""
+        """Returns the basis as polynomials on each span."""
         return SpanPolynomials(self.knots, self.degree, self.periodic)
 
     def with_points(self, distinct: Floats) -> BSpline:
-        """The spline of the same basis through other distinct control points (m, 2)."""
+        """Returns the spline of the same basis with other distinct control points (m, 2)."""
         points = np.concatenate([distinct, distinct[: self.degree]]) if self.periodic else distinct
         spline = replace(self, control_points=points)
         spline.__dict__["tables"] = self.tables
         return spline
 
     def local_basis(self, u: Floats, derivative: int = 0) -> tuple[Floats, Ints]:
-        """Values (k, p + 1) at u (k,), and the distinct control points (k, p + 1) that they belong to."""
+        """Returns the basis (k, p + 1) at u (k,) and the distinct control points (k, p + 1) it multiplies."""
         values, span = self.tables.evaluate(u, derivative)
         columns = span[:, None] + np.arange(-self.degree, 1)
         return values[derivative], columns % self.size if self.periodic else columns
 
     def basis_matrix(self, u: Floats, derivative: int = 0) -> Floats:
-        """B (k, m) onto the distinct control points: S(u) = B c."""
+        """Returns B (k, m) for the distinct control points: S(u) = B c."""
         values, span = self.tables.evaluate(u, derivative)
         return scatter(values[derivative], span - self.degree, self.size, self.periodic)
 
     def evaluate(self, u: Floats, derivative: int = 0) -> Floats:
-        """d^r S / du^r (k, 2) at u (k,), clipped to the domain or wrapped into it."""
+        """Returns d^r S / du^r (k, 2) at u (k,); u is clipped to the domain, or wrapped if periodic."""
         values, columns = self.local_basis(u, derivative)
         position: Floats = np.einsum("kj,kjd->kd", values, self.control_points[columns])
         return position
 
     def tangent_unit(self, u: Floats) -> Floats:
-        """S' / |S'| (k, 2), zero where S' vanishes."""
+        """Returns S' / |S'| (k, 2), which is zero where S' vanishes."""
         first = self.evaluate(u, 1)
         norm = np.linalg.norm(first, axis=1, keepdims=True)
         return np.asarray(np.divide(first, norm, out=np.zeros_like(first), where=norm > 0.0))
 
     def curvature(self, u: Floats) -> Floats:
-        """(x' y'' - y' x'') / |S'|^3 (k,), 1/m, positive in a left turn; zero where S' vanishes."""
+        """Returns (x' y'' - y' x'') / |S'|^3 (k,) in 1/m: positive in a left turn, zero where S' vanishes."""
         first, second = self.evaluate(u, 1), self.evaluate(u, 2)
         cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
         cube = np.linalg.norm(first, axis=1) ** 3
         return np.asarray(np.divide(cross, cube, out=np.zeros_like(cross), where=cube > 0.0))
 
     def foot_points(self, points: Floats) -> FootPoints:
-        """The nearest points of the whole curve to points (k, 2) of the map frame."""
+        """Searches the whole curve for the foot points of points (k, 2), map frame."""
         low, high = self.domain
         step = (high - low) / (_GRID_PER_SPAN * (len(self.control_points) - self.degree))
         lows, highs = np.full(len(points), low), np.full(len(points), high)
         return foot_points(self.tables, self.control_points, points, lows, highs, step)
 
     def length(self) -> float:
-        """Length of the curve, metres."""
+        """Returns the length of the curve in m."""
         return float(self._break_lengths[-1])
 
     def arc_length(self, u: Floats) -> Floats:
-        """Length (k,) from the domain's beginning to u (k,), clipped to it: Gauss-Legendre on each span."""
+        """Returns the length (k,) from the first parameter to u (k,), in m: Gauss-Legendre on each span."""
         breaks = self.breaks
         u = np.clip(u, breaks[0], breaks[-1])
         index = np.clip(np.searchsorted(breaks, u, side="right") - 1, 0, len(breaks) - 2)
         return self._break_lengths[index] + self._gauss_lengths(breaks[index], u)
 
     def parameters_at(self, lengths: Floats) -> Floats:
-        """u (k,) at arc lengths (k,), clipped to the curve: the inverse of `arc_length`."""
+        """Returns u (k,) at arc lengths (k,), clipped to the curve: the inverse of `arc_length`."""
         low, high = self.domain
         lengths = np.clip(lengths, 0.0, self.length())
         grid = np.linspace(low, high, _GRID_PER_SPAN * (len(self.breaks) - 1) + 1)
@@ -211,25 +214,25 @@ class BSpline:
 
     @cached_property
     def _break_lengths(self) -> Floats:
-        """Arc length at each break."""
+        """Returns the arc length at each break."""
         breaks = self.breaks
         return np.concatenate([[0.0], np.cumsum(self._gauss_lengths(breaks[:-1], breaks[1:]))])
 
     def _gauss_lengths(self, starts: Floats, ends: Floats) -> Floats:
-        """Integral of |S'| (k,) over intervals that cross no knot."""
+        """Returns the integrals (k,) of |S'| over intervals that cross no knot."""
         half = 0.5 * (ends - starts)
         nodes = (0.5 * (starts + ends))[:, None] + half[:, None] * _GAUSS_NODES
         speed = np.linalg.norm(self.evaluate(nodes.ravel(), 1), axis=1).reshape(nodes.shape)
         return np.asarray(half * (speed @ _GAUSS_WEIGHTS))
 
     def with_end_knots(self, knots: Floats) -> BSpline:
-        """The same curve on its domain, where only knots outside the domain are others: exact."""
+        """Returns the same curve on knots that differ only outside the domain; the change is exact."""
         self._refuse_periodic("change the ends of")
         matrix = end_change_matrix(self.knots, self.degree, knots)
         return BSpline(knots, matrix @ self.control_points, self.degree)
 
     def clamp(self, start: bool = True, end: bool = True) -> BSpline:
-        """The same curve with the chosen end knots p + 1-fold, so that the end control points lie on it."""
+        """Returns the same curve with (p + 1)-fold knots at the chosen ends, which become control points."""
         knots, p = self.knots.copy(), self.degree
         if start:
             knots[:p] = knots[p]
@@ -238,7 +241,7 @@ class BSpline:
         return self.with_end_knots(knots)
 
     def unclamp(self, start: bool = True, end: bool = True) -> BSpline:
-        """The same curve with floating ends: the chosen end's knot interval repeated p times outward."""
+        """Returns the same curve with floating ends: p knots repeat the chosen end's interval outward."""
         knots, p = self.knots.copy(), self.degree
         outward = np.arange(1, p + 1)
         if start:
@@ -248,7 +251,7 @@ class BSpline:
         return self.with_end_knots(knots)
 
     def extension_knots(self, point: Floats) -> Floats:
-        """Knots (n + p + 2,) of the curve extended to a point (2,): interval by chord length, end clamped."""
+        """Returns the knots (n + p + 2,) of `extend_to`; the new interval follows from the chord."""
         low, high = self.domain
         chord = float(np.linalg.norm(point - self.evaluate(np.array([high]))[0]))
         mean = (high - low) / (len(self.breaks) - 1)
@@ -259,9 +262,9 @@ class BSpline:
         return np.concatenate([kept, np.full(self.degree + 1, new_end)])
 
     def extend_to(self, point: Floats) -> BSpline:
-        """The curve carried on to a point (2,): unchanged where it was, the new end clamped on the point.
+        """Returns the curve extended to a point (2,), unchanged on its old domain and clamped at the point.
 
-        The end is unclamped about its old domain, the point is the new last control point (Hu et al. 2002).
+        The old end is unclamped, and the point becomes the last control point (Hu et al. 2002).
         """
         self._refuse_periodic("extend")
         knots = self.extension_knots(point)
@@ -269,27 +272,28 @@ class BSpline:
         return BSpline(knots, np.concatenate([kept, np.reshape(point, (1, 2))]), self.degree)
 
     def grow(self, control_points: Floats, interval: float | None = None) -> BSpline:
-        """Control points (k, 2) appended at a floating end: no basis function or control point changes.
+        """Returns the curve with control points (k, 2) appended at its floating end.
 
-        Each appends a knot, `interval` (by default the last one) after the knot before. The domain moves on
-        to knots that were there; where the end is clamped it would not move, so unclamp first.
+        No basis function and no other control point changes. Each new point appends a knot, `interval` after
+        the last one (by default the last interval), and the domain advances by one knot. A clamped end would
+        not advance: SettingsError is raised.
         """
         self._refuse_periodic("grow")
         step = self.knots[-1] - self.knots[-2] if interval is None else interval
         if step <= 0.0:
-            raise SettingsError("a clamped end can't grow: unclamp it first")
+            raise SettingsError("a clamped end cannot grow: unclamp it first")
         added = self.knots[-1] + step * np.arange(1, len(control_points) + 1)
         knots = np.concatenate([self.knots, added])
         return BSpline(knots, np.concatenate([self.control_points, control_points]), self.degree)
 
     def reversed(self) -> BSpline:
-        """The same curve travelled the other way: S(-u) on [-high, -low]."""
+        """Returns the same curve in the opposite direction: S(-u) on [-high, -low]."""
         return BSpline(-self.knots[::-1], self.control_points[::-1], self.degree, self.periodic)
 
     def covariance_at(self, u: Floats, joint_covariance: Floats) -> Floats:
-        """cov S(u) = B Sigma B^T (k, 2, 2), of the joint covariance (2m, 2m) over x0, y0, x1, y1 ...
+        """Returns cov S(u) = B Sigma B^T (k, 2, 2), cross terms between control points included.
 
-        Cross terms between control points are included.
+        The joint covariance Sigma (2 m, 2 m) is ordered by control point: x0, y0, x1, y1 and so on.
         """
         values, columns = self.local_basis(u)
         blocks = joint_covariance.reshape(self.size, 2, self.size, 2).transpose(0, 2, 1, 3)
@@ -298,17 +302,17 @@ class BSpline:
         return covariance
 
     def normal_sigma(self, u: Floats, joint_covariance: Floats) -> Floats:
-        """sqrt(n^T cov S(u) n) (k,): standard deviation across the curve, metres."""
+        """Returns sqrt(n^T cov S(u) n) (k,): the standard deviation across the curve in m."""
         tangent = self.tangent_unit(u)
         normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
         variance = np.einsum("ka,kab,kb->k", normal, self.covariance_at(u, joint_covariance), normal)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def to_scipy(self) -> ScipyBSpline:
-        """The same curve as scipy's class; outside of an open domain it gives NaN."""
+        """Returns the same curve as scipy's class, which gives NaN outside of an open domain."""
         extrapolate: Literal["periodic", False] = "periodic" if self.periodic else False
         return ScipyBSpline(self.knots, self.control_points, self.degree, extrapolate=extrapolate)
 
     def _refuse_periodic(self, what: str) -> None:
         if self.periodic:
-            raise SettingsError(f"can't {what} a periodic spline: it has no ends")
+            raise SettingsError(f"cannot {what} a periodic spline: it has no ends")

@@ -1,9 +1,10 @@
-"""Knots where cones ask for them: one at each cone, and those taken out that are missed least."""
+"""Knots placed by the cones: each cone begins with a knot, and the knots that matter least are removed."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,39 +17,48 @@ from .knots import energy_rows
 
 Array = NDArray[np.float64]
 
+EVEN: Final = 1e-9
+"""The square of the interval (m^2) that a removal leaves is weighed by this against the cost of the removal
+(m^2): among knots that cost nothing, the one that leaves the shortest interval is removed."""
+MARGIN: Final = 0.1
+"""A smaller curve must have a sum of squares that is smaller by this share to be chosen."""
+COINCIDENT: Final = 1e-9
+"""Cones whose parameters differ by no more than this (m) share one knot. Two knots so close to each other
+impose the same constraint up to rounding, and the cost of the second one would be 0 / 0."""
+
 
 @dataclass(frozen=True, eq=False)
 class Thinned:
-    """A least-squares spline through ordered points, on fewer and fewer breaks."""
+    """Holds a least-squares spline through ordered points, after the removal of some knots."""
 
     breaks: Array
-    """(b + 1,) of the parameter."""
+    """(b + 1,) These are the knots that remain, in the parameter of the points (m)."""
     size: int
-    """Distinct control points."""
+    """The spline has this number of distinct control points."""
     residual: Array
-    """(k, 2) from where it passes the points to them, m."""
+    """(k, 2) Each row is the offset from the spline to a point, at the point's parameter (m)."""
     leverage: Array
-    """(k,) by how much each point draws it there, 0 to 1."""
+    """(k,) Each entry is the share of its own point in the curve there: the diagonal of the hat matrix."""
 
     @property
     def rss(self) -> float:
-        """Sum of squared distances of the points, m^2."""
+        """Returns the residual sum of squares (m^2)."""
         return float((self.residual**2).sum())
 
     @property
     def crossed(self) -> float:
-        """The same of each point from the curve that is fitted without it, m^2: cross-validation."""
+        """Returns the sum of squares (m^2) where each point in turn is left out of the fit."""
         return float(((self.residual / (1.0 - self.leverage)[:, None]) ** 2).sum())
 
 
 def chosen_breaks(points: Array, periodic: bool, fit: FitSettings, least: int, most: int) -> Thinned:
-    """Of `thin`'s curves of `least` to `most` control points the one that foretells a cone left out best.
+    """Chooses, among the curves of `thin` with `least` to `most` control points, by cross-validation.
 
-    The largest, unless a smaller one is better by a margin: which of nearly equal ones is best is chance.
-    Cross-validation, as the other criterion, `n log(rss / n) + p log(n)` (BIC), took a knot for every cone on
-    all 22 boundaries of eleven tracks: with so many knots rss, and with it the noise that BIC reckons with,
-    vanishes. At a given size the curve is nearer to the cones than one whose knots
-    follow the curvature: 0.066 m in place of 0.107 m on cones with 3 cm of noise.
+    The largest curve is chosen, unless a smaller one predicts a point left out better by `MARGIN`: which of
+    nearly equal curves is best is chance. The other criterion, `n log(rss / n) + p log(n)` (BIC), took a knot
+    for every cone on all 22 boundaries of eleven tracks: with so many knots rss vanishes, and with it BIC's
+    estimate of the noise. At a given size the curve is nearer to the cones than one whose knots follow the
+    curvature: 0.066 m in place of 0.107 m on cones with 3 cm of noise.
     """
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
     high = float(along[-1] + (np.hypot(*(points[0] - points[-1])) if periodic else 0.0))
@@ -57,52 +67,55 @@ def chosen_breaks(points: Array, periodic: bool, fit: FitSettings, least: int, m
     return min(within, key=lambda curve: (1.0 if curve is within[0] else 1.0 + MARGIN) * curve.crossed)
 
 
-EVEN = 1e-9
-"""Of knots that aren't missed at all, the one goes that leaves the least interval (m^2 by m^2)."""
-MARGIN = 0.1
-"""So much better (of the sum of squares) a smaller curve must be."""
-
-
 def thin(
     points: Array, u: Array, high: float, periodic: bool, fit: FitSettings, least: int
 ) -> Iterator[Thinned]:
-    """From a break at each of the points (k, 2), at u (k,) in [0, high], down to `least` control points.
+    """Yields least-squares curves with one knot less each, from a knot at each point down to `least` points.
 
-    Each curve has one knot less than the last, the one that is missed least.
+    The points (k, 2) have the parameters u (k,) in [0, high]; `least` counts control points. Each step
+    removes the knot whose removal costs least; ties go to the shortest interval.
 
-    A knot t is no knot any more where the p-th derivative doesn't jump there: a linear constraint a'c = 0. It
-    costs `|a'c|^2 / (a' G^-1 a)`, G the normal equations; and whatever is linear in the control points,
-    `w'c`, is less by `w' G^-1 a / (a' G^-1 a) a'c` then. So of the jumps at all knots and of the curve at the
-    points, W, what changes is `W c` and `W G^-1 A'` only, by a rank of one.
+    A knot disappears where the p-th derivative does not jump: a linear constraint a'c = 0. The removal costs
+    `|a'c|^2 / (a' G^-1 a)`, where G is the matrix of the normal equations, and every linear function `w'c`
+    decreases by `w' G^-1 a / (a' G^-1 a) a'c`. So it suffices to update `W c` and `W G^-1 A'` by a rank of
+    one, where the rows of W are the jumps A at all knots and the basis at the points.
     """
-    breaks = np.unique(np.concatenate([[0.0], u, [high]]))
+    breaks = _breaks(u, high)
     frame = _frame(breaks, periodic, fit.degree)
     B, bending, jumps = frame.basis_matrix(u), energy_rows(frame), _jumps(frame)
     factor = cho_factor(B.T @ B + fit.smoothness * bending.T @ bending)
-    watched, n, left = np.concatenate([jumps, B]), len(jumps), np.arange(len(jumps))
+    watched, n, remaining = np.concatenate([jumps, B]), len(jumps), np.arange(len(jumps))
     spread, values = watched @ cho_solve(factor, jumps.T), watched @ cho_solve(factor, B.T @ points)
     leverage = np.einsum("kn,nk->k", B, cho_solve(factor, B.T))
     for size in range(B.shape[1], max(least, B.shape[1] - n) - 1, -1):
-        kept = breaks[np.concatenate([[0], 1 + left, [-1]])]
+        kept = breaks[np.concatenate([[0], 1 + remaining, [-1]])]
         yield Thinned(kept, size, points - values[n:], leverage)
-        if len(left):
-            price = (values[left] ** 2).sum(axis=1) / spread.diagonal()[left]
-            gone = int((price + EVEN * (kept[2:] - kept[:-2]) ** 2).argmin())
-            k, column = left[gone], spread[:, left[gone]].copy()
+        if len(remaining):
+            cost = (values[remaining] ** 2).sum(axis=1) / spread.diagonal()[remaining]
+            removed = int((cost + EVEN * (kept[2:] - kept[:-2]) ** 2).argmin())
+            k, column = remaining[removed], spread[:, remaining[removed]].copy()
             leverage = leverage - column[n:] ** 2 / column[k]
             values = values - np.outer(column / column[k], values[k])
             spread -= np.outer(column / column[k], spread[k])
-            left = np.delete(left, gone)
+            remaining = np.delete(remaining, removed)
+
+
+def _breaks(u: Array, high: float) -> Array:
+    """Returns the distinct parameters among 0, u (k,) and `high`."""
+    inner = np.unique(u[(u > COINCIDENT) & (u < high - COINCIDENT)])
+    inner = inner[np.diff(inner, prepend=0.0) > COINCIDENT]
+    return np.concatenate([[0.0], inner, [high]])
 
 
 def _frame(breaks: Array, periodic: bool, degree: int) -> BSpline:
+    """Returns a spline on the breaks whose control points are zero."""
     count = len(breaks) - 1
     build = BSpline.periodic_from if periodic else BSpline.clamped_from
     return build(breaks, np.zeros((count if periodic else count + degree, 2)), degree)
 
 
 def _jumps(frame: BSpline) -> Array:
-    """(b - 1, m) jump of the highest derivative at each inner break, by the distinct control points."""
+    """Returns (b - 1, m) the jump of the highest derivative at each inner break, by control point."""
     breaks = frame.breaks
     highest = frame.basis_matrix(0.5 * (breaks[1:] + breaks[:-1]), frame.degree)
     return np.asarray(np.diff(highest, axis=0))

@@ -1,4 +1,4 @@
-"""Where knots go: curvature-weighted breaks, refits onto other knots as matrices, fits to ordered points."""
+"""Knots by curvature (paper: Simplification), refits onto other knots, and fits to ordered points."""
 
 from __future__ import annotations
 
@@ -18,19 +18,20 @@ from pathspace_graph.settings.knots import BreakSettings, FitSettings
 from .bspline import BSpline
 
 _SAMPLES_PER_BREAK: Final = 40
-"""Curvature samples for each break wanted, equally spaced along the curve."""
+"""The curvature is sampled at this number of equally spaced places for each requested break."""
 _SAMPLES_PER_SPAN: Final = 8
-"""Least-squares samples on each span of a refit: enough for any degree up to 7."""
+"""A refit has this number of least-squares samples on each span: enough for any degree up to 7."""
 _BRIDGE: Final = 1e-3
-"""Weight of the refit's second differences beside its samples, where a span has too few of them."""
+"""Second derivatives have this weight beside the samples of a refit, on spans that have too few samples."""
 _BENDING_PER_SPAN: Final = 3
-"""Second differences taken on each span."""
+"""The second derivative is taken at this number of places on each such span."""
 
 
 def quantile_breaks(u: Floats, curvature: Floats, count: int, settings: BreakSettings) -> Floats:
-    """Breaks (count + 1,) at equal quantiles of (1 - b) |kappa| / sum |kappa| + b / N over N equal lengths.
+    """Returns breaks (count + 1,) at equal quantiles of (1 - b) |kappa| / sum |kappa| + b / N.
 
-    u (N + 1,): the samples' increasing parameters, curvature (N,) between them, 1/m; b the linear baseline.
+    The N intervals between the increasing parameters u (N + 1,) have equal lengths; kappa (N,) is their
+    curvature in 1/m, and b is the linear baseline. SettingsError is raised if `count` is less than 1.
     """
     if count < 1:
         raise SettingsError(f"at least one knot interval is needed, not {count}")
@@ -47,10 +48,11 @@ def quantile_breaks(u: Floats, curvature: Floats, count: int, settings: BreakSet
 def curvature_weighted_breaks(
     spline: BSpline, count: int, settings: BreakSettings, low: float | None = None, high: float | None = None
 ) -> Floats:
-    """Breaks (count + 1,) in the spline's own parameter between low and high (by default its domain).
+    """Returns breaks (count + 1,) in the spline's own parameter between low and high (default: its domain).
 
-    The paper's Simplification: sample equally along the curve, take curvature as a probability density, mix
-    in the linear baseline, put knots at equal quantiles. Beyond an open curve's ends counts as straight.
+    As in the paper's Simplification, the curvature at equal distances along the curve is a probability
+    density, to which the linear baseline is added; the knots are its equal quantiles. An open curve counts
+    as straight beyond its ends. SettingsError is raised if the stretch is empty.
     """
     first, last = spline.domain
     low, high = first if low is None else low, last if high is None else high
@@ -65,7 +67,7 @@ def curvature_weighted_breaks(
 
 
 def _equal_lengths(spline: BSpline, low: float, high: float, count: int) -> Floats:
-    """Parameters (count + 1,) from low to high, equal chords apart; beyond an end at the mean speed."""
+    """Returns parameters (count + 1,) from low to high at equal distances, extrapolated beyond an end."""
     first, last = spline.domain
     grid = np.linspace(low, high, 4 * count + 1)
     chords = np.linalg.norm(np.diff(spline.evaluate(grid), axis=0), axis=1)
@@ -79,20 +81,20 @@ def _equal_lengths(spline: BSpline, low: float, high: float, count: int) -> Floa
 
 @dataclass(frozen=True, eq=False)
 class Refit:
-    """A change of basis between an old and a new spline, on each coordinate alike."""
+    """Holds the change of basis between an old and a new spline; it is the same for both coordinates."""
 
     new_from_old: Floats
-    """F (m_new, m_old): C_new = F C_old, least squares over samples of the old curve."""
+    """(m_new, m_old) The matrix F fits the new curve to samples of the old one: C_new = F C_old."""
     old_from_new: Floats
-    """E (m_old, m_new): C_old ~ E C_new, least squares of the new curve's samples in the old basis."""
+    """(m_old, m_new) The matrix E fits the old curve to samples of the new one: C_old ~ E C_new."""
 
 
 def refit(old: BSpline, new: BSpline, u_map: Callable[[Floats], Floats] | None = None) -> Refit:
-    """Least squares between the bases of two splines: only the knots of `new` matter, not its control points.
+    """Fits the bases of two splines to each other; only the knots of `new` are used, not its control points.
 
-    `u_map` takes increasing parameters of the old spline to those of the new (by default the same); of a
-    periodic new spline they are wrapped, so that the beginning of an open curve and an end that overlaps it,
-    once around, land on the same stretch. Where the new domain has no sample of the old, F bridges smoothly.
+    `u_map` maps increasing parameters of the old spline to those of the new one (default: the same ones). A
+    periodic new spline wraps them, so the beginning of an open curve and an end that overlaps it lie on the
+    same stretch. Where the new domain has no sample of the old one, F fills the gap smoothly.
     """
     u = _refit_samples(old, new)
     w = u if u_map is None else u_map(u)
@@ -104,13 +106,13 @@ def refit(old: BSpline, new: BSpline, u_map: Callable[[Floats], Floats] | None =
 
 
 def _least_squares(matrix: Floats, right: Floats) -> Floats:
-    """argmin |M X - R| by normal equations: for a B-spline basis sampled all along, of a small condition."""
+    """Returns argmin |M X - R| by normal equations, which a sampled B-spline basis keeps well conditioned."""
     factor = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
     return np.asarray(scipy.linalg.cho_solve(factor, matrix.T @ right, check_finite=False))
 
 
 def _refit_samples(old: BSpline, new: BSpline) -> Floats:
-    """Parameters over the old domain, middles of equal parts of every span, dense enough for the new."""
+    """Returns the middles of equal parts of every old span, dense enough for the new spans."""
     widths = np.diff(old.breaks)
     finer = int(np.ceil(widths.max() / np.diff(new.breaks).min()))
     parts = _SAMPLES_PER_SPAN * min(max(1, finer), _SAMPLES_PER_SPAN)
@@ -119,14 +121,14 @@ def _refit_samples(old: BSpline, new: BSpline) -> Floats:
 
 
 def _sparse_spans(spline: BSpline, u: Floats) -> NDArray[np.bool_]:
-    """(spans,) where a spline's own span has fewer samples than it has control points."""
+    """Returns (spans,) whether a span has fewer samples than control points."""
     low, high = spline.domain
     inside = low + np.mod(u - low, high - low) if spline.periodic else u
     return np.histogram(inside, spline.breaks)[0] <= spline.degree
 
 
 def _bending_rows(spline: BSpline) -> Floats:
-    """h^2 S''(u) onto the distinct control points, at the middle of equal parts of every span of width h."""
+    """Returns rows whose product with the control points is h^2 S'' at places on every span of width h."""
     breaks = spline.breaks
     width = np.diff(breaks)
     offsets = (np.arange(_BENDING_PER_SPAN) + 0.5) / _BENDING_PER_SPAN
@@ -143,11 +145,12 @@ def fit_spline(
     settings: FitSettings | None = None,
     breaks: Floats | None = None,
 ) -> BSpline:
-    """The least-squares spline of `size` distinct control points through ordered points (k, 2), metres.
+    """Fits a spline of `size` distinct control points to ordered points (k, 2) in m, by least squares.
 
-    Parameters begin as chord lengths and are moved to the foot points; knots follow the curvature, unless
-    `breaks` are given (in chord lengths from the first point). The best of all fits by rmse is returned. A
-    weak bending energy decides where points are few, so two points (three where periodic) give a curve.
+    The points' parameters begin as chord lengths and are moved to the foot points. Knots follow the
+    curvature, unless `breaks` are given (in chord lengths from the first point). The fit with the smallest
+    rmse is returned. A weak bending energy makes two points enough (three for a periodic curve).
+    SettingsError is raised if there are fewer distinct points, or too few control points for the degree.
     """
     settings = FitSettings() if settings is None else settings
     u, high = _chord_lengths(points, periodic)
@@ -166,7 +169,7 @@ def fit_spline(
 
 
 def _chord_lengths(points: Floats, periodic: bool) -> tuple[Floats, float]:
-    """Chord length (k,) from the first point to each, and the whole curve's."""
+    """Returns the chord length (k,) from the first point to each point, and that of the whole curve."""
     following = np.roll(points, -1, axis=0) if periodic else points[1:]
     chords = np.linalg.norm(following - points[: len(following)], axis=1)
     along = np.concatenate([[0.0], np.cumsum(chords)])
@@ -178,7 +181,7 @@ def _chord_lengths(points: Floats, periodic: bool) -> tuple[Floats, float]:
 def _fit_on(
     points: Floats, u: Floats, breaks: Floats, periodic: bool, settings: FitSettings
 ) -> tuple[BSpline, Floats, float]:
-    """The fit on given breaks after refreshing foot points: spline, parameters (k,), rmse in metres."""
+    """Fits on given breaks and refreshes foot points; returns spline, parameters (k,) and rmse (m)."""
     p = settings.degree
     count = len(breaks) - 1
     build = BSpline.periodic_from if periodic else BSpline.clamped_from
@@ -198,7 +201,7 @@ def _fit_on(
 
 
 def energy_rows(spline: BSpline) -> Floats:
-    """Rows R with |R c|^2 = integral of |S''|^2 (exact up to degree 4), of |S'|^2 for degree 1."""
+    """Returns rows R with |R c|^2 = integral of |S''|^2 (exact up to degree 4), or of |S'|^2 for degree 1."""
     nodes, weights = np.polynomial.legendre.leggauss(3)
     breaks = spline.breaks
     half = 0.5 * np.diff(breaks)

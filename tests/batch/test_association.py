@@ -38,7 +38,7 @@ def corridor_state() -> State:
 def associated(points_map: list[list[float]], labels: list[int], strict: bool) -> DetectionTable:
     """Returns detections of the pose at (20, 0), after the association."""
     points_vehicle = np.array(points_map) - [20.0, 0.0]
-    table = detections_of(np.zeros(len(labels), np.intp), points_vehicle, np.array(labels), SIGMA)
+    table = detections_of(points_vehicle, np.array(labels), SIGMA)
     associate(corridor_state(), table, SETTINGS, GATE, strict)
     return table
 
@@ -123,7 +123,7 @@ def test_a_detection_beyond_the_end_of_a_curve_is_not_used() -> None:
 
 
 def test_what_was_used_before_is_associated_anew() -> None:
-    table = detections_of(np.zeros(1, np.intp), np.array([[5.0, 9.0]]), np.array([LEFT]), SIGMA)
+    table = detections_of(np.array([[5.0, 9.0]]), np.array([LEFT]), SIGMA)
     table.take(np.array([0]), LEFT, np.array([25.0]))
     associate(corridor_state(), table, SETTINGS, GATE, strict=True)
     assert not table.used.any()

@@ -13,7 +13,8 @@ from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
+from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.batch import course_log
@@ -29,7 +30,7 @@ SCALE, BIAS = 0.004, 0.004
 
 
 @cache
-def drifting() -> tuple[Log, Chain]:
+def drifting() -> tuple[Log, LogOdometry]:
     """Returns laps of a closed course whose odometry drifts."""
     log = course_log(2.6)
     twists = log.odometry.twist * [1.0 + SCALE, 1.0 + SCALE, 1.0] + [0.0, 0.0, BIAS]
@@ -112,7 +113,7 @@ def test_what_is_aligned_is_a_minimum_of_odometry_and_correspondences() -> None:
 
 def test_the_curves_of_a_closed_course_stand_beside_its_path() -> None:
     log, chain = drifting()
-    state = start_odometry(chain, collect_detections(log), SETTINGS)
+    state = start_odometry(chain, DetectionTable.of(log.cycles), SETTINGS)
     assert set(state.boundaries) == set(BOUNDARIES)
     assert log.truth is not None
     for label, boundary in state.boundaries.items():
@@ -128,7 +129,7 @@ def test_a_path_that_does_not_recur_is_dead_reckoned() -> None:
     cones, labels = corridor(60.0)
     log = exact_log(ahead(6.0, 5.0), cones, labels)
     chain = integrate_log(log, log.odometry_sigma, SETTINGS.odometry)
-    state = start_odometry(chain, collect_detections(log), SETTINGS)
+    state = start_odometry(chain, DetectionTable.of(log.cycles), SETTINGS)
     np.testing.assert_array_equal(state.poses, chain.dead_reckoned(np.zeros(2)))
     np.testing.assert_array_equal(state.calibration, 0.0)
     for label, y in ((LEFT, 2.0), (RIGHT, -2.0)):

@@ -13,7 +13,8 @@ from pathspace_graph.batch.mapper import own_settings
 from pathspace_graph.batch.optimizer import gradient_norm
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved
 from pathspace_graph.graph.keys import pose_key
-from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
+from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -30,7 +31,7 @@ def small_system() -> tuple[BatchSystem, State]:
     log = lap_log(bean_track())
     settings = own_settings(MapperSettings())
     chain = integrate_log(log, log.odometry_sigma, settings.odometry)
-    detections = collect_detections(log)
+    detections = DetectionTable.of(log.cycles)
     detections.point = detections.point + np.random.default_rng(1).normal(0.0, 0.1, detections.point.shape)
     state = start_odometry(chain, detections, settings)
     system = BatchSystem(detections, chain, settings, Biweight(settings.batch.gate))
@@ -44,7 +45,7 @@ def small_system() -> tuple[BatchSystem, State]:
 
 def test_dead_reckoning_of_an_exact_log_is_the_truth() -> None:
     log = lap_log(bean_track())
-    chain: Chain = integrate_log(log, log.odometry_sigma, MapperSettings().odometry)
+    chain: LogOdometry = integrate_log(log, log.odometry_sigma, MapperSettings().odometry)
     np.testing.assert_allclose(chain.dead_reckoned(np.zeros(2))[:, :2], true_poses(log)[:, :2], atol=1e-6)
 
 
@@ -76,7 +77,7 @@ def test_poses_alone_move_as_beside_a_map_that_is_held() -> None:
     system, state = small_system()
     at = system.evaluate(state)
     problem = system.eliminated(at)
-    held = problem.beside(np.zeros(problem.map.size))
+    held = problem.poses_given(np.zeros(problem.map.size))
     np.testing.assert_allclose(system.poses_alone(at), held, atol=1e-9)
 
 

@@ -1,4 +1,4 @@
-"""S_z: the ridge regression, its cubature transform, and the choices where the paper is open."""
+"""S_z: the ridge regression, its cubature transform, and the choices that the paper leaves open."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ COVARIANCE = np.array([[0.04, 0.01], [0.01, 0.09]])
 
 
 def curve() -> BSpline:
-    """A clamped curve of 10 spans along x."""
+    """Returns a clamped curve of 10 spans along x."""
     u = np.linspace(0.0, 40.0, 13)
     return BSpline.clamped_from(np.linspace(0.0, 40.0, 11), np.column_stack([u, np.sin(0.1 * u)]))
 
 
-def readings_beside(spline: BSpline, u: Array, offset: float) -> Array:
+def points_beside(spline: BSpline, u: Array, offset: float) -> Array:
     return spline.evaluate(u) + np.array([0.0, offset])
 
 
-def test_the_penalty_is_less_where_the_readings_act_and_squared_as_the_cost_has_it() -> None:
+def test_the_penalty_is_less_where_detections_act_and_the_cost_squares_it() -> None:
     basis = curve().basis_matrix(np.array([9.0, 10.0, 11.0]))
     settings = CkfSettings(ridge=0.3)
     diagonal = np.diagonal(regularization(basis, settings))
@@ -36,26 +36,26 @@ def test_the_penalty_is_less_where_the_readings_act_and_squared_as_the_cost_has_
     np.testing.assert_allclose(np.diagonal(squared), diagonal**2)
 
 
-def test_the_fit_is_the_minimum_of_the_cost_that_its_solution_belongs_to() -> None:
-    """|y - B C|^2 + (C - C_mu)' L (C - C_mu) has no slope there."""
+def test_the_fit_minimizes_the_cost_of_its_solution() -> None:
+    """The gradient of |y - B C|^2 + (C - C_mu)' L (C - C_mu) is zero."""
     spline, settings = curve(), CkfSettings(ridge=0.2)
     u = np.array([9.0, 14.0, 15.5])
     basis, known = spline.basis_matrix(u), spline.control_points
-    readings = readings_beside(spline, u, 0.8)
-    fitted = fit_detections(basis, readings, np.tile(COVARIANCE, (3, 1, 1)), known, settings).points
-    slope = basis.T @ (basis @ fitted - readings) + regularization(basis, settings) @ (fitted - known)
+    detections = points_beside(spline, u, 0.8)
+    fitted = fit_detections(basis, detections, np.tile(COVARIANCE, (3, 1, 1)), known, settings).points
+    slope = basis.T @ (basis @ fitted - detections) + regularization(basis, settings) @ (fitted - known)
     np.testing.assert_allclose(slope, 0.0, atol=1e-10)
 
 
-def test_it_interpolates_where_readings_are_and_keeps_to_the_prior_elsewhere() -> None:
+def test_it_interpolates_the_detections_and_keeps_the_prior_elsewhere() -> None:
     spline = curve()
     u = np.array([10.0, 13.0, 15.5])
-    basis, readings = spline.basis_matrix(u), readings_beside(spline, u, 0.8)
+    basis, detections = spline.basis_matrix(u), points_beside(spline, u, 0.8)
     settings, covariances = CkfSettings(ridge=1e-6), np.tile(COVARIANCE, (3, 1, 1))
     fitted = spline.with_points(
-        fit_detections(basis, readings, covariances, spline.control_points, settings).points
+        fit_detections(basis, detections, covariances, spline.control_points, settings).points
     )
-    np.testing.assert_allclose(fitted.evaluate(u), readings, atol=1e-4)
+    np.testing.assert_allclose(fitted.evaluate(u), detections, atol=1e-4)
     away = np.linspace(28.0, 40.0, 30)
     np.testing.assert_allclose(fitted.evaluate(away), spline.evaluate(away), atol=1e-12)
 
@@ -63,11 +63,11 @@ def test_it_interpolates_where_readings_are_and_keeps_to_the_prior_elsewhere() -
 def test_a_stronger_ridge_moves_the_curve_less() -> None:
     spline, u = curve(), np.array([10.0, 13.0])
     basis, covariances = spline.basis_matrix(u), np.tile(COVARIANCE, (2, 1, 1))
-    readings = readings_beside(spline, u, 1.0)
+    detections = points_beside(spline, u, 1.0)
     moved = [
         np.abs(
             fit_detections(
-                basis, readings, covariances, spline.control_points, CkfSettings(ridge=ridge)
+                basis, detections, covariances, spline.control_points, CkfSettings(ridge=ridge)
             ).points
             - spline.control_points
         ).max()
@@ -76,25 +76,25 @@ def test_a_stronger_ridge_moves_the_curve_less() -> None:
     assert moved == sorted(moved, reverse=True)
 
 
-def test_the_readings_uncertainty_goes_through_the_fit() -> None:
-    """cov C = (G x I) K (G x I)', and nothing for control points that no reading reaches."""
+def test_the_covariance_of_the_detections_goes_through_the_fit() -> None:
+    """cov C = (G x I) K (G x I)', which is zero for control points that no detection reaches."""
     spline, u = curve(), np.array([10.0, 13.0])
     basis, settings = spline.basis_matrix(u), CkfSettings()
     covariances = np.stack([COVARIANCE, 2.0 * COVARIANCE])
-    reading = fit_detections(basis, spline.evaluate(u), covariances, spline.control_points, settings)
+    fitted = fit_detections(basis, spline.evaluate(u), covariances, spline.control_points, settings)
     gain = np.kron(ridge_gain(basis, settings), np.eye(2))
     joint = np.block([[covariances[0], np.zeros((2, 2))], [np.zeros((2, 2)), covariances[1]]])
-    np.testing.assert_allclose(reading.covariance, gain @ joint @ gain.T, atol=1e-12)
-    assert np.abs(reading.covariance[-6:]).max() < 1e-20
+    np.testing.assert_allclose(fitted.covariance, gain @ joint @ gain.T, atol=1e-12)
+    assert np.abs(fitted.covariance[-6:]).max() < 1e-20
 
 
-def test_readings_on_the_curve_fit_the_curve() -> None:
-    """The prediction of S_z is S_z of readings that lie on the curve: of any curve."""
+def test_the_prediction_is_the_fit_of_detections_on_the_curve() -> None:
+    """This holds for detections on any curve."""
     spline, u, rng = curve(), np.array([10.0, 13.0, 14.0]), np.random.default_rng(0)
     basis, covariances, settings = spline.basis_matrix(u), np.tile(COVARIANCE, (3, 1, 1)), CkfSettings()
     other = spline.with_points(spline.control_points + rng.normal(size=spline.control_points.shape))
     fitted = fit_detections(basis, other.evaluate(u), covariances, spline.control_points, settings)
     np.testing.assert_allclose(fitted.refitted(other.control_points[None])[0], fitted.points, atol=1e-9)
-    combine = fitted.range_basis()
-    assert combine.shape == (13, 3)
-    np.testing.assert_allclose(combine @ combine.T @ fitted.gain, fitted.gain, atol=1e-9)
+    vectors = fitted.range_basis()
+    assert vectors.shape == (13, 3)
+    np.testing.assert_allclose(vectors @ vectors.T @ fitted.gain, fitted.gain, atol=1e-9)

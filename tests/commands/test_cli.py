@@ -20,6 +20,7 @@ from pathspace_graph.io.map import read_map
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
 
 from ..scenes.paths import TRACKS
+from ..scenes.pretenders import contents
 
 SHORT_TRACK = [
     *("--generator.lap-length", "100", "160"),
@@ -45,10 +46,6 @@ def map_folder(log_folder: Path) -> Path:
     folder = log_folder.parent / "map"
     assert main(["online", str(log_folder), "--out", str(folder)]) == 0
     return folder
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {file.name: file.read_bytes() for file in sorted(folder.iterdir())}
 
 
 def names(folder: Path) -> set[str]:

@@ -22,7 +22,7 @@ def straight() -> Log:
     return exact_log(ahead(6.0, 8.0), cones, labels)
 
 
-def test_a_straight_drive_maps_each_cone_seen_once() -> None:
+def test_a_straight_drive_maps_each_detected_cone_once() -> None:
     log = straight()
     result = run_online(log, make_online("landmark-ckf", MapperSettings(), log), name="landmark-ckf")
     assert log.truth is not None
@@ -37,8 +37,8 @@ def test_a_straight_drive_maps_each_cone_seen_once() -> None:
         assert np.linalg.eigvalsh(boundary.covariance)[0] > 0.0
 
 
-def test_colours_are_respected() -> None:
-    """Readings that turn the other colour make landmarks of that colour, and don't move the old ones."""
+def test_detections_update_only_landmarks_of_their_label() -> None:
+    """Detections whose label changes create landmarks with the new label, and do not move the old ones."""
     log = straight()
     swapped = tuple(
         Detections(c.t, c.points_vehicle, c.covariances, 1 - c.labels) if k >= len(log.cycles) // 2 else c
@@ -50,7 +50,7 @@ def test_colours_are_respected() -> None:
     assert set(sides[LEFT]) == set(sides[RIGHT]) == {-1.0, 1.0}
 
 
-def test_one_false_detection_makes_no_landmark_unless_told_so() -> None:
+def test_one_false_detection_creates_no_landmark_unless_the_settings_say_so() -> None:
     log = straight()
 
     def with_ghost(c: Detections) -> Detections:

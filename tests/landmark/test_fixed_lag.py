@@ -1,4 +1,4 @@
-"""The landmark graph online: exact laps, and drives with one thing wrong in each."""
+"""The landmark graph online: exact laps, and drives with one fault in each."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from scipy.spatial import KDTree
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.table1 import lap_metrics
 from pathspace_graph.eval.metrics.trajectory import ate
-from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
@@ -48,7 +47,7 @@ def points(track: Map, label: int) -> Array:
 
 
 def farthest(track: Map, log: Log) -> float:
-    """Largest distance (m) from a landmark to a true cone of its colour, and back."""
+    """Returns the largest distance (m) from a landmark to a true cone of its label, and back."""
     assert log.truth is not None
     worst = 0.0
     for label in BOUNDARIES:
@@ -69,7 +68,7 @@ def test_an_exact_lap_closes_with_one_landmark_for_each_cone(lap: Log) -> None:
         assert np.linalg.eigvalsh(boundary.covariance)[0] > 0.0
 
 
-def test_a_noisy_drive_is_nearly_as_good_as_its_readings() -> None:
+def test_a_noisy_drive_is_mapped_completely() -> None:
     log = simulate(bean_track(), SimulationSettings(laps=2), seed=1)
     result = run_online(log, make_online("landmark-fixed-lag", MapperSettings(), log))
     assert log.truth is not None
@@ -83,18 +82,17 @@ def test_a_noisy_drive_is_nearly_as_good_as_its_readings() -> None:
     assert farthest(result.map, log) < 3.0
 
 
-def test_one_reading_makes_no_landmark_and_three_do() -> None:
+def test_two_detections_create_no_landmark_and_three_do() -> None:
     cones, labels = corridor(60.0)
     log = exact_log(ahead(5.0, 4.0), cones, labels)
-    nothing = np.array([[5.0, 6.0]])
+    thing = np.array([[5.0, 6.0]])  # it stands still, off the track
     k = 10
 
     def seen(times: int) -> int:
         cycles = list(log.cycles)
         for i in range(k, k + times):
             c = cycles[i]
-            # a thing that stands still, off the track
-            local = nothing - np.array([[0.5 * (i - k), 0.0]])
+            local = thing - np.array([[0.5 * (i - k), 0.0]])
             cycles[i] = Detections(
                 c.t,
                 np.concatenate([c.points_vehicle, local]),
@@ -108,7 +106,7 @@ def test_one_reading_makes_no_landmark_and_three_do() -> None:
     assert seen(3) == without + 1
 
 
-def test_unknown_colours_are_used_and_make_nothing() -> None:
+def test_detections_with_unknown_labels_are_used_and_create_nothing() -> None:
     cones, labels = corridor(60.0)
     log = exact_log(ahead(5.0, 4.0), cones, labels)
     blank = [replace(c, labels=np.full(len(c.labels), UNKNOWN)) for c in log.cycles]
@@ -119,9 +117,9 @@ def test_unknown_colours_are_used_and_make_nothing() -> None:
     assert min(used[20:30]) > 0
 
 
-def test_a_cone_first_seen_in_the_wrong_colour_gets_its_own() -> None:
+def test_a_cone_first_detected_with_the_wrong_label_gets_its_own() -> None:
     cones, labels = corridor(40.0)
-    cones = cones + np.array([8.0, 0.0])  # so that none passes before it is outvoted
+    cones = cones + np.array([8.0, 0.0])  # so that no cone leaves the view before it is outvoted
     log = exact_log(ahead(5.0, 5.0), cones, labels)
     cycles = list(log.cycles)
     swapped = np.array([RIGHT, LEFT, UNKNOWN])
@@ -130,44 +128,10 @@ def test_a_cone_first_seen_in_the_wrong_colour_gets_its_own() -> None:
     track = run(with_cycles(log, cycles)).map()
     for label in BOUNDARIES:
         assert (np.sign(points(track, label)[:, 1]) == (1 if label == LEFT else -1)).all()
-    seen_rows = run(log).map()
-    assert track.size == seen_rows.size
+    assert track.size == run(log).map().size
 
 
-def test_nothing_seen_is_an_empty_map() -> None:
+def test_a_log_without_detections_gives_an_empty_map() -> None:
     log = exact_log(ahead(5.0, 2.0), np.zeros((0, 2)), np.zeros(0, np.intp))
     estimator = run(log)
     assert estimator.map().size == 0 and not estimator.map().closed
-
-
-def recognizing(gap: Array, sigma: float) -> tuple[Array, Array] | None:
-    """Pairs found between an old row at x and the same one seen again, all of it `sigma` (m) uncertain."""
-    estimator = LandmarkFixedLag(MapperSettings())
-    smoother = estimator.smoother
-    n = len(gap)
-    x = np.cumsum(gap)
-    old = np.concatenate([np.column_stack([x, np.full(n, y)]) for y in (2.0, -2.0)])
-    labels = np.repeat([LEFT, RIGHT], n).astype(np.intp)
-    smoother.map.state.add(np.concatenate([old, old + np.array([0.6 * sigma, 0.0])]), np.tile(labels, 2))
-    common = np.zeros((8 * n, 2))
-    common[4 * n :: 2, 0], common[4 * n + 1 :: 2, 1] = sigma, 0.1  # the new row's shift is all one
-    covariance = common @ common.T + 0.01 * np.eye(8 * n)
-    entries = Layout(smoother.map.state.keys).entries
-    smoother.last_covariance = lambda keys: covariance[  # type: ignore[method-assign]
-        np.ix_(entries(keys), entries(keys))
-    ]
-    found = detect_loop(smoother, np.arange(2 * n, 4 * n), np.arange(2 * n), reach=8.0)
-    return None if found is None else (found.recent, found.old)
-
-
-def test_rows_are_recognized_as_a_whole() -> None:
-    """Shifted by more than half the distance of its cones, each new one is nearest to the wrong old one."""
-    found = recognizing(np.array([3.0, 4.0, 3.3, 5.0, 2.8, 4.4]), 3.5)
-    assert found is not None
-    first, second = found
-    np.testing.assert_array_equal(np.sort(first) - 12, np.arange(12))
-    np.testing.assert_array_equal(first - 12, second)
-
-
-def test_a_row_that_repeats_itself_is_not_recognized() -> None:
-    assert recognizing(np.full(6, 3.0), 3.5) is None

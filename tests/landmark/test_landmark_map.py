@@ -1,4 +1,4 @@
-"""The landmarks on the engine: rows, prediction, marginalization, merging, against dense algebra."""
+"""Landmarks in the engine: rows, marginalization, merged graphs and labels, against dense algebra."""
 
 from __future__ import annotations
 
@@ -9,59 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.landmark import landmark_residuals
-from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, merge_variables, normal_equations
-from pathspace_graph.graph.keys import landmark_keys, pose_key, sizes
-from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.keys import landmark_keys, sizes
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.landmark.closing import merge
-from pathspace_graph.landmark.landmark_map import LandmarkMap, LandmarkSmoother
-from pathspace_graph.landmark.prediction import predict
 from pathspace_graph.landmark.state import LandmarkState
-from pathspace_graph.mapping.prediction import smoother_settings
-from pathspace_graph.settings.mapper import GateSettings, MapperSettings, RelinearizeSettings
 
-from ..scenes.drives import ODOMETRY_SIGMA, see
 from ..scenes.jacobians import assert_jacobians
+from ..scenes.landmarks import CONES, LABELS, QUADRATIC, SPEED, drive_on, driven
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-
-CONES = np.array([[6.0, 2.0], [6.0, -2.0], [10.0, 2.5], [10.0, -1.5], [6.1, 2.05]])
-LABELS = np.array([LEFT, RIGHT, LEFT, RIGHT, LEFT], dtype=np.intp)
-PERIOD = 0.1
-SPEED = 1.0
-QUADRATIC = replace(MapperSettings(), lag=100.0, gate=GateSettings(huber=np.inf))
-
-
-def drive_on(smoother: LandmarkSmoother, cycle: int, twist: tuple[float, float, float]) -> None:
-    """The pose of one more cycle, reached with a twist (m/s, m/s, rad/s)."""
-    steps = 1 if cycle else 0
-    odometry = integrate_twists(np.full(steps, PERIOD), np.tile(twist, (steps, 1)), ODOMETRY_SIGMA)
-    smoother.predict(PERIOD * cycle, odometry, smoother.map.settings.odometry.sigmas_start)
-
-
-def see_all(smoother: LandmarkSmoother, cycle: int, noise: float) -> None:
-    """Every cone is seen from the newest pose, and its landmark known."""
-    t, rng = PERIOD * cycle, np.random.default_rng(cycle)
-    if cycle == 0:
-        smoother.map.state.add(CONES + 0.1, LABELS)
-    seen = see(t, np.array([SPEED * t, 0.0, 0.0]), CONES, LABELS)
-    noisy = seen.points_vehicle + noise * rng.normal(0.0, 0.1, seen.points_vehicle.shape)
-    rows = smoother.map.detections.append(replace(seen, points_vehicle=noisy), cycle)
-    smoother.map.detections.take(np.arange(rows.start, rows.stop), np.arange(len(CONES)))
-
-
-def driven(cycles: int, settings: MapperSettings = QUADRATIC, noise: float = 1.0) -> LandmarkSmoother:
-    """A drive straight on, all cones seen in every cycle."""
-    smoother = FixedLagSmoother(smoother_settings(settings), LandmarkMap(settings))
-    for cycle in range(cycles):
-        drive_on(smoother, cycle, (SPEED, 0.1, 0.05))
-        see_all(smoother, cycle, noise)
-        smoother.step()
-        smoother.marginalize()
-    return smoother
 
 
 def test_rows_are_the_derivatives_of_their_residuals() -> None:
@@ -81,39 +38,21 @@ def test_rows_are_the_derivatives_of_their_residuals() -> None:
     assert_jacobians(whitened, [x])
 
 
-def test_a_tie_pulls_two_landmarks_together_as_far_as_it_is_sure() -> None:
+def test_a_loop_pair_pulls_two_landmarks_together() -> None:
     smoother = driven(3)
     apart = np.diff(smoother.map.state.landmarks[[0, 4]], axis=0)
     smoother.map.loop_pairs = np.array([[4, 0]])
     smoother.step()
-    tied = np.diff(smoother.map.state.landmarks[[0, 4]], axis=0)
+    held = np.diff(smoother.map.state.landmarks[[0, 4]], axis=0)
     smoother.map.loop_pairs = np.zeros((0, 2), np.intp)
     smoother.step()
     free = np.diff(smoother.map.state.landmarks[[0, 4]], axis=0)
-    assert np.hypot(*tied.T) < 0.9 * np.hypot(*apart.T)
-    np.testing.assert_allclose(free, apart, atol=1e-3)  # nothing of the tie is left
-
-
-def test_what_it_predicts_is_what_a_step_with_the_new_pose_would_say() -> None:
-    """`H Sigma H'` reached through the odometry equals that of the whole system, the new pose included."""
-    smoother = driven(6, noise=0.0)
-    drive_on(smoother, 6, (SPEED, 0.0, 0.3))
-    landmarks, state = np.array([2, 0]), smoother.map.state
-    found = predict(smoother, landmarks)
-    pose, points = smoother.variables.poses[-1].copy(), state.landmarks[landmarks]
-    rows = landmark_residuals(np.tile(pose, (2, 1)), points, np.zeros((2, 2)))
-    np.testing.assert_allclose(found.points_vehicle, rows.residual)
-    before = smoother.variables.values.copy()
-    smoother.step()
-    np.testing.assert_allclose(smoother.variables.values, before, atol=0.1)
-    for k, landmark in enumerate(landmarks.tolist()):
-        covariance = smoother.last_covariance(np.array([pose_key(6), state.keys[landmark]]))
-        h = np.concatenate([rows.by_pose[k], rows.by_landmark[k]], axis=1)
-        np.testing.assert_allclose(found.covariances[k], h @ covariance @ h.T, rtol=2e-3)
+    assert np.hypot(*held.T) < 0.9 * np.hypot(*apart.T)
+    np.testing.assert_allclose(free, apart, atol=1e-3)  # nothing remains of the pair
 
 
 def test_the_last_steps_covariance_is_the_inverse_of_its_system() -> None:
-    """That of the step, though the window has moved on since."""
+    """It is the covariance of the step, even after the window has moved on."""
     smoother = driven(4)
     layout, keys = smoother.layout, smoother.map.state.keys[[3, 1]]
     hessian, _ = normal_equations(smoother.linear_graph(), layout)
@@ -124,36 +63,14 @@ def test_the_last_steps_covariance_is_the_inverse_of_its_system() -> None:
     np.testing.assert_allclose(smoother.last_covariance(keys), expected, rtol=1e-6)
 
 
-def test_poses_that_leave_take_nothing_with_them() -> None:
-    """With a short lag the map is that of the whole drive, up to what is linearized earlier."""
+def test_marginalized_poses_take_no_information_with_them() -> None:
+    """With a short lag the map is that of the whole drive, except for the earlier linearization points."""
     whole, short = driven(25), driven(25, replace(QUADRATIC, lag=0.5))
     assert len(short.times) == 6
     np.testing.assert_allclose(short.map.state.landmarks, whole.map.state.landmarks, atol=3e-3)
     keys = whole.map.state.keys
     expected = whole.last_covariance(keys)
     np.testing.assert_allclose(short.last_covariance(keys), expected, atol=0.03 * expected.max())
-
-
-@pytest.mark.parametrize("tolerance", [1e-12, 10.0])  # so that no factor goes stale by itself
-def test_merging_is_the_constraint_that_both_are_one(tolerance: float) -> None:
-    stale = RelinearizeSettings(tolerance, tolerance)
-    smoother = driven(8, replace(QUADRATIC, lag=0.3, relinearize=stale))
-    layout, variables, state = smoother.layout, smoother.variables, smoother.map.state
-    hessian, vector = normal_equations(smoother.linear_graph(), layout)
-    negative_gradient = vector - hessian @ (variables.values - variables.reference)
-    constraint = np.zeros((2, layout.size))
-    constraint[:, layout.entries(state.keys[[4]])] = np.eye(2)
-    constraint[:, layout.entries(state.keys[[0]])] = -np.eye(2)
-    kkt = np.block([[hessian, constraint.T], [constraint, np.zeros((2, 2))]])
-    step = np.linalg.solve(kkt, np.append(negative_gradient, -constraint @ variables.values))[: layout.size]
-    expected = (variables.values + step)[layout.entries(state.keys[:4])]
-    before = state.landmarks[0].copy()
-    merge(smoother, np.array([4]), np.array([0]))
-    np.testing.assert_array_equal(state.numbers, np.arange(4))
-    assert smoother.map.merged_into == {4: 0}
-    assert set(smoother.map.detections.landmark.tolist()) == {0, 1, 2, 3}
-    np.testing.assert_allclose(state.landmarks, expected.reshape(-1, 2), atol=1e-3)
-    assert np.abs(expected[:2] - before).max() > 0.01
 
 
 def test_a_merged_graph_has_the_error_of_the_old_one_where_both_are_one() -> None:
@@ -169,7 +86,7 @@ def test_a_merged_graph_has_the_error_of_the_old_one_where_both_are_one() -> Non
             known[key] = known[same] + apart
         old_error = old.error(_vectors(known))
         raised.append(new.error(at_new) - old_error)
-    np.testing.assert_allclose(raised, raised[0], atol=1e-9 * old_error)  # a constant is nobody's
+    np.testing.assert_allclose(raised, raised[0], atol=1e-9 * old_error)  # a constant does not matter
 
 
 def test_a_key_that_the_graph_does_not_hold_merges_into_nothing() -> None:
@@ -182,14 +99,14 @@ def test_a_key_that_the_graph_does_not_hold_merges_into_nothing() -> None:
 
 
 @pytest.mark.parametrize("observed", [2, 0])
-def test_a_landmark_has_the_colour_of_most_of_its_readings(observed: int) -> None:
+def test_a_landmark_has_the_label_of_most_of_its_detections(observed: int) -> None:
     state = LandmarkState()
     state.next_number = 10 * observed  # numbers, not positions
     n = state.add(CONES, LABELS)
     state.vote(np.array([RIGHT, RIGHT, RIGHT]), n[[0, 0, 1]])
     np.testing.assert_array_equal(state.labels, [RIGHT, RIGHT, LEFT, RIGHT, LEFT])
     state.vote(np.array([LEFT, LEFT]), n[[0, 0]])
-    assert state.labels[0] == RIGHT  # a tie changes nothing
+    assert state.labels[0] == RIGHT  # an equal count changes nothing
     state.vote(np.array([LEFT]), n[[0]])
     assert state.labels[0] == LEFT
 

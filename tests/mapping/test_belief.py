@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 def belief_with_points(seed: int = 0) -> Belief:
-    """A pose and three points, all correlated, and a calibration."""
+    """Returns a pose, three points and a calibration, all correlated."""
     rng = np.random.default_rng(seed)
     calibration = np.array([0.05, 0.04])
     belief = Belief(np.array([1.0, -2.0, 0.4]), np.diag([0.2, 0.1, 0.03]) ** 2, calibration)
@@ -38,7 +38,7 @@ def test_prediction_has_the_moments_of_a_sample() -> None:
     np.testing.assert_allclose(belief.covariance, np.cov(moved.T), atol=1e-3)
 
 
-def test_new_points_are_where_the_vehicle_sees_them_with_its_uncertainty() -> None:
+def test_new_points_have_the_uncertainty_of_pose_and_detection() -> None:
     pose, covariance = np.array([1.0, -2.0, 0.4]), np.diag([0.2, 0.1, 0.03]) ** 2
     belief, reading = Belief(pose, covariance), np.array([[8.0, 1.0]])
     belief.add_points(reading, 0.04 * np.eye(2)[None])
@@ -56,7 +56,7 @@ def test_the_views_of_map_and_vehicle_are_inverse() -> None:
 
 
 def test_a_linear_update_is_the_kalman_filter() -> None:
-    """P - P H' (H P H' + R)^-1 H P, and the mean that goes with it."""
+    """The covariance is P - P H' (H P H' + R)^-1 H P."""
     belief, rng = belief_with_points(), np.random.default_rng(4)
     columns, matrix, noise = point_columns(np.array([0, 2])), rng.normal(size=(3, 4)), 0.01 * np.eye(3)
     full = np.zeros((3, len(belief.mean)))
@@ -68,7 +68,7 @@ def test_a_linear_update_is_the_kalman_filter() -> None:
     np.testing.assert_allclose(belief.covariance, covariance - gain @ full @ covariance, atol=1e-9)
 
 
-def test_a_change_of_points_is_exact_and_leaves_the_rest() -> None:
+def test_transformed_points_are_exact_and_the_others_stay() -> None:
     belief = belief_with_points()
     before, covariance = belief.mean.copy(), belief.covariance.copy()
     matrix = np.array([[0.5, 0.5], [0.0, 1.0], [1.5, -0.5]])
@@ -88,7 +88,7 @@ def test_reordering_keeps_each_point_with_its_covariance() -> None:
     np.testing.assert_array_equal(belief.covariance[5:7, :3], block)
 
 
-def test_readings_of_a_known_point_fix_the_pose() -> None:
+def test_detections_of_known_points_fix_the_pose() -> None:
     belief = Belief(np.array([0.3, -0.2, 0.01]), np.diag([0.5, 0.5, 0.02]) ** 2)
     known = np.array([[10.0, 2.0], [9.0, -2.0]])
     belief.mean = np.concatenate([belief.mean, known.ravel()])

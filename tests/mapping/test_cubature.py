@@ -16,7 +16,7 @@ def random_covariance(rng: np.random.Generator, size: int) -> Array:
     return root @ root.T + 0.1 * np.eye(size)
 
 
-def test_points_have_the_mean_and_covariance_they_are_laid_for() -> None:
+def test_cubature_points_have_the_given_mean_and_covariance() -> None:
     rng = np.random.default_rng(0)
     mean, covariance = rng.normal(size=5), random_covariance(rng, 5)
     points = cubature_points(mean, square_root(covariance))
@@ -40,19 +40,19 @@ def test_the_mean_of_a_cubic_is_exact() -> None:
     assert result.mean[0] == pytest.approx(0.7**3 + 3 * 0.7 * 0.25)
 
 
-def test_a_slope_reaches_what_the_function_depends_on_by_correlation_only() -> None:
+def test_the_slope_gives_the_covariance_with_correlated_variables() -> None:
     """Cov(f(x), y) of jointly Gaussian x, y is E[f'(x)] Cov(x, y) (Stein): 2 m s_xy of a parabola."""
     result = transform(lambda x: x**2 - x, np.array([0.7]), np.array([[0.25]]))
     assert (result.slope @ np.array([0.1]))[0] == pytest.approx((2.0 * 0.7 - 1.0) * 0.1)
 
 
-def test_a_slope_is_off_in_the_fourth_order_only() -> None:
+def test_the_slope_is_wrong_in_the_fourth_order_only() -> None:
     """E[3 x^2] = 3 m^2 + 3 s^2 of a cubic, where the rule of the third degree has 3 m^2 + s^2."""
     result = transform(lambda x: x**3, np.array([0.7]), np.array([[0.04]]))
     assert result.slope[0, 0] == pytest.approx(3.0 * 0.7**2 + 0.04)
 
 
-def test_a_singular_covariance_has_a_root_all_the_same() -> None:
+def test_a_singular_covariance_has_a_square_root() -> None:
     direction = np.array([[1.0, 2.0, -1.0]])
     covariance = direction.T @ direction
     root = square_root(covariance)

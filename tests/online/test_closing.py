@@ -16,10 +16,10 @@ from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
-from pathspace_graph.mapping.registration import Matches, Registration, _certain, near_start, register
+from pathspace_graph.mapping.registration import Matches, Registration, is_certain, near_start, register
 from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
+from pathspace_graph.online.closing import substitute
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.online.simplification import substitute
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.knots import Knots
 from pathspace_graph.settings.mapper import ClosingSettings, MapperSettings
@@ -308,7 +308,7 @@ def test_a_straight_driven_again_tells_no_place_along_it(again: float, sigma: fl
     rows, near = np.arange(30), np.ones(30, bool)
     matches = Matches(rows, rows % 2, np.full(30, again), near, np.eye(3), np.zeros(3))
     posterior = np.diag([sigma**2, 0.01, 1e-4])
-    assert _certain(matches, posterior, ClosingSettings()) is certain
+    assert is_certain(matches, posterior, ClosingSettings()) is certain
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -347,6 +347,6 @@ def test_where_there_are_several_places_to_choose_from_patience_is_no_excuse() -
     rows, near = np.arange(30), np.ones(30, bool)
     matches = Matches(rows, rows % 2, np.full(30, 50.0), near, np.eye(3), np.zeros(3))
     posterior = np.diag([0.25, 0.01, 1e-4])
-    assert _certain(matches, posterior, ClosingSettings(), lost=False)
-    assert not _certain(matches, posterior, ClosingSettings(), lost=True)
-    assert _certain(matches, np.diag([0.04, 0.01, 1e-4]), ClosingSettings(), lost=True)
+    assert is_certain(matches, posterior, ClosingSettings(), lost=False)
+    assert not is_certain(matches, posterior, ClosingSettings(), lost=True)
+    assert is_certain(matches, np.diag([0.04, 0.01, 1e-4]), ClosingSettings(), lost=True)

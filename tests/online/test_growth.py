@@ -12,9 +12,9 @@ from scipy.spatial import KDTree
 from pathspace_graph.eval.metrics.curves import mapped_points, true_curve
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.mapping.candidates import undisputed
 from pathspace_graph.mapping.path import PathAhead
 from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.online.growth import undisputed
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import DT, ahead, corridor, detections, exact_log, map_log, true_poses

@@ -14,10 +14,10 @@ from pathspace_graph.batch.knots import boundary_of
 from pathspace_graph.batch.mapper import own_settings
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.io.log import Log
+from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.measurements import Chain, collect_detections, integrate_log
+from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.vehicle import integrate
@@ -43,7 +43,10 @@ def straight(seconds: float = 6.0, smoothness: float = SMOOTHNESS) -> tuple[Batc
     cones, labels = corridor(60.0)
     log = exact_log(ahead(6.0, seconds), cones, labels)
     settings = own_settings(whole)
-    chain, detections = integrate_log(log, log.odometry_sigma, settings.odometry), collect_detections(log)
+    chain, detections = (
+        integrate_log(log, log.odometry_sigma, settings.odometry),
+        DetectionTable.of(log.cycles),
+    )
     state = start_odometry(chain, detections, settings)
     system = BatchSystem(detections, chain, settings, Biweight(LEAST_SQUARES))
     system.begin(state)
@@ -58,7 +61,7 @@ def settled(system: BatchSystem, state: State, steps: int = 4) -> State:
     for _ in range(steps):
         at = system.evaluate(state)
         for projected in at.projected.values():
-            system.detections.u[projected.rows] = projected.foot.u
+            system.detections.refine(projected.rows, projected.foot.u)
         problem = system.eliminated(at)
         state = moved(state, problem.step(np.zeros(problem.map.size)))
     return state
@@ -84,7 +87,7 @@ def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, A
     return noisy, calibration
 
 
-def _with_errors(chain: Chain, local: Array) -> Chain:
+def _with_errors(chain: LogOdometry, local: Array) -> LogOdometry:
     """Returns the chain with errors (P - 1, 3), each in the frame of the end of its interval."""
     odometry = copy(chain.odometry)
     moved_ends = to_map(local[:, :2], odometry.deltas)
@@ -127,16 +130,8 @@ def course_log(laps: float, speed: float = 6.0) -> Log:
     return exact_log(twists, cones, np.repeat([LEFT, RIGHT], len(middle)).astype(np.intp))
 
 
-def detections_of(cycle: IntArray, points_vehicle: Array, labels: IntArray, sigma: float) -> DetectionTable:
-    """Returns detections (m, 2) with isotropic sigma (m), none of them used."""
-    m = len(cycle)
-    return DetectionTable(
-        cycle=cycle,
-        point=points_vehicle,
-        covariance=np.tile(sigma**2 * np.eye(2), (m, 1, 1)),
-        label=labels,
-        boundary=labels.copy(),
-        u=np.zeros(m),
-        used=np.zeros(m, bool),
-        changed=np.zeros(m, bool),
-    )
+def detections_of(points_vehicle: Array, labels: IntArray, sigma: float) -> DetectionTable:
+    """Returns the detections (m, 2) of cycle 0 with isotropic sigma (m), none of them used."""
+    covariances, table = np.tile(sigma**2 * np.eye(2), (len(labels), 1, 1)), DetectionTable()
+    table.append(Detections(0.0, points_vehicle, covariances, labels), 0)
+    return table

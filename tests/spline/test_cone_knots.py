@@ -105,3 +105,22 @@ def test_knots_of_a_straight_that_needs_none_stay_spread() -> None:
     points = np.column_stack([4.0 * np.arange(16.0), np.zeros(16)])
     *_, last = thin(points, points[:, 0], 60.0, False, FIT, 8)
     assert np.diff(last.breaks).max() <= 4 * 4.0 + 1e-9
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-14, 1e-12])
+def test_cones_at_one_place_share_a_knot(gap: float) -> None:
+    """Two knots that coincide up to rounding would be one constraint twice, of which one costs 0 / 0."""
+    points = np.insert(keyhole(), 30, keyhole()[30], axis=0)
+    u = np.insert(along(keyhole()), 30, along(keyhole())[30] - gap)
+    with np.errstate(all="raise"):
+        path = list(thin(points, u, float(u[-1]), False, FIT, 8))
+    assert path[0].size == len(points) + 1
+    assert np.diff(path[0].breaks).min() > 1.0
+
+
+def test_cones_at_the_ends_up_to_rounding_add_no_knot() -> None:
+    points = keyhole()
+    u = along(points)
+    u[0], high = 1e-12, float(u[-1]) + 1e-12
+    first = next(thin(points, u, high, False, FIT, 8))
+    assert (first.size, first.breaks[0], first.breaks[-1]) == (len(points) + 2, 0.0, high)

@@ -1,0 +1,45 @@
+"""The figures are those of the run; never how fast."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pathspace_graph.eval.benchmark.measurement import Gtsam, Measurement, measure, metrics
+from pathspace_graph.settings.mapper import MapperSettings
+
+from ...scenes.benchmark import record
+from ...scenes.drives import ahead, corridor, exact_log
+
+
+def test_a_short_run_gives_every_figure() -> None:
+    measurement = measure(exact_log(ahead(8.0, 7.0), *corridor(80.0)), MapperSettings(lag=1.0), every=10)
+    assert len(measurement.cycles) == 70
+    assert measurement.gtsam.samples == 2
+    assert measurement.closing is None
+    figures = {metric.key: metric.value for metric in metrics(measurement)}
+    assert figures["gtsam"] == pytest.approx(figures["gtsam_optimize"] + figures["gtsam_marginal"])
+    assert np.isfinite(figures["mean_by_gtsam"])
+    assert len(measurement.rival) == 70
+    assert figures["landmark"] > 0.0
+    assert np.isnan(figures["closing"])
+    assert np.isnan(figures["last_lap_by_lap_2"])
+
+
+def test_figures_by_hand() -> None:
+    """Three laps of 100 cycles: 2, 3 and 4 ms, one closing cycle of 40 ms; GTSAM takes 2 ms, the rival 8."""
+    cycles = [record(k, 0.002 + 0.001 * (k // 100), 1 + k // 100) for k in range(300)]
+    cycles[99] = record(99, 0.040, 1)
+    measurement = Measurement(tuple(cycles), 3, 99, Gtsam("any", 0.0015, 0.0005, 25), (0.008,) * 300)
+    figures = {metric.key: metric for metric in metrics(measurement)}
+    mean_later = (49 * 2.0 + 40.0 + 100 * 3.0 + 100 * 4.0) / 250
+    assert figures["mean_by_gtsam"].value == pytest.approx(mean_later / 2.0)
+    assert figures["mean_by_landmark"].value == pytest.approx(mean_later / 8.0)
+    assert figures["mean"].value == pytest.approx((99 * 2.0 + 40.0 + 700.0) / 300)
+    assert figures["median"].value == pytest.approx(3.0)
+    assert figures["p99"].value == pytest.approx(4.0)
+    assert figures["slowest"].value == figures["closing"].value == pytest.approx(40.0)
+    assert figures["mean_lap_2"].value == pytest.approx(3.0)
+    assert figures["last_lap_by_lap_2"].value == pytest.approx(4.0 / 3.0)
+    assert figures["mean_update"].value == pytest.approx(0.5 * figures["mean"].value)
+    assert {key for key, metric in figures.items() if not metric.holds} == {"last_lap_by_lap_2"}

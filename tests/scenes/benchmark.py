@@ -1,0 +1,16 @@
+"""A run of the benchmark whose figures are known."""
+
+from __future__ import annotations
+
+from pathspace_graph.eval.benchmark.measurement import Gtsam, Measurement
+from pathspace_graph.io.results import CycleRecord
+
+
+def record(cycle: int, seconds: float, lap: int) -> CycleRecord:
+    return CycleRecord(cycle, 0.1 * cycle, seconds, 5, 5, 4, lap, {"update": 0.5 * seconds})
+
+
+def steady_run(seconds: float = 0.002) -> Measurement:
+    """Three laps of 100 cycles that take equally long; the last one of lap 1 closes the loop."""
+    cycles = tuple(record(k, seconds, 1 + k // 100) for k in range(300))
+    return Measurement(cycles, 3, 99, Gtsam("any", 0.001, 0.001, 25), (0.01,) * 300)
