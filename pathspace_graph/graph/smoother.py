@@ -274,7 +274,7 @@ class FixedLagSmoother(Generic[M_co]):
         self.inactive = InactiveMap()
         self.user_factors.reactivate()
         self._marginalize_keyframes()
-        self.map.all_active()
+        self.map.activate_all()
 
     def _marginalize_keyframes(self) -> None:
         keyframes = self.variables.keyframes
@@ -305,7 +305,7 @@ class FixedLagSmoother(Generic[M_co]):
             self.variables.remove(np.array([key]))
         self.times.pop(0)
         self.window.odometry.drop_first()
-        self.map.leave(cycle)
+        self.map.drop_cycle(cycle)
 
     # --- loop closure and other variables ----------------------------------------------------------------
 

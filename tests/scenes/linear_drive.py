@@ -33,7 +33,7 @@ class LinearTrack:
 
     def __init__(self, seed: int) -> None:
         self.variables = Variables()
-        self.slid = False
+        self.reached_inactive = False
         self.structure: object = object()
         self.inactive: IntArray = NOTHING
         self.seed = seed
@@ -79,10 +79,10 @@ class LinearTrack:
         z = np.array([4.0, 5.0]) / 9.0
         return [self._at_values(np.array([[key], [key]]), np.eye(2) / 9.0, z, int(key % 5)) for key in points]
 
-    def all_active(self) -> None:
+    def activate_all(self) -> None:
         self.inactive, self.structure = NOTHING, object()
 
-    def leave(self, cycle: int) -> None:
+    def drop_cycle(self, cycle: int) -> None:
         pass
 
 
