@@ -1,4 +1,4 @@
-"""The fixed-lag window: what a batch finds, what it knows of itself, and which factors are made anew."""
+"""The fixed-lag smoother: its functions one by one, its estimate against a batch, and its covariances."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_nothing_to_reactivate_changes_nothing() -> None:
 @pytest.mark.parametrize("lag", [1, 3])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_window_on_a_linear_drive_is_full_batch(lag: int, seed: int) -> None:
-    """Mean and joint covariance of all that it still knows, however many poses have left."""
+    """Mean and joint covariance of all variables agree, however many poses have been marginalized."""
     drive = LinearDrive(lag, seed)
     drive.drive(14)
     smoother, keys = drive.smoother, drive.smoother.variables.keys
@@ -138,8 +138,8 @@ def test_covariance_is_in_the_order_of_the_keys() -> None:
     np.testing.assert_allclose(drive.smoother.covariance(keys), drive.covariance(keys), rtol=1e-7, atol=1e-10)
 
 
-def test_the_prior_is_the_schur_complement_of_what_has_left() -> None:
-    """Of the factors of the poses that left, without those of the window and without the weak priors."""
+def test_marginalization_is_a_schur_complement() -> None:
+    """The covariance of all remaining variables is the same before and after."""
     drive = LinearDrive(2)
     drive.drive(3)
     smoother = drive.smoother
@@ -196,8 +196,8 @@ def test_a_variable_that_nothing_holds_is_named() -> None:
         drive.smoother.covariance(pose_keys(np.array([4])))
 
 
-def test_forgetting_a_point_removes_what_had_left_and_keeps_what_is_in_the_window() -> None:
-    """The prior knows nothing of it any more, and of all others as much as before."""
+def test_removing_information_on_a_point_keeps_the_window_and_all_other_points() -> None:
+    """The prior no longer holds the point, and the covariance of all other points is the same."""
     drive = LinearDrive(2)
     drive.drive(8)
     smoother, gone = drive.smoother, control_keys(0, np.array([5, 6]))
@@ -221,7 +221,7 @@ def test_forgetting_a_point_removes_what_had_left_and_keeps_what_is_in_the_windo
 
 
 def test_substituted_points_know_what_the_old_ones_did() -> None:
-    """Three points that were, to a shift, a matrix times two new ones: as in a dense change of variables."""
+    """Three points are, up to a shift, a matrix times two new ones: as in a dense change of variables."""
     drive = LinearDrive(2)
     drive.drive(14)
     smoother, rng, sigma = drive.smoother, np.random.default_rng(0), 0.2
@@ -249,7 +249,7 @@ def test_substituted_points_know_what_the_old_ones_did() -> None:
     np.testing.assert_array_equal(smoother.variables.of(new), points.ravel())
 
 
-# --- which factors are made anew -------------------------------------------------------------------------
+# --- relinearization in the mapper -----------------------------------------------------------------------
 
 
 def drive_bean(settings: MapperSettings, cycles: int) -> FixedLagMapper:
@@ -307,7 +307,7 @@ def height(factor: LinearFactor) -> int:
 
 
 def test_the_steps_system_is_that_of_the_graph_at_the_estimate() -> None:
-    """Where everything is linearized anew: nothing stale, nothing twice, nothing left out."""
+    """Everything is linearized again here: no factor is stale, missing or counted twice."""
     settings = MapperSettings(relinearize=RelinearizeSettings(1e-12, 1e-12))
     smoother = drive_bean(settings, 60).smoother
     smoother.factorize()
@@ -345,7 +345,7 @@ def numeric_end(mapper: FixedLagMapper) -> tuple[Array, Array, Array]:
 
 @pytest.mark.parametrize("together", [1, 2])
 def test_predicted_is_that_of_the_dense_joint_covariance_with_the_newest_pose(together: int) -> None:
-    """The newest pose was no part of the step: it is reached by its odometry, whose noise adds to it."""
+    """The newest pose was not in the step: its odometry predicts it and adds noise."""
     mapper = drive_bean(MapperSettings(), 59)
     smoother, odometry = mapper.smoother, list(split_odometry(lap_log(bean_track(), 0.0)))[59]
     mapper._predict(odometry[0], odometry[1].t)

@@ -1,4 +1,4 @@
-"""Values by key: what comes in and goes out moves nothing else, and the keys mean what they say."""
+"""Variables by key: insertion and removal keep the other values, and keys are GTSAM's symbols."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_keys_are_gtsam_s_symbols() -> None:
 
 
 def test_the_order_of_the_keys_is_calibration_points_poses() -> None:
-    """What `State.map_points` and the damping of a step rest on."""
+    """`State.map_points` and the damping of a step depend on it."""
     ordered = [CALIBRATION_KEY, *(gtsam.symbol(letter, 5) for letter in ("l", "m", "r", "x"))]
     assert ordered == sorted(ordered)
 
@@ -196,7 +196,7 @@ def test_a_known_key_is_not_inserted_again() -> None:
     np.testing.assert_array_equal(variables.values, before.values)
 
 
-def test_a_reference_is_the_first_value_unless_it_is_told() -> None:
+def test_a_reference_is_the_first_value_unless_it_is_given() -> None:
     variables = Variables()
     variables.insert(LEFT_KEYS[:2], np.arange(4.0))
     variables.values += 10.0
