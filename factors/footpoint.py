@@ -114,7 +114,7 @@ def foot_points(
     coarse_step: float,
     iterations: int = SEARCH_ITERATIONS,
 ) -> FootPoints:
-    """Returns `u_i = argmin |S(u) - p_i|` over u in [u_low_i, u_high_i], and what the curve is there.
+    """Returns `u_i = argmin |S(u) - p_i|` over u in [u_low_i, u_high_i], and the curve there.
 
     The minimum is global as far as a coarse grid of step `coarse_step` in u resolves it. control_points
     (n, 2) are unwrapped where the curve is periodic, points (m, 2) are in the same frame, in m, and the

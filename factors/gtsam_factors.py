@@ -52,7 +52,7 @@ def spline_projection_factor(
     an optimizer judges its steps by the true cost. No derivative contains the turning of sigma with the
     normal, so an optimizer that judges by the error may stop beside the fixed point of Gauss-Newton, by as
     much as sigma depends on the direction. A row whose foot point is not interior contributes zero; where
-    foot points leave their stretches, the factor is to be created anew.
+    foot points leave their stretches, the factor is to be created again.
     """
     if not len(points_vehicle) == len(covariances) == len(low) == len(high) > 0:
         raise ValueError(

@@ -211,20 +211,20 @@ def condition(
 
 
 def merge_variables(
-    graph: gtsam.GaussianFactorGraph, gone: IntArray, kept: IntArray, offset: Array
+    graph: gtsam.GaussianFactorGraph, removed: IntArray, kept: IntArray, offset: Array
 ) -> gtsam.GaussianFactorGraph:
-    """Returns the graph where each key of `gone` (k,) is replaced by that of `kept` (k,).
+    """Returns the graph where each key of `removed` (k,) is replaced by that of `kept` (k,).
 
-    The unknowns satisfy `d_gone = d_kept + offset` (n,). This is exact: with `d_old = E d_new + e`, the
+    The unknowns satisfy `d_removed = d_kept + offset` (n,). This is exact: with `d_old = E d_new + e`, the
     information becomes `E' L E` and the vector `E' (g - L e)`.
     """
     old = Layout(keys_of(graph))
-    becomes, places = old.keys.copy(), old.positions(gone)
+    becomes, places = old.keys.copy(), old.positions(removed)
     becomes[places[places >= 0]] = kept[places >= 0]
     new = Layout(np.unique(becomes))
     E, e = np.zeros((old.size, new.size)), np.zeros(old.size)
     E[np.arange(old.size), new.entries(becomes)] = 1.0
-    e[old.entries(gone[places >= 0])] = offset[np.repeat(places >= 0, sizes(gone))]
+    e[old.entries(removed[places >= 0])] = offset[np.repeat(places >= 0, sizes(removed))]
     information, vector = normal_equations(graph, old)
     root, right = square_root_form(E.T @ information @ E, E.T @ (vector - information @ e))
     return graph_of(as_hessian_factor(graph_of(jacobian_factor(new.keys, root, right))))

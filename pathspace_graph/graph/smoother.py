@@ -244,10 +244,10 @@ class FixedLagSmoother(Generic[M_co]):
         if len(keys) == 0:
             return
         shared = [*self.window.weak_on(keys), *self.user_factors.deactivate(keys, self.variables)]
-        held = self.user_factors.remove(keys, self.variables)
+        user = self.user_factors.remove(keys, self.variables)
         keyframes = self.variables.keyframes
         self._finish_submap()
-        self.prior = self.inactive.push(graph_of(self.prior, *held), keys, keyframes, shared)
+        self.prior = self.inactive.push(graph_of(self.prior, *user), keys, keyframes, shared)
         self.variables.remove(keyframes)
         self.window.drop(self.inactive.members)  # a factor linearized earlier may still hold one of them
 
@@ -274,7 +274,7 @@ class FixedLagSmoother(Generic[M_co]):
         self.inactive = InactiveMap()
         self.user_factors.reactivate()
         self._marginalize_keyframes()
-        self.map.all_active()
+        self.map.activate_all()
 
     def _marginalize_keyframes(self) -> None:
         keyframes = self.variables.keyframes
@@ -294,8 +294,8 @@ class FixedLagSmoother(Generic[M_co]):
         The pose stays as a keyframe where inactive variables depend on it.
         """
         cycle, key = self.first_cycle, pose_key(self.first_cycle)
-        held = self.user_factors.remove(np.array([key]), self.variables)
-        own = graph_of(self.window.of_cycle.pop(cycle).linear, *held)
+        user = self.user_factors.remove(np.array([key]), self.variables)
+        own = graph_of(self.window.of_cycle.pop(cycle).linear, *user)
         if self.submaps is not None:
             self.submaps.add_pose(key, own, self.variables)
         self.prior = graph_of(self.prior, own)
@@ -305,7 +305,7 @@ class FixedLagSmoother(Generic[M_co]):
             self.variables.remove(np.array([key]))
         self.times.pop(0)
         self.window.odometry.drop_first()
-        self.map.leave(cycle)
+        self.map.drop_cycle(cycle)
 
     # --- loop closure and other variables ----------------------------------------------------------------
 
@@ -332,26 +332,26 @@ class FixedLagSmoother(Generic[M_co]):
         E is `change` (n, k). The prior of the old points is carried over, reduced by a shift of sigma (m).
         """
         self.epoch += 1
-        held = self.user_factors.remove(old, self.variables)
+        user = self.user_factors.remove(old, self.variables)
         reference = self.variables.reference[self.variables.layout.entries(old)]
         offset = np.kron(change, np.eye(POINT)) @ points.ravel() - reference
-        self.prior = substitute_points(graph_of(self.prior, *held), old, new, change, offset, sigma)
+        self.prior = substitute_points(graph_of(self.prior, *user), old, new, change, offset, sigma)
         self.variables.remove(old)
         self.variables.insert(new, points.ravel())
         self.window.clear()
 
-    def merge(self, gone: IntArray, kept: IntArray) -> None:
-        """Merges map points `gone` (k,) into points `kept` (k,), which keep their values.
+    def merge(self, removed: IntArray, kept: IntArray) -> None:
+        """Merges map points `removed` (k,) into points `kept` (k,), which keep their values.
 
         The prior is transformed exactly. Submaps are not, so the loop must be closed. The map's rows must be
         on the kept keys from now on.
         """
         self.epoch += 1
-        held, layout = self.user_factors.remove(gone, self.variables), self.variables.layout
+        user, layout = self.user_factors.remove(removed, self.variables), self.variables.layout
         reference = self.variables.reference
-        offset = reference[layout.entries(kept)] - reference[layout.entries(gone)]
-        self.prior = merge_variables(graph_of(self.prior, *held), gone, kept, offset)
-        self.variables.remove(gone)
+        offset = reference[layout.entries(kept)] - reference[layout.entries(removed)]
+        self.prior = merge_variables(graph_of(self.prior, *user), removed, kept, offset)
+        self.variables.remove(removed)
         self.window.clear()
 
     # --- covariances -------------------------------------------------------------------------------------

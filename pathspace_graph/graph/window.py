@@ -28,7 +28,7 @@ class MapRows(Protocol):
 
     variables: Variables
     """These are the map points, the calibration and the poses."""
-    slid: bool
+    reached_inactive: bool
     """If true, a row of the last call of `rows` should be on an inactive map point, but is not."""
 
     @property
@@ -53,10 +53,10 @@ class MapRows(Protocol):
     def linear_gauge(self, whole: bool) -> list[Rows]:
         """Returns the linear weak priors, which are made again only when `structure` changes."""
 
-    def all_active(self) -> None:
+    def activate_all(self) -> None:
         """Makes every map point active."""
 
-    def leave(self, cycle: int) -> None:
+    def drop_cycle(self, cycle: int) -> None:
         """Notes that the pose of a cycle, the window's oldest, has been marginalized."""
 
 
@@ -115,7 +115,7 @@ class WindowFactors(Generic[M_co]):
         moved = self._moved()
         stale = self._stale(cycles, moved)
         own = jacobian_factors(self._rows(stale), self.variables)
-        if self.map.slid or not all(inactive.isdisjoint(factor.keys) for factor in own.values()):
+        if self.map.reached_inactive or not all(inactive.isdisjoint(factor.keys) for factor in own.values()):
             return False
         self.of_cycle |= own
         self.map.linearized(stale)

@@ -25,7 +25,7 @@ NO_PAIRS: IntArray = np.zeros((0, 2), np.intp)
 class LandmarkMap:
     """Holds the landmarks and the detections of the window, and linearizes their residuals."""
 
-    slid = False
+    reached_inactive = False
     """No landmark is ever inactive."""
 
     def __init__(self, settings: MapperSettings) -> None:
@@ -73,10 +73,10 @@ class LandmarkMap:
         residual = (pairs[:, 0] - pairs[:, 1]).ravel() / sigma
         return [Rows(keys, np.tile(axes, (len(pairs), 1)), residual, keys[:, 0])]
 
-    def all_active(self) -> None:
+    def activate_all(self) -> None:
         """Does nothing, since every landmark is always active."""
 
-    def leave(self, cycle: int) -> None:
+    def drop_cycle(self, cycle: int) -> None:
         """Removes the detections of a cycle, whose pose was the oldest of the window."""
         self.detections.keep_from(cycle + 1)
 

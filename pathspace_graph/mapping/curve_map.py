@@ -40,7 +40,7 @@ class CurveMap:
         self.variables = self.state.variables
         self.detections = DetectionTable()
         """The table holds the detections of the poses in the window."""
-        self.slid = False
+        self.reached_inactive = False
         """The flag is set when a foot point of the latest `rows` has slid to an inactive part of a curve."""
         self._found: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
 
@@ -66,7 +66,7 @@ class CurveMap:
         poses = self.variables.poses_at(cycle)
         points = to_map(detections.point[rows], poses)
         foot = curves.refine(state.map_points, points, curve, detections.u[rows])
-        self._found, self.slid = (rows, foot.u), curves.reaches_inactive(curve, foot)
+        self._found, self.reached_inactive = (rows, foot.u), curves.reaches_inactive(curve, foot)
         measured = points, detections.covariance[rows], poses, foot, settings
         jacobian, residual = (
             _to_point(*measured) if settings.spline.residual == "point" else _across(*measured)
@@ -81,11 +81,11 @@ class CurveMap:
             self.detections.refine(*self._found)
             self.detections.mark_linearized()
 
-    def all_active(self) -> None:
+    def activate_all(self) -> None:
         """Makes every control point active."""
         self.state.active_stretch = {}
 
-    def leave(self, cycle: int) -> None:
+    def drop_cycle(self, cycle: int) -> None:
         """Removes the detections of a cycle whose pose, the oldest one, has left the window."""
         self.detections.keep_from(cycle + 1)
         self.state.drop_oldest_pose_u()

@@ -140,7 +140,7 @@ def pose_plus(pose: Array, delta: Array) -> Array:
 
 
 def test_calibrated_odometry_jacobians_in_pose2s_tangent() -> None:
-    """Residuals of metres; the noise model is left out, as the factor's function leaves it out."""
+    """Residuals are metres large; the noise model whitens them outside this function."""
     odometry = integrate_noisy(np.random.default_rng(3))
     unit = IntegratedOdometry(odometry.delta, np.eye(3), odometry.calibration_jacobian, np.eye(3))
     factor = calibrated_odometry_factor(0, 1, 2, unit)
@@ -235,7 +235,7 @@ def straight_factor(u: Array, points: Array) -> tuple[gtsam.CustomFactor, gtsam.
 
 
 def test_a_row_whose_foot_point_leaves_its_stretch_contributes_zero() -> None:
-    """Until the factor is created anew; so does one beyond the end of the curve."""
+    """So does a row beyond the end of the curve."""
     end = TABLES.high
     points = np.array([[10.5, 0.4], [13.0, 0.4], [end + 0.5, 0.4]])
     factor, values = straight_factor(np.array([10.0, 10.0, end]), points)

@@ -1,4 +1,4 @@
-"""The landmark factor's Jacobians, and that it is what GTSAM's own factor says."""
+"""The landmark factor: its Jacobians, and its residual against GTSAM's transform."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from ..scenes.jacobians import assert_jacobians
 Array = NDArray[np.float64]
 
 
-def one_reading(pose: Array, landmark: Array, reading: Array) -> Sequence[Array]:
-    rows = landmark_residuals(pose[None], landmark[None], reading[None])
+def one_detection(pose: Array, landmark: Array, detection: Array) -> Sequence[Array]:
+    rows = landmark_residuals(pose[None], landmark[None], detection[None])
     return rows.residual[0], rows.by_pose[0], rows.by_landmark[0], -np.eye(2)
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_jacobians_far_from_zero(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    pose, landmark, reading = rng.normal(0.0, 10.0, 3), rng.normal(0.0, 20.0, 2), rng.normal(0.0, 10.0, 2)
-    assert_jacobians(one_reading, [pose, landmark, reading])
+    pose, landmark, detection = rng.normal(0.0, 10.0, 3), rng.normal(0.0, 20.0, 2), rng.normal(0.0, 10.0, 2)
+    assert_jacobians(one_detection, [pose, landmark, detection])
 
 
 def test_a_landmark_to_the_left_is_seen_to_the_left() -> None:

@@ -66,7 +66,7 @@ def test_covariance_against_monte_carlo() -> None:
 
 
 def test_covariance_of_a_straight_run_by_hand() -> None:
-    """Ten steps of 0.1 s at 5 m/s: a yaw error in the middle of a step swings what is left of the way."""
+    """Ten steps of 0.1 s at 5 m/s: a yaw error in the middle of a step turns the rest of the path."""
     odometry = integrate_twists(np.full(10, 0.1), np.tile([5.0, 0.0, 0.0], (10, 1)), SIGMA)
     left = 5.0 * (1.0 - 0.1 * (np.arange(10) + 0.5))
     yaw = (0.1 * SIGMA[2]) ** 2
@@ -79,7 +79,7 @@ def test_covariance_of_a_straight_run_by_hand() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_calibration_jacobian(seed: int) -> None:
-    """Derivative of the end by errors of the readings, but for the midpoint rule's (w dt)^2 / 24."""
+    """It is the derivative of the end by errors of the samples, up to the midpoint rule's (w dt)^2 / 24."""
     durations, twists = random_twists(np.random.default_rng(seed), 8)
     nominal = integrate_twists(durations, twists, SIGMA)
 

@@ -28,7 +28,7 @@ SIGMA_MODEL = 0.08
 SIDESTEPS = 1e-3 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 """A foot point that jumps where its point moves by one of these (m) has a rival at the same distance."""
 MAX_BEND = 0.8
-"""Largest curvature times distance: at 1 the reading is the centre of curvature."""
+"""This is the largest curvature times distance; at 1 the point is the centre of curvature."""
 
 
 def control_columns(tables: SpanPolynomials, span: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -80,7 +80,7 @@ def well_posed(tables: SpanPolynomials, distinct: Array, points: Array, u: Array
 
 
 def projection_function(tables: SpanPolynomials, points_vehicle: Array, u: Array):
-    """(pose, control points) -> residuals, Jacobians; every call finds the foot points anew."""
+    """Returns a function of pose and control points that finds the foot points again in every call."""
     covariances = np.tile(0.01 * np.eye(2), (len(u), 1, 1))
 
     def function(pose: Array, control: Array) -> tuple[Array, Array, Array]:
@@ -101,7 +101,7 @@ def to_vehicle(points: Array, pose: Array) -> Array:
     return (points - pose[:2]) @ np.array([[c, -s], [s, c]])
 
 
-def readings_beside(
+def points_beside(
     rng: np.random.Generator, tables: SpanPolynomials, distinct: Array, distance: Array
 ) -> tuple[Array, Array]:
     """Points (m, 2) at given signed distances from the curve and their parameters, the well posed ones."""
@@ -125,17 +125,17 @@ def test_jacobians_are_exact_metres_away_from_the_curve(seed: int, degree: int, 
     """Every term through the foot point vanishes, though it moves with pose and control points."""
     rng = np.random.default_rng(seed)
     tables, distinct = random_curve(rng, degree, kind)
-    points, u = readings_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 25))
+    points, u = points_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 25))
     pose = np.append(rng.uniform(-20.0, 20.0, 2), rng.uniform(-np.pi, np.pi))
     function = projection_function(tables, to_vehicle(points, pose), u)
     assert_jacobians(function, [pose, distinct.ravel()])
 
 
 def test_the_samples_are_far_from_zero_and_their_foot_points_move() -> None:
-    """What the test above rests on: residuals of metres, and parameters that depend on the pose."""
+    """The test above is about residuals of metres and parameters that depend on the pose."""
     rng = np.random.default_rng(1)
     tables, distinct = random_curve(rng, 3, "open")
-    points, u = readings_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 200))
+    points, u = points_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 200))
     foot = find(tables, distinct, points, u)
     assert np.abs(foot.distance).max() > 4.0
     assert (np.abs(foot.distance) > 1.0).sum() > 50
@@ -159,16 +159,16 @@ def test_jacobians_at_degenerate_states(pose: list[float], distance: float) -> N
     rng = np.random.default_rng(3)
     tables, distinct = random_curve(rng, 3, "open")
     distinct = distinct + np.array(pose[:2])
-    points, u = readings_beside(rng, tables, distinct, np.full(10, distance))
+    points, u = points_beside(rng, tables, distinct, np.full(10, distance))
     assert len(u) > 3
     function = projection_function(tables, to_vehicle(points, np.array(pose)), u)
     assert_jacobians(function, [np.array(pose), distinct.ravel()])
 
 
-def test_a_reading_at_the_vehicle_itself_does_not_turn() -> None:
+def test_a_detection_at_the_vehicle_itself_does_not_turn() -> None:
     rng = np.random.default_rng(4)
     tables, distinct = random_curve(rng, 3, "periodic")
-    points, u = readings_beside(rng, tables, distinct, np.array([1.0, 1.0]))
+    points, u = points_beside(rng, tables, distinct, np.array([1.0, 1.0]))
     pose = np.append(points[0], 0.7)
     function = projection_function(tables, np.zeros((1, 2)), u[:1])
     assert_jacobians(function, [pose, distinct.ravel()])
@@ -179,7 +179,7 @@ def test_coinciding_control_points_keep_the_jacobians() -> None:
     rng = np.random.default_rng(5)
     tables, distinct = random_curve(rng, 3, "open")
     distinct[5] = distinct[4]
-    points, u = readings_beside(rng, tables, distinct, rng.uniform(-0.5, 0.5, 20))
+    points, u = points_beside(rng, tables, distinct, rng.uniform(-0.5, 0.5, 20))
     assert_jacobians(projection_function(tables, points, u), [np.zeros(3), distinct.ravel()])
 
 
@@ -221,11 +221,11 @@ def test_sigma_across_against_monte_carlo() -> None:
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), degree=st.integers(1, 4), kind=st.sampled_from(["open", "periodic"]))
 def test_jacobians_of_the_offset_from_a_held_foot_point(seed: int, degree: int, kind: str) -> None:
-    """Isotropic readings, whose whitening doesn't turn with the pose; foot points metres away, then held."""
+    """The whitening of isotropic detections does not turn with the pose; foot points stay fixed."""
     rng = np.random.default_rng(seed)
     tables, distinct = random_curve(rng, degree, kind)
     pose = np.append(rng.uniform(-20.0, 20.0, 2), rng.uniform(-np.pi, np.pi))
-    points, u = readings_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 15))
+    points, u = points_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 15))
     found, vehicle = find(tables, distinct, points, u), to_vehicle(points, pose)
     covariances = np.tile(0.01 * np.eye(2), (len(u), 1, 1))
     columns = control_columns(tables, found.span)
@@ -242,11 +242,11 @@ def test_jacobians_of_the_offset_from_a_held_foot_point(seed: int, degree: int, 
     assert_jacobians(function, [pose, distinct.ravel()])
 
 
-def test_the_offset_is_as_unlikely_as_the_reading_and_turns_with_it() -> None:
+def test_the_offset_is_as_unlikely_as_the_detection_and_turns_with_it() -> None:
     """|r|^2 is the squared Mahalanobis distance by the covariance in the map frame; both see one distance."""
     rng = np.random.default_rng(7)
     tables, distinct = random_curve(rng, 3, "open")
-    points, u = readings_beside(rng, tables, distinct, rng.uniform(-3.0, 3.0, 20))
+    points, u = points_beside(rng, tables, distinct, rng.uniform(-3.0, 3.0, 20))
     foot, poses = find(tables, distinct, points, u), np.column_stack([*points.T, rng.uniform(-3, 3, len(u))])
     covariances = np.tile(np.array([[0.04, 0.015], [0.015, 0.01]]), (len(u), 1, 1))
     rows = offset_from_foot_point(points, covariances, poses, foot, SIGMA_MODEL)

@@ -22,7 +22,7 @@ SIZES = (st.integers(0, 1000), st.integers(1, 40), st.integers(1, 6))
 
 
 def random_variables(rng: np.random.Generator, poses: int, points: int) -> Variables:
-    """Values somewhere, that have moved from where they were first."""
+    """Returns values that differ from their references."""
     variables = Variables()
     variables.insert(np.array([CALIBRATION_KEY]), rng.normal(size=2))
     variables.insert(landmark_keys(np.arange(points)), rng.normal(size=POINT * points))
@@ -32,7 +32,7 @@ def random_variables(rng: np.random.Generator, poses: int, points: int) -> Varia
 
 
 def random_rows(rng: np.random.Generator, poses: int, points: int) -> list[Rows]:
-    """Odometry with a calibration, readings of two landmarks from each pose, priors of the points."""
+    """Returns odometry with a calibration, detections of landmarks from each pose, and priors of points."""
     start = np.repeat(np.arange(poses - 1), POSE)
     shared = np.full(len(start), CALIBRATION_KEY)
     between = np.column_stack([shared, pose_keys(start), pose_keys(start + 1)])
@@ -66,7 +66,7 @@ def dense(groups: list[Rows], layout: Layout) -> tuple[Array, Array]:
 
 
 def scene(seed: int, poses: int, points: int) -> tuple[Elimination, Array, Array]:
-    """A problem, and the same dense."""
+    """Returns a problem, and its dense normal equations."""
     rng = np.random.default_rng(seed)
     variables, groups = random_variables(rng, poses, points), random_rows(rng, poses, points)
     problem = Elimination(linear_graph(groups, variables), variables.layout)
@@ -76,7 +76,7 @@ def scene(seed: int, poses: int, points: int) -> tuple[Elimination, Array, Array
 @settings(deadline=None)
 @given(*SIZES)
 def test_the_solution_is_that_of_the_dense_system(seed: int, poses: int, points: int) -> None:
-    """A change from the values, wherever they were first."""
+    """The solution is a change from the values, whatever the references are."""
     problem, matrix, right = scene(seed, poses, points)
     n = problem.map.size
     np.testing.assert_allclose(problem.step(np.zeros(n)), np.linalg.solve(matrix, right), atol=1e-7)
@@ -91,7 +91,7 @@ def test_damping_is_added_to_the_map() -> None:
         np.testing.assert_allclose(problem.step(damping), np.linalg.solve(damped, right), atol=1e-9)
 
 
-def test_poses_beside_a_map_that_is_held() -> None:
+def test_poses_given_a_fixed_map() -> None:
     rng = np.random.default_rng(4)
     variables, groups = random_variables(rng, 30, 5), random_rows(rng, 30, 5)
     problem = Elimination(linear_graph(groups, variables), variables.layout)
@@ -125,7 +125,7 @@ def test_the_joint_covariance_has_the_order_that_is_asked_for() -> None:
     np.testing.assert_allclose(problem.joint(keys), inverse[np.ix_(entries, entries)], atol=1e-9)
 
 
-def test_poses_that_nothing_holds_are_singular() -> None:
+def test_undetermined_poses_are_singular() -> None:
     rng = np.random.default_rng(6)
     variables = random_variables(rng, 10, 3)
     odometry, _, _, points = random_rows(rng, 10, 3)
@@ -134,7 +134,7 @@ def test_poses_that_nothing_holds_are_singular() -> None:
         Elimination(linear_graph([odometry, points], variables), variables.layout)
 
 
-def test_a_map_that_nothing_holds_is_singular_but_where_it_is_damped() -> None:
+def test_an_undetermined_map_is_singular_unless_it_is_damped() -> None:
     rng = np.random.default_rng(7)
     variables = random_variables(rng, 10, 3)
     odometry, detections, first, points = random_rows(rng, 10, 3)
@@ -149,7 +149,7 @@ def test_a_map_that_nothing_holds_is_singular_but_where_it_is_damped() -> None:
 
 
 def test_a_variable_that_no_factor_holds_is_named() -> None:
-    """GTSAM's `hessian` would give a smaller matrix and say nothing."""
+    """GTSAM's `hessian` would give a smaller matrix without an error."""
     rng = np.random.default_rng(8)
     variables, groups = random_variables(rng, 10, 3), random_rows(rng, 10, 3)
     graph = linear_graph(groups, variables)

@@ -1,4 +1,4 @@
-"""Gaussian graphs against dense algebra, and the traps of the binding that the engine stands between."""
+"""Gaussian graphs against dense algebra, and the traps of the binding that the engine avoids."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ LAYOUT = Layout(KEYS)
 CHAIN = [np.append(MAP_KEYS[k : k + 4], POSE_KEYS[k : k + 1]) for k in range(4)] + [
     np.append(KEYS[:1], POSE_KEYS[k : k + 2]) for k in range(3)
 ]
-"""Keys of factors that hold everything: readings of each pose, and odometry."""
+"""Factors on these keys determine all variables: detections of each pose, and odometry."""
 
 
 def at(values: Array, keys: IntArray = KEYS) -> gtsam.VectorValues:
@@ -111,8 +111,8 @@ def test_information_of_any_rank_is_a_factor_on_many_keys(rank: int) -> None:
     )
 
 
-def test_rooted_information_has_an_error_that_is_never_negative_and_a_row_for_each_direction() -> None:
-    """Unlike that of a Hessian factor without its constant: an optimizer can judge its steps by it."""
+def test_the_square_root_form_has_an_error_that_is_never_negative_and_a_row_for_each_direction() -> None:
+    """An optimizer can judge steps by it, unlike by the error of a Hessian factor without a constant."""
     rng, layout = np.random.default_rng(3), Layout(LEFT_KEYS)
     root = rng.normal(size=(5, layout.size))
     information, vector = root.T @ root, root.T @ rng.normal(size=5)
@@ -155,7 +155,7 @@ def test_a_graph_on_other_keys_than_the_layout_s_is_refused(
 
 
 def test_gtsam_leaves_out_a_key_that_no_factor_holds() -> None:
-    """Documents why it is looked for."""
+    """This is why the engine looks for such a key."""
     graph, *_ = random_graph(np.random.default_rng(6), [LEFT_KEYS[:2]], LEFT_KEYS[:2])
     hessian, _ = graph.hessian(gtsam.Ordering(LEFT_KEYS[:3].tolist()))
     assert hessian.shape == (4, 4)
@@ -208,7 +208,7 @@ def test_covariance_is_that_of_the_dense_inverse_in_the_order_of_the_keys() -> N
 
 @pytest.mark.parametrize("gone", [POSE_KEYS[:1], np.append(LEFT_KEYS[1:3], POSE_KEYS[:2]), MAP_KEYS])
 def test_eliminate_gives_the_schur_complement_and_the_conditional_mean(gone: IntArray) -> None:
-    """p(x) = p(gone | rest) p(rest): both information forms by the joint covariance of the whole."""
+    """`p(x) = p(gone | rest) p(rest)`: both information forms follow from the joint covariance."""
     rng = np.random.default_rng(11)
     graph, hessian, vector = random_graph(rng, CHAIN)
     conditional, remaining = eliminate(graph, gone)
@@ -279,8 +279,8 @@ def test_merged_keys_are_one_variable() -> None:
 
 
 @pytest.mark.parametrize("unknown", [False, True])
-def test_forgetting_leaves_the_others_as_sure_as_before(unknown: bool) -> None:
-    """The rest has the same covariance and the same mean; also where a forgotten one was free."""
+def test_removing_information_keeps_the_covariance_of_the_others(unknown: bool) -> None:
+    """The others keep covariance and mean, also where a removed variable was undetermined."""
     rng = np.random.default_rng(14)
     graph, hessian, vector = random_graph(rng, [*CHAIN, POSE_KEYS])
     gone, rest = LEFT_KEYS[[1, 3]], np.setdiff1d(KEYS, LEFT_KEYS[[1, 3]])
@@ -344,7 +344,7 @@ def test_the_linear_term_of_a_hessian_factor_is_such_a_view_too() -> None:
 
 
 def test_no_function_gives_a_view_of_a_factor_away() -> None:
-    """Every array is the same after its graph and factors are gone, and their memory written over."""
+    """Every array stays the same after its graph and factors are freed and their memory is overwritten."""
     rng = np.random.default_rng(19)
     graph, *_ = random_graph(rng, CHAIN)
     rest = Layout(np.setdiff1d(KEYS, POSE_KEYS[:1]))

@@ -127,7 +127,7 @@ def test_a_factor_outlives_all_that_it_was_made_of() -> None:
 
 
 def test_a_conditional_on_many_keys_copies_the_block_that_it_is_given() -> None:
-    """What the memory of the factors rests on, in the binding itself."""
+    """The memory of the factors depends on this behaviour of the binding."""
     block = np.asfortranarray(np.random.default_rng(5).normal(size=(4, 11)))
     matrix = gtsam.VerticalBlockMatrix([2, 2, 3, 3, 1], block, False)
     factor, before = gtsam.GaussianConditional([1, 2, 3, 4], 1, matrix), block.copy()

@@ -1,4 +1,4 @@
-"""The fixed-lag window: what a batch finds, what it knows of itself, and which factors are made anew."""
+"""The fixed-lag smoother: its functions one by one, its estimate against a batch, and its covariances."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.se2 import compose
-from pathspace_graph.graph.gaussian import graph_of, keys_of, normal_equations
+from pathspace_graph.graph.gaussian import factorize, graph_of, keys_of, normal_equations
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
+from pathspace_graph.graph.odometry import calibrated_delta
 from pathspace_graph.graph.rows import LinearFactor, Rows
+from pathspace_graph.graph.smoother import FixedLagSmoother, SmootherSettings
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import split_odometry
@@ -18,10 +21,98 @@ from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
 
 from ..scenes.drives import ODOMETRY_SIGMA, bean_track, lap_log
 from ..scenes.graph import columns_of
-from ..scenes.linear_drive import LinearDrive
+from ..scenes.linear_drive import LinearDrive, LinearTrack
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+
+# --- poses that come and go ------------------------------------------------------------------------------
+
+SETTINGS = SmootherSettings(
+    lag=2.0, tolerances=(1e-9, 1e-9), keyframe_interval=1e9, sigma_calibration=(0.25, 0.5)
+)
+ODOMETRY = integrate_twists(np.full(4, 0.25), np.tile([8.0, 0.1, 0.4], (4, 1)), np.array([0.2, 0.1, 0.05]))
+
+
+def test_a_new_smoother_knows_the_calibration_as_its_settings_say() -> None:
+    smoother = FixedLagSmoother(SETTINGS, LinearTrack(0))
+    information, vector = normal_equations(smoother.prior, smoother.layout)
+    np.testing.assert_allclose(information, np.diag([16.0, 4.0]))
+    np.testing.assert_array_equal(vector, 0.0)
+    assert (smoother.first_cycle, smoother.next_cycle) == (0, 0)
+
+
+def test_the_first_pose_is_predicted_from_the_start_with_both_uncertainties() -> None:
+    smoother = FixedLagSmoother(SETTINGS, LinearTrack(0))
+    pose = smoother.predict(3.0, ODOMETRY, (0.1, 0.2, 0.3))
+    np.testing.assert_allclose(pose, ODOMETRY.delta, atol=1e-12)
+    expected = ODOMETRY.covariance + np.diag([0.01, 0.04, 0.09])
+    found = factorize(smoother.prior, smoother.layout).covariance(pose_keys(np.array([0])))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    assert smoother.times == [3.0]
+    assert smoother.submaps is not None
+    assert len(smoother.window.odometry) == 0
+
+
+def test_the_next_pose_is_predicted_by_the_calibrated_odometry() -> None:
+    smoother = FixedLagSmoother(SETTINGS, LinearTrack(0))
+    first = smoother.predict(0.0, ODOMETRY, (0.1, 0.2, 0.3))
+    smoother.variables.calibration[:] = 0.02, -0.1
+    second = smoother.predict(1.0, ODOMETRY, (0.1, 0.2, 0.3))
+    expected = compose(first, calibrated_delta(ODOMETRY, np.array([0.02, -0.1])))
+    np.testing.assert_allclose(second, expected, atol=1e-12)
+    np.testing.assert_array_equal(smoother.variables.poses, [first, second])
+    assert (smoother.times, smoother.next_cycle, len(smoother.window.odometry)) == ([0.0, 1.0], 2, 1)
+
+
+@pytest.mark.parametrize(("late", "first"), [(0.0, 3), (1e-10, 3), (1e-6, 4), (1.0, 4), (100.0, 5)])
+def test_a_pose_leaves_when_it_is_older_than_the_lag_and_the_newest_stays(late: float, first: int) -> None:
+    """Cycles 3, 4 and 5 are in a window of two seconds; the newest stamp is `late` by that much."""
+    drive = LinearDrive(2)
+    drive.drive(6)
+    smoother = drive.smoother
+    smoother.times[-1] += late
+    smoother.marginalize()
+    assert smoother.first_cycle == first
+    assert len(smoother.times) == len(smoother.variables.poses) == smoother.next_cycle - first
+    assert len(smoother.window.odometry) == len(smoother.times) - 1
+    assert not (smoother.layout.positions(pose_keys(np.arange(first))) >= 0).any()
+
+
+def test_merged_points_are_known_as_well_as_both_together() -> None:
+    """The merged prior at any values has the old prior's error where both points are at the same place."""
+    drive = LinearDrive(2)
+    drive.drive(8)
+    smoother, rng = drive.smoother, np.random.default_rng(0)
+    gone, kept = control_keys(0, np.array([4])), control_keys(0, np.array([5]))
+    old = Layout(keys_of(smoother.prior))
+    before, variables = normal_equations(smoother.prior, old), smoother.variables.copy()
+    at_kept = variables.of(kept)
+    smoother.merge(gone, kept)
+    assert smoother.epoch == 1
+    assert (smoother.variables.layout.positions(gone) < 0).all()
+    np.testing.assert_array_equal(smoother.variables.of(kept), at_kept)
+    new = Layout(keys_of(smoother.prior))
+    after, errors = normal_equations(smoother.prior, new), []
+    for _ in range(4):
+        variables.values = rng.normal(size=len(variables.values))
+        variables.values[variables.layout.entries(gone)] = variables.of(kept)
+        at = [variables.change(variables.layout.entries(layout.keys)) for layout in (old, new)]
+        errors.append([0.5 * d @ H @ d - g @ d for d, (H, g) in zip(at, (before, after), strict=True)])
+    lost = np.diff(errors, axis=1)[:, 0]
+    np.testing.assert_allclose(lost, lost[0], atol=1e-8 * np.abs(errors).max())
+
+
+def test_nothing_to_reactivate_changes_nothing() -> None:
+    drive = LinearDrive(2)
+    drive.drive(5)
+    smoother = drive.smoother
+    before = smoother.prior, smoother.inactive, smoother.submaps
+    smoother.reactivate()
+    smoother.deactivate(np.zeros(0, np.intp))
+    smoother.refresh()
+    assert (smoother.prior, smoother.inactive, smoother.submaps) == before
+
 
 # --- a linear drive --------------------------------------------------------------------------------------
 
@@ -29,7 +120,7 @@ IntArray = NDArray[np.intp]
 @pytest.mark.parametrize("lag", [1, 3])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_window_on_a_linear_drive_is_full_batch(lag: int, seed: int) -> None:
-    """Mean and joint covariance of all that it still knows, however many poses have left."""
+    """Mean and joint covariance of all variables agree, however many poses have been marginalized."""
     drive = LinearDrive(lag, seed)
     drive.drive(14)
     smoother, keys = drive.smoother, drive.smoother.variables.keys
@@ -47,8 +138,8 @@ def test_covariance_is_in_the_order_of_the_keys() -> None:
     np.testing.assert_allclose(drive.smoother.covariance(keys), drive.covariance(keys), rtol=1e-7, atol=1e-10)
 
 
-def test_the_prior_is_the_schur_complement_of_what_has_left() -> None:
-    """Of the factors of the poses that left, without those of the window and without the weak priors."""
+def test_marginalization_is_a_schur_complement() -> None:
+    """The covariance of all remaining variables is the same before and after."""
     drive = LinearDrive(2)
     drive.drive(3)
     smoother = drive.smoother
@@ -80,6 +171,10 @@ def test_a_damped_step_adds_to_the_diagonal_of_the_map_points_alone() -> None:
     assert smoother.last_step is not None
     lower = np.tril(smoother.last_step.factor)
     np.testing.assert_allclose(lower @ lower.T, hessian, atol=1e-10 * hessian.max())
+    keys = np.append(drive.keys[[3, 1]], pose_key(2))
+    entries = smoother.layout.entries(keys)
+    expected = np.linalg.inv(hessian)[np.ix_(entries, entries)]
+    np.testing.assert_allclose(smoother.last_covariance(keys), expected, rtol=1e-7, atol=1e-10)
 
 
 def test_looking_at_the_graph_changes_nothing() -> None:
@@ -101,8 +196,8 @@ def test_a_variable_that_nothing_holds_is_named() -> None:
         drive.smoother.covariance(pose_keys(np.array([4])))
 
 
-def test_forgetting_a_point_removes_what_had_left_and_keeps_what_is_in_the_window() -> None:
-    """The prior knows nothing of it any more, and of all others as much as before."""
+def test_removing_information_on_a_point_keeps_the_window_and_all_other_points() -> None:
+    """The prior no longer holds the point, and the covariance of all other points is the same."""
     drive = LinearDrive(2)
     drive.drive(8)
     smoother, gone = drive.smoother, control_keys(0, np.array([5, 6]))
@@ -126,7 +221,7 @@ def test_forgetting_a_point_removes_what_had_left_and_keeps_what_is_in_the_windo
 
 
 def test_substituted_points_know_what_the_old_ones_did() -> None:
-    """Three points that were, to a shift, a matrix times two new ones: as in a dense change of variables."""
+    """Three points are, up to a shift, a matrix times two new ones: as in a dense change of variables."""
     drive = LinearDrive(2)
     drive.drive(14)
     smoother, rng, sigma = drive.smoother, np.random.default_rng(0), 0.2
@@ -154,7 +249,7 @@ def test_substituted_points_know_what_the_old_ones_did() -> None:
     np.testing.assert_array_equal(smoother.variables.of(new), points.ravel())
 
 
-# --- which factors are made anew -------------------------------------------------------------------------
+# --- relinearization in the mapper -----------------------------------------------------------------------
 
 
 def drive_bean(settings: MapperSettings, cycles: int) -> FixedLagMapper:
@@ -170,6 +265,7 @@ def factors_of_cycles(mapper: FixedLagMapper) -> dict[int, LinearFactor]:
     return dict(mapper.smoother.window.of_cycle)
 
 
+@pytest.mark.slow
 def test_the_tolerance_holds_once_the_loop_has_closed() -> None:
     mapper = FixedLagMapper(odometry_sigma=ODOMETRY_SIGMA)
     for odometry, cycle in split_odometry(lap_log(bean_track(), 45.0)):
@@ -211,7 +307,7 @@ def height(factor: LinearFactor) -> int:
 
 
 def test_the_steps_system_is_that_of_the_graph_at_the_estimate() -> None:
-    """Where everything is linearized anew: nothing stale, nothing twice, nothing left out."""
+    """Everything is linearized again here: no factor is stale, missing or counted twice."""
     settings = MapperSettings(relinearize=RelinearizeSettings(1e-12, 1e-12))
     smoother = drive_bean(settings, 60).smoother
     smoother.factorize()
@@ -249,7 +345,7 @@ def numeric_end(mapper: FixedLagMapper) -> tuple[Array, Array, Array]:
 
 @pytest.mark.parametrize("together", [1, 2])
 def test_predicted_is_that_of_the_dense_joint_covariance_with_the_newest_pose(together: int) -> None:
-    """The newest pose was no part of the step: it is reached by its odometry, whose noise adds to it."""
+    """The newest pose was not in the step: its odometry predicts it and adds noise."""
     mapper = drive_bean(MapperSettings(), 59)
     smoother, odometry = mapper.smoother, list(split_odometry(lap_log(bean_track(), 0.0)))[59]
     mapper._predict(odometry[0], odometry[1].t)

@@ -123,8 +123,8 @@ def test_a_submap_leaves_a_rigid_motion_free() -> None:
     assert values[2] < 1e-10 * values[-1] < values[3]
 
 
-def test_a_submap_forgets_control_points_and_nothing_else() -> None:
-    """What is left has the same covariance and the same mean."""
+def test_a_submap_loses_information_on_removed_points_only() -> None:
+    """The other variables keep covariance and mean."""
     rng = np.random.default_rng(3)
     submap = random_submap(rng)
     less = submap.without(np.array([POINTS[1], POINTS[1] + 1]))
@@ -145,7 +145,7 @@ def test_a_submap_forgets_control_points_and_nothing_else() -> None:
 
 @dataclass(frozen=True)
 class Drive:
-    """Poses and control points of two boundaries, and what the poses measured, linearized once."""
+    """Holds poses and control points of two boundaries with measurements that are linearized once."""
 
     variables: Variables
     """Calibration, six control points, nine poses a metre apart; away from their references."""
@@ -158,7 +158,7 @@ class Drive:
 
 
 def random_drive(rng: np.random.Generator, late: int) -> Drive:
-    """The last point of the left boundary is seen from pose `late` on only."""
+    """The last point of the left boundary is seen only from pose `late` on."""
     keys = np.concatenate([[CALIBRATION_KEY], *(control_keys(b, np.arange(3)) for b in (0, 1))])
     poses = np.column_stack([np.arange(9.0), rng.normal(size=9) * 0.2, rng.normal(size=9)])
     values = np.concatenate([rng.normal(size=2), rng.normal(size=12) * 5.0, poses.ravel()])
@@ -191,7 +191,7 @@ def odometry_rows(drive: Drive, k: int, rng: np.random.Generator) -> Rows:
 
 
 def drive_on(drive: Drive, groups: list[list[Rows]], interval: float) -> tuple[Submaps, Array, Array]:
-    """Submaps after every pose but the last has left, oldest first; A and b of what was known before."""
+    """Returns submaps of all poses but the last, added oldest first, and the dense A and b."""
     variables = drive.variables
     known = np.array([CALIBRATION_KEY, drive.poses[0]])
     A, b = np.diag(np.arange(1.0, 6.0)), np.linspace(-1.0, 1.0, 5)
@@ -237,7 +237,7 @@ def test_the_submaps_are_the_dense_marginal_where_they_were_linearized(interval:
 
 @pytest.mark.parametrize("interval", [0.5, 2.5])
 def test_a_whole_drive_turned_with_its_start_is_known_as_well_as_before(interval: float) -> None:
-    """Submaps linearized anew after a rigid motion of everything: the same information, turned."""
+    """Submaps that are linearized after a rigid motion of everything have the same information, turned."""
     rng = np.random.default_rng(8)
     drive = random_drive(rng, 0)
     variables = drive.variables
@@ -262,7 +262,7 @@ def test_a_whole_drive_turned_with_its_start_is_known_as_well_as_before(interval
     np.testing.assert_allclose(turned, rotation @ negative_gradient, atol=1e-9 * scale)
 
 
-def test_submaps_forget_map_points_and_go_on() -> None:
+def test_submaps_go_on_after_information_is_removed() -> None:
     rng = np.random.default_rng(9)
     drive = random_drive(rng, 0)
     groups = [[detection_rows(drive, k, rng), odometry_rows(drive, k, rng)] for k in range(8)]

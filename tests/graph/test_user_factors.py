@@ -1,4 +1,4 @@
-"""A user's own GTSAM factors on poses, map and calibration: as in a batch, and what a GNSS is worth."""
+"""A user's own GTSAM factors on poses, map and calibration: against a batch, and with GNSS on real drives."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_gnss_on_a_linear_chain_is_full_batch() -> None:
 
 @pytest.mark.parametrize("span", [2, 5, 8])
 def test_factors_across_poses_of_the_window_are_full_batch(span: int) -> None:
-    """The oldest pose leaves with factors that reach up to the newest pose of the window."""
+    """The oldest pose is marginalized with factors that also hold the newest pose of the window."""
     rng = np.random.default_rng(1)
     log = straight(rng)
     truth = true_poses(log)
@@ -128,7 +128,7 @@ def test_factors_across_poses_of_the_window_are_full_batch(span: int) -> None:
 
 
 def test_a_winding_chain_is_nearly_full_batch() -> None:
-    """Nonlinear: what has left the window stays linearized where it was."""
+    """The factors are nonlinear: marginalized ones keep their linearization point."""
     rng = np.random.default_rng(2)
     twists = np.column_stack([np.full(300, 6.0), np.zeros(300), np.sin(0.02 * np.arange(300))])
     log = odometry_only(twists)
@@ -221,6 +221,7 @@ def test_a_custom_factor_is_as_good_as_a_native_one() -> None:
     np.testing.assert_allclose(poses[0], poses[1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_loop_closes_with_gnss_too() -> None:
     log = lap_log(bean_track(), overrun=45.0)
     truth = true_poses(log)
@@ -236,7 +237,7 @@ POINT_NOISE = 0.4
 
 
 def point_prior(number: int, at: Array) -> gtsam.NonlinearFactor:
-    """A surveyed control point of the left boundary."""
+    """Returns the factor of a surveyed control point of the left boundary."""
     noise = gtsam.noiseModel.Isotropic.Sigma(2, POINT_NOISE)
     return gtsam.PriorFactorPoint2(int(control_keys(0, np.array(number))), at, noise)
 
@@ -282,7 +283,7 @@ APART = np.concatenate([-np.eye(2), np.eye(2)], axis=1)
 
 @pytest.mark.parametrize("back", [False, True])
 def test_factors_on_the_map_and_the_calibration_are_full_batch(back: bool) -> None:
-    """While their points are active, while they are inactive, after they came back, after a pose has left."""
+    """Points are active, inactive and active again, and a pose is marginalized."""
     rng = np.random.default_rng(4)
     drive, b = LinearDrive(2), rng.normal(size=(6, 2)) * 8.0
     given = {
@@ -330,7 +331,7 @@ def test_a_factor_on_an_inactive_point_brings_the_map_back() -> None:
 
 
 def test_a_factor_on_points_is_relinearized_again_when_they_come_back() -> None:
-    """It is the user's factor that is held meanwhile, not its linearization."""
+    """The user's factor itself is kept meanwhile, not its linearization."""
     drive = LinearDrive(2)
     drive.drive(7)
     noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.1)
@@ -374,8 +375,9 @@ def nearest(mapper: FixedLagMapper, label: int, place: Array) -> Array:
     return np.asarray(points[np.argmin(np.hypot(*(points - place).T))])
 
 
+@pytest.mark.slow
 def test_a_surveyed_point_pulls_after_it_has_become_inactive_and_after_the_loop_has_closed() -> None:
-    """The readings say otherwise: the curve gives way beside it, and is the same on the far side."""
+    """The detections contradict the factor: the curve moves part of the way."""
     with_factor, place = surveyed(60, RIGHT, 0.5)
     without, _ = surveyed(60, RIGHT, 0.0)
     assert with_factor.closed and without.closed

@@ -1,4 +1,4 @@
-"""Values by key: what comes in and goes out moves nothing else, and the keys mean what they say."""
+"""Variables by key: insertion and removal keep the other values, and keys are GTSAM's symbols."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from pathspace_graph.graph.keys import (
     pose_keys,
     sizes,
 )
-from pathspace_graph.graph.variables import UNKNOWN, Layout, Variables, spread
+from pathspace_graph.graph.variables import UNKNOWN, Layout, Variables, rotation_blocks, spread
 
 from ..scenes.graph import KEYS, LEFT_KEYS, MAP_KEYS, POSE_KEYS, RIGHT_KEYS, columns_of, random_variables
 
@@ -54,7 +54,7 @@ def test_keys_are_gtsam_s_symbols() -> None:
 
 
 def test_the_order_of_the_keys_is_calibration_points_poses() -> None:
-    """What `State.map_points` and the damping of a step rest on."""
+    """`State.map_points` and the damping of a step depend on it."""
     ordered = [CALIBRATION_KEY, *(gtsam.symbol(letter, 5) for letter in ("l", "m", "r", "x"))]
     assert ordered == sorted(ordered)
 
@@ -96,6 +96,11 @@ def test_a_block_is_all_columns_of_a_letter(letter: str, own: IntArray) -> None:
 def test_spread_is_every_column_of_a_block() -> None:
     assert spread(np.array([5, 0, 9]), np.array([2, 3, 1])).tolist() == [5, 6, 0, 1, 2, 9]
     assert spread(np.zeros(0, np.intp), np.zeros(0, np.intp)).tolist() == []
+
+
+def test_rotation_blocks_turn_some_pairs_of_columns_and_leave_the_others() -> None:
+    found = rotation_blocks(5, np.array([0, 3]), np.array([np.pi / 2.0, np.pi])) @ [1.0, 2.0, 7.0, 3.0, 4.0]
+    np.testing.assert_allclose(found, [-2.0, 1.0, 7.0, -3.0, -4.0], atol=1e-12)
 
 
 # --- values ----------------------------------------------------------------------------------------------
@@ -191,7 +196,7 @@ def test_a_known_key_is_not_inserted_again() -> None:
     np.testing.assert_array_equal(variables.values, before.values)
 
 
-def test_a_reference_is_the_first_value_unless_it_is_told() -> None:
+def test_a_reference_is_the_first_value_unless_it_is_given() -> None:
     variables = Variables()
     variables.insert(LEFT_KEYS[:2], np.arange(4.0))
     variables.values += 10.0

@@ -206,7 +206,7 @@ def on_an_inactive_point(window: WindowFactors[Track]) -> frozenset[int]:
 def beyond_the_active_map(window: WindowFactors[Track]) -> frozenset[int]:
     """The map says that a row should be on a point that is inactive."""
     move(window, pose_key(1), 0, 1.0)
-    window.map.slid = True
+    window.map.reached_inactive = True
     return ACTIVE
 
 

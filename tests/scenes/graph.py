@@ -1,4 +1,4 @@
-"""Random linear problems on keys, as dense matrices and as the engine has them."""
+"""Random linear problems on keys, as dense matrices and as graphs of the engine."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ LEFT_KEYS, RIGHT_KEYS, POSE_KEYS = (
 )
 MAP_KEYS = np.concatenate([LEFT_KEYS, RIGHT_KEYS])
 KEYS = np.concatenate([[CALIBRATION_KEY], MAP_KEYS, POSE_KEYS])
-"""Calibration, seven control points, four poses: ascending."""
+"""The keys of the calibration, seven control points and four poses are ascending."""
 
 
 def width(key: int) -> int:
-    """Entries of a key's variable, written once more."""
+    """Returns the number of entries of a key's variable, independently of the engine."""
     return 3 if chr(key >> 56) == "x" else 2
 
 
 def columns_of(keys: IntArray, among: IntArray) -> IntArray:
-    """Columns of some keys (k,) where those `among` lie one after the other, written once more."""
+    """Returns the columns of some keys (k,) in a layout of keys `among`, independently of the engine."""
     widths = [width(int(key)) for key in among]
     starts = dict(zip(among.tolist(), np.cumsum(widths) - widths, strict=True))
     return np.concatenate([starts[int(key)] + np.arange(width(int(key))) for key in keys])
 
 
 def random_variables(rng: np.random.Generator, keys: IntArray = KEYS) -> Variables:
-    """Values that have moved away from their references."""
+    """Returns values that differ from their references."""
     variables = Variables()
     variables.insert(keys, rng.normal(size=Layout(keys).size))
     variables.values += rng.normal(size=len(variables.values))
@@ -45,7 +45,7 @@ def random_variables(rng: np.random.Generator, keys: IntArray = KEYS) -> Variabl
 
 
 def random_rows(rng: np.random.Generator, sets: list[IntArray], count: int, owners: int) -> Rows:
-    """Rows, each on one key of each set, owned by one of a few cycles."""
+    """Returns rows, each on one key of each set, owned by one of a few cycles."""
     keys = np.stack([rng.choice(one, count) for one in sets], axis=1)
     size = sum(width(int(one[0])) for one in sets)
     owner = 40 + rng.integers(0, owners, count)
@@ -53,7 +53,7 @@ def random_rows(rng: np.random.Generator, sets: list[IntArray], count: int, owne
 
 
 def random_groups(rng: np.random.Generator, owners: int = 4) -> list[Rows]:
-    """Readings of three control points, odometry with its calibration, spacings, and a group of none."""
+    """Returns detections of three control points, odometry with calibration, spacings, and an empty group."""
     detections = random_rows(rng, [POSE_KEYS, LEFT_KEYS[:2], LEFT_KEYS[2:], RIGHT_KEYS], 60, owners)
     odometry = random_rows(rng, [KEYS[:1], POSE_KEYS[:2], POSE_KEYS[2:]], 30, owners)
     spacing = random_rows(rng, [RIGHT_KEYS[:1], RIGHT_KEYS[1:]], 5, owners)
@@ -62,7 +62,7 @@ def random_groups(rng: np.random.Generator, owners: int = 4) -> list[Rows]:
 
 
 def dense_rows(groups: list[Rows], keys: IntArray) -> tuple[Array, Array, IntArray]:
-    """J (m, n), r (m,) and the owner (m,) of all rows, on all columns of the keys."""
+    """Returns J (m, n), r (m,) and the owner (m,) of all rows, on all columns of the keys."""
     size = sum(width(int(key)) for key in keys)
     matrices = []
     for rows in groups:
@@ -77,7 +77,7 @@ def dense_rows(groups: list[Rows], keys: IntArray) -> tuple[Array, Array, IntArr
 def random_factor(
     rng: np.random.Generator, keys: IntArray, rows: int | None = None
 ) -> tuple[gtsam.GaussianConditional, Array, Array]:
-    """A factor on keys, and its A and b; more rows than columns unless told."""
+    """Returns a factor on keys with its A and b; without `rows` it has more rows than columns."""
     size = sum(width(int(key)) for key in keys)
     rows = size + 2 if rows is None else rows
     A, b = rng.normal(size=(rows, size)), rng.normal(size=rows)
@@ -87,7 +87,7 @@ def random_factor(
 def random_graph(
     rng: np.random.Generator, sets: list[IntArray], keys: IntArray = KEYS, rows: int | None = None
 ) -> tuple[gtsam.GaussianFactorGraph, Array, Array]:
-    """A factor on each set of keys, and the dense `A'A` and `A'b` on the columns of all keys."""
+    """Returns a factor on each set of keys, and the dense `A'A` and `A'b` on the columns of all keys."""
     size = sum(width(int(key)) for key in keys)
     hessian, vector, factors = np.zeros((size, size)), np.zeros(size), []
     for own in sets:
@@ -100,7 +100,7 @@ def random_graph(
 
 
 def schur(hessian: Array, vector: Array, gone: IntArray) -> tuple[Array, Array]:
-    """Information form of what stays where the entries `gone` (k,) are marginalized out."""
+    """Returns the information form of all other entries after `gone` (k,) are marginalized out."""
     stay = np.setdiff1d(np.arange(len(vector)), gone)
     covariance = np.linalg.inv(hessian)
     information = np.linalg.inv(covariance[np.ix_(stay, stay)])
@@ -108,11 +108,11 @@ def schur(hessian: Array, vector: Array, gone: IntArray) -> tuple[Array, Array]:
 
 
 def turn(theta: float) -> Array:
-    """R(theta) (2, 2)."""
+    """Returns R(theta) (2, 2)."""
     c, s = np.cos(theta), np.sin(theta)
     return np.array([[c, -s], [s, c]])
 
 
 def pose_columns(keys: IntArray) -> list[tuple[int, int]]:
-    """Of each pose among keys its key, and its first column."""
+    """Returns the key and the first column of each pose among keys."""
     return [(int(key), int(columns_of(np.array([key]), keys)[0])) for key in keys if width(int(key)) == POSE]

@@ -53,11 +53,11 @@ class Scene:
     state: Array
     """[left | right control points, calibration, poses]: the initial estimate."""
     start: Array
-    """First pose, held by a prior."""
+    """This is the first pose, which has a prior."""
     odometry: list[IntegratedOdometry]
     """Between the poses."""
     slots: tuple[Array, Array]
-    """Pose of each reading, by boundary."""
+    """Each detection was made from this pose, by boundary."""
     points: tuple[Array, Array]
     """Readings (m, 2) in the vehicle frame."""
     covariances: tuple[Array, Array]
@@ -73,12 +73,12 @@ class Scene:
 
 
 def on_bend(s: Array, radius: float) -> Array:
-    """Points along a left bend of the middle line with radius 25 m, here at another radius."""
+    """Returns points along a left bend of the middle line with radius 25 m, at another radius."""
     return np.column_stack([radius * np.sin(s / 25.0), 25.0 - radius * np.cos(s / 25.0)])
 
 
 def make_scene(seed: int, isotropic: bool = True, outliers: int = 4) -> Scene:
-    """Noisy odometry and readings of cones beside the way; the estimate starts at dead reckoning."""
+    """Returns noisy odometry and detections of cones beside the path, and an estimate by dead reckoning."""
     rng = np.random.default_rng(seed)
     true = np.column_stack([on_bend(1.8 * np.arange(POSES), 25.0), 1.8 * np.arange(POSES) / 25.0])
     odometry = [integrate_noisy(rng) for _ in range(POSES - 1)]
@@ -95,7 +95,7 @@ def make_scene(seed: int, isotropic: bool = True, outliers: int = 4) -> Scene:
 
 
 def integrate_noisy(rng: np.random.Generator) -> IntegratedOdometry:
-    """Nine readings of 0.02 s at 10 m/s in the bend."""
+    """Returns nine samples of 0.02 s at 10 m/s in the bend."""
     sigma = np.array([0.25, 0.12, 0.035])
     return integrate_twists(np.full(9, 0.02), [10.0, 0.0, 0.4] + rng.normal(size=(9, 3)) * sigma, sigma)
 
@@ -126,7 +126,7 @@ def search(scene: Scene, label: int) -> Array:
 
 
 def detection_rows(scene: Scene, label: int, state: Array) -> Rows:
-    """All readings of a boundary at once, by the kernels."""
+    """Returns the whitened rows of all detections of a boundary."""
     slots, u = scene.slots[label], scene.u[label]
     poses = scene.poses(state)[slots]
     points = to_map(scene.points[label], poses)
@@ -177,7 +177,7 @@ def odometry_rows(scene: Scene, state: Array) -> Rows:
 
 
 def prior_rows_of(scene: Scene, state: Array) -> list[Rows]:
-    """The first pose and the calibration are held."""
+    """Returns the rows of the priors on the first pose and the calibration."""
     calibration = MAP + np.arange(2)[:, None]
     start = MAP + 2 + np.arange(POSE)[:, None]
     return [
@@ -282,7 +282,7 @@ def in_tangents(scene: Scene, state: Array, J: Array) -> Array:
 
 
 def curves(scene: Scene, state: Array) -> Array:
-    """Both curves, sampled where readings hold them."""
+    """Returns samples of both curves where there are detections."""
     samples = []
     for label in (0, 1):
         u = np.linspace(scene.u[label].min(), scene.u[label].max(), 100)

@@ -1,4 +1,4 @@
-"""A drive whose measurements are all linear, so that a window must find what a batch finds."""
+"""A drive with linear measurements only, so that a window and a batch have the same estimate."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 POINTS = 12
-"""Map points, of which pose k sees a few about the one of its own number."""
+"""This is the number of map points; pose k sees some of those near point k."""
 SIGMA_CALIBRATION = np.array([0.3, 0.5])
 SIGMA_START = np.array([0.5, 0.4, 0.3])
 NOTHING = np.zeros(0, np.intp)
 
 
 class LinearTrack:
-    """Map points in a row, `J x - z` of each cycle, and weak priors between neighbours."""
+    """Holds map points in a row, measurements `J x - z` of each cycle, and weak priors between neighbours."""
 
     def __init__(self, seed: int) -> None:
         self.variables = Variables()
-        self.slid = False
+        self.reached_inactive = False
         self.structure: object = object()
         self.inactive: IntArray = NOTHING
         self.seed = seed
@@ -42,7 +42,7 @@ class LinearTrack:
         return NOTHING
 
     def measured(self, cycle: int) -> tuple[IntArray, Array, Array]:
-        """Keys (m, 3) of the rows of a cycle, J (m, 7) and z (m,)."""
+        """Returns the keys (m, 3) of the rows of a cycle, J (m, 7) and z (m,)."""
         rng = np.random.default_rng((self.seed, cycle))
         first = np.minimum(cycle + rng.integers(0, 2, 6), POINTS - 2)
         keys = [np.full(6, pose_key(cycle)), control_keys(0, first), control_keys(0, first + 1)]
@@ -59,14 +59,14 @@ class LinearTrack:
         pass
 
     def weak(self, whole: bool) -> tuple[IntArray, IntArray]:
-        """Keys (k, 2) of neighbours that are tied, and (m,) of points that are held."""
+        """Returns keys (k, 2) of neighbours with a weak prior, and keys (m,) of points with a weak prior."""
         known = self.variables.keys
         known = known[(known >= control_keys(0, np.array(0))) & (known < pose_key(0))]
         active = known if whole else np.setdiff1d(known, self.inactive)
         return np.stack([active[:-1], active[1:]], axis=1), active
 
     def gauge(self, whole: bool) -> list[Rows]:
-        """`(c_{j+1} - c_j - (1, 2)) / 3`, a row for each coordinate."""
+        """Returns `(c_{j+1} - c_j - (1, 2)) / 3`, a row for each coordinate."""
         pairs, _ = self.weak(whole)
         J = np.kron(np.array([-1.0, 1.0]), np.eye(2)) / 3.0
         return [
@@ -74,20 +74,20 @@ class LinearTrack:
         ]
 
     def linear_gauge(self, whole: bool) -> list[Rows]:
-        """`(c_j - (4, 5)) / 9`."""
+        """Returns `(c_j - (4, 5)) / 9`, a row for each coordinate."""
         _, points = self.weak(whole)
         z = np.array([4.0, 5.0]) / 9.0
         return [self._at_values(np.array([[key], [key]]), np.eye(2) / 9.0, z, int(key % 5)) for key in points]
 
-    def all_active(self) -> None:
+    def activate_all(self) -> None:
         self.inactive, self.structure = NOTHING, object()
 
-    def leave(self, cycle: int) -> None:
+    def drop_cycle(self, cycle: int) -> None:
         pass
 
 
 class LinearOdometry(OdometryChain):
-    """`W_k (x_{k+1} - x_k - delta_k + G_k b)`."""
+    """Odometry with the linear residual `W_k (x_{k+1} - x_k - delta_k + G_k b)`."""
 
     def rows(self, variables: Variables, cycles: IntArray) -> list[Rows]:
         slots = cycles - variables.first_cycle
@@ -103,13 +103,13 @@ class LinearOdometry(OdometryChain):
 
 @dataclass(eq=False)
 class LinearDrive:
-    """A window on a drive, and everything that was ever measured in it."""
+    """Holds a window on a drive, and all measurements of the drive."""
 
     lag: int
-    """Poses of the window, less one."""
+    """The window has one pose more than this."""
     seed: int = 0
     tolerance: float = 1e-9
-    """From which change on factors are linearized anew."""
+    """Factors are linearized again after a change larger than this."""
     odometry: list[IntegratedOdometry] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -130,7 +130,7 @@ class LinearDrive:
         return self.smoother.next_cycle
 
     def drive(self, cycles: int) -> None:
-        """So many cycles: a pose, the points that it is the first to see, a step; the oldest pose leaves."""
+        """Drives some cycles: a pose, the points that it is the first to see, a step, marginalization."""
         for _ in range(cycles):
             self.predict()
             self.smoother.step()
@@ -152,28 +152,28 @@ class LinearDrive:
             self.see(np.array([k + 2]))
 
     def see(self, numbers: IntArray) -> None:
-        """New map points, anywhere."""
+        """Inserts new map points at random places."""
         points = self.rng.normal(size=(len(numbers), 2)) * 7.0
         self.smoother.variables.insert(control_keys(0, numbers), points.ravel())
         self.track.structure = object()
 
     def deactivate(self, before: int) -> None:
-        """The active ones of the first map points leave, which no pose of the window sees."""
+        """Deactivates map points below a number, which no pose of the window may see."""
         keys = np.setdiff1d(control_keys(0, np.arange(before)), self.track.inactive)
         self.smoother.deactivate(keys)
         self.track.inactive = np.union1d(self.track.inactive, keys)
         self.track.structure = object()
 
-    # --- the same, all at once ---------------------------------------------------------------------------
+    # --- the batch ---------------------------------------------------------------------------------------
 
     @property
     def keys(self) -> IntArray:
-        """Calibration, all points seen so far, and every pose that there ever was."""
+        """Returns the keys of the calibration, all points seen so far, and all poses of the drive."""
         points = control_keys(0, np.arange(min(self.cycles + 2, POINTS)))
         return np.concatenate([[CALIBRATION_KEY], points, pose_keys(np.arange(self.cycles))])
 
     def batch(self) -> tuple[Array, Array]:
-        """`J'J` and `J'z` of everything that was ever measured, on the columns of all keys."""
+        """Returns `J'J` and `J'z` of all measurements, on the columns of all keys."""
         keys = self.keys
         matrices = [_scattered([CALIBRATION_KEY], np.diag(1.0 / SIGMA_CALIBRATION), keys)]
         right = [np.zeros(2)]
@@ -201,11 +201,11 @@ class LinearDrive:
         return J.T @ J, J.T @ z
 
     def mean(self, keys: IntArray) -> Array:
-        """Of the batch, of some keys."""
+        """Returns the batch estimate of some keys."""
         return np.linalg.solve(*self.batch())[columns_of(keys, self.keys)]
 
     def covariance(self, keys: IntArray) -> Array:
-        """Of the batch, of some keys."""
+        """Returns the joint covariance of some keys in the batch."""
         entries = columns_of(keys, self.keys)
         return np.linalg.inv(self.batch()[0])[np.ix_(entries, entries)]
 
