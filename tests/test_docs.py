@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import csv
 import inspect
 import json
@@ -24,15 +25,18 @@ import pytest
 from pathspace_graph import FixedLagMapper, Log
 from pathspace_graph.cli import COMMANDS, _parse
 from pathspace_graph.errors import InputError
+from pathspace_graph.eval.study.overrides import leaves
 from pathspace_graph.io.log import write_log
 from pathspace_graph.io.results import write_result
 from pathspace_graph.run import run_online, split_odometry
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim import track_files
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
 from .scenes.jacobians import numeric_jacobian
-from .scenes.paths import ROOT
+from .scenes.paths import ROOT, modules
+from .test_prose import texts
 from .test_rooms import ARROWS, LEAVES
 
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
@@ -151,6 +155,40 @@ def test_named_commands_are_accepted(page: Path) -> None:
             name, *arguments = re.sub(r"\s+#.*", "", command[1]).split()
             assert name in COMMANDS, line
             assert _parse(name, arguments) is not None, line
+
+
+REFERENCE = re.compile(r"`([a-z_]+(?:\.\w+)+)`")
+"""A dotted name in the text of a module: another module, something in one, a setting, or a file."""
+SUFFIXES = {"csv", "json", "toml", "md", "tum"}
+"""Files of data have these."""
+
+
+def is_found(reference: str, beside: str) -> bool:
+    """Whether a dotted name is a module or in one, from the package on or from the package `beside`."""
+    for path in (f"{beside}.{reference}".split("."), reference.split(".")):
+        for length in range(len(path), 0, -1):
+            module, name = ".".join(path[:length]), ".".join(path[length:])
+            if module in modules():
+                return not name or exists(module, name)
+    return False
+
+
+def test_references_in_docstrings_exist() -> None:
+    """`room.module.name`, and `module.name` of a module beside the one that says it."""
+    settings = set(leaves(MapperSettings()))
+    broken = []
+    for module, file in modules().items():
+        heads = {other.stem for other in file.parent.glob("*.py")} | {
+            name.partition(".")[0] for name in ARROWS
+        }
+        for text in texts(ast.parse(file.read_text())):
+            for reference in REFERENCE.findall(text.text):
+                head, _, last = reference.partition(".")
+                if head not in heads - {"settings"} or reference in settings or last in SUFFIXES:
+                    continue
+                found = (file.parent / reference).exists() or is_found(reference, module.rpartition(".")[0])
+                broken += [] if found else [f"{module}: {reference}"]
+    assert broken == []
 
 
 # --- blocks of Python ------------------------------------------------------------------------------------
@@ -290,6 +328,7 @@ def test_the_new_estimator_maps_online(installed: Path, log_folder: Path) -> Non
     assert len((installed / "map" / "trajectory.tum").read_text().splitlines()) == 80
 
 
+@pytest.mark.slow
 def test_the_new_estimator_is_compared(installed: Path, log_folder: Path) -> None:
     names = ["dead-reckoning", "landmark-fixed-lag"]
     run_command(installed, f"compare {log_folder} --out comparison --estimators {' '.join(names)}")

@@ -176,7 +176,7 @@ def _draw_fitted(axes: Axes, data: Fit) -> None:
     draw_curve(axes, data.fitted, PURPLE, "$S_z$", zorder=3.5)
     draw_control_points(axes, points, PURPLE, "$C_z$, 2σ")
     draw_ellipses(axes, points, point_blocks(data.measurement.covariance), PURPLE)
-    axes.set_title("(c) their mean and covariance: the measurement $S_z$")
+    axes.set_title("(c) $S_z$: their mean and covariance")
 
 
 def _draw_basis(axes: Axes, data: Fit) -> None:

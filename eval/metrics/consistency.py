@@ -1,4 +1,4 @@
-"""Whether a map's covariance is honest: NEES of the whole map, and errors at the cones by their own sigma."""
+"""Whether a covariance is honest: NEES of the whole map, and the errors of the curves at the true cones."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from scipy.stats import chi2
 
+from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.factors.gauge import greville
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
@@ -26,25 +27,25 @@ LEVEL: Final = 0.95
 """An honest map's NEES lies in the interval with this probability."""
 
 
-# --- the whole map ---------------------------------------------------------------------------------------
+# --- squared errors ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class Nees:
-    """Holds the normalized estimation error squared `e' P^-1 e` of a map.
+class NormalizedError:
+    """Holds a normalized error squared `e' P^-1 e`, where P is the covariance that an estimator claims.
 
-    It is chi-squared distributed with `dof` degrees of freedom where the covariance P is honest (Bar-Shalom,
-    Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4).
+    It is chi-squared distributed with `dof` degrees of freedom where P is honest (Bar-Shalom, Li and
+    Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4).
     """
 
     value: float
-    """This is the sum over both boundaries; it is NaN where a covariance is singular."""
+    """This is e' P^-1 e; it is NaN where P is singular."""
     dof: int
     """The chi-squared distribution has this many degrees of freedom."""
 
     @property
     def ratio(self) -> float:
-        """Returns NEES per degree of freedom: 1 is honest, more is overconfident, less is too cautious."""
+        """Returns the value per degree of freedom: 1 is honest, more overconfident, less too cautious."""
         return self.value / self.dof if self.dof else float("nan")
 
     @property
@@ -62,8 +63,21 @@ class Nees:
         return low <= self.ratio <= high
 
 
-def map_nees(track: Map, truth: Truth) -> Nees:
-    """Returns the NEES of a map by the covariance that the map itself holds.
+def _squared(error: Array, covariance: Array) -> float:
+    """Returns e' P^-1 e, or NaN where P isn't positive definite."""
+    if len(error) == 0:
+        return 0.0
+    try:
+        return float(error @ cho_solve(cho_factor(covariance), error))
+    except np.linalg.LinAlgError:
+        return float("nan")
+
+
+# --- the whole map ---------------------------------------------------------------------------------------
+
+
+def map_nees(track: Map, truth: Truth) -> NormalizedError:
+    """Returns the normalized estimation error squared (NEES) of a map, by the covariance that it holds.
 
     The error of a curve is its signed distance to the true curve, at as many places as the curve has degrees
     of freedom across itself. The error of landmarks is their offset in the plane. The state of the estimator
@@ -80,7 +94,7 @@ def map_nees(track: Map, truth: Truth) -> Nees:
             error, covariance = landmark_errors(boundary, truth.cones[truth.cone_labels == label])
         value += _squared(error, covariance)
         dof += len(error)
-    return Nees(value, dof)
+    return NormalizedError(value, dof)
 
 
 def curve_errors(boundary: SplineBoundary, curve_true: Array) -> tuple[Array, Array]:
@@ -118,16 +132,6 @@ def landmark_errors(boundary: PointBoundary, cones: Array) -> tuple[Array, Array
     columns = (2 * landmark[:, None] + np.arange(2)).ravel()
     error = (cones[cone] - boundary.points[landmark]).ravel()
     return error, boundary.covariance[np.ix_(columns, columns)]
-
-
-def _squared(error: Array, covariance: Array) -> float:
-    """Returns e' P^-1 e, or NaN where P isn't positive definite."""
-    if len(error) == 0:
-        return 0.0
-    try:
-        return float(error @ cho_solve(cho_factor(covariance), error))
-    except np.linalg.LinAlgError:
-        return float("nan")
 
 
 # --- at the true cones -----------------------------------------------------------------------------------
@@ -173,6 +177,30 @@ def normal_errors(track: Map, truth: Truth) -> NormalErrors:
             errors.append(feet.distance)
             sigmas.append(boundary.spline.normal_sigma(feet.u, boundary.covariance))
     return NormalErrors(np.concatenate(errors), np.concatenate(sigmas))
+
+
+def joint_cone_error(result: BatchResult, truth: Truth) -> NormalizedError:
+    """Returns e' (B Sigma B' + diag(s^2))^-1 e, the errors of both curves at all true cones at once.
+
+    In contrast to the NEES of the map, Sigma is the joint covariance of both boundaries from the detections,
+    and s is the scatter of the cones about a smooth curve, at each cone, larger where a cone was never
+    detected. So this judges the batch itself: whether it predicts the true cones.
+    """
+    errors, sigmas, designs, offset = [np.zeros(0)], [np.zeros(0)], [], 0
+    size = len(result.map_covariance)
+    for label, boundary in sorted(result.map.boundaries.items()):
+        assert isinstance(boundary, SplineBoundary)
+        feet = closest_points(boundary.spline, truth.cones[truth.cone_labels == label])
+        design = np.zeros((len(feet.u), size))
+        by_point = np.einsum("km,kd->kmd", boundary.spline.basis_matrix(feet.u), feet.normal_unit)
+        design[:, offset : offset + 2 * boundary.size] = by_point.reshape(len(feet.u), -1)
+        errors.append(feet.distance)
+        sigmas.append(result.scatter.sigma(label, feet.u))
+        designs.append(design)
+        offset += 2 * boundary.size
+    e, B = np.concatenate(errors), np.concatenate([np.zeros((0, size)), *designs])
+    covariance = B @ result.map_covariance @ B.T + np.diag(np.concatenate(sigmas) ** 2)
+    return NormalizedError(_squared(e, covariance), len(e))
 
 
 def with_marginals(track: Map) -> Map:

@@ -8,12 +8,13 @@ from typing import Final, Literal
 
 import numpy as np
 
+from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.labels import BOUNDARIES
 
-from .consistency import map_nees, normal_errors, with_marginals
+from .consistency import joint_cone_error, map_nees, normal_errors, with_marginals
 from .cost import covariance_bytes, map_bytes, stage_times
 from .curves import curve_distance
 from .ghosts import GhostSettings, ghosts
@@ -93,19 +94,39 @@ _ALL: Final = (
     Metric("f", "limit, fit of the curves", "m", scope="run", better="none"),
     Metric("limit", "limit", "m", scope="run", better="none"),
     Metric("nees", "NEES per degree of freedom", digits=2, better="none"),
-    Metric("nees_low", "its 95 % interval, from", digits=2, better="none"),
-    Metric("nees_high", "its 95 % interval, to", digits=2, better="none"),
-    Metric("nees_inside", "NEES within its interval", "%", 1, better="higher"),
+    Metric("nees_low", "NEES, 95 % interval from", digits=2, better="none"),
+    Metric("nees_high", "NEES, 95 % interval to", digits=2, better="none"),
+    Metric("nees_inside", "NEES within its 95 % interval", "%", 1, better="higher"),
     Metric("nees_marginals", "NEES per degree of freedom, of the marginals", digits=2, better="none"),
     Metric("inside", "cones within 2σ of the curve", "%", 1, better="none"),
     Metric("inside_marginals", "cones within 2σ of the marginals", "%", 1, better="none"),
     Metric("normalized_error", "mean squared error by variance at the cones", digits=2, better="none"),
-    Metric("normalized_error_marginals", "the same by variance of the marginals", digits=2, better="none"),
+    Metric(
+        "normalized_error_marginals",
+        "mean squared error by marginal variance at the cones",
+        digits=2,
+        better="none",
+    ),
+    Metric(
+        "normalized_error_joint",
+        "squared error by the joint covariance of the batch at the cones",
+        digits=2,
+        better="none",
+        scope="run",
+    ),
+    Metric(
+        "normalized_error_joint_inside",
+        "joint squared error within its 95 % interval",
+        "%",
+        1,
+        better="higher",
+        scope="run",
+    ),
     Metric("closed", "loop closed", "%", 0, better="higher"),
     Metric("converged", "batch converged", "%", 0, better="higher", scope="run"),
     Metric("cost", "cost of the batch", digits=1, scope="run"),
     Metric("bytes", "map", "kB", 2),
-    Metric("bytes_covariance", "its covariance", "kB", 1),
+    Metric("bytes_covariance", "covariance of the map", "kB", 1),
     Metric("ms_mean", "update, mean", "ms", 2, time=True),
     Metric("ms_median", "update, median", "ms", 2, time=True),
     Metric("ms_p99", "update, 99th percentile", "ms", 2, time=True),
@@ -151,6 +172,9 @@ def measure(
     values |= _drive_values(run, log.truth, -np.inf, np.inf)
     if isinstance(run, BatchRun):
         values |= {"converged": run.converged, "cost": run.cost}
+    if isinstance(run, BatchResult) and log.truth is not None and has_cones(log.truth):
+        joint = joint_cone_error(run, log.truth)
+        values |= {"normalized_error_joint": joint.ratio, "normalized_error_joint_inside": joint.honest}
     if yardsticks:
         least = limit(log, run.map)
         values |= {"l": least.l, "f": least.f, "limit": least.total}

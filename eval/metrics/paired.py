@@ -40,11 +40,6 @@ class Estimate:
         """Returns the upper end of the interval."""
         return self.mean + self.half
 
-    @property
-    def significant(self) -> bool:
-        """Returns whether 0 is outside of the interval."""
-        return bool(self.low > 0.0 or self.high < 0.0)
-
 
 def estimate(values: Array) -> Estimate:
     """Returns the mean of the values (n,) and its interval, mean -+ t(0.975, n - 1) s / sqrt(n)."""

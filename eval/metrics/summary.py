@@ -14,9 +14,10 @@ from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
+from pathspace_graph.laps import lap_end_indices
 
 from .consistency import normal_errors
-from .table1 import LapMetrics, lap_end_times, lap_metrics, laps_metrics, root_mean_square
+from .table1 import LapMetrics, lap_metrics, root_mean_square
 from .trajectory import ate, trajectory_errors
 
 Array = NDArray[np.float64]
@@ -51,7 +52,7 @@ def lap_times(log: Log) -> Array:
     """Returns the stamps (s) at which true laps end; without a true path there are none."""
     if log.truth is None or len(log.truth.poses) == 0:
         return np.zeros(0)
-    return lap_end_times(log.truth)
+    return log.truth.pose_t[lap_end_indices(log.truth.poses)]
 
 
 def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
@@ -63,9 +64,10 @@ def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
     if log.truth is None or not has_cones(log.truth):
         return []
     if isinstance(result, BatchRun):
-        return laps_metrics([(result.laps, result.map)], log.truth)
+        return [lap_metrics(result.map, log.truth, result.laps)]
     by_truth = tuple(enumerate(result.snapshots, start=1))
-    return laps_metrics(by_truth if len(log.truth.poses) else result.lap_maps, log.truth)
+    maps = by_truth if len(log.truth.poses) else result.lap_maps
+    return [lap_metrics(track, log.truth, lap) for lap, track in maps]
 
 
 def not_mapped(track: Map, log: Log) -> list[str]:

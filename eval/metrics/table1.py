@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +12,6 @@ from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.laps import LapSettings, lap_end_indices
 from pathspace_graph.spline.bspline import BSpline
 
 Array = NDArray[np.float64]
@@ -63,11 +61,6 @@ def capped_rmse(distances: Array, cap: float = MISSED_DISTANCE) -> float:
     return root_mean_square(np.minimum(distances, cap))
 
 
-def laps_metrics(lap_maps: Sequence[tuple[int, Map]], truth: Truth) -> list[LapMetrics]:
-    """Returns the rows of (lap, map as it stood at its end)."""
-    return [lap_metrics(track, truth, lap) for lap, track in lap_maps]
-
-
 def cone_distances(track: Map, truth: Truth) -> Array:
     """Returns the distance (K,) in m of each true cone from its own mapped boundary, in the truth's order.
 
@@ -107,8 +100,3 @@ def closest_points(spline: BSpline, points_map: Array) -> FootPoints:
 def root_mean_square(values: Array) -> float:
     """Returns sqrt(mean v^2); NaN without values."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
-
-
-def lap_end_times(truth: Truth, settings: LapSettings | None = None) -> Array:
-    """Returns the stamp (laps,) in s at which each complete lap of the true path ends."""
-    return truth.pose_t[lap_end_indices(truth.poses, settings)]

@@ -14,7 +14,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.settings.mapper import MapperSettings
 
-FORMAT: Final = "pathspace-cell/1"
+FORMAT: Final = "pathspace-cell/2"
 
 Record = dict[str, Any]
 """It has the types of JSON only."""

@@ -11,7 +11,7 @@ from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 
-from ...scenes.straight_maps import landmarks, line
+from .straight_maps import landmarks, line
 
 
 def test_bytes_of_a_map() -> None:

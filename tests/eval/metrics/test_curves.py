@@ -17,7 +17,7 @@ from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.labels import LEFT, RIGHT
 
-from ...scenes.straight_maps import landmarks, line, row, truth
+from .straight_maps import landmarks, line, row, truth
 
 Array = NDArray[np.float64]
 

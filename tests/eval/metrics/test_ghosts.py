@@ -10,7 +10,7 @@ from pathspace_graph.eval.metrics.ghosts import GhostSettings, ghosts
 from pathspace_graph.io.map import Map
 from pathspace_graph.labels import LEFT, RIGHT
 
-from ...scenes.straight_maps import landmarks, line, row, truth
+from .straight_maps import landmarks, line, row, truth
 
 
 def test_ghost_landmarks_and_duplicates() -> None:

@@ -13,7 +13,7 @@ from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.labels import LEFT, RIGHT
 
-from ...scenes.straight_maps import landmarks, line, row, truth
+from .straight_maps import landmarks, line, row, truth
 
 STAMPS = np.arange(0.5, 40.0, 1.0)
 """The cycles are one second apart."""

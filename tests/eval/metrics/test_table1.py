@@ -12,9 +12,7 @@ from pathspace_graph.eval.metrics.table1 import (
     boundary_distances,
     capped_rmse,
     cone_distances,
-    lap_end_times,
     lap_metrics,
-    laps_metrics,
     missed_share,
 )
 from pathspace_graph.io.log import Truth
@@ -80,12 +78,6 @@ def test_landmarks_are_measured_to_the_nearest() -> None:
     assert row.rmse == pytest.approx(np.sqrt(0.5))
 
 
-def test_laps_are_rows_of_the_map_as_it_stood() -> None:
-    true = truth([(5, 2, LEFT)])
-    rows = laps_metrics([(1, Map(False, {LEFT: straight(3.0)})), (2, Map(True, {LEFT: straight(2.5)}))], true)
-    assert [(row.lap, row.rmse) for row in rows] == [(1, pytest.approx(1.0)), (2, pytest.approx(0.5))]
-
-
 @given(seed=st.integers(0, 10_000))
 def test_the_closest_point_is_no_farther_than_any_sample(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -98,14 +90,6 @@ def test_the_closest_point_is_no_farther_than_any_sample(seed: int) -> None:
     sampled = np.linalg.norm(points[:, None] - samples[None], axis=2).min(axis=1)
     assert (distances <= sampled + 1e-3).all()
     np.testing.assert_allclose(distances, sampled, atol=0.02)
-
-
-def test_lap_ends_of_the_true_path_are_times() -> None:
-    angle = np.arange(0.0, 2.5 * 2 * np.pi, 0.02)
-    wrapped = np.arctan2(np.sin(angle), np.cos(angle))
-    poses = np.stack([25.0 * np.sin(angle), 25.0 * (1 - np.cos(angle)), wrapped], axis=1)
-    times = lap_end_times(truth([], poses, 3.0 * angle))
-    np.testing.assert_allclose(times, 3.0 * 2 * np.pi * np.array([1.0, 2.0]), atol=0.06)
 
 
 def test_missed_at_a_distance_and_rmse_with_a_missed_cone_as_three_metres() -> None:

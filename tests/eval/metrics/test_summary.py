@@ -1,0 +1,82 @@
+"""The summary of a run: the paper's table by laps, when laps end, and what wasn't mapped."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.eval.metrics.summary import lap_times, laps_of, not_mapped, summarize
+from pathspace_graph.io.log import Detections, Log, Odometry, Truth
+from pathspace_graph.io.map import Map
+from pathspace_graph.io.results import BatchRun, RunResult
+from pathspace_graph.labels import LEFT, RIGHT
+
+from .straight_maps import line, row, truth
+
+Array = NDArray[np.float64]
+
+ANGLE = np.arange(0.0, 2.5 * 2 * np.pi, 0.02)
+"""Two and a half laps are driven on a circle of 25 m, at a third of a radian a second."""
+
+
+def log(path: bool = True) -> Log:
+    """Only left cones are detected."""
+    heading = np.arctan2(np.sin(ANGLE), np.cos(ANGLE))
+    poses = np.stack([25.0 * np.sin(ANGLE), 25.0 * (1 - np.cos(ANGLE)), heading], axis=1)
+    true = truth(row(2.0), row(-2.0))
+    if path:
+        true = Truth(3.0 * ANGLE, poses, true.cones, true.cone_labels)
+    seen = Detections(0.0, np.ones((3, 2)), np.tile(np.eye(2), (3, 1, 1)), np.full(3, LEFT))
+    return Log(Odometry(np.array([0.0, 1.0]), np.zeros((2, 3))), (seen,), np.full(3, 0.1), truth=true)
+
+
+def map_at(offset: float) -> Map:
+    return Map(False, {LEFT: line(2.0 + offset)})
+
+
+RUN = RunResult(
+    "made",
+    {},
+    map_at(0.1),
+    np.zeros(0),
+    np.zeros((0, 3)),
+    (),
+    2,
+    lap_maps=((1, map_at(0.5)),),
+    snapshots=(map_at(0.3), map_at(0.2)),
+)
+
+
+def test_true_laps_end_where_the_path_comes_round() -> None:
+    np.testing.assert_allclose(lap_times(log()), 3.0 * 2 * np.pi * np.array([1.0, 2.0]), atol=0.06)
+    assert len(lap_times(log(path=False))) == len(lap_times(replace(log(), truth=None))) == 0
+
+
+def test_the_paper_s_table_has_a_row_for_each_true_lap_or_else_each_estimated_one() -> None:
+    rows = laps_of(RUN, log())
+    assert [(r.lap, r.rmse, r.missed, r.size) for r in rows] == [
+        (1, pytest.approx(0.3), 0.5, 4),
+        (2, pytest.approx(0.2), 0.5, 4),
+    ]
+    assert [(r.lap, r.rmse) for r in laps_of(RUN, log(path=False))] == [(1, pytest.approx(0.5))]
+    assert laps_of(RUN, replace(log(), truth=None)) == []
+    batch = BatchRun("made", {}, map_at(0.4), np.zeros(0), np.zeros((0, 3)), (), 2)
+    assert [(r.lap, r.rmse) for r in laps_of(batch, log())] == [(2, pytest.approx(0.4))]
+
+
+def test_a_boundary_that_is_missing_has_a_reason() -> None:
+    assert not_mapped(map_at(0.0), log()) == ["right boundary: not mapped, no right detections"]
+    missing = not_mapped(Map(False, {RIGHT: line(-2.0)}), log())
+    assert missing == ["left boundary: not mapped, 3 left detections were too few or agreed too little"]
+
+
+def test_the_summary_has_the_final_map_beside_the_laps() -> None:
+    summary = summarize(RUN, log())
+    assert summary["final"] == {"rmse": pytest.approx(0.1), "missed": 0.5, "size": 4}
+    assert [r["lap"] for r in summary["laps"]] == [1, 2]
+    assert summary["inside_two_sigma"] == 1.0
+    assert (summary["seconds"], summary["closed"], summary["lap_count"]) == (None, False, 2)
+    assert "laps" not in summarize(RUN, replace(log(), truth=None))
