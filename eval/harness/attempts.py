@@ -24,7 +24,7 @@ Measure = Callable[[RunResult, Log, float], M]
 
 @dataclass(frozen=True, eq=False)
 class Attempt(Generic[M]):
-    """What came of one attempt."""
+    """Holds what came of one attempt."""
 
     result: RunResult | None = None
     """The run gave this; it is None where the attempt failed."""
