@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from difflib import get_close_matches
+from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 
 class PathspaceError(Exception):
@@ -48,3 +49,19 @@ def check_name(name: Any, known: Iterable[str], expected: str) -> None:
     near = get_close_matches(str(name), known, n=1, cutoff=0.0)
     hint = f", the nearest is '{near[0]}'" if near else ""
     raise SettingsError(f"{expected}, found '{name}'{hint}")
+
+
+NUMBERS: Final[dict[str, Callable[[Any], bool]]] = {
+    "a positive number": lambda value: 0 < value < inf,
+    "a number of at least 0": lambda value: 0 <= value < inf,
+    "a number in [0, 1]": lambda value: 0 <= value <= 1,
+}
+"""A number is checked against one of these, by the words of the message."""
+
+
+def check_numbers(settings: object, group: str, names: Iterable[str], expected: str) -> None:
+    """Raises a SettingsError for the first of these settings that is not as `expected`, a key of NUMBERS."""
+    for name in names:
+        value = getattr(settings, name)
+        if not NUMBERS[expected](value):
+            raise SettingsError(f"{group}.{name}: expected {expected}, found {value}")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import SettingsError, check_numbers
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
@@ -36,7 +36,7 @@ class OdometryNoise:
     def __post_init__(self) -> None:
         if len(self.white) != 3 or not all(0 < sigma < np.inf for sigma in self.white):
             raise SettingsError(f"odometry.white: expected three positive numbers, found {self.white}")
-        _check_range("odometry", self, ("scale", "gyro_bias"), 0.0, np.inf)
+        check_numbers(self, "odometry", ("scale", "gyro_bias"), "a number of at least 0")
 
 
 @dataclass(frozen=True)
@@ -78,12 +78,13 @@ class SensorSettings:
 
     def __post_init__(self) -> None:
         positive = ("rate", "range_max", "bearing_sigma", "range_sigma", "fov")
-        _check_range("sensor", self, positive, np.nextafter(0.0, 1.0), np.inf)
+        check_numbers(self, "sensor", positive, "a positive number")
         at_least_0 = ("range_min", "range_sigma_growth", "detection_falloff", "false_positives")
-        _check_range("sensor", self, at_least_0, 0.0, np.inf)
+        check_numbers(self, "sensor", at_least_0, "a number of at least 0")
         if self.fov > 2 * np.pi or self.range_min >= self.range_max:
             raise SettingsError("sensor: expected fov <= 2 pi rad and range_min < range_max")
-        _check_range("sensor", self, ("detection_probability", "blind_fraction", "wrong_colour"), 0.0, 1.0)
+        shares = ("detection_probability", "blind_fraction", "wrong_colour")
+        check_numbers(self, "sensor", shares, "a number in [0, 1]")
         if len(self.range_bias_at) != len(self.range_bias_values) or not np.all(
             np.diff(self.range_bias_at) > 0
         ):
@@ -177,10 +178,3 @@ def _cartesian(
     xy = cos * sin * (along - across)
     covariances = np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
     return np.column_stack([ranges * cos, ranges * sin]), covariances
-
-
-def _check_range(section: str, settings: object, names: tuple[str, ...], low: float, high: float) -> None:
-    for name in names:
-        value = getattr(settings, name)
-        if not low <= value <= high or np.isinf(value):
-            raise SettingsError(f"{section}.{name}: expected a number in [{low:g}, {high:g}], found {value}")

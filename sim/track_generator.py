@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import SettingsError, check_numbers
 
 from .geometry import along_polyline, arc_lengths, curvature, left_normals, ring, unit
 from .track import Track
@@ -73,9 +73,8 @@ class TrackGeneratorSettings:
             low, high = getattr(self, name)
             if not 0 <= low <= high:
                 raise SettingsError(f"generator.{name}: expected 0 <= least <= greatest, found {low, high}")
-        for name in ("hairpin_inward", "slalom_probability", "chicane_probability"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise SettingsError(f"generator.{name}: expected a probability, found {getattr(self, name)}")
+        probabilities = ("hairpin_inward", "slalom_probability", "chicane_probability")
+        check_numbers(self, "generator", probabilities, "a number in [0, 1]")
         if self.corners[0] < 3:
             raise SettingsError(f"generator.corners: expected at least 3, found {self.corners[0]}")
         if self.hairpin_diameter <= self.width[1]:

@@ -10,7 +10,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import SettingsError, check_numbers
 
 from .centre_line import CentreLine
 from .geometry import arc_lengths, curvature, direction, left_normals
@@ -65,14 +65,9 @@ class VehicleSettings:
             "settle_distance",
             "rate",
         )
-        for name in positive:
-            if not 0 < getattr(self, name) < np.inf:
-                raise SettingsError(
-                    f"vehicle.{name}: expected a positive number, found {getattr(self, name)}"
-                )
-        for name in ("speed_start", "wander", "half_width", "margin", "overrun"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise SettingsError(f"vehicle.{name}: expected a number >= 0, found {getattr(self, name)}")
+        check_numbers(self, "vehicle", positive, "a positive number")
+        at_least_0 = ("speed_start", "wander", "half_width", "margin", "overrun")
+        check_numbers(self, "vehicle", at_least_0, "a number of at least 0")
         shortest, longest = self.wander_wavelengths
         if not 0 < shortest <= longest < np.inf:
             raise SettingsError(f"vehicle.wander_wavelengths: expected 0 < a <= b, found {shortest, longest}")

@@ -35,8 +35,7 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
 from .scenes.jacobians import numeric_jacobian
-from .scenes.paths import ROOT
-from .scenes.source import modules
+from .scenes.paths import ROOT, modules
 from .test_prose import texts
 from .test_rooms import ARROWS, LEAVES
 

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from .scenes.paths import ROOT
-from .scenes.source import PACKAGE, modules, room_of
+from .scenes.paths import PACKAGE, ROOT, modules, room_of
 
 MOST_FILES = 15
 EXTRAS = {"distributed"}

@@ -90,7 +90,7 @@ class BatchMapper:
         odometry_sigma: Array | None = None,
         online: Callable[[MapperSettings, Array], CurveMapper] | None = None,
     ) -> None:
-        """`odometry_sigma` (3,) is the standard deviation of a measured twist (m/s, m/s, rad/s).
+        """Keeps the settings, and the standard deviation (3,) of a measured twist (m/s, m/s, rad/s).
 
         `online` makes the online mapper whose map the optimization begins with. A start from odometry needs
         none.

@@ -115,7 +115,7 @@ class BatchSystem:
         """Returns the problem at a state; foot points are refined from those that the detections have.
 
         `hold` sets the sigma of each detection across its curve, which later evaluations keep. The
-        derivatives ignore that the sigma depends on the direction of the curve.
+        derivatives leave out that the sigma depends on the direction of the curve.
         """
         projected = {label: self._project(state, label, hold) for label in state.boundaries}
         odometry = self.chain.terms(state.poses, state.calibration)

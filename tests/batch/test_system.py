@@ -77,7 +77,7 @@ def test_poses_alone_move_as_beside_a_map_that_is_held() -> None:
     system, state = small_system()
     at = system.evaluate(state)
     problem = system.eliminated(at)
-    held = problem.beside(np.zeros(problem.map.size))
+    held = problem.poses_given(np.zeros(problem.map.size))
     np.testing.assert_allclose(system.poses_alone(at), held, atol=1e-9)
 
 

@@ -11,7 +11,7 @@ from pathspace_graph.ckf.state import CurveState
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.registration import Motion
 
-from ..scenes.curves import RADII, around, bend, circles, detections_of
+from .scenes import RADII, around, bend, circles, detections_of
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from pathspace_graph.mapping.path import DrivenPath, PathAhead
 from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.curves import detections_of, straight_rows
+from .scenes import detections_of, straight_rows
 
 Array = NDArray[np.float64]
 

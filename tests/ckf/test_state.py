@@ -13,7 +13,7 @@ from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 
-from ..scenes.curves import COVARIANCE, around, begin, bend, straight_rows
+from .scenes import COVARIANCE, around, begin, bend, straight_rows
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.belief import to_vehicle_rows
 from pathspace_graph.settings.comparison import CkfSettings
 
-from ..scenes.curves import COVARIANCE, bend, detections_of, straight_rows
+from .scenes import COVARIANCE, bend, detections_of, straight_rows
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -73,6 +73,7 @@ def scene(seed: int, poses: int, points: int) -> tuple[Elimination, Array, Array
     return problem, *dense(groups, variables.layout)
 
 
+@settings(deadline=None)
 @given(*SIZES)
 def test_the_solution_is_that_of_the_dense_system(seed: int, poses: int, points: int) -> None:
     """A change from the values, wherever they were first."""
@@ -104,6 +105,7 @@ def test_poses_beside_a_map_that_is_held() -> None:
     np.testing.assert_allclose(alone.pose_marginals[-1], last, atol=1e-9)
 
 
+@settings(deadline=None)
 @given(*SIZES)
 def test_covariances_are_blocks_of_the_dense_inverse(seed: int, poses: int, points: int) -> None:
     problem, matrix, _ = scene(seed, poses, points)

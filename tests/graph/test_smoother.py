@@ -170,67 +170,12 @@ def factors_of_cycles(mapper: FixedLagMapper) -> dict[int, LinearFactor]:
     return dict(mapper.smoother.window.of_cycle)
 
 
-def test_factors_are_kept_as_long_as_nothing_has_moved_by_the_tolerance() -> None:
-    mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(1e3, 1e3)), 60)
-    mapper.smoother.step(0.5)
-    before, weak = factors_of_cycles(mapper), dict(mapper.smoother.window.gauge)
-    mapper.poses[:] += 0.3
-    mapper.smoother.step(0.5)
-    after = factors_of_cycles(mapper)
-    assert len(before) == len(mapper.poses) == len(after)
-    assert all(after[cycle] is factor for cycle, factor in before.items())
-    assert all(mapper.smoother.window.gauge[owner] is factor for owner, factor in weak.items())
-
-
-def test_all_factors_are_new_in_every_step_while_the_loop_is_open() -> None:
-    mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(1e3, 1e3)), 60)
-    mapper.smoother.window.exact = True
-    mapper.smoother.step(0.5)
-    before = factors_of_cycles(mapper)
-    mapper.smoother.step(0.5)
-    after = factors_of_cycles(mapper)
-    assert not any(after[cycle] is factor for cycle, factor in before.items())
-    assert FixedLagMapper().smoother.window.exact
-
-
 def test_the_tolerance_holds_once_the_loop_has_closed() -> None:
     mapper = FixedLagMapper(odometry_sigma=ODOMETRY_SIGMA)
     for odometry, cycle in split_odometry(lap_log(bean_track(), 45.0)):
         mapper.update(odometry, cycle)
         assert mapper.smoother.window.exact is not mapper.closed
     assert mapper.closed
-
-
-def test_all_factors_are_new_where_everything_has_moved() -> None:
-    mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(1e-12, 1e-12)), 60)
-    mapper.smoother.step(0.5)
-    before, weak = factors_of_cycles(mapper), dict(mapper.smoother.window.gauge)
-    mapper.smoother.variables.values[:] += 1e-9
-    mapper.smoother.factorize(0.5)
-    after = factors_of_cycles(mapper)
-    assert not any(after[cycle] is factor for cycle, factor in before.items())
-    assert not any(mapper.smoother.window.gauge[owner] is factor for owner, factor in weak.items())
-
-
-@pytest.mark.parametrize(("entry", "size"), [(0, 0.02), (1, 0.02), (2, 0.002)])
-def test_a_pose_that_has_moved_makes_the_factors_that_hold_it_anew(entry: int, size: float) -> None:
-    """Its own cycle's, and that of the cycle before, whose odometry leads to it."""
-    mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(0.01, 0.001)), 60)
-    smoother = mapper.smoother
-    smoother.step(0.5)
-    smoother.variables.values[:] = smoother.variables.linearized
-    before, slot = factors_of_cycles(mapper), 7
-    mapper.poses[slot, entry] += 0.4 * size
-    smoother.factorize(0.5)
-    assert all(smoother.window.of_cycle[cycle] is factor for cycle, factor in before.items())
-    mapper.poses[slot, entry] += size
-    smoother.factorize(0.5)
-    new = [
-        cycle - smoother.first_cycle
-        for cycle, f in before.items()
-        if smoother.window.of_cycle[cycle] is not f
-    ]
-    assert new == [slot - 1, slot]
 
 
 @pytest.mark.parametrize("into_use", [False, True])

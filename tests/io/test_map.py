@@ -12,9 +12,17 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline as ScipyBSpline
 
-from pathspace_graph.errors import InputError, OutputError
-from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, map_from_json, map_to_json, read_map
-from pathspace_graph.io.results import CycleRecord, RunResult, write_result
+from pathspace_graph.errors import InputError
+from pathspace_graph.io.json_file import write_json
+from pathspace_graph.io.map import (
+    MAP_FILE,
+    Map,
+    PointBoundary,
+    SplineBoundary,
+    map_from_json,
+    map_to_json,
+    read_map,
+)
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 
@@ -43,22 +51,6 @@ def spline_map() -> Map:
     )
 
 
-def result() -> RunResult:
-    rng = np.random.default_rng(4)
-    return RunResult(
-        estimator="fixed-lag",
-        settings={},
-        laps=1,
-        map=spline_map(),
-        trajectory_t=np.array([0.1, 0.2, 1 / 3]),
-        trajectory=np.column_stack([rng.normal(0.0, 10.0, (3, 2)), [0.0, np.pi, -3.0]]),
-        cycles=(
-            CycleRecord(0, 0.1, 1e-3, 0, 4, 7, 1),
-            CycleRecord(1, 0.2, np.float64(2e-3), 9, 7, 12, 2),
-        ),
-    )
-
-
 def test_scipy_evaluates_the_written_map_the_same() -> None:
     track = spline_map()
     written = json.loads(json.dumps(map_to_json(track)))
@@ -84,11 +76,11 @@ def test_a_periodic_boundary_repeats_its_first_control_points_and_counts_them_on
 
 
 def test_what_is_written_is_read_back_exactly(tmp_path: Path) -> None:
-    original = result()
-    write_result(tmp_path / "map", original, {})
-    track = read_map(tmp_path / "map")
+    original = spline_map()
+    write_json(tmp_path / MAP_FILE, map_to_json(original))
+    track = read_map(tmp_path)
     assert track.closed and track.size == 16 and sorted(track.boundaries) == [LEFT, RIGHT]
-    for label, boundary in original.map.boundaries.items():
+    for label, boundary in original.boundaries.items():
         read = track.boundaries[label]
         assert isinstance(read, SplineBoundary) and isinstance(boundary, SplineBoundary)
         np.testing.assert_array_equal(read.spline.knots, boundary.spline.knots)
@@ -113,55 +105,6 @@ def test_a_map_of_points_and_an_empty_one_make_the_round_trip() -> None:
 
 def _no_points() -> PointBoundary:
     return PointBoundary(np.zeros((0, 2)), np.zeros((0, 0)))
-
-
-def test_the_folder_holds_the_four_files_of_the_contract(tmp_path: Path) -> None:
-    original = result()
-    summary = {
-        "estimator": "fixed-lag",
-        "ate": np.float64(np.nan),
-        "laps": [{"lap": np.int64(1), "rmse": 0.5}],
-    }
-    write_result(tmp_path / "map", original, summary)
-    assert {file.name for file in (tmp_path / "map").iterdir()} == {
-        "map.json",
-        "trajectory.tum",
-        "cycles.csv",
-        "summary.json",
-    }
-    rows = (tmp_path / "map" / "cycles.csv").read_text().splitlines()
-    assert rows[:2] == ["cycle,t,seconds,size_left,size_right,readings,lap", "0,0.1,0.001,0,4,7,1"]
-    assert rows[2] == "1,0.2,0.002,9,7,12,2"
-    read = json.loads((tmp_path / "map" / "summary.json").read_text())
-    assert read == {"estimator": "fixed-lag", "ate": None, "laps": [{"lap": 1, "rmse": 0.5}]}
-
-
-def test_the_trajectory_keeps_every_digit_and_its_heading(tmp_path: Path) -> None:
-    original = result()
-    write_result(tmp_path / "map", original, {})
-    rows = np.loadtxt(tmp_path / "map" / "trajectory.tum")
-    np.testing.assert_array_equal(rows[:, 0], original.trajectory_t)
-    np.testing.assert_array_equal(rows[:, 1:3], original.trajectory[:, :2])
-    np.testing.assert_array_equal(rows[:, 3:6], 0.0)
-    np.testing.assert_allclose(2 * np.arctan2(rows[:, 6], rows[:, 7]), original.trajectory[:, 2], atol=1e-15)
-
-
-def test_a_second_result_keeps_the_first_and_a_foreign_folder_is_left_alone(tmp_path: Path) -> None:
-    write_result(tmp_path / "map", result(), {"run": 1})
-    write_result(tmp_path / "map", result(), {"run": 2})
-    assert json.loads((tmp_path / "map.~1~" / "summary.json").read_text()) == {"run": 1}
-    foreign = tmp_path / "thesis"
-    foreign.mkdir()
-    (foreign / "chapter.tex").write_text("years of work")
-    with pytest.raises(OutputError):
-        write_result(foreign, result(), {})
-    assert [file.name for file in foreign.iterdir()] == ["chapter.tex"]
-
-
-def test_nothing_is_left_of_a_result_that_can_not_be_written(tmp_path: Path) -> None:
-    with pytest.raises(TypeError):
-        write_result(tmp_path / "map", result(), {"bad": object()})
-    assert list(tmp_path.iterdir()) == []
 
 
 Change = Callable[[Any], None]

@@ -67,8 +67,8 @@ def test_a_reading_that_slides_to_where_an_open_map_is_inactive_brings_all_of_it
     detections = smoother.map.detections
     assert not state.whole and len(smoother.inactive) > 0
     rows, size = int(detections.used.sum()), smoother.layout.size
-    reading = np.flatnonzero(detections.used)[-1]
-    detections.u[reading], detections.changed[reading] = 1.0, True
+    newest = np.flatnonzero(detections.used)[-1:]
+    detections.take(newest, detections.boundary[newest], np.ones(1))
     smoother.step(found.settings.sigma_step)
     assert state.whole and len(smoother.inactive) == 0
     assert smoother.layout.size > size

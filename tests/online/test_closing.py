@@ -16,7 +16,7 @@ from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
-from pathspace_graph.mapping.registration import Matches, Registration, is_certain, near_start, register
+from pathspace_graph.mapping.registration import Registration, near_start, register
 from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
 from pathspace_graph.online.closing import substitute
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -299,18 +299,6 @@ def test_another_way_past_the_beginning_is_no_loop() -> None:
     assert not mapper.closed
 
 
-@pytest.mark.parametrize(
-    ("again", "sigma", "certain"),
-    [(10.0, 0.2, True), (10.0, 0.5, False), (50.0, 0.5, True), (50.0, 5.0, False)],
-)
-def test_a_straight_driven_again_tells_no_place_along_it(again: float, sigma: float, certain: bool) -> None:
-    """However long it is: only as far as the place is known to about half a metre."""
-    rows, near = np.arange(30), np.ones(30, bool)
-    matches = Matches(rows, rows % 2, np.full(30, again), near, np.eye(3), np.zeros(3))
-    posterior = np.diag([sigma**2, 0.01, 1e-4])
-    assert is_certain(matches, posterior, ClosingSettings()) is certain
-
-
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_lost_place_is_found_by_position_and_heading(
     run: tuple[FixedLagMapper, list[CycleResult]], turned: bool
@@ -341,12 +329,3 @@ def test_a_window_that_has_drifted_far_is_registered_back(before: FixedLagMapper
     assert registration is not None
     moved = registration.motion.apply(mapper.poses[:, :2])
     np.testing.assert_allclose(moved, poses_before[:, :2], atol=0.4)
-
-
-def test_where_there_are_several_places_to_choose_from_patience_is_no_excuse() -> None:
-    rows, near = np.arange(30), np.ones(30, bool)
-    matches = Matches(rows, rows % 2, np.full(30, 50.0), near, np.eye(3), np.zeros(3))
-    posterior = np.diag([0.25, 0.01, 1e-4])
-    assert is_certain(matches, posterior, ClosingSettings(), lost=False)
-    assert not is_certain(matches, posterior, ClosingSettings(), lost=True)
-    assert is_certain(matches, np.diag([0.04, 0.01, 1e-4]), ClosingSettings(), lost=True)

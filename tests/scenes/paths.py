@@ -1,10 +1,30 @@
-"""Where the project is, and the real tracks beside it, which not every machine has."""
+"""The project's folder, the modules of the package, and the real tracks, which not every machine has."""
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-"""The project's folder."""
+"""The project lies in this folder."""
 TRACKS = ROOT.parent / "shared" / "tracks"
-"""Track files of other projects, in a folder for each kind."""
+"""Track files of other projects lie here, in a folder for each kind."""
+PACKAGE = "pathspace_graph"
+BESIDE = ("factors", "sim", "eval")
+"""These folders at the root are parts of the package."""
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Returns every module of the package by its name without the package's own."""
+    files = {}
+    for home in (ROOT / PACKAGE, *(ROOT / folder for folder in BESIDE)):
+        for file in sorted(home.rglob("*.py")):
+            parts = file.relative_to(ROOT / PACKAGE if home.name == PACKAGE else ROOT).with_suffix("").parts
+            files[".".join(parts)] = file
+    return files
+
+
+def room_of(module: str) -> str:
+    """Returns the folder that a module lies in, or the module itself where it lies at the top."""
+    return module.rpartition(".")[0] or module

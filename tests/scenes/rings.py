@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 
 RADII = {LEFT: 8.0, RIGHT: 12.0}
 CENTRE = np.array([0.0, 10.0])
+SHIFT = 0.2
+"""The boundary of `shifted_ring` has this standard deviation in x and in y (m)."""
 
 
 class Rings:
@@ -93,3 +95,11 @@ def write_logs(folder: Path) -> Path:
     for seed, name in enumerate("ab"):
         write_log(simulate(track, SimulationSettings(laps=2), seed), folder / "logs" / name)
     return folder / "logs"
+
+
+def shifted_ring(radius: float) -> SplineBoundary:
+    """A ring around (0, 20) m, travelled anticlockwise, whose control points all move as one."""
+    angle = 2 * np.pi * np.arange(16) / 16
+    points = radius * np.stack([np.sin(angle), -np.cos(angle)], axis=1) + [0.0, 20.0]
+    together = np.tile(np.eye(2), (16, 1))
+    return SplineBoundary(BSpline.periodic_from(np.arange(17.0), points), SHIFT**2 * together @ together.T)

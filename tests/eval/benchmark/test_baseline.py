@@ -22,7 +22,7 @@ from pathspace_graph.eval.benchmark.baseline import (
 from pathspace_graph.eval.benchmark.measurement import metrics
 from pathspace_graph.eval.benchmark.metric import Metric
 
-from ...scenes.benchmark import steady_run
+from ...scenes.timing import steady_run
 
 
 def ratio(value: float, key: str = "a", direction: Literal["lower", "higher"] = "lower") -> Metric:

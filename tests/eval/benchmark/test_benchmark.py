@@ -11,7 +11,7 @@ import pytest
 from pathspace_graph.eval.benchmark import benchmark
 from pathspace_graph.eval.benchmark.measurement import metrics
 
-from ...scenes.benchmark import steady_run
+from ...scenes.timing import steady_run
 
 
 @pytest.mark.parametrize(("times", "code"), [(1.0, None), (2.0, 1)])

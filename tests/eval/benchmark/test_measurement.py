@@ -8,8 +8,8 @@ import pytest
 from pathspace_graph.eval.benchmark.measurement import Gtsam, Measurement, measure, metrics
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ...scenes.benchmark import record
 from ...scenes.drives import ahead, corridor, exact_log
+from ...scenes.timing import record
 
 
 def test_a_short_run_gives_every_figure() -> None:

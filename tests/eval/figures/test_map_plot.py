@@ -12,7 +12,7 @@ from pathspace_graph.io.log import Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import LEFT, RIGHT
 
-from ...scenes.shifted_ring import shifted_ring
+from ...scenes.rings import shifted_ring
 
 
 def ring_map() -> Map:

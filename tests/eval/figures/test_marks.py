@@ -19,7 +19,7 @@ from pathspace_graph.eval.figures.marks import (
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.spline.bspline import BSpline
 
-from ...scenes.shifted_ring import SIGMA, shifted_ring
+from ...scenes.rings import SHIFT, shifted_ring
 
 
 @pytest.mark.parametrize("scale", [1.0, 5.0])
@@ -28,7 +28,7 @@ def test_the_band_is_two_sigma_to_either_side_along_the_normal(scale: float) -> 
     u = curve_parameters(ring.spline, 7)
     left, right = uncertainty_band(ring, u, scale)
     centre = ring.spline.evaluate(u)
-    np.testing.assert_allclose(np.linalg.norm(left - centre, axis=1), 2 * SIGMA * scale, rtol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(left - centre, axis=1), 2 * SHIFT * scale, rtol=1e-9)
     np.testing.assert_allclose(left + right, 2 * centre, atol=1e-12)
     # left of the direction of travel is inside of an anticlockwise ring
     middle = np.array([0.0, 20.0])
@@ -55,10 +55,10 @@ def test_the_band_of_a_closed_curve_is_a_ring_and_reaches_as_far() -> None:
     ring = shifted_ring(22.0)
     band, curve = drawn_band(ring), ring.spline.evaluate(curve_parameters(ring.spline))
     extents = band.get_path().get_extents()
-    assert extents.x1 == pytest.approx(curve[:, 0].max() + 2 * SIGMA, abs=1e-3)
-    assert extents.y0 == pytest.approx(curve[:, 1].min() - 2 * SIGMA, abs=1e-3)
+    assert extents.x1 == pytest.approx(curve[:, 0].max() + 2 * SHIFT, abs=1e-3)
+    assert extents.y0 == pytest.approx(curve[:, 1].min() - 2 * SHIFT, abs=1e-3)
     # the inner edge runs the other way, so the areas subtract
-    assert abs(area(band)) == pytest.approx(4 * SIGMA * ring.spline.length(), rel=1e-3)
+    assert abs(area(band)) == pytest.approx(4 * SHIFT * ring.spline.length(), rel=1e-3)
 
 
 def test_the_band_of_an_open_curve_is_one_polygon() -> None:

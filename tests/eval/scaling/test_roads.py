@@ -19,7 +19,7 @@ from pathspace_graph.eval.scaling.roads import (
 from pathspace_graph.eval.scaling.settings import RoadSettings
 from pathspace_graph.io.log import Log
 
-from ...scenes.scaling import SMALL
+from ...scenes.timing import SMALL
 
 ROAD = RoadSettings()
 

@@ -16,7 +16,7 @@ from pathspace_graph.eval.scaling.roads import make_drives
 from pathspace_graph.eval.scaling.scaling import measure_scaling
 from pathspace_graph.eval.scaling.settings import ScalingSettings
 
-from ...scenes.scaling import SMALL
+from ...scenes.timing import SMALL
 
 
 def test_a_small_measurement_end_to_end(tmp_path: Path) -> None:

@@ -1,9 +1,23 @@
-"""A run of the benchmark whose figures are known."""
+"""A run of the benchmark whose times are known, and a small measurement of scaling."""
 
 from __future__ import annotations
 
 from pathspace_graph.eval.benchmark.measurement import Gtsam, Measurement
+from pathspace_graph.eval.scaling.settings import ScalingSettings
 from pathspace_graph.io.results import CycleRecord
+
+SMALL = ScalingSettings(
+    cones_min=20.0,
+    cones_max=60.0,
+    bins=4,
+    fit_from=20.0,
+    readings=(2, 6, 12),
+    readings_cones=60,
+    warm_up=5,
+    laps=2,
+    laps_cones=40,
+    budget=10.0,
+)
 
 
 def record(cycle: int, seconds: float, lap: int) -> CycleRecord:

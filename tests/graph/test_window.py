@@ -1,0 +1,260 @@
+"""The window's factors: which of them a relinearization replaces, and what it leaves as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.odometry import integrate_twists
+from pathspace_graph.graph.gaussian import graph_of, keys_of, normal_equations
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
+from pathspace_graph.graph.rows import LinearFactor
+from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.window import WindowFactors
+
+from ..scenes.graph import dense_rows
+from ..scenes.linear_drive import LinearTrack
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+CYCLES = np.arange(4)
+TOLERANCE_POINT, TOLERANCE_HEADING = 0.1, 0.01
+ACTIVE: frozenset[int] = frozenset()
+"""No variable is inactive."""
+
+
+class Track(LinearTrack):
+    """A linear track whose detections in use can change."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self.changed_cycles: list[int] = []
+
+    def changed(self) -> IntArray:
+        return np.array(self.changed_cycles, np.intp)
+
+    def linearized(self, cycles: IntArray) -> None:
+        self.changed_cycles = []
+
+
+def make_window(seed: int = 0) -> WindowFactors[Track]:
+    """Returns a window of four poses and six map points, all of whose factors are linearized."""
+    rng = np.random.default_rng(seed)
+    track = Track(seed)
+    track.variables.insert(np.array([CALIBRATION_KEY]), rng.normal(size=2))
+    track.variables.insert(control_keys(0, np.arange(6)), rng.normal(size=12))
+    track.variables.insert(pose_keys(CYCLES), rng.normal(size=POSE * len(CYCLES)))
+    window = WindowFactors(track, (TOLERANCE_POINT, TOLERANCE_HEADING))
+    for _ in CYCLES[1:]:
+        twists = rng.normal(size=(3, POSE))
+        window.odometry.append(integrate_twists(np.full(3, 0.1), twists, np.array([0.2, 0.1, 0.05])))
+    assert window.relinearize(CYCLES, ACTIVE)
+    return window
+
+
+def new_cycles(window: WindowFactors[Track], before: dict[int, LinearFactor]) -> list[int]:
+    """Returns the cycles whose factor is another object than before."""
+    return [cycle for cycle, factor in window.of_cycle.items() if before.get(cycle) is not factor]
+
+
+def move(window: WindowFactors[Track], key: int, entry: int, size: float) -> None:
+    variables = window.variables
+    variables.values[variables.layout.columns(np.array([key]))[0] + entry] += size
+
+
+def holding(factors: dict[int, LinearFactor], key: int) -> list[int]:
+    return [owner for owner, factor in factors.items() if key in factor.keys]
+
+
+def assert_linearized_at_the_values(window: WindowFactors[Track]) -> None:
+    """The window's normal equations are those of dense rows at the current values."""
+    variables, track = window.variables, window.map
+    groups = [
+        *track.rows(CYCLES),
+        *window.odometry.rows(variables, CYCLES),
+        *track.gauge(False),
+        *track.linear_gauge(False),
+    ]
+    J, r, _ = dense_rows(groups, variables.keys)
+    hessian, vector = normal_equations(graph_of(*window.linear), variables.layout)
+    np.testing.assert_allclose(hessian, J.T @ J, atol=1e-9 * np.abs(hessian).max())
+    now = variables.values - variables.reference
+    np.testing.assert_allclose(vector - hessian @ now, -J.T @ r, atol=1e-8 * np.abs(vector).max())
+
+
+def test_the_first_linearization_makes_every_factor() -> None:
+    window = make_window()
+    assert sorted(window.of_cycle) == CYCLES.tolist()
+    assert_linearized_at_the_values(window)
+
+
+def test_a_factor_is_kept_while_nothing_moves_by_more_than_the_tolerance() -> None:
+    window = make_window()
+    before, weak = dict(window.of_cycle), dict(window.gauge)
+    for key, entry, size in (
+        (pose_key(1), 0, 0.9 * TOLERANCE_POINT),
+        (pose_key(2), POSE - 1, -0.9 * TOLERANCE_HEADING),
+        (int(control_keys(0, np.array(2))), 1, 0.9 * TOLERANCE_POINT),
+    ):
+        move(window, key, entry, size)
+    assert window.relinearize(CYCLES, ACTIVE)
+    assert new_cycles(window, before) == []
+    assert all(window.gauge[owner] is factor for owner, factor in weak.items())
+
+
+@pytest.mark.parametrize(
+    ("entry", "size"),
+    [(0, 1.1 * TOLERANCE_POINT), (1, -1.1 * TOLERANCE_POINT), (POSE - 1, 1.1 * TOLERANCE_HEADING)],
+)
+def test_a_moved_pose_makes_its_own_cycle_stale_and_the_one_whose_odometry_leads_to_it(
+    entry: int, size: float
+) -> None:
+    window = make_window()
+    before = dict(window.of_cycle)
+    move(window, pose_key(2), entry, size)
+    assert window.relinearize(CYCLES, ACTIVE)
+    assert new_cycles(window, before) == [1, 2]
+
+
+def test_a_moved_point_makes_the_cycles_and_the_weak_priors_stale_that_hold_it() -> None:
+    window, key = make_window(), int(control_keys(0, np.array(2)))
+    before, weak = dict(window.of_cycle), dict(window.gauge)
+    move(window, key, 0, 1.1 * TOLERANCE_POINT)
+    assert window.relinearize(CYCLES, ACTIVE)
+    assert 0 < len(new_cycles(window, before)) < len(CYCLES)
+    assert new_cycles(window, before) == holding(before, key)
+    replaced = [owner for owner, factor in weak.items() if window.gauge[owner] is not factor]
+    assert 0 < len(replaced) < len(weak)
+    assert sorted(replaced) == sorted(holding(weak, key))
+
+
+def test_small_motions_add_up_until_the_tolerance_is_passed() -> None:
+    """The distance counts from the last linearization, and not from the last call."""
+    window = make_window()
+    before = dict(window.of_cycle)
+    for expected in ([], [], [0]):
+        move(window, pose_key(0), 0, 0.4 * TOLERANCE_POINT)
+        assert window.relinearize(CYCLES, ACTIVE)
+        assert new_cycles(window, before) == expected
+
+
+def test_the_calibration_never_makes_a_factor_stale() -> None:
+    """Every row is linear in it."""
+    window = make_window()
+    before = dict(window.of_cycle)
+    move(window, CALIBRATION_KEY, 0, 100.0)
+    window.exact = True
+    assert window.relinearize(CYCLES, ACTIVE)
+    assert new_cycles(window, before) == []
+    assert_linearized_at_the_values(window)
+
+
+def test_an_exact_window_relinearizes_after_any_motion() -> None:
+    window = make_window()
+    before = dict(window.of_cycle)
+    move(window, pose_key(3), 0, 1e-12)
+    window.exact = True
+    assert window.relinearize(CYCLES, ACTIVE)
+    assert new_cycles(window, before) == [2, 3]
+    window.variables.values += 1.0
+    assert window.relinearize(CYCLES, ACTIVE)
+    assert_linearized_at_the_values(window)
+
+
+def test_other_detections_make_their_own_cycle_stale() -> None:
+    window = make_window()
+    before = dict(window.of_cycle)
+    window.map.changed_cycles = [1]
+    assert window.relinearize(CYCLES, ACTIVE)
+    assert new_cycles(window, before) == [1]
+    assert window.map.changed_cycles == []
+
+
+def test_only_moved_variables_get_another_linearization_point() -> None:
+    window = make_window()
+    variables = window.variables
+    point = variables.linearized.copy()
+    move(window, pose_key(1), 0, 2.0 * TOLERANCE_POINT)
+    move(window, pose_key(3), 0, 0.5 * TOLERANCE_POINT)
+    assert window.relinearize(CYCLES, ACTIVE)
+    moved = variables.layout.entries(pose_keys(np.array([1])))
+    point[moved] = variables.values[moved]
+    np.testing.assert_array_equal(variables.linearized, point)
+
+
+def test_weak_priors_between_other_points_are_all_made_again() -> None:
+    window = make_window()
+    before, weak = dict(window.of_cycle), dict(window.gauge)
+    window.map.inactive, window.map.structure = control_keys(0, np.array([0])), object()
+    assert window.relinearize(CYCLES, ACTIVE)
+    assert new_cycles(window, before) == []
+    assert all(window.gauge[owner] is not factor for owner, factor in weak.items() if owner in window.gauge)
+    held = keys_of(graph_of(*(factor.linear for factor in window.gauge.values())))
+    np.testing.assert_array_equal(held, control_keys(0, np.arange(1, 6)))
+
+
+def on_an_inactive_point(window: WindowFactors[Track]) -> frozenset[int]:
+    """A stale cycle sees a point that is inactive."""
+    move(window, pose_key(1), 0, 1.0)
+    return frozenset(control_keys(0, np.arange(6)).tolist())
+
+
+def beyond_the_active_map(window: WindowFactors[Track]) -> frozenset[int]:
+    """The map says that a row should be on a point that is inactive."""
+    move(window, pose_key(1), 0, 1.0)
+    window.map.slid = True
+    return ACTIVE
+
+
+@pytest.mark.parametrize("reach", [on_an_inactive_point, beyond_the_active_map])
+def test_nothing_changes_where_a_row_needs_an_inactive_variable(
+    reach: Callable[[WindowFactors[Track]], frozenset[int]],
+) -> None:
+    window = make_window()
+    before, point = dict(window.of_cycle), window.variables.linearized.copy()
+    inactive = reach(window)
+    assert not window.relinearize(CYCLES, inactive)
+    assert new_cycles(window, before) == []
+    np.testing.assert_array_equal(window.variables.linearized, point)
+
+
+def test_fresh_factors_are_at_the_values_and_leave_the_kept_ones_alone() -> None:
+    window = make_window()
+    before = dict(window.of_cycle)
+    window.variables.values += 0.5 * TOLERANCE_HEADING
+    fresh = normal_equations(graph_of(*window.fresh(CYCLES, whole=False)), window.variables.layout)
+    assert new_cycles(window, before) == []
+    window.exact = True
+    assert window.relinearize(CYCLES, ACTIVE)
+    kept = normal_equations(graph_of(*window.linear), window.variables.layout)
+    for found, expected in zip(fresh, kept, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_weak_priors_on_some_points_are_the_rows_that_hold_one_of_them() -> None:
+    """Points 1 and 2 have a prior each, and are neighbours of each other, of 0 and of 3."""
+    window, keys = make_window(), control_keys(0, np.array([1, 2]))
+    (factor,) = window.weak_on(keys)
+    layout = Layout(control_keys(0, np.arange(4)))
+    differences = np.diff(np.eye(4), axis=0)
+    spacing = differences.T @ differences
+    expected = np.kron(spacing / 9.0 + np.diag([0.0, 1.0, 1.0, 0.0]) / 81.0, np.eye(2))
+    np.testing.assert_allclose(normal_equations(graph_of(factor), layout)[0], expected, atol=1e-12)
+
+
+def test_dropped_factors_are_made_again() -> None:
+    window = make_window()
+    before = dict(window.of_cycle)
+    window.drop(frozenset([pose_key(0)]))
+    assert sorted(window.of_cycle) == [1, 2, 3]
+    assert window.relinearize(CYCLES, ACTIVE)
+    assert new_cycles(window, before) == [0]
+    window.clear()
+    assert window.of_cycle == {}
+    assert window.relinearize(CYCLES, ACTIVE)
+    assert sorted(window.of_cycle) == CYCLES.tolist()
+    assert_linearized_at_the_values(window)

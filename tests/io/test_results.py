@@ -1,0 +1,69 @@
+"""The folder of a result: the four files of the contract, all of them or none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pathspace_graph.errors import OutputError
+from pathspace_graph.io.map import Map, PointBoundary
+from pathspace_graph.io.results import CycleRecord, RunResult, write_result
+from pathspace_graph.labels import LEFT
+
+
+def result() -> RunResult:
+    rng = np.random.default_rng(4)
+    return RunResult(
+        estimator="fixed-lag",
+        settings={},
+        laps=1,
+        map=Map(False, {LEFT: PointBoundary(np.ones((1, 2)), np.eye(2))}),
+        trajectory_t=np.array([0.1, 0.2, 1 / 3]),
+        trajectory=np.column_stack([rng.normal(0.0, 10.0, (3, 2)), [0.0, np.pi, -3.0]]),
+        cycles=(
+            CycleRecord(0, 0.1, 1e-3, 0, 4, 7, 1),
+            CycleRecord(1, 0.2, np.float64(2e-3), 9, 7, 12, 2),
+        ),
+    )
+
+
+def test_the_folder_holds_the_four_files_of_the_contract(tmp_path: Path) -> None:
+    original = result()
+    summary = {
+        "estimator": "fixed-lag",
+        "ate": np.float64(np.nan),
+        "laps": [{"lap": np.int64(1), "rmse": 0.5}],
+    }
+    write_result(tmp_path / "map", original, summary)
+    assert {file.name for file in (tmp_path / "map").iterdir()} == {
+        "map.json",
+        "trajectory.tum",
+        "cycles.csv",
+        "summary.json",
+    }
+    rows = (tmp_path / "map" / "cycles.csv").read_text().splitlines()
+    assert rows[:2] == ["cycle,t,seconds,size_left,size_right,readings,lap", "0,0.1,0.001,0,4,7,1"]
+    assert rows[2] == "1,0.2,0.002,9,7,12,2"
+    read = json.loads((tmp_path / "map" / "summary.json").read_text())
+    assert read == {"estimator": "fixed-lag", "ate": None, "laps": [{"lap": 1, "rmse": 0.5}]}
+
+
+def test_a_second_result_keeps_the_first_and_a_foreign_folder_is_left_alone(tmp_path: Path) -> None:
+    write_result(tmp_path / "map", result(), {"run": 1})
+    write_result(tmp_path / "map", result(), {"run": 2})
+    assert json.loads((tmp_path / "map.~1~" / "summary.json").read_text()) == {"run": 1}
+    foreign = tmp_path / "thesis"
+    foreign.mkdir()
+    (foreign / "chapter.tex").write_text("years of work")
+    with pytest.raises(OutputError):
+        write_result(foreign, result(), {})
+    assert [file.name for file in foreign.iterdir()] == ["chapter.tex"]
+
+
+def test_nothing_is_left_of_a_result_that_can_not_be_written(tmp_path: Path) -> None:
+    with pytest.raises(TypeError):
+        write_result(tmp_path / "map", result(), {"bad": object()})
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,68 @@
+"""The chain of candidates: which of them may follow one another, by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pathspace_graph.mapping.candidates import Candidates, End, chain
+from pathspace_graph.settings.mapper import GrowthSettings
+
+SETTINGS = GrowthSettings(lateral_change=1.5, lateral_rate=0.2, beside=2.0, lateral_gap=0.8)
+
+
+def candidates(*places: tuple[float, float]) -> Candidates:
+    """Returns candidates at (station, side), each at the point (station, side)."""
+    points = np.array(places).reshape(-1, 2)
+    return Candidates(points, np.arange(len(points)), points[:, 0], points[:, 1])
+
+
+def end(station: float, side: float) -> End:
+    return End(np.array([station, side]), station, side)
+
+
+def test_a_row_at_one_distance_is_a_chain() -> None:
+    assert chain(candidates((0.0, 2.0), (4.0, 2.0), (8.0, 2.0)), SETTINGS, None).tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("side", "follows"), [(1.0, True), (4.29, True), (4.31, False)])
+def test_the_next_may_be_farther_from_the_path_by_a_step_and_a_rate(side: float, follows: bool) -> None:
+    """4 m on: 2 + 1.5 + 0.2 * 4 = 4.3 m; to the other side it may come as near as it likes."""
+    for found, begin in (
+        (candidates((0.0, 2.0), (4.0, side)), None),
+        (candidates((4.0, side)), end(0.0, 2.0)),
+    ):
+        assert (len(found.points) - 1 in chain(found, SETTINGS, begin)) == follows
+
+
+def test_one_that_is_left_out_does_not_lead_on_to_the_next() -> None:
+    """The far row stands 6 m from the path: each of its cones is measured from the last near one."""
+    found = candidates((0.0, 2.0), (4.0, 6.0), (8.0, 6.0), (12.0, 2.0))
+    assert chain(found, SETTINGS, None).tolist() == [0, 3]
+
+
+@pytest.mark.parametrize(("gap", "chosen"), [(0.7, [0, 1]), (0.9, [0])])
+def test_of_those_beside_each_other_the_nearest_to_the_path_stay(gap: float, chosen: list[int]) -> None:
+    assert chain(candidates((0.0, 2.0), (1.9, 2.0 + gap)), SETTINGS, None).tolist() == chosen
+    apart = candidates((0.0, 2.0), (2.1, 2.0 + gap))
+    assert chain(apart, SETTINGS, None).tolist() == [0, 1]
+
+
+def test_no_candidates_are_an_empty_chain() -> None:
+    assert chain(candidates(), SETTINGS, end(0.0, 2.0)).tolist() == []
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 30.0), st.floats(0.0, 9.0)), max_size=12), st.floats(0.0, 5.0))
+def test_every_link_of_a_chain_keeps_the_rule(places: list[tuple[float, float]], side: float) -> None:
+    found = candidates(*sorted(places))
+    chosen = found.where(chain(found, SETTINGS, end(-1.0, side)))
+    sides, stations = np.append(side, chosen.sides), np.append(-1.0, chosen.stations)
+    assert (np.diff(sides) <= 1.5 + 0.2 * np.diff(stations) + 1e-9).all()
+
+
+def test_chosen_candidates_keep_their_places_together() -> None:
+    found = candidates((0.0, 2.0), (4.0, 3.0), (8.0, 1.0)).where(np.array([2, 0]))
+    assert found.indices.tolist() == [2, 0]
+    np.testing.assert_array_equal(found.points, np.column_stack([found.stations, found.sides]))

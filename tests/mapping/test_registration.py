@@ -1,0 +1,242 @@
+"""Registration: a drifted window beside hand-made curves is found back, or rightly refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_keys
+from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.path import DrivenPath
+from pathspace_graph.mapping.registration import (
+    Matches,
+    Motion,
+    Registration,
+    agrees,
+    is_certain,
+    near_start,
+    register,
+)
+from pathspace_graph.mapping.state import State
+from pathspace_graph.settings.mapper import ClosingSettings, MapperSettings, PathSettings
+
+from ..scenes.curves import boundary_through
+from ..scenes.drives import detections
+
+Array = NDArray[np.float64]
+
+RADIUS, HALF_WIDTH = 20.0, 2.0
+SIDES = {LEFT: -HALF_WIDTH, RIGHT: HALF_WIDTH}
+"""Counterclockwise, the left boundary is the inner one."""
+POSES = 20
+DENT = 0.35
+PRIOR = np.diag([0.5, 0.5, 0.05]) ** 2
+
+
+def motion(x: float, y: float, theta: float, centre: Array | None = None) -> Motion:
+    return Motion(np.zeros(2) if centre is None else centre, np.array([x, y, theta]))
+
+
+@dataclass
+class Window:
+    """Holds curves of one lap and a quarter, and poses at the beginning again, a metre apart."""
+
+    track: CurveMap
+    times: list[float]
+    truth: Array
+    """(P, 3) These are the poses before they drifted."""
+    dent: float
+
+    @property
+    def poses(self) -> Array:
+        return self.track.state.poses
+
+    def drift(self, by: Motion) -> None:
+        """Moves all poses rigidly, as an error of the odometry does."""
+        self.poses[:, :2] = by.apply(self.poses[:, :2])
+        self.poses[:, 2] += by.vector[2]
+
+    def register(self, covariance: Array = PRIOR, **settings: float) -> Registration | None:
+        closing = ClosingSettings(**settings)  # type: ignore[arg-type]
+        beginning = self.truth[:1] if np.trace(covariance[:2, :2]) < 9.0 else drive(0.0, 1.4, 40, self.dent)
+        return register(self.track, self.times, covariance, beginning, closing)
+
+
+def rim(side: float, dent: float, phi: Array) -> Array:
+    """Returns points (k, 2) of an oval `(RADIUS + side) (1 + dent cos 2 phi)` at angles (k,)."""
+    r = (RADIUS + side) * (1.0 + dent * np.cos(2.0 * phi))
+    return np.column_stack([r * np.cos(phi), r * np.sin(phi)])
+
+
+def drive(begin: float, end: float, count: int, dent: float) -> Array:
+    """Returns poses (count, 3) on the middle line, along it."""
+    phi = np.linspace(begin, end, count)
+    xy = rim(0.0, dent, phi)
+    ahead = rim(0.0, dent, phi + 1e-5) - xy
+    return np.column_stack([xy, np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))])
+
+
+def window(dent: float = DENT) -> Window:
+    """Returns a window whose detections lie exactly on the curves; a seventh has no colour."""
+    state = State()
+    poses = drive(0.1, 1.2, POSES, dent)
+    state.variables.insert(np.array([CALIBRATION_KEY]), np.zeros(2))
+    state.variables.insert(pose_keys(np.arange(POSES)), poses.ravel())
+    for label, side in SIDES.items():
+        state.add_boundary(label, *boundary_through(rim(side, dent, np.linspace(0.0, 2.5 * np.pi, 150))))
+    track = CurveMap(MapperSettings(), state)
+    for k, (x, y, theta) in enumerate(poses):
+        c, s = np.cos(theta), np.sin(theta)
+        ahead = np.arctan2(y, x) + np.array([0.1, 0.4, 0.7, 0.7])
+        seen = np.concatenate(
+            [rim(side, dent, ahead[:3]) for side in SIDES.values()] + [rim(HALF_WIDTH, dent, ahead[3:])]
+        )
+        labels = np.array([LEFT] * 3 + [RIGHT] * 3 + [UNKNOWN], np.intp)
+        seen = (seen - [x, y]) @ np.array([[c, -s], [s, c]])
+        track.detections.append(detections(0.1 * k, seen, labels), k)
+    return Window(track, [0.1 * k for k in range(POSES)], poses.copy(), dent)
+
+
+# --- motions ---------------------------------------------------------------------------------------------
+
+
+def test_a_motion_turns_about_its_centre_and_then_moves() -> None:
+    moved = motion(1.0, 0.0, np.pi / 2, np.array([2.0, 0.0])).apply(np.array([[2.0, 0.0], [3.0, 0.0]]))
+    np.testing.assert_allclose(moved, [[3.0, 0.0], [3.0, 1.0]], atol=1e-12)
+
+
+# --- registration ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("by", [(0.0, 0.0, 0.0), (0.4, -0.3, 0.02), (-0.5, 0.2, -0.03)])
+def test_a_drifted_window_is_moved_back(by: tuple[float, float, float]) -> None:
+    scene = window()
+    scene.drift(motion(*by, scene.truth[-1, :2]))
+    found = scene.register()
+    assert found is not None
+    np.testing.assert_allclose(found.motion.apply(scene.poses[:, :2]), scene.truth[:, :2], atol=0.12)
+    assert found.motion.vector[2] == pytest.approx(-by[2], abs=0.01)
+
+
+def test_matches_are_coloured_detections_beside_their_own_curve() -> None:
+    scene = window()
+    scene.drift(motion(0.2, 0.1, 0.01, scene.truth[-1, :2]))
+    found = scene.register()
+    assert found is not None
+    table = scene.track.detections
+    for label, (rows, u) in found.matches.items():
+        assert len(rows) == 3 * POSES and (table.label[rows] == label).all()
+        points = found.motion.apply(to_map(table.point[rows], scene.poses[table.cycle[rows]]))
+        boundary, control_points = (
+            scene.track.state.boundaries[label],
+            scene.track.state.control_points(label),
+        )
+        assert np.hypot(*(boundary.evaluate(control_points, u) - points).T).max() < 0.15
+        assert u.max() < 60.0
+
+
+def test_only_the_newest_seconds_are_registered() -> None:
+    scene = window()
+    found = scene.register(window=1.0, sigma_max=1.0)
+    assert found is not None
+    cycles = scene.track.detections.cycle[np.concatenate([rows for rows, _ in found.matches.values()])]
+    assert set(cycles.tolist()) == set(range(10, POSES))
+
+
+def test_a_lost_vehicle_is_registered_from_the_best_place_of_the_beginning() -> None:
+    """15 m along the track is farther than the iteration bridges; its own uncertainty allows it."""
+    scene = window()
+    scene.drift(motion(13.0, -7.0, 0.1, scene.truth[-1, :2]))
+    assert scene.register() is None
+    found = scene.register(np.diag([8.0, 8.0, 0.2]) ** 2)
+    assert found is not None
+    np.testing.assert_allclose(found.motion.apply(scene.poses[:, :2]), scene.truth[:, :2], atol=0.3)
+
+
+# --- refusals --------------------------------------------------------------------------------------------
+
+
+def test_a_circle_tells_no_place_along_it() -> None:
+    """The same detections on a circle leave the motion along it as uncertain as it was."""
+    assert window().register(PRIOR) is not None
+    assert window(dent=0.0).register(PRIOR) is None
+    assert window(dent=0.0).register(PRIOR, sigma_max=2.0) is not None
+
+
+def test_detections_beside_the_curves_are_refused() -> None:
+    """A track of the same shape, but a metre wider to either side."""
+    scene = window()
+    table = scene.track.detections
+    table.point[table.label == LEFT, 1] += 1.0
+    table.point[table.label == RIGHT, 1] -= 1.0
+    assert scene.register() is None
+
+
+@pytest.mark.parametrize(
+    ("count", "outliers", "span", "expected"),
+    [
+        (30, 0, 10.0, True),
+        (24, 0, 10.0, False),
+        (30, 5, 10.0, True),
+        (30, 8, 10.0, False),
+        (30, 0, 7.0, False),
+    ],
+)
+def test_enough_detections_agree_along_enough_of_both_curves(
+    count: int, outliers: int, span: float, expected: bool
+) -> None:
+    """At least 25, 80 % of which are inliers, along 8 m."""
+    rows = np.arange(count)
+    inlier = rows >= outliers
+    u = np.where(rows < count // 2, rows / (count // 2 - 1), (rows - count // 2) / (count - count // 2 - 1))
+    labels = (rows >= count // 2).astype(np.intp)
+    u[outliers] = 0.0
+    matches = Matches(rows, labels, span * u, inlier, np.eye(3), np.zeros(3))
+    assert agrees(matches, [LEFT, RIGHT], ClosingSettings()) is expected
+
+
+@pytest.mark.parametrize(
+    ("again", "sigma", "lost", "certain"),
+    [
+        (10.0, 0.2, False, True),
+        (10.0, 0.5, False, False),
+        (50.0, 0.5, False, True),
+        (50.0, 5.0, False, False),
+        (50.0, 0.5, True, False),
+        (50.0, 0.2, True, True),
+    ],
+)
+def test_a_place_must_be_certain_and_less_so_after_a_long_stretch(
+    again: float, sigma: float, lost: bool, certain: bool
+) -> None:
+    """However long a straight is driven again, it tells no place along it; a lost vehicle gets no rebate."""
+    rows, inlier = np.arange(30), np.ones(30, bool)
+    matches = Matches(rows, rows % 2, np.full(30, again), inlier, np.eye(3), np.zeros(3))
+    assert is_certain(matches, np.diag([0.01, sigma**2, 1.0]), ClosingSettings(), lost) is certain
+
+
+# --- near the start --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("pose", "near"),
+    [
+        ((0.0, 0.0, 0.0), True),
+        ((10.0, 9.0, 0.3), True),
+        ((10.0, 12.0, 0.3), False),
+        ((10.0, 0.0, np.pi), False),
+        ((10.0, 0.0, 2.0 * np.pi), True),
+    ],
+)
+def test_near_the_start_is_a_matter_of_place_and_direction(pose: tuple[float, ...], near: bool) -> None:
+    """After 80 m along x, on the first 20 m: within 8 m + 3 % of 80 m, and 0.8 rad."""
+    path = DrivenPath(PathSettings(memory=20.0))
+    for x in np.arange(0.0, 80.1, 0.5):
+        path.update(np.array([x, 0.0, 0.0]))
+    assert near_start(path, np.array(pose), ClosingSettings()) is near
+    assert not near_start(path, np.array(pose), ClosingSettings(min_path=100.0))

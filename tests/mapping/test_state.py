@@ -1,0 +1,118 @@
+"""The state and its curves side by side: keys, views, the active stretch, and foot points on both."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.graph.keys import CALIBRATION_KEY, control_keys, pose_keys
+from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.mapping.state import State
+from pathspace_graph.settings.mapper import SplineSettings
+
+from ..scenes.curves import boundary_through
+
+Array = NDArray[np.float64]
+
+
+def straight_row(y: float, length: float = 40.0) -> Array:
+    """Returns cones (k, 2) 4 m apart along x."""
+    x = np.arange(0.0, length + 0.1, 4.0)
+    return np.column_stack([x, np.full(len(x), y)])
+
+
+@pytest.fixture
+def state() -> State:
+    """Two straight boundaries, the right one added first, and three poses between them."""
+    found = State()
+    found.variables.insert(np.array([CALIBRATION_KEY]), np.zeros(2))
+    found.variables.insert(pose_keys(np.arange(3)), np.array([[k, 0.0, 0.0] for k in range(3)]).ravel())
+    for label, y in ((RIGHT, -2.0), (LEFT, 2.0)):
+        found.add_boundary(label, *boundary_through(straight_row(y)))
+        found.pose_u[label] = np.arange(3.0)
+    return found
+
+
+def test_boundaries_lie_in_the_order_of_their_labels(state: State) -> None:
+    assert list(state.boundaries) == [LEFT, RIGHT]
+    left, right = state.control_points(LEFT), state.control_points(RIGHT)
+    np.testing.assert_array_equal(state.map_points, np.concatenate([left, right]))
+    np.testing.assert_array_equal(state.map_keys, np.concatenate([state.keys(LEFT), state.keys(RIGHT)]))
+    np.testing.assert_allclose(left[:, 1], 2.0, atol=1e-6)
+
+
+def test_control_points_and_poses_are_views(state: State) -> None:
+    state.control_points(RIGHT)[0] = [7.0, 8.0]
+    np.testing.assert_array_equal(state.map_points[len(state.control_points(LEFT))], [7.0, 8.0])
+    state.poses[1] = [4.0, 5.0, 6.0]
+    np.testing.assert_array_equal(state.variables.of(pose_keys(np.array([1]))), [4.0, 5.0, 6.0])
+
+
+def test_a_copy_changes_alone(state: State) -> None:
+    other = state.copy()
+    other.control_points(LEFT)[:] = 0.0
+    other.replace_boundary(RIGHT, *boundary_through(straight_row(-3.0, 12.0)))
+    other.drop_oldest_pose_u()
+    assert state.control_points(LEFT)[0, 1] == pytest.approx(2.0, abs=1e-6)
+    assert state.boundaries[RIGHT].size > other.boundaries[RIGHT].size
+    assert (len(state.pose_u[LEFT]), len(other.pose_u[LEFT])) == (3, 2)
+
+
+def test_a_boundary_that_has_grown_gets_active_control_points_at_its_end(state: State) -> None:
+    boundary, size = state.boundaries[LEFT], state.boundaries[LEFT].size
+    state.active_stretch = {LEFT: np.arange(4, size)}
+    points = boundary.grow(state.control_points(LEFT).copy(), np.array([48.0]), np.array([[48.0, 2.0]]))
+    state.extend(LEFT, points[size:])
+    assert len(state.control_points(LEFT)) == boundary.size > size
+    assert state.active(LEFT).tolist() == list(range(4, boundary.size))
+    np.testing.assert_array_equal(state.keys(LEFT), control_keys(LEFT, np.arange(boundary.size)))
+    assert state.active(RIGHT) is state.boundaries[RIGHT].everything
+
+
+def test_the_curves_are_laid_out_anew_only_when_they_change(state: State) -> None:
+    first = state.curves
+    assert state.curves is first
+    state.active_stretch = {LEFT: np.arange(4, state.boundaries[LEFT].size)}
+    assert state.curves is not first and not state.whole
+    state.active_stretch = {}
+    assert state.whole and state.curves is not first
+
+
+def test_foot_points_on_both_curves_are_those_on_each_alone(state: State) -> None:
+    rng = np.random.default_rng(0)
+    curve, u = rng.integers(0, 2, 20), rng.uniform(3.0, 35.0, 20)
+    points = np.column_stack([u, rng.normal(size=20)])
+    found = state.curves.find(state.map_points, points, curve, u - 3.0, u + 3.0)
+    refined = state.curves.refine(state.map_points, points, curve, u)
+    for index, label in enumerate((LEFT, RIGHT)):
+        own, boundary = curve == index, state.boundaries[label]
+        control = state.control_points(label)
+        alone = boundary.find(control, points[own], u[own] - 3.0, u[own] + 3.0)
+        np.testing.assert_allclose(found.u[own], alone.u, atol=1e-12)
+        np.testing.assert_allclose(found.distance[own], points[own, 1] - (2.0, -2.0)[index], atol=1e-6)
+        np.testing.assert_allclose(
+            refined.u[own], boundary.refine(control, points[own], u[own]).u, atol=1e-12
+        )
+        keys = state.curves.keys[found.columns[own]]
+        np.testing.assert_array_equal(keys, state.keys(label)[boundary.columns(alone.span)])
+
+
+def test_a_foot_point_before_the_active_stretch_is_noticed(state: State) -> None:
+    first = 5
+    state.active_stretch = {LEFT: np.arange(first, state.boundaries[LEFT].size)}
+    begins = state.boundaries[LEFT].knots[first + SplineSettings().degree]
+    u, curve = np.array([begins + 1.0, 1.0]), np.array([0, 1])
+    foot = state.curves.refine(state.map_points, np.column_stack([u, [2.0, -2.0]]), curve, u)
+    assert not state.curves.reaches_inactive(curve, foot)
+    u = np.array([begins - 1.0, 1.0])
+    foot = state.curves.refine(state.map_points, np.column_stack([u, [2.0, -2.0]]), curve, u)
+    assert state.curves.reaches_inactive(curve, foot)
+
+
+def test_the_extrapolated_end_is_no_part_of_a_stretch(state: State) -> None:
+    trusted = state.boundaries[RIGHT].trusted
+    assert trusted == 40.0 + SplineSettings().confirmed_margin
+    np.testing.assert_array_equal(
+        state.curves.believed(np.array([1, 1]), np.array([20.0, 99.0])), [20.0, trusted]
+    )
