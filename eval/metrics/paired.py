@@ -70,9 +70,10 @@ def paired_p(differences: Array) -> float:
 
 
 def holm(p: Array) -> Array:
-    """Returns p (m,) corrected by Holm's method: `max over j <= i of (m - j) p_(j)`, j from 0, at most 1.
+    """Returns p (m,) corrected by Holm's method.
 
-    NaN isn't counted and stays NaN. (scipy.stats corrects the false discovery rate only.)
+    The i-th smallest becomes `max over j <= i of (m - j) p_(j)`, j from 0, at most 1. NaN isn't counted and
+    stays NaN. scipy.stats corrects the false discovery rate only, so this is written by hand.
     """
     corrected = np.full(len(p), np.nan)
     known = np.flatnonzero(~np.isnan(p))

@@ -308,8 +308,7 @@ class FarSettings(Positive):
 
 @dataclass(frozen=True)
 class RelinearizeSettings(Positive):
-    """Says which factors of the window are linearized anew in a step: those whose variables have moved
-    farther.
+    """Says which factors of the window are linearized anew in a step: those whose variables moved.
 
     This applies after the loop has closed. Until then all factors are linearized anew, since an error of
     linearization turns the map with a long lever there.

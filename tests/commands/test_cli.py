@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from pathspace_graph.commands.options import one_line
 from pathspace_graph.io.log import Detections, Log, read_log, write_log
 from pathspace_graph.io.map import read_map
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
+from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.paths import TRACKS
 from ..scenes.pretenders import contents
@@ -293,6 +294,14 @@ def test_an_interrupt_leaves_nothing_half_written(
 def test_help_explains_the_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--help"]) == 0
     assert "--out" in capsys.readouterr().out
+
+
+def test_help_shows_each_text_as_one_paragraph(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["online", "--help"]) == 0
+    assert "Poses stay in the window for this time (s)." in capsys.readouterr().out
+    for group in (MapperSettings(), MapperSettings().closing):
+        for entry in fields(group):
+            assert entry.metadata["help"].endswith(".") and "\n" not in entry.metadata["help"], entry.name
 
 
 def test_a_box_becomes_its_first_part_on_one_line() -> None:

@@ -28,7 +28,7 @@ from pathspace_graph.settings.comparison import LandmarkSettings
 from pathspace_graph.settings.mapper import GrowthSettings
 
 from ..scenes.drives import detections
-from ..scenes.landmarks import SPEED, drive_on, driven, with_covariance
+from .scenes import SPEED, drive_on, driven, with_covariance
 
 Array = NDArray[np.float64]
 

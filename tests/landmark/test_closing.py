@@ -10,7 +10,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.landmark.closing import JointCompatibility, LoopPairs, detect_loop, optimize_loop
 from pathspace_graph.landmark.merging import merge
 
-from ..scenes.landmarks import driven, with_covariance
+from .scenes import driven, with_covariance
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.landmark.state import LandmarkState
 
 from ..scenes.jacobians import assert_jacobians
-from ..scenes.landmarks import CONES, LABELS, QUADRATIC, SPEED, drive_on, driven
+from .scenes import CONES, LABELS, QUADRATIC, SPEED, drive_on, driven
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]

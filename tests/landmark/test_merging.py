@@ -17,7 +17,7 @@ from pathspace_graph.landmark.state import LandmarkState
 from pathspace_graph.settings.comparison import LandmarkSettings
 from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
 
-from ..scenes.landmarks import QUADRATIC, driven, oracle_system
+from .scenes import QUADRATIC, driven, oracle_system
 
 
 def test_pairs_have_one_label_and_the_newer_landmark_comes_first() -> None:

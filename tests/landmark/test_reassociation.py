@@ -18,7 +18,7 @@ from pathspace_graph.landmark.reassociation import (
 from pathspace_graph.landmark.state import UNASSOCIATED, LandmarkState
 from pathspace_graph.landmark.system import LandmarkSystem
 
-from ..scenes.landmarks import normal_equations_of, oracle_system
+from .scenes import normal_equations_of, oracle_system
 
 
 def reassociate(system: LandmarkSystem, state: LandmarkState) -> None:

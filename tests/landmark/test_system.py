@@ -19,7 +19,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import ahead, exact_log
-from ..scenes.landmarks import beginning_of, normal_equations_of, oracle_system
+from .scenes import beginning_of, normal_equations_of, oracle_system
 
 
 def test_the_cost_falls_along_the_gradient_of_the_rows(bean: Log) -> None:

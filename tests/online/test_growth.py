@@ -1,4 +1,4 @@
-"""Growth: whose a place is where colours contradict each other, and where along the way a curve ends."""
+"""Growth: what a curve begins with, what extends it, what colours decide, and how it is taken back."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.path import PathAhead
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.online.growth import undisputed
+from pathspace_graph.online.growth import count_in_order, undisputed
 from pathspace_graph.settings.mapper import MapperSettings
 
+from ..scenes.curves import boundary_through
 from ..scenes.drives import DT, ahead, corridor, detections, exact_log, map_log, true_poses
 
 Array = NDArray[np.float64]
 
 
-# --- whose a place is ------------------------------------------------------------------------------------
+# --- contradicting colours -------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +110,120 @@ def test_an_end_nearer_to_an_older_stretch_of_the_path_does_not_follow_that() ->
         mapper.growth.expand(mapper.smoother, PathAhead(points, stations, float(stations[3]))) == frozenset()
     )
     assert (boundary.confirmed_end, boundary.size) == (confirmed, size)
+
+
+# --- growth by hand --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def alone() -> FixedLagMapper:
+    """A mapper at the origin, heading along x, that has seen nothing."""
+    log = exact_log(ahead(0.0, 0.3), np.zeros((0, 2)), np.zeros(0, np.intp))
+    return map_log(log, FixedLagMapper())[0]
+
+
+def along_x(driven: float = 0.0, begin: float = -10.0) -> PathAhead:
+    """Returns a path along x, on which the vehicle is at x = `driven` and sees 7 m ahead."""
+    x = np.arange(begin, driven + 7.01, 0.5)
+    return PathAhead(np.column_stack([x, np.zeros(len(x))]), x - begin, driven - begin)
+
+
+def track(mapper: FixedLagMapper, *points: tuple[float, float], label: int = LEFT, times: int = 3) -> None:
+    """Makes tentative tracks at points, detected so many times."""
+    for k in range(times):
+        mapper.growth.tentative[label].add(np.array(points), np.full(len(points), 0.01), 0.1 * k)
+
+
+def grow(mapper: FixedLagMapper, path: PathAhead) -> list[tuple[float, float]]:
+    """Expands the curves along a path; returns the cones of the left one, to a centimetre."""
+    mapper.growth.expand(mapper.smoother, path)
+    observed = mapper.boundaries[LEFT].observed if LEFT in mapper.boundaries else []
+    return [(round(float(x), 2), round(float(y), 2)) for x, y in observed]
+
+
+def test_a_curve_begins_with_two_confirmed_tracks_in_the_order_of_the_path(alone: FixedLagMapper) -> None:
+    track(alone, (1.0, 2.0))
+    assert grow(alone, along_x()) == []
+    track(alone, (4.0, 2.0), times=2)
+    assert grow(alone, along_x()) == []
+    track(alone, (-2.0, 2.2), (4.0, 2.0), times=3)
+    assert grow(alone, along_x()) == [(-2.0, 2.2), (1.0, 2.0), (4.0, 2.0)]
+    assert RIGHT not in alone.boundaries
+    assert len(alone.growth.tentative[LEFT].points) == 0
+    assert len(alone.smoother.map.state.pose_u[LEFT]) == len(alone.poses)
+
+
+def test_a_curve_begins_on_its_own_side_within_reach_and_not_too_far_from_the_path(
+    alone: FixedLagMapper,
+) -> None:
+    track(alone, (1.0, -2.0), (3.0, -2.0), (1.0, 11.0), (4.0, 11.0), (7.5, 2.0), (10.0, 2.0))
+    assert grow(alone, along_x()) == []
+    assert grow(alone, along_x(3.5)) == [(7.5, 2.0), (10.0, 2.0)]
+
+
+@pytest.mark.parametrize(
+    ("point", "extends"),
+    [
+        ((6.0, 2.0), True),
+        ((4.6, 2.0), False),
+        ((4.2, 2.9), False),
+        ((3.0, 3.0), False),
+        ((6.0, 3.9), True),
+        ((6.0, 4.2), False),
+        ((6.0, -0.5), False),
+        ((7.4, 2.0), False),
+    ],
+    ids=["next", "at the end", "beside the end", "behind", "wider", "too wide", "other side", "out of reach"],
+)
+def test_a_curve_is_extended_by_what_comes_next(
+    alone: FixedLagMapper, point: tuple[float, float], extends: bool
+) -> None:
+    """The end is at (4, 2): the next cone is at least 0.7 m away, 0.3 m on, and at most 1.9 m farther out."""
+    track(alone, (0.0, 2.0), (4.0, 2.0))
+    assert len(grow(alone, along_x())) == 2
+    track(alone, point)
+    found = grow(alone, along_x())
+    assert found[2:] == ([point] if extends else [])
+    boundary = alone.boundaries[LEFT]
+    length = 4.0 + np.hypot(point[0] - 4.0, point[1] - 2.0) * extends
+    assert boundary.confirmed_end == pytest.approx(length, abs=0.05)
+
+
+def test_an_end_that_the_vehicle_has_passed_follows_the_path(alone: FixedLagMapper) -> None:
+    """It is more than 2 m behind with nothing ahead, and is carried on to 1 m behind the vehicle."""
+    track(alone, (0.0, 2.0), (4.0, 2.0))
+    grow(alone, along_x())
+    boundary = alone.boundaries[LEFT]
+    grow(alone, along_x(5.9))
+    assert boundary.confirmed_end == pytest.approx(4.0)
+    grow(alone, along_x(8.0))
+    end = boundary.evaluate(alone.control_points(LEFT), np.array([boundary.confirmed_end]))[0]
+    np.testing.assert_allclose(end, [7.0, 2.0], atol=0.3)
+    assert len(boundary.observed) == 2
+
+
+def test_cones_that_were_passed_in_another_order_are_counted(alone: FixedLagMapper) -> None:
+    """The curve went (0, 2), (4, 2), (12, 2), (8, 2): after 9 m the third has not been passed yet."""
+    boundary, _ = boundary_through(np.array([[0.0, 2.0], [4.0, 2.0], [12.0, 2.0], [8.0, 2.0]]))
+    settings = MapperSettings().growth
+    counts = [count_in_order(boundary, along_x(x), settings) for x in (3.0, 7.0, 9.0, 13.0)]
+    assert counts == [4, 4, 2, 2]
+    in_order, _ = boundary_through(np.array([[0.0, 2.0], [4.0, 2.0], [8.0, 2.0], [12.0, 2.0]]))
+    assert count_in_order(in_order, along_x(13.0), settings) == 4
+
+
+def test_a_curve_that_is_taken_back_goes_through_its_cones_in_the_right_order(alone: FixedLagMapper) -> None:
+    """The curve was led past (12, 2) first and then back to (8, 2)."""
+    track(alone, (0.0, 2.0), (4.0, 2.0))
+    grow(alone, along_x())
+    track(alone, (12.0, 2.0))
+    assert grow(alone, along_x(6.0)) == [(0.0, 2.0), (4.0, 2.0), (12.0, 2.0)]
+    boundary = alone.boundaries[LEFT]
+    boundary.observed.append(np.array([8.0, 2.0]))
+    boundary.cone_parameters.append(boundary.confirmed_end + 4.0)
+    boundary.confirmed_end += 4.0
+    assert grow(alone, along_x(13.0)) == [(0.0, 2.0), (4.0, 2.0), (8.0, 2.0), (12.0, 2.0)]
+    assert boundary.confirmed_end == pytest.approx(12.0, abs=0.05)
 
 
 # --- the order of the drive --------------------------------------------------------------------------------

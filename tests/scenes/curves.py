@@ -1,4 +1,4 @@
-"""Boundaries through points that are put in by hand, and smoothers that hold them."""
+"""Boundaries through points that are put in by hand."""
 
 from __future__ import annotations
 

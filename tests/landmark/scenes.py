@@ -20,7 +20,7 @@ from pathspace_graph.landmark.system import LandmarkSystem
 from pathspace_graph.mapping.prediction import smoother_settings
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 
-from .drives import ODOMETRY_SIGMA, see
+from ..scenes.drives import ODOMETRY_SIGMA, see
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]

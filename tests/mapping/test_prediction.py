@@ -1,0 +1,78 @@
+"""The prediction of poses by odometry, cycle by cycle and over a whole log."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.io.log import Log, Odometry
+from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.log_odometry import integrate_log
+from pathspace_graph.mapping.path import DrivenPath
+from pathspace_graph.mapping.prediction import integrate_odometry, predict, smoother_settings
+from pathspace_graph.run import split_odometry
+from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
+
+from ..scenes.drives import DT, ODOMETRY_SIGMA, ahead, exact_log, true_poses
+
+Array = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    """A drive of 2 s around a bend, which sees nothing."""
+    twists = ahead(5.0, 2.0) + np.array([0.0, 0.1, 0.5])
+    return exact_log(twists, np.zeros((0, 2)), np.zeros(0, np.intp))
+
+
+def test_the_last_twist_is_held_until_the_stamp() -> None:
+    """4 m/s for 0.1 s, then 2 m/s for 0.3 s."""
+    odometry = Odometry(np.array([0.0, 0.1]), np.array([[4.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
+    motion = integrate_odometry(odometry, 0.4, np.array([0.5, 0.0, 0.0]))
+    np.testing.assert_allclose(motion.delta, [1.0, 0.0, 0.0], atol=1e-12)
+    assert motion.covariance[0, 0] == pytest.approx(0.25 * (0.1**2 + 0.3**2), rel=1e-6)
+
+
+def test_every_cycle_adds_its_pose_and_extends_the_path(log: Log) -> None:
+    settings = MapperSettings()
+    smoother, path = FixedLagSmoother(smoother_settings(settings), CurveMap(settings)), DrivenPath()
+    for odometry, cycle in split_odometry(log):
+        predict(smoother, path, odometry, cycle.t, ODOMETRY_SIGMA, settings)
+    np.testing.assert_allclose(smoother.variables.poses, true_poses(log), atol=1e-9)
+    assert smoother.times == [cycle.t for cycle in log.cycles]
+    driven = np.hypot(*np.diff(true_poses(log)[:, :2], axis=0).T).sum()
+    assert path.length == pytest.approx(driven, rel=1e-3)
+    assert path.curvature == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_log_is_dead_reckoned_along_its_true_poses(log: Log) -> None:
+    odometry = integrate_log(log, ODOMETRY_SIGMA, OdometrySettings())
+    np.testing.assert_allclose(odometry.dead_reckoned(np.zeros(2)), true_poses(log), atol=1e-9)
+    assert len(odometry) == len(log.cycles) == len(odometry.stamps)
+    residual, _ = odometry.terms(true_poses(log), np.zeros(2))
+    np.testing.assert_allclose(residual, 0.0, atol=1e-6)
+
+
+def test_a_calibration_frees_the_odometry_of_a_bias(log: Log) -> None:
+    """Odometry that turns by 0.02 rad/s too fast is corrected by that bias."""
+    biased = exact_log(
+        log.odometry.twist + np.array([0.0, 0.0, 0.02]), np.zeros((0, 2)), np.zeros(0, np.intp)
+    )
+    odometry = integrate_log(biased, ODOMETRY_SIGMA, OdometrySettings())
+    poses = odometry.dead_reckoned(np.array([0.0, 0.02]))
+    np.testing.assert_allclose(poses[:, 2], true_poses(log)[:, 2], atol=1e-9)
+    np.testing.assert_allclose(poses, true_poses(log), atol=2 * DT**2)
+
+
+def test_the_rows_of_the_priors_have_their_cost(log: Log) -> None:
+    odometry = integrate_log(log, ODOMETRY_SIGMA, OdometrySettings())
+    rng = np.random.default_rng(0)
+    first = odometry.first + np.array([1e-4, -2e-4, 1e-5])
+    calibration = odometry.calibration_sigma * rng.normal(size=2)
+    _, *priors = odometry.rows(odometry.terms(true_poses(log), calibration), first, calibration)
+    cost = 0.5 * sum(float(rows.residual @ rows.residual) for rows in priors)
+    assert odometry.prior_cost(first, calibration) == pytest.approx(cost, rel=1e-9)
+    expected = 0.5 * float(((calibration / odometry.calibration_sigma) ** 2).sum())
+    assert odometry.prior_cost(odometry.first, calibration) == pytest.approx(expected, rel=1e-9)
