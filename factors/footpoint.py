@@ -53,7 +53,7 @@ class FootPoints:
     interior: Bools
     """This is false (m,) at an end of an open curve, and at a limit beyond which the curve comes nearer."""
     basis: Floats
-    """In these basis values (m, p + 1) at u, column j belongs to the control point span - p + j."""
+    """Column j of these basis values (m, p + 1) at u belongs to control point `columns[:, j]`."""
     span: Ints
     """These are the knot spans (m,) of u; the spans of several curves are numbered consecutively."""
     columns: Ints

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .se2 import to_vehicle
+
 Array = NDArray[np.float64]
 
 
@@ -30,8 +32,7 @@ def landmark_residuals(poses: Array, landmarks: Array, points_vehicle: Array) ->
         dr/dt = -R^T,   dr/dtheta = (a_y, -a_x) with a = R^T (l - t),   dr/dl = R^T
     """
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    dx, dy = landmarks[:, 0] - poses[:, 0], landmarks[:, 1] - poses[:, 1]
-    expected = np.column_stack([c * dx + s * dy, -s * dx + c * dy])
+    expected = to_vehicle(landmarks, poses)
     by_landmark = np.stack([np.column_stack([c, s]), np.column_stack([-s, c])], axis=1)
     by_theta = np.column_stack([expected[:, 1], -expected[:, 0]])
     by_pose = np.concatenate([-by_landmark, by_theta[:, :, None]], axis=2)

@@ -40,6 +40,16 @@ def to_map(points_vehicle: Array, poses: Array) -> Array:
     return np.array([c * x - s * y + poses[:, 0], s * x + c * y + poses[:, 1]]).T
 
 
+def to_vehicle(points_map: Array, poses: Array) -> Array:
+    """Returns `z = R^T (p - t)` (m, 2) in the vehicle frame of each row's own pose (m, 3).
+
+    points_map (m, 2) are in the map frame.
+    """
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    dx, dy = points_map[:, 0] - poses[:, 0], points_map[:, 1] - poses[:, 1]
+    return np.array([c * dx + s * dy, -s * dx + c * dy]).T
+
+
 def se2_exp(tangents: Array) -> Array:
     """Returns the exponential of SE(2), row by row: relative poses (k, 3).
 

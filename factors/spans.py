@@ -119,13 +119,9 @@ class SpanPolynomials:
         u is wrapped or clipped first.
         """
         number, s = self.locate(u)
-        stack, column = self._stack(derivatives), s[:, None]
-        values: Floats = stack[-1].take(number, axis=0)
-        for power in range(self.degree - 1, -1, -1):
-            values *= column
-            values += stack[power].take(number, axis=0)
-        shaped = values.reshape(len(s), derivatives + 1, self.degree + 1)
-        return shaped.transpose(1, 0, 2), number + self.degree
+        values = horner(self._stack(derivatives).take(number, axis=1), s[:, None])
+        by_order = values.reshape(len(s), derivatives + 1, self.degree + 1).transpose(1, 0, 2)
+        return by_order, number + self.degree
 
     def polynomials(self, derivatives: int) -> Floats:
         """Returns the polynomials of all orders by span: (n - p, (p + 1) (derivatives + 1), p + 1)."""

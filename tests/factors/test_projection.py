@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.bspline import clamped_knots, periodic_knots, uniform_knots
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.projection import offset_from_foot_point, project, sigma_across
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import to_map, to_vehicle
 from pathspace_graph.factors.spans import SpanPolynomials
 
 from ..scenes.jacobians import assert_jacobians
@@ -96,11 +96,6 @@ def projection_function(tables: SpanPolynomials, points_vehicle: Array, u: Array
     return function
 
 
-def to_vehicle(points: Array, pose: Array) -> Array:
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return (points - pose[:2]) @ np.array([[c, -s], [s, c]])
-
-
 def points_beside(
     rng: np.random.Generator, tables: SpanPolynomials, distinct: Array, distance: Array
 ) -> tuple[Array, Array]:
@@ -127,7 +122,7 @@ def test_jacobians_are_exact_metres_away_from_the_curve(seed: int, degree: int, 
     tables, distinct = random_curve(rng, degree, kind)
     points, u = points_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 25))
     pose = np.append(rng.uniform(-20.0, 20.0, 2), rng.uniform(-np.pi, np.pi))
-    function = projection_function(tables, to_vehicle(points, pose), u)
+    function = projection_function(tables, to_vehicle(points, pose[None]), u)
     assert_jacobians(function, [pose, distinct.ravel()])
 
 
@@ -161,7 +156,7 @@ def test_jacobians_at_degenerate_states(pose: list[float], distance: float) -> N
     distinct = distinct + np.array(pose[:2])
     points, u = points_beside(rng, tables, distinct, np.full(10, distance))
     assert len(u) > 3
-    function = projection_function(tables, to_vehicle(points, np.array(pose)), u)
+    function = projection_function(tables, to_vehicle(points, np.array([pose])), u)
     assert_jacobians(function, [np.array(pose), distinct.ravel()])
 
 
@@ -226,7 +221,7 @@ def test_jacobians_of_the_offset_from_a_held_foot_point(seed: int, degree: int, 
     tables, distinct = random_curve(rng, degree, kind)
     pose = np.append(rng.uniform(-20.0, 20.0, 2), rng.uniform(-np.pi, np.pi))
     points, u = points_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 15))
-    found, vehicle = find(tables, distinct, points, u), to_vehicle(points, pose)
+    found, vehicle = find(tables, distinct, points, u), to_vehicle(points, pose[None])
     covariances = np.tile(0.01 * np.eye(2), (len(u), 1, 1))
     columns = control_columns(tables, found.span)
 

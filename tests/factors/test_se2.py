@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.factors.gtsam_factors import pose_array
-from pathspace_graph.factors.se2 import compose, rotation, se2_exp, to_map, wrap_angle
+from pathspace_graph.factors.se2 import compose, rotation, se2_exp, to_map, to_vehicle, wrap_angle
 
 
 @pytest.mark.parametrize("turn", [0.0, 1e-12, 1e-6, 0.1, 3.0, -3.0])
@@ -31,6 +31,14 @@ def test_wrap_angle_is_half_open() -> None:
 def test_to_map_is_the_rigid_transform() -> None:
     points = to_map(np.array([[1.0, 2.0], [1.0, 0.0]]), np.array([[3.0, 4.0, np.pi / 2], [0.0, 0.0, np.pi]]))
     np.testing.assert_allclose(points, [[1.0, 5.0], [-1.0, 0.0]], atol=1e-12)
+
+
+def test_the_vehicle_frame_is_the_inverse_of_the_map_frame() -> None:
+    rng = np.random.default_rng(1)
+    points, poses = rng.normal(size=(9, 2)), rng.normal(size=(9, 3)) * 5.0
+    np.testing.assert_allclose(to_vehicle(to_map(points, poses), poses), points, atol=1e-12)
+    quarter = to_vehicle(np.array([[1.0, 5.0]]), np.array([[3.0, 4.0, np.pi / 2]]))
+    np.testing.assert_allclose(quarter, [[1.0, 2.0]], atol=1e-12)
 
 
 def test_poses_are_composed_row_by_row() -> None:

@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import odometry_residuals
+from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, keys_of, normal_equations
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
 from pathspace_graph.graph.rows import Rows, jacobian_factors
 from pathspace_graph.graph.submaps import Submap, Submaps
 from pathspace_graph.graph.variables import Layout, Variables
 
-from ..scenes.graph import columns_of, dense_rows, schur, turn
+from ..scenes.graph import columns_of, dense_rows, schur
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -45,7 +46,7 @@ def variables_at(x: Array, keys: IntArray, rng: np.random.Generator) -> Variable
 
 def seen_from(x: Array, keyframe: Array) -> Array:
     """Calibration, points and end pose as a keyframe sees them, written once more."""
-    inverse = turn(keyframe[2]).T
+    inverse = rotation(keyframe[2]).T
     points = x[2:-POSE].reshape(-1, 2)
     return np.concatenate(
         [
@@ -79,7 +80,7 @@ def moved(x: Array, theta: float, shift: Array) -> Array:
     """All values after a rigid motion of the map frame."""
     x = x.copy()
     for at in (*range(2, SIZE - POSE, 2), SIZE - POSE, SIZE):
-        x[at : at + 2] = turn(theta) @ x[at : at + 2] + shift
+        x[at : at + 2] = rotation(theta) @ x[at : at + 2] + shift
     x[[SIZE - 1, SIZE + 2]] += theta
     return x
 
@@ -108,11 +109,11 @@ def test_a_rigid_motion_turns_the_gradient_and_keeps_the_energy(
     y = moved(x, theta, np.array([dx, dy]))
     assert energy(submap, y) == pytest.approx(energy(submap, x), rel=1e-8, abs=1e-8)
     before, after = linearized(submap, x, rng), linearized(submap, y, rng)
-    rotation = np.eye(SIZE + POSE)
+    rotations = np.eye(SIZE + POSE)
     for at in (*range(2, SIZE - POSE, 2), SIZE - POSE, SIZE):
-        rotation[at : at + 2, at : at + 2] = turn(theta)
-    np.testing.assert_allclose(after[1], rotation @ before[1], rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(after[0], rotation @ before[0] @ rotation.T, rtol=1e-8, atol=1e-8)
+        rotations[at : at + 2, at : at + 2] = rotation(theta)
+    np.testing.assert_allclose(after[1], rotations @ before[1], rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(after[0], rotations @ before[0] @ rotations.T, rtol=1e-8, atol=1e-8)
 
 
 def test_a_submap_leaves_a_rigid_motion_free() -> None:
@@ -171,7 +172,7 @@ def random_drive(rng: np.random.Generator, late: int) -> Drive:
 def detection_rows(drive: Drive, k: int, rng: np.random.Generator) -> Rows:
     """`R_k' (c_j - t_k) - z`, with random z."""
     pose = drive.variables.of(drive.poses[k : k + 1])
-    inverse, keys, jacobian = turn(pose[2]).T, [], []
+    inverse, keys, jacobian = rotation(pose[2]).T, [], []
     by_heading = np.array([[0.0, 1.0], [-1.0, 0.0]]) @ inverse
     for key in drive.seen[k]:
         offset = drive.variables.of(np.array([key])) - pose[:2]
@@ -248,18 +249,18 @@ def test_a_whole_drive_turned_with_its_start_is_known_as_well_as_before(interval
     before = normal_equations(submaps.graph(variables), variables.layout)
     negative_gradient = before[1] - before[0] @ (variables.values - variables.reference)
     theta, shift = 2.3, np.array([40.0, -7.0])
-    rotation = np.eye(variables.layout.size)
+    rotations = np.eye(variables.layout.size)
     for key in variables.keys[1:].tolist():
         x = slice((at := int(columns_of(np.array([key]), variables.keys)[0])), at + 2)
-        rotation[x, x] = turn(theta)
-        variables.values[x] = turn(theta) @ variables.values[x] + shift
+        rotations[x, x] = rotation(theta)
+        variables.values[x] = rotation(theta) @ variables.values[x] + shift
         if chr(key >> 56) == "x":
             variables.values[at + 2] += theta
     after = normal_equations(submaps.graph(variables), variables.layout)
     scale = np.abs(before[0]).max()
-    np.testing.assert_allclose(after[0], rotation @ before[0] @ rotation.T, atol=1e-9 * scale)
+    np.testing.assert_allclose(after[0], rotations @ before[0] @ rotations.T, atol=1e-9 * scale)
     turned = after[1] - after[0] @ (variables.values - variables.reference)
-    np.testing.assert_allclose(turned, rotation @ negative_gradient, atol=1e-9 * scale)
+    np.testing.assert_allclose(turned, rotations @ negative_gradient, atol=1e-9 * scale)
 
 
 def test_submaps_go_on_after_information_is_removed() -> None:

@@ -107,12 +107,6 @@ def schur(hessian: Array, vector: Array, gone: IntArray) -> tuple[Array, Array]:
     return information, information @ (covariance @ vector)[stay]
 
 
-def turn(theta: float) -> Array:
-    """Returns R(theta) (2, 2)."""
-    c, s = np.cos(theta), np.sin(theta)
-    return np.array([[c, -s], [s, c]])
-
-
 def pose_columns(keys: IntArray) -> list[tuple[int, int]]:
     """Returns the key and the first column of each pose among keys."""
     return [(int(key), int(columns_of(np.array([key]), keys)[0])) for key in keys if width(int(key)) == POSE]

@@ -21,7 +21,7 @@ from pathspace_graph.factors.gtsam_factors import (
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists, odometry_residuals
 from pathspace_graph.factors.projection import project
-from pathspace_graph.factors.se2 import compose, to_map
+from pathspace_graph.factors.se2 import compose, rotation, to_map
 from pathspace_graph.factors.spans import SpanPolynomials
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE
 
@@ -107,8 +107,7 @@ def make_readings(
     cones = on_bend(np.arange(1.0, 28.0, 2.5), 23.0 if label == 0 else 27.0)
     slots, points = [], []
     for k, pose in enumerate(true):
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        local = (cones - pose[:2]) @ np.array([[c, -s], [s, c]])
+        local = (cones - pose[:2]) @ rotation(pose[2])
         seen = local[np.hypot(*local.T) < 12.0]
         slots += [k] * len(seen)
         points += list(seen)
@@ -276,8 +275,8 @@ def in_tangents(scene: Scene, state: Array, J: Array) -> Array:
     """The same with each pose's columns by its own axes, as the tangent of `gtsam.Pose2` has them."""
     turned = J.copy()
     for k, pose in enumerate(scene.poses(state)):
-        x, c, s = MAP + 2 + POSE * k, np.cos(pose[2]), np.sin(pose[2])
-        turned[:, x : x + 2] = J[:, x : x + 2] @ np.array([[c, -s], [s, c]])
+        x = MAP + 2 + POSE * k
+        turned[:, x : x + 2] = J[:, x : x + 2] @ rotation(pose[2])
     return turned
 
 
