@@ -29,12 +29,14 @@ def test_every_example_has_a_test() -> None:
     assert {file.stem for file in EXAMPLES.glob("*.py")} == tested
 
 
+@pytest.mark.slow
 def test_gnss_holds_the_vehicle_where_cones_let_it_drift() -> None:
     alone, with_gnss = example("gnss").main()
     assert with_gnss < 0.4
     assert with_gnss < 0.25 * alone
 
 
+@pytest.mark.slow
 def test_a_boundary_passes_through_the_surveyed_point() -> None:
     without, with_survey = example("surveyed_point").main()
     assert with_survey < 0.1

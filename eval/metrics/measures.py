@@ -43,8 +43,6 @@ class Metric:
     """Tables show the values in this unit; it is empty for pure numbers and counts."""
     digits: int = 3
     """Tables show this many digits after the decimal point."""
-    better: Literal["lower", "higher", "none"] = "lower"
-    """Lower or higher values are better, or neither is."""
     scope: Literal["lap", "run"] = "lap"
     """A lap's metric is measured of every lap and of the whole run, a run's metric of the whole run only."""
     time: bool = False
@@ -73,7 +71,7 @@ PAPER: Final = (
 """These are the metrics of the paper's Table 1."""
 _ALL: Final = (
     *PAPER,
-    Metric("cones", "true cones", digits=0, better="none"),
+    Metric("cones", "true cones", digits=0),
     Metric("size_share", "size by true cones", "%", 1),
     Metric("missed_2m", "missed at 2 m", "%", 1),
     Metric("missed_1m", "missed at 1 m", "%", 1),
@@ -90,28 +88,26 @@ _ALL: Final = (
     Metric("across", "trajectory error across", "m"),
     Metric("gap_curves", "gap to batch, curves", "m", scope="run"),
     Metric("gap_trajectory", "gap to batch, trajectory", "m", scope="run"),
-    Metric("l", "limit, landmarks by oracle association", "m", scope="run", better="none"),
-    Metric("f", "limit, fit of the curves", "m", scope="run", better="none"),
-    Metric("limit", "limit", "m", scope="run", better="none"),
-    Metric("nees", "NEES per degree of freedom", digits=2, better="none"),
-    Metric("nees_low", "NEES, 95 % interval from", digits=2, better="none"),
-    Metric("nees_high", "NEES, 95 % interval to", digits=2, better="none"),
-    Metric("nees_inside", "NEES within its 95 % interval", "%", 1, better="higher"),
-    Metric("nees_marginals", "NEES per degree of freedom, of the marginals", digits=2, better="none"),
-    Metric("inside", "cones within 2σ of the curve", "%", 1, better="none"),
-    Metric("inside_marginals", "cones within 2σ of the marginals", "%", 1, better="none"),
-    Metric("normalized_error", "mean squared error by variance at the cones", digits=2, better="none"),
+    Metric("l", "limit, landmarks", "m", scope="run"),
+    Metric("f", "limit, fit", "m", scope="run"),
+    Metric("limit", "limit", "m", scope="run"),
+    Metric("nees", "NEES per degree of freedom", digits=2),
+    Metric("nees_low", "NEES, 95 % interval from", digits=2),
+    Metric("nees_high", "NEES, 95 % interval to", digits=2),
+    Metric("nees_inside", "NEES within its 95 % interval", "%", 1),
+    Metric("nees_marginals", "NEES per degree of freedom, of the marginals", digits=2),
+    Metric("inside", "cones within 2σ of the curve", "%", 1),
+    Metric("inside_marginals", "cones within 2σ of the marginals", "%", 1),
+    Metric("normalized_error", "mean squared error by variance at the cones", digits=2),
     Metric(
         "normalized_error_marginals",
         "mean squared error by marginal variance at the cones",
         digits=2,
-        better="none",
     ),
     Metric(
         "normalized_error_joint",
         "squared error by the joint covariance of the batch at the cones",
         digits=2,
-        better="none",
         scope="run",
     ),
     Metric(
@@ -119,11 +115,10 @@ _ALL: Final = (
         "joint squared error within its 95 % interval",
         "%",
         1,
-        better="higher",
         scope="run",
     ),
-    Metric("closed", "loop closed", "%", 0, better="higher"),
-    Metric("converged", "batch converged", "%", 0, better="higher", scope="run"),
+    Metric("closed", "loop closed", "%", 0),
+    Metric("converged", "batch converged", "%", 0, scope="run"),
     Metric("cost", "cost of the batch", digits=1, scope="run"),
     Metric("bytes", "map", "kB", 2),
     Metric("bytes_covariance", "covariance of the map", "kB", 1),

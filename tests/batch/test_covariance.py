@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.simplification import map_block
@@ -70,6 +71,7 @@ def mean_nees(samples: Array, covariance: Array) -> float:
     )
 
 
+@pytest.mark.slow
 def test_both_curves_together_err_as_much_as_claimed() -> None:
     curves, _, claimed, _ = errors()
     np.testing.assert_allclose(curves.std(axis=0), np.sqrt(np.diag(claimed)), rtol=0.2)

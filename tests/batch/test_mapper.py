@@ -154,6 +154,7 @@ def test_the_covariances_are_of_the_right_shape_and_positive() -> None:
     assert np.linalg.eigvalsh(result.map_covariance).min() > 0.0
 
 
+@pytest.mark.slow
 def test_the_command_writes_its_result(tmp_path: Path) -> None:
     write_log(bean(), tmp_path / "log")
     arguments = ["batch", str(tmp_path / "log"), "--out", str(tmp_path / "map"), "--start", "online"]

@@ -129,6 +129,7 @@ def test_it_can_be_drawn_and_printed(tmp_path: Path, capfd: pytest.CaptureFixtur
     assert "b0" in capfd.readouterr().out
 
 
+@pytest.mark.slow
 def test_levenberg_marquardt_finds_the_same_optimum() -> None:
     """It begins where the curves began, a tenth of a metre away."""
     exact, begun = straight(4.0, MapperSettings().batch.sigma_smoothness)

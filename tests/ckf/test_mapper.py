@@ -37,6 +37,7 @@ def test_a_straight_drive_is_mapped_straight() -> None:
         assert np.abs(points[:, 1] - y).max() < 0.1
 
 
+@pytest.mark.slow
 def test_an_exact_lap_closes_both_curves() -> None:
     log = lap_log(bean_track(), overrun=60.0)
     mapper = CkfMapper(odometry_sigma=log.odometry_sigma)
@@ -48,6 +49,7 @@ def test_an_exact_lap_closes_both_curves() -> None:
     assert sum(sizes) < 0.6 * len(log.truth.cones)
 
 
+@pytest.mark.slow
 def test_a_noisy_lap_is_mapped_with_few_control_points() -> None:
     log = simulate(
         generate_track(np.random.default_rng(2), TrackGeneratorSettings()), SimulationSettings(laps=2), 0

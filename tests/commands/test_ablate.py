@@ -64,6 +64,7 @@ def test_the_command_leaves_tables_and_figures(
     assert contents(out) == before
 
 
+@pytest.mark.slow
 def test_the_command_takes_other_tracks_seeds_and_laps(
     file: Path, tmp_path: Path, track: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -97,6 +98,7 @@ def test_bad_usage_is_one_line_and_leaves_nothing(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_the_command_refuses_the_folder_of_another_study(
     file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -148,6 +148,7 @@ def test_the_summary_says_how_and_how_well(map_folder: Path) -> None:
     assert summary["ate"] ** 2 == pytest.approx(summary["rmse_along"] ** 2 + summary["rmse_across"] ** 2)
 
 
+@pytest.mark.slow
 def test_settings_of_the_mapper_are_options(log_folder: Path, tmp_path: Path) -> None:
     options = ["--lag", "1.5", "--growth.reach", "6.5"]
     assert main(["online", str(log_folder), "--out", str(tmp_path / "map"), *options]) == 0
@@ -155,6 +156,7 @@ def test_settings_of_the_mapper_are_options(log_folder: Path, tmp_path: Path) ->
     assert (settings["lag"], settings["growth"]["reach"]) == (1.5, 6.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["online", "batch"])
 def test_a_huber_loss_without_a_limit_is_least_squares(
     command: str, log_folder: Path, tmp_path: Path
@@ -185,6 +187,7 @@ def test_a_log_without_detections_says_what_it_could_not_map(
     assert main(["plot", str(tmp_path / "map"), "--out", str(tmp_path / "map.svg")]) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", [LEFT, RIGHT])
 def test_a_log_of_one_boundary_maps_that_one(
     label: int, log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -209,6 +212,7 @@ def test_plot_draws_a_map_with_its_log(log_folder: Path, map_folder: Path, tmp_p
     assert names(tmp_path) == {"map.png"}
 
 
+@pytest.mark.slow
 def test_demo_shows_the_table_and_leaves_log_map_and_picture(
     log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -69,6 +69,7 @@ def test_the_command_writes_tables_figures_and_maps(
     assert json.loads((out / "comparison.json").read_text())["failures"] == []
 
 
+@pytest.mark.slow
 def test_a_second_comparison_keeps_the_first_and_a_failure_ends_in_3(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], quick: None
 ) -> None:
@@ -97,6 +98,7 @@ def test_where_all_fail_the_tables_say_so(
     assert (out / "table.tex").exists() and not list(out.rglob("*.png"))
 
 
+@pytest.mark.slow
 def test_several_logs_have_folders_of_their_own_and_intervals(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], quick: None
 ) -> None:

@@ -193,6 +193,7 @@ def test_side_by_side_has_a_row_per_lap_and_dashes_where_one_has_fewer() -> None
     assert side_by_side({"ours": []}).rows == ()
 
 
+@pytest.mark.slow
 def test_maps_are_drawn_over_one_stretch_with_what_they_reach(folder: Path) -> None:
     named = read_logs(folder / "a")
     found = compare(named, ["rings", "broken", "gaps"])

@@ -170,6 +170,7 @@ def test_the_covariance_of_a_simplified_curve_needs_no_sigma_points() -> None:
 # --- command ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command_writes_every_figure_and_its_caption(tmp_path: Path) -> None:
     out = tmp_path / "figures"
     assert main(["figures", "--out", str(out)]) == 0

@@ -32,6 +32,7 @@ def alone(real: Study) -> pd.DataFrame:
     return without_times(frame)
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_as_one(real: Study, alone: pd.DataFrame) -> None:
     pd.testing.assert_frame_equal(without_times(run_study(real, jobs=2)), alone)
 

@@ -63,6 +63,7 @@ def test_holm_by_hand() -> None:
     np.testing.assert_allclose(holm(np.array([0.9, 0.8])), [1.0, 1.0])
 
 
+@pytest.mark.slow
 def test_holm_keeps_false_alarms_of_a_whole_study_rare() -> None:
     rng, alarms = np.random.default_rng(2), 0
     for _ in range(400):

@@ -19,6 +19,7 @@ from pathspace_graph.eval.scaling.settings import ScalingSettings
 from ...scenes.timing import SMALL
 
 
+@pytest.mark.slow
 def test_a_small_measurement_end_to_end(tmp_path: Path) -> None:
     drives = make_drives(SMALL)
     told: list[int] = []
