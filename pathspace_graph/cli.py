@@ -71,7 +71,7 @@ def _run(arguments: list[str]) -> int:
     elif first == "--version":
         print(f"{PROGRAM} {version(PROGRAM)}")
     elif first in COMMANDS:
-        command = _parse(first, arguments[1:])
+        command = parse_command(first, arguments[1:])
         if command is not None:
             command.run()
     else:
@@ -88,7 +88,7 @@ def overview() -> str:
     return "\n".join([usage, "", *lines, "", f"{PROGRAM} COMMAND --help explains each command."])
 
 
-def _parse(name: str, arguments: list[str]) -> Any:
+def parse_command(name: str, arguments: list[str]) -> Any:
     """Returns the command with its options, or None where its help was asked for and printed."""
     options = import_module(".commands.options", __package__)
     command = import_module(f".commands.{COMMANDS[name].module}", __package__)

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph import FixedLagMapper, Log
-from pathspace_graph.cli import COMMANDS, _parse
+from pathspace_graph.cli import COMMANDS, parse_command
 from pathspace_graph.errors import InputError
 from pathspace_graph.eval.study.overrides import leaves
 from pathspace_graph.io.log import write_log
@@ -154,7 +154,7 @@ def test_named_commands_are_accepted(page: Path) -> None:
         if command is not None:
             name, *arguments = re.sub(r"\s+#.*", "", command[1]).split()
             assert name in COMMANDS, line
-            assert _parse(name, arguments) is not None, line
+            assert parse_command(name, arguments) is not None, line
 
 
 REFERENCE = re.compile(r"`([a-z_]+(?:\.\w+)+)`")
