@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, normal_equations
 from pathspace_graph.graph.keys import are_poses, control_keys, pose_key
 from pathspace_graph.graph.user_factors import as_nonlinear
@@ -22,7 +23,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import FarSettings, MapperSettings, RelinearizeSettings, SplineSettings
 
 from ..scenes.drives import bean_track, lap_log
-from ..scenes.graph import KEYS, POSE_KEYS, pose_columns, random_factor, random_variables, turn
+from ..scenes.graph import KEYS, POSE_KEYS, pose_columns, random_factor, random_variables
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -80,7 +81,7 @@ def turned(mapper: FixedLagMapper) -> Array:
     matrix = np.eye(mapper.smoother.layout.size)
     for key, x in pose_columns(keys):
         theta = mapper.smoother.variables.of(np.array([key]))[2]
-        matrix[x : x + 2, x : x + 2] = turn(theta)
+        matrix[x : x + 2, x : x + 2] = rotation(theta)
     return matrix
 
 
@@ -142,7 +143,7 @@ def test_gtsam_s_marginals_are_the_mapper_s(mapper: FixedLagMapper) -> None:
         found = np.array(marginals.marginalCovariance(key))
         if are_poses(np.array(key)):
             T = np.eye(3)
-            T[:2, :2] = turn(smoother.variables.of(np.array([key]))[2])
+            T[:2, :2] = rotation(smoother.variables.of(np.array([key]))[2])
             found = T @ found @ T.T
         size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         assert (np.abs(found - expected) <= 1e-3 * size).all()
@@ -194,7 +195,7 @@ def test_a_linear_factor_on_our_unknowns_is_one_of_a_nonlinear_graph(rows: int) 
     found, found_descent = graph.linearize(values).hessian(variables.layout.ordering)
     T = np.eye(variables.layout.size)
     for key, x in pose_columns(KEYS):
-        T[x : x + 2, x : x + 2] = turn(variables.of(np.array([key]))[2])
+        T[x : x + 2, x : x + 2] = rotation(variables.of(np.array([key]))[2])
     d = variables.values - variables.reference
     np.testing.assert_allclose(found, T.T @ A.T @ A @ T, atol=1e-9 * np.abs(found).max())
     np.testing.assert_allclose(found_descent, T.T @ A.T @ (b - A @ d), atol=1e-9 * np.abs(found).max())
