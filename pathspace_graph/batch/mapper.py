@@ -20,10 +20,11 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
+from pathspace_graph.mapping.prediction import odometry_noise
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import Stopwatch, settings_dict
 from pathspace_graph.settings.batch import Start
-from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from .cones import cone_counts
 from .dead_reckoning import start_odometry
@@ -97,7 +98,7 @@ class BatchMapper:
         """
         self.settings = settings or MapperSettings()
         self.online = online
-        self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
+        self.odometry_sigma = odometry_noise(odometry_sigma)
 
     def solve(
         self, log: Log, start: Start | None = None, on_round: Callable[[], None] | None = None

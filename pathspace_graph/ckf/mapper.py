@@ -10,10 +10,10 @@ from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import integrate_odometry
+from pathspace_graph.mapping.prediction import integrate_odometry, odometry_noise
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.run import CycleResult, Stopwatch
-from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from .closing import associate_early_segment, simplify, update_by_correspondences
 from .expansion import Expansion
@@ -32,7 +32,7 @@ class CkfMapper:
 
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
-        self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
+        self.odometry_sigma = odometry_noise(odometry_sigma)
         self.state = CurveState(Belief.at_start(self.settings.odometry), self.settings)
         """This holds the pose, the curves and their joint covariance."""
         self.path = DrivenPath(self.settings.path)

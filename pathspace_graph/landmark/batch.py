@@ -12,8 +12,9 @@ from pathspace_graph.graph.keys import POSE
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import BatchRun
 from pathspace_graph.laps import LapCounter
+from pathspace_graph.mapping.prediction import odometry_noise
 from pathspace_graph.run import settings_dict, split_odometry
-from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from .fixed_lag import LandmarkFixedLag
 from .merging import find_duplicates
@@ -32,7 +33,7 @@ class LandmarkBatch:
 
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
-        self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
+        self.odometry_sigma = odometry_noise(odometry_sigma)
 
     def solve(self, log: Log) -> BatchRun:
         """Solves a log: associate, optimize, merge and remove landmarks, until the associations stay.

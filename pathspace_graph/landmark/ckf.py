@@ -26,10 +26,10 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns, to_vehicle_rows
-from pathspace_graph.mapping.prediction import integrate_odometry
+from pathspace_graph.mapping.prediction import integrate_odometry, odometry_noise
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult, Stopwatch
-from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import Association, Gates, associate, compatible, pair_costs
 from .state import UNASSOCIATED, landmark_counts, point_map
@@ -46,7 +46,7 @@ class LandmarkCkf:
 
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
-        self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
+        self.odometry_sigma = odometry_noise(odometry_sigma)
         self.belief = Belief.at_start(self.settings.odometry)
         """This is the state `x = [pose | calibration | landmarks]`."""
         self.labels: IntArray = np.zeros(0, np.intp)

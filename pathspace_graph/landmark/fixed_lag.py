@@ -11,11 +11,11 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import predict, smoother_settings
+from pathspace_graph.mapping.prediction import odometry_noise, predict, smoother_settings
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult, Stopwatch
-from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import associate_created, associate_newest
 from .closing import detect_loop, optimize_loop
@@ -36,7 +36,7 @@ class LandmarkFixedLag:
 
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
-        self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
+        self.odometry_sigma = odometry_noise(odometry_sigma)
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), LandmarkMap(self.settings))
         """This holds the variables, the window and its prior."""
         self.smoother.window.exact = True

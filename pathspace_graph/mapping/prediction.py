@@ -9,11 +9,19 @@ from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twist
 from pathspace_graph.graph.smoother import FixedLagSmoother, SmootherSettings
 from pathspace_graph.graph.window import MapRows
 from pathspace_graph.io.log import Odometry
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
 from .path import DrivenPath
 
 Array = NDArray[np.float64]
+
+
+def odometry_noise(sigma: Array | None) -> Array:
+    """Returns the standard deviations (3,) of a twist as a copy; without any, those of the simulator.
+
+    They are in m/s, m/s and rad/s.
+    """
+    return np.array(ODOMETRY_SIGMA if sigma is None else sigma, float)
 
 
 def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:

@@ -18,10 +18,10 @@ from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import predict, smoother_settings
+from pathspace_graph.mapping.prediction import odometry_noise, predict, smoother_settings
 from pathspace_graph.mapping.registration import near_start, register
 from pathspace_graph.run import CycleResult, Stopwatch
-from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
 from .activation import deactivate_distant
@@ -55,7 +55,7 @@ class FixedLagMapper:
         solver: Solver | None = None,
     ) -> None:
         self.settings = settings or MapperSettings()
-        self.odometry_sigma = np.array(ODOMETRY_SIGMA if odometry_sigma is None else odometry_sigma, float)
+        self.odometry_sigma = odometry_noise(odometry_sigma)
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), CurveMap(self.settings))
         """The smoother holds the variables, the factors of the window, and the prior."""
         self.smoother.window.exact = True

@@ -24,9 +24,9 @@ class BreakSettings:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.baseline <= 1.0:
-            raise SettingsError(f"the baseline must be a share in [0, 1], not {self.baseline}")
+            raise SettingsError(f"baseline: expected a share in [0, 1], found {self.baseline}")
         if not self.curvature_max > 0.0:
-            raise SettingsError(f"the largest curvature must be positive, not {self.curvature_max}")
+            raise SettingsError(f"curvature_max: expected a positive number, found {self.curvature_max}")
 
 
 @dataclass(frozen=True)
