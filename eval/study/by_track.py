@@ -10,8 +10,8 @@ import pandas as pd
 from pathspace_graph.eval.metrics.measures import Metric
 from pathspace_graph.eval.metrics.text_table import TextTable
 
-from .frame import COMBINATION, RUN
-from .study import EVERY_LAP, LATER_LAPS, Study, column_of
+from .frame import COMBINATION, RUN, last_laps
+from .study import LATER_LAPS, Study, column_of
 
 _OVER_ALL: Final = {"all, mean": "mean", "all, median": "median", "all, largest": "max"}
 """These rows stand below the tracks, and each is made by a function of pandas."""
@@ -55,12 +55,11 @@ def _rows(columns: dict[str, tuple[Metric, str]], frame: pd.DataFrame) -> Iterat
 
 def _values(frame: pd.DataFrame, metric: Metric, laps: str) -> pd.Series[float]:
     """Returns a value for each run that finished, by track and seed."""
-    done = frame[frame["failure"] == ""]
-    if metric.key not in done:
+    if metric.key not in frame:
         return pd.Series(dtype=float)
+    done = frame[frame["failure"] == ""] if laps else last_laps(frame)
     if laps == LATER_LAPS:
         done = done[done["lap"] > 1]
     elif laps.isdecimal():
         done = done[done["lap"] == int(laps)]
-    by_run = done.assign(value=done[metric.key].astype(float)).groupby([*RUN], sort=False)["value"]
-    return by_run.mean() if laps in (EVERY_LAP, LATER_LAPS) else by_run.last()
+    return done.assign(value=done[metric.key].astype(float)).groupby([*RUN], sort=False)["value"].mean()

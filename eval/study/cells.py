@@ -38,8 +38,10 @@ class Cell:
     @cached_property
     def id(self) -> str:
         """Returns an identity of everything that the result depends on, except the code."""
-        parts = {"drive": self.drive.id, "estimator": self.estimator, "settings": asdict(self.settings)}
-        return identity(**parts, **({"yardsticks": True} if self.yardsticks else {}))
+        settings = asdict(self.settings)
+        return identity(
+            drive=self.drive.id, estimator=self.estimator, settings=settings, yardsticks=self.yardsticks
+        )
 
     @property
     def names(self) -> dict[str, Any]:

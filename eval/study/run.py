@@ -63,7 +63,7 @@ class Plan:
             "baseline": {"variant": study.baseline_variant, "estimator": study.baseline.estimator},
             "metrics": study.metrics,
             "columns": study.columns,
-            **({"yardsticks": True} if study.yardsticks else {}),
+            "yardsticks": study.yardsticks,
         }
 
 

@@ -62,6 +62,12 @@ def test_a_failed_run_is_counted_and_has_no_value() -> None:
     assert table("rmse", of=frame(failed=("bean", 0)))["bean"] == ("0 of 1", "–")
 
 
+def test_a_last_lap_without_a_value_is_not_that_of_the_lap_before() -> None:
+    runs = frame()
+    runs.loc[(runs["track"] == "bean") & (runs["lap"] == 3), "rmse"] = float("nan")
+    assert table("rmse", of=runs)["bean"] == ("1 of 1", "–")
+
+
 def test_a_metric_that_was_not_measured_is_a_dash() -> None:
     assert table("limit")["oval"] == ("2 of 2", "–")
 
