@@ -19,6 +19,7 @@ from .cost import covariance_bytes, map_bytes, stage_times
 from .curves import curve_distance
 from .ghosts import GhostSettings, ghosts
 from .limit import limit
+from .reach import reach_values
 from .summary import has_cones, lap_times
 from .table1 import capped_rmse, cone_distances, lap_metrics, missed_share, root_mean_square
 from .trajectory import position_rms, trajectory_errors
@@ -86,6 +87,10 @@ _ALL: Final = (
     Metric("ate", "trajectory error (ATE)", "m"),
     Metric("along", "trajectory error along", "m"),
     Metric("across", "trajectory error across", "m"),
+    Metric("reach_median", "reach, median", "m", 1),
+    Metric("reach_p10", "reach, 10th percentile", "m", 1),
+    Metric("reach_short", "reach under 4 m, share of cycles", "%", 1),
+    Metric("reach_error", "error of the cones in reach", "m"),
     Metric("gap_curves", "gap to batch, curves", "m", scope="run"),
     Metric("gap_trajectory", "gap to batch, trajectory", "m", scope="run"),
     Metric("l", "limit, landmarks", "m", scope="run"),
@@ -259,13 +264,15 @@ def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:
 
 
 def _drive_values(run: RunResult, truth: Truth | None, begin: float, end: float) -> dict[str, float]:
-    """Returns the trajectory's errors (m) and an online run's update times (ms) in (begin, end] s."""
+    """Returns the trajectory's errors (m), the reach (m) and the update times (ms) in (begin, end] s."""
     values: dict[str, float] = {}
     if truth is not None and len(truth.poses):
         inside = (run.trajectory_t > begin) & (run.trajectory_t <= end)
         errors = trajectory_errors(run.trajectory_t[inside], run.trajectory[inside], truth)
         values["ate"] = position_rms(errors)
         values["along"], values["across"] = (root_mean_square(column) for column in errors[:, :2].T)
+        if run.reach is not None:
+            values |= reach_values(run.reach[inside])
     cycles = online_cycles(run, begin, end)
     if cycles:
         whole = stage_times(cycles)[0]

@@ -68,6 +68,12 @@ class RunResult:
     """Each complete lap of the estimated trajectory has its number and the map as it stood at its end."""
     snapshots: tuple[Map, ...] = ()
     """The map is kept as it stood at each of the times that were asked for."""
+    reach: Array | None = None
+    """Each perception cycle has a row (n, 3), if an observer knew the truth: the reach ahead of the vehicle
+    (m), the sum of squared distances (m^2) of the true cones on that stretch, and their number. The reach is
+    NaN where the cycle doesn't count."""
+    observing: float = 0.0
+    """The observer took this wall time (s), which is no part of the estimator's."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -132,3 +132,7 @@ class LandmarkCkf:
     def map(self) -> Map:
         """Returns the map as it stands, with the joint covariance of each boundary's landmarks."""
         return point_map(self.belief.points, self.labels, self.belief.covariance[HEAD:, HEAD:], False)
+
+    def outline(self) -> Map:
+        """Returns a copy of the present map without covariances."""
+        return point_map(self.belief.points, self.labels, None, False)

@@ -160,3 +160,8 @@ class LandmarkFixedLag:
             return Map(self.closed, {})
         joint = self.smoother.last_covariance(state.keys)
         return point_map(state.landmarks, state.labels, joint, self.closed)
+
+    def outline(self) -> Map:
+        """Returns a copy of the present map without covariances."""
+        state = self.smoother.map.state
+        return point_map(state.landmarks, state.labels, None, self.closed)

@@ -14,7 +14,7 @@ from pathspace_graph.graph.keys import POINT, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.io.map import Map, SplineBoundary
+from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
@@ -181,6 +181,14 @@ class FixedLagMapper:
             spline = boundary.spline(self.control_points(label).copy())
             boundaries[label] = SplineBoundary(spline, covariance)
         return Map(self.closed, boundaries)
+
+    def outline(self) -> Map:
+        """Returns a copy of the present map without covariances, which takes a hundredth of the time."""
+        state, values = self.smoother.map.state, self.smoother.variables.values.copy()
+        self.smoother.refresh()
+        splines = {b: at.spline(state.control_points(b).copy()) for b, at in self.boundaries.items()}
+        self.smoother.variables.values[:] = values  # to look at the map must not change the estimate
+        return Map(self.closed, {b: SplineBoundary(s, NO_COVARIANCE) for b, s in splines.items()})
 
     # --- the graph ---------------------------------------------------------------------------------------
 
