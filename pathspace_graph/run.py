@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 
 from .labels import LEFT, RIGHT
 from .laps import LapCounter
@@ -70,6 +70,14 @@ class OutliningEstimator(Protocol):
 
     def outline(self) -> Map:
         """Returns a copy of the map as it stands, without covariances, which are empty (0, 0)."""
+
+
+@runtime_checkable
+class VehicleEstimator(Protocol):
+    """Describes an online estimator that says how well it knows the vehicle's pose and its calibration."""
+
+    def vehicle_state(self) -> VehicleState:
+        """Returns the newest pose and the calibration, with their joint covariance."""
 
 
 Observer = Callable[[CycleResult, Map], None]
@@ -177,6 +185,7 @@ class _Run:
                 readings=result.readings,
                 lap=lap,
                 stages=dict(result.stages),
+                closed=result.closed,
             )
         )
         if self._observer is not None:
@@ -201,6 +210,7 @@ class _Run:
             laps=self._laps.completed,
             lap_maps=tuple(self._lap_maps),
             snapshots=tuple(self._snapshots),
+            vehicle=_vehicle_state(self._estimator) if self._records else None,
             observing=self._observing,
         )
 
@@ -209,6 +219,10 @@ class _Run:
             if self._snapshot_times[len(self._snapshots)] >= before:
                 return
             self._snapshots.append(self._estimator.map())
+
+
+def _vehicle_state(estimator: OnlineEstimator) -> VehicleState | None:
+    return estimator.vehicle_state() if isinstance(estimator, VehicleEstimator) else None
 
 
 def settings_dict(settings: Any) -> dict[str, Any]:

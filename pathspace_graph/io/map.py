@@ -76,6 +76,10 @@ class Map:
     boundaries: Mapping[int, MapBoundary]
     """Each boundary stands under its label, LEFT or RIGHT; a boundary that could not be mapped is absent."""
 
+    joint_covariance: Array | None = None
+    """This is the joint covariance (2m, 2m) in m^2 of the points of all boundaries, in the order of their
+    labels; it is None where it isn't known, for example because the map was read from a file."""
+
     @property
     def size(self) -> int:
         """Returns the number of control points or landmarks on both boundaries together."""

@@ -118,11 +118,12 @@ def point_map(points: Array, labels: IntArray, joint: Array | None, closed: bool
 
     Where the joint covariance is None, the boundaries have none.
     """
-    boundaries = {}
+    boundaries, order = {}, [np.zeros(0, np.intp)]
     for label in BOUNDARIES:
         own = np.flatnonzero(labels == label)
         if len(own):
-            columns = (POINT * own[:, None] + np.arange(POINT)).ravel()
-            covariance = NO_COVARIANCE if joint is None else joint[np.ix_(columns, columns)]
+            order.append((POINT * own[:, None] + np.arange(POINT)).ravel())
+            covariance = NO_COVARIANCE if joint is None else joint[np.ix_(order[-1], order[-1])]
             boundaries[label] = PointBoundary(points[own].copy(), covariance)
-    return Map(closed, boundaries)
+    columns = np.concatenate(order)
+    return Map(closed, boundaries, None if joint is None else joint[np.ix_(columns, columns)])

@@ -17,7 +17,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.run import CycleResult, OutliningEstimator, split_odometry
+from pathspace_graph.run import CycleResult, OutliningEstimator, VehicleEstimator, split_odometry
 from pathspace_graph.settings.mapper import GaugeSettings, GrowthSettings, MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
@@ -134,13 +134,23 @@ def assert_outline(track: Map, whole: Map) -> None:
 
 
 @pytest.mark.parametrize("name", ["fixed-lag", "landmark-fixed-lag", "ckf", "landmark-ckf"])
-def test_an_outline_is_the_map_without_covariances(name: str, lap: Log) -> None:
+def test_every_estimator_has_an_outline_a_vehicle_and_a_joint_covariance(name: str, lap: Log) -> None:
     estimator = make_online(name, MapperSettings(), lap)
     for odometry, cycle in list(split_odometry(lap))[:50]:
         estimator.update(odometry, cycle)
     assert isinstance(estimator, OutliningEstimator)
     assert set(estimator.map().boundaries) == {LEFT, RIGHT}
     assert_outline(estimator.outline(), estimator.map())
+    assert isinstance(estimator, VehicleEstimator)
+    state = estimator.vehicle_state()
+    assert (state.pose.shape, state.calibration.shape, state.covariance.shape) == ((3,), (2,), (5, 5))
+    assert (state.sigmas > 0.0).all()
+    joint = estimator.map().joint_covariance
+    assert joint is not None
+    sizes = np.cumsum([2 * boundary.size for boundary in estimator.map().boundaries.values()])
+    for end, boundary in zip(sizes, estimator.map().boundaries.values(), strict=True):
+        own = slice(end - 2 * boundary.size, end)
+        np.testing.assert_array_equal(joint[own, own], boundary.covariance)
 
 
 def test_an_outline_does_not_update_the_inactive_map(
