@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, is_dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 
 from .labels import LEFT, RIGHT
 from .laps import LapCounter
@@ -69,6 +69,31 @@ class BatchEstimator(Protocol):
         """Returns the optimum over a whole log, whose truth is not read."""
 
 
+@runtime_checkable
+class OutliningEstimator(Protocol):
+    """Describes an online estimator whose map is cheap to look at in every cycle."""
+
+    def outline(self) -> Map:
+        """Returns a copy of the map as it stands, without covariances, which are empty (0, 0)."""
+
+
+@runtime_checkable
+class VehicleEstimator(Protocol):
+    """Describes an online estimator that says how well it knows the vehicle's pose and its calibration."""
+
+    def vehicle_state(self) -> VehicleState:
+        """Returns the newest pose and the calibration, with their joint covariance."""
+
+
+Observer = Callable[[CycleResult, Map], None]
+"""It is shown the result of each cycle and the outline of the map, which it must not change."""
+
+
+def outline(estimator: OnlineEstimator) -> Map:
+    """Returns the present map, without covariances where the estimator can give it so."""
+    return estimator.outline() if isinstance(estimator, OutliningEstimator) else estimator.map()
+
+
 class Stopwatch:
     """Measures how long each stage of an update takes, from the moment that it is made."""
 
@@ -112,14 +137,16 @@ def run_online(
     name: str = "fixed-lag",
     snapshot_times: Sequence[float] | Array = (),
     on_cycle: Callable[[CycleRecord], None] | None = None,
+    observer: Observer | None = None,
 ) -> RunResult:
     """Feeds a log's odometry and cycles to an online estimator, in order of time and never ahead of it.
 
     The truth of the log is not read. For each of the `snapshot_times` (s, ascending) the map is kept as it
-    stood then, after the last cycle that isn't later. `on_cycle` is called after each cycle. BLAS has one
-    thread, since its threads stall small solves.
+    stood then, after the last cycle that isn't later. `on_cycle` is called after each cycle, and `observer`
+    with what the cycle gave and the outline of the map; neither counts in the times. BLAS has one thread,
+    since its threads stall small solves.
     """
-    run = _Run(estimator, [float(t) for t in snapshot_times])
+    run = _Run(estimator, [float(t) for t in snapshot_times], observer)
     with threadpool_limits(limits=1):
         for odometry, detections in split_odometry(log):
             record = run.cycle(odometry, detections)
@@ -131,8 +158,12 @@ def run_online(
 class _Run:
     """Collects the results of a run in progress."""
 
-    def __init__(self, estimator: OnlineEstimator, snapshot_times: list[float]) -> None:
+    def __init__(
+        self, estimator: OnlineEstimator, snapshot_times: list[float], observer: Observer | None
+    ) -> None:
         self._estimator = estimator
+        self._observer = observer
+        self._observing = 0.0
         self._snapshot_times = snapshot_times
         self._snapshots: list[Map] = []
         self._laps = LapCounter()
@@ -159,8 +190,13 @@ class _Run:
                 readings=result.readings,
                 lap=lap,
                 stages=dict(result.stages),
+                closed=result.closed,
             )
         )
+        if self._observer is not None:
+            begin = time.perf_counter()
+            self._observer(result, outline(self._estimator))
+            self._observing += time.perf_counter() - begin
         return self._records[-1]
 
     def result(self, name: str) -> RunResult:
@@ -179,6 +215,8 @@ class _Run:
             laps=self._laps.completed,
             lap_maps=tuple(self._lap_maps),
             snapshots=tuple(self._snapshots),
+            vehicle=_vehicle_state(self._estimator) if self._records else None,
+            observing=self._observing,
         )
 
     def _take_snapshots(self, before: float) -> None:
@@ -186,6 +224,10 @@ class _Run:
             if self._snapshot_times[len(self._snapshots)] >= before:
                 return
             self._snapshots.append(self._estimator.map())
+
+
+def _vehicle_state(estimator: OnlineEstimator) -> VehicleState | None:
+    return estimator.vehicle_state() if isinstance(estimator, VehicleEstimator) else None
 
 
 def settings_dict(settings: Any) -> dict[str, Any]:

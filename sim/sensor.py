@@ -107,12 +107,16 @@ class SensorSettings:
         return np.clip(self.detection_probability - self.detection_falloff * ranges, 0.0, 1.0)
 
 
-def measure_twists(twists: FloatArray, noise: OdometryNoise, rng: Generator) -> FloatArray:
-    """Returns measured twists (N, 3): `(1 + scale) [vx, vy]` and `wz + bias`, each plus white noise."""
-    scale = 1.0 + noise.scale * rng.standard_normal()
+def measure_twists(twists: FloatArray, noise: OdometryNoise, rng: Generator) -> tuple[FloatArray, FloatArray]:
+    """Returns measured twists (N, 3), and the scale error (-) and the bias (rad/s) that they have (2,).
+
+    They are `(1 + scale) [vx, vy]` and `wz + bias`, each plus white noise.
+    """
+    scale = noise.scale * rng.standard_normal()
     bias = noise.gyro_bias * rng.standard_normal()
     white = rng.standard_normal(twists.shape) * np.array(noise.white)
-    return np.asarray(twists * np.array([scale, scale, 1.0]) + np.array([0.0, 0.0, bias]) + white)
+    factors = np.array([1.0 + scale, 1.0 + scale, 1.0])
+    return np.asarray(twists * factors + np.array([0.0, 0.0, bias]) + white), np.array([scale, bias])
 
 
 class ConeSensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.random import Generator
@@ -48,9 +48,9 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     wander_rng, odometry_rng, sensor_rng = np.random.default_rng(seed).spawn(3)
     track = to_map_frame(track)
     driven = drive(track, settings.laps, settings.vehicle, wander_rng)
-    twists = measure_twists(driven.twists, settings.odometry, odometry_rng)
+    twists, calibration = measure_twists(driven.twists, settings.odometry, odometry_rng)
     cycles, associations = _perceive(track, driven, settings.sensor, sensor_rng)
-    truth = _truth(track, driven, cycles, associations)
+    truth = replace(_truth(track, driven, cycles, associations), calibration=calibration)
     return Log(
         odometry=Odometry(driven.t, twists),
         cycles=tuple(cycles),

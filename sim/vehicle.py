@@ -52,7 +52,8 @@ class VehicleSettings:
     settle_distance: float = 5.0
     """The vehicle moves from its start pose to the middle over this distance (m)."""
     overrun: float = 10.0
-    """The vehicle drives this far beyond the last lap's end (m), so that the lap is complete."""
+    """The vehicle drives this far beyond the last lap's end (m), so that the lap is complete; where it is
+    negative, the drive ends before the line, and the road stays open."""
     rate: float = 50.0
     """There are this many true poses per second (Hz), at the odometry's rate."""
 
@@ -66,8 +67,10 @@ class VehicleSettings:
             "rate",
         )
         check_numbers(self, "vehicle", positive, "a positive number")
-        at_least_0 = ("speed_start", "wander", "half_width", "margin", "overrun")
+        at_least_0 = ("speed_start", "wander", "half_width", "margin")
         check_numbers(self, "vehicle", at_least_0, "a number of at least 0")
+        if not np.isfinite(self.overrun):
+            raise SettingsError(f"vehicle.overrun: expected a number, found {self.overrun}")
         shortest, longest = self.wander_wavelengths
         if not 0 < shortest <= longest < np.inf:
             raise SettingsError(f"vehicle.wander_wavelengths: expected 0 < a <= b, found {shortest, longest}")
@@ -136,6 +139,8 @@ def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Genera
     line = track.centre_line
     start = line.nearest(track.start)
     total = laps * line.length + settings.overrun if line.closed else line.length - start
+    if total <= 0.0:
+        raise SettingsError(f"vehicle.overrun: expected a drive, found none of {total:g} m")
     s = np.linspace(0.0, total, max(int(total / PATH_STEP), MIN_PATH))
     at = (start + s) % line.length if line.closed else start + s
     normals = left_normals(line.tangents(at))

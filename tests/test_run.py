@@ -16,7 +16,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.labels import LEFT
-from pathspace_graph.run import CycleResult, run_online, split_odometry
+from pathspace_graph.run import CycleResult, outline, run_online, split_odometry
 
 
 def detections(t: float) -> Detections:
@@ -183,6 +183,22 @@ def test_a_log_without_cycles_gives_an_empty_result() -> None:
     assert result.trajectory_t.shape == (0,)
     assert result.cycles == ()
     assert [track.size for track in result.snapshots] == [0]
+
+
+def test_an_observer_sees_each_cycle_with_the_map_as_it_stands_then() -> None:
+    seen: list[tuple[float, int]] = []
+    result, _ = run(5, observer=lambda cycle, track: seen.append((cycle.t, track.size)))
+    assert seen == [(k / 10.0, k + 1) for k in range(5)]
+    assert result.observing > 0.0 and result.reach is None
+    assert run(5)[0].observing == 0.0
+
+
+def test_an_outline_is_preferred_to_a_map() -> None:
+    class Outlining(Counting):
+        def outline(self) -> Map:
+            return Map(True, {})
+
+    assert outline(Outlining()).closed and not outline(Counting()).closed
 
 
 def test_blas_has_one_thread_while_it_runs() -> None:

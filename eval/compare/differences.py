@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from pathspace_graph import estimators as registry
-from pathspace_graph.eval.metrics.gap import gap
+from pathspace_graph.eval.metrics.gap import from_batch, gap
 from pathspace_graph.eval.metrics.measures import MEAN_DIGITS, METRICS, UNKNOWN, Metric
 from pathspace_graph.eval.metrics.paired import difference
 from pathspace_graph.eval.metrics.text_table import TextTable
@@ -39,21 +39,24 @@ _NOT_PAIRED: Final = ("nees_low", "nees_high")
 
 
 def with_gaps(comparison: Comparison) -> Comparison:
-    """Returns the comparison with the gaps to the batch in the rows of whole logs, where `spline` ran too."""
+    """Returns the comparison with the gaps to the batch in the rows of whole logs, where `spline` ran too.
+
+    Every row has the turn from the batch over the whole log, and the rmse by that of the batch.
+    """
     outcomes: list[Outcome] = []
     for named in comparison.logs:
         of_log = comparison.of(named.name)
-        batch = next((o.result for o in of_log if o.estimator == registry.DEFAULT_BATCH), None)
+        batch = next((o for o in of_log if o.estimator == registry.DEFAULT_BATCH), None)
         outcomes += of_log if batch is None else [_with_gap(outcome, batch) for outcome in of_log]
     return replace(comparison, outcomes=tuple(outcomes))
 
 
-def _with_gap(outcome: Outcome, batch: RunResult) -> Outcome:
-    if outcome.result is None or outcome.estimator == registry.DEFAULT_BATCH:
+def _with_gap(outcome: Outcome, batch: Outcome) -> Outcome:
+    if outcome.result is None or batch.result is None or outcome.estimator == registry.DEFAULT_BATCH:
         return outcome
-    columns = gap_columns(outcome.result, batch)
+    columns, whole = gap_columns(outcome.result, batch.result), batch.rows[-1]
     rows = tuple(row | columns if row["scope"] == "log" else row for row in outcome.rows)
-    return replace(outcome, rows=rows)
+    return replace(outcome, rows=tuple(row | from_batch(row, whole) for row in rows))
 
 
 def gap_columns(result: RunResult, batch: RunResult) -> Row:

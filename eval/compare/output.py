@@ -9,7 +9,6 @@ from typing import Any, Final
 from matplotlib.figure import Figure
 
 from pathspace_graph.eval.figures.files import save_figures
-from pathspace_graph.eval.metrics.blind_spot import find_blind_spot
 from pathspace_graph.eval.metrics.summary import summarize, versions
 from pathspace_graph.eval.metrics.text_table import TextTable
 from pathspace_graph.io.files import atomic_folder
@@ -18,6 +17,7 @@ from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.io.results import write_result
 from pathspace_graph.settings.mapper import MapperSettings
 
+from .blind_spot import find_blind_spot
 from .comparison import Comparison, NamedLog, Outcome
 from .differences import paired_frame, paired_table
 from .plot import plot_blind_spot, plot_maps

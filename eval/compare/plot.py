@@ -27,12 +27,12 @@ from pathspace_graph.eval.figures.style import (
     grouped_legend,
     set_frame,
 )
-from pathspace_graph.eval.metrics.blind_spot import BlindSpot
 from pathspace_graph.eval.metrics.curves import mapped_points
 from pathspace_graph.eval.metrics.measures import PAPER
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 
+from .blind_spot import BlindSpot
 from .comparison import Outcome
 
 Array = NDArray[np.float64]

@@ -70,7 +70,7 @@ def final_table(comparison: Comparison) -> TextTable:
     final = frame[frame["scope"] == "log"]
     known = [m for m in METRICS.values() if m.key in frame and not final[m.key].astype(float).isna().all()]
     means = {
-        name: final[final["estimator"] == name][[m.key for m in known]].astype(float).mean()
+        name: {m.key: m.over(final.loc[final["estimator"] == name, m.key]) for m in known}
         for name in comparison.estimators
     }
     rows = tuple(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import NAMES
@@ -24,6 +26,19 @@ class Gap:
     """This is the root mean square distance (m) of the poses across it."""
     heading: float
     """This is the root mean square difference (rad) of the headings."""
+
+
+def from_batch(values: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the turn (rad) of a map from that of the batch over the same log, and the rmse by the batch's.
+
+    Both are given by their metrics. Small turns about one point add up, so the turn from the batch is the
+    difference of the turns from the truth. Where either map has no such metric, the result has none.
+    """
+    found: dict[str, Any] = {}
+    if {"turn", "rmse"} <= set(values) & set(batch):
+        found["turn_from_batch"] = float(values["turn"] - batch["turn"])
+        found["rmse_by_batch"] = float(values["rmse"] / batch["rmse"])
+    return found
 
 
 def gap(run: RunResult, reference: RunResult) -> Gap:

@@ -7,24 +7,30 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.laps import lap_end_indices
 
 from .consistency import joint_cone_error, map_nees, normal_errors, with_marginals
 from .cost import covariance_bytes, map_bytes, stage_times
 from .curves import curve_distance
 from .ghosts import GhostSettings, ghosts
 from .limit import limit
-from .summary import has_cones, lap_times
+from .reach import reach_values
+from .summary import has_cones, lap_times, vehicle_of
 from .table1 import capped_rmse, cone_distances, lap_metrics, missed_share, root_mean_square
-from .trajectory import position_rms, trajectory_errors
+from .trajectory import position_rms, trajectory_errors, vehicle_errors
+from .turn import turn_from_truth
 
-FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3}
-"""Columns hold shares and bytes, which these factors turn into the units of the tables."""
+FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3, "°": float(np.rad2deg(1.0)), "mrad/s": 1e3}
+"""Columns hold shares, bytes and radians, which these factors turn into the units of the tables."""
+EARLY: Final = 30.0
+"""A loop may close this far before the true drive is back at the start (m), which the sensor sees ahead."""
 MEAN_DIGITS: Final = 2
 """A mean with its interval is shown with at least this many digits after the decimal point."""
 UNKNOWN: Final = "–"
@@ -47,6 +53,8 @@ class Metric:
     """A lap's metric is measured of every lap and of the whole run, a run's metric of the whole run only."""
     time: bool = False
     """A wall time differs whenever the same run is repeated; nothing else does."""
+    average: Literal["mean", "rms"] = "mean"
+    """Tables show this of several runs: an error with a sign has a root mean square, all others a mean."""
 
     @property
     def heading(self) -> str:
@@ -57,6 +65,14 @@ class Metric:
     def factor(self) -> float:
         """Returns the factor from the column's unit to that of the tables."""
         return FACTORS.get(self.unit, 1.0)
+
+    def over(self, values: ArrayLike) -> float:
+        """Returns the average of values of several runs, without those that aren't known."""
+        known = np.asarray(values, float)
+        known = known[~np.isnan(known)]
+        if len(known) == 0:
+            return float("nan")
+        return root_mean_square(known) if self.average == "rms" else float(np.mean(known))
 
     def text(self, value: float) -> str:
         """Returns a value as tables show it."""
@@ -86,6 +102,15 @@ _ALL: Final = (
     Metric("ate", "trajectory error (ATE)", "m"),
     Metric("along", "trajectory error along", "m"),
     Metric("across", "trajectory error across", "m"),
+    Metric("reach_median", "reach, median", "m", 1),
+    Metric("reach_p10", "reach, 10th percentile", "m", 1),
+    Metric("reach_short", "reach under 4 m, share of cycles", "%", 1),
+    Metric("reach_error", "error of the cones in reach", "m"),
+    Metric("turn", "turn about the start", "°", 2, average="rms"),
+    Metric("turn_sigma", "turn about the start, claimed sigma", "°", 2, average="rms"),
+    Metric("turn_nees", "NEES of the turn", digits=2),
+    Metric("turn_from_batch", "turn from the batch", "°", 2, average="rms"),
+    Metric("rmse_by_batch", "rmse by that of the batch", digits=2),
     Metric("gap_curves", "gap to batch, curves", "m", scope="run"),
     Metric("gap_trajectory", "gap to batch, trajectory", "m", scope="run"),
     Metric("l", "limit, landmarks", "m", scope="run"),
@@ -118,6 +143,22 @@ _ALL: Final = (
         scope="run",
     ),
     Metric("closed", "loop closed", "%", 0),
+    Metric("false_closing", "loop closed falsely", "%", 1, scope="run"),
+    Metric("scale", "scale error of the speeds", "%", 2, scope="run"),
+    Metric("scale_true", "scale error of the speeds, true", "%", 2, scope="run"),
+    Metric("scale_sigma", "scale error of the speeds, claimed sigma", "%", 2, scope="run", average="rms"),
+    Metric("scale_error", "error of the scale", "%", 2, scope="run", average="rms"),
+    Metric("scale_by_sigma", "error of the scale by claimed sigma", digits=2, scope="run", average="rms"),
+    Metric("bias", "bias of the yaw rate", "mrad/s", 2, scope="run"),
+    Metric("bias_true", "bias of the yaw rate, true", "mrad/s", 2, scope="run"),
+    Metric("bias_sigma", "bias of the yaw rate, claimed sigma", "mrad/s", 2, scope="run", average="rms"),
+    Metric("bias_error", "error of the bias", "mrad/s", 2, scope="run", average="rms"),
+    Metric("bias_by_sigma", "error of the bias by claimed sigma", digits=2, scope="run", average="rms"),
+    Metric("heading_sigma", "last heading, claimed sigma", "°", 2, scope="run", average="rms"),
+    Metric("heading_error", "error of the last heading", "°", 2, scope="run", average="rms"),
+    Metric(
+        "heading_by_sigma", "error of the last heading by claimed sigma", digits=2, scope="run", average="rms"
+    ),
     Metric("converged", "batch converged", "%", 0, scope="run"),
     Metric("cost", "cost of the batch", digits=1, scope="run"),
     Metric("bytes", "map", "kB", 2),
@@ -165,6 +206,7 @@ def measure(
         rows.append(Row(lap, values | _drive_values(run, log.truth, begin, end)))
     values = _map_values(run.map, log.truth, ghost_settings, marginals)
     values |= _drive_values(run, log.truth, -np.inf, np.inf)
+    values |= _end_values(run, log.truth)
     if isinstance(run, BatchRun):
         values |= {"converged": run.converged, "cost": run.cost}
     if isinstance(run, BatchResult) and log.truth is not None and has_cones(log.truth):
@@ -209,7 +251,7 @@ def _map_values(
     if truth is None or not has_cones(truth):
         return values
     values |= _cone_values(track, truth) | _curve_values(track, truth, ghost_settings)
-    values |= _consistency_values(track, truth)
+    values |= _consistency_values(track, truth) | _turn_values(track, truth)
     if marginals:
         by_marginals = _consistency_values(with_marginals(track), truth)
         keys = ("nees", "inside", "normalized_error")
@@ -258,14 +300,53 @@ def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:
     }
 
 
+def _turn_values(track: Map, truth: Truth) -> dict[str, float]:
+    """Returns the turn of a map from the truth (rad), and what its covariance says of it."""
+    found = turn_from_truth(track, truth)
+    values = {"turn": found.angle, "turn_sigma": found.sigma, "turn_nees": found.nees}
+    return {key: value for key, value in values.items() if not np.isnan(value)}
+
+
+def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
+    """Returns what is known of the vehicle at the end of the log, and whether the loop has closed falsely."""
+    values: dict[str, float] = {}
+    if truth is None or len(run.trajectory) == 0:
+        return values
+    state = vehicle_of(run)
+    if state is not None:
+        values |= vehicle_errors(state, float(run.trajectory_t[-1]), truth)
+    if len(truth.poses):
+        values["false_closing"] = closes_falsely(run, truth)
+    return values
+
+
+def closes_falsely(run: RunResult, truth: Truth) -> bool:
+    """Returns whether the loop closed before the true drive was back at the start.
+
+    An online run closes at a cycle, and a batch at the end of the log.
+    """
+    if not run.map.closed:
+        return False
+    closed = (record.t for record in run.cycles if record.closed)
+    t = float("inf") if isinstance(run, BatchRun) else next(closed, float("inf"))
+    ends = lap_end_indices(truth.poses)
+    if len(ends) == 0:
+        return True
+    steps = np.linalg.norm(np.diff(truth.poses[:, :2], axis=0), axis=1)
+    driven = np.append(0.0, np.cumsum(steps))
+    return bool(np.interp(t, truth.pose_t, driven) < driven[ends[0]] - EARLY)
+
+
 def _drive_values(run: RunResult, truth: Truth | None, begin: float, end: float) -> dict[str, float]:
-    """Returns the trajectory's errors (m) and an online run's update times (ms) in (begin, end] s."""
+    """Returns the trajectory's errors (m), the reach (m) and the update times (ms) in (begin, end] s."""
     values: dict[str, float] = {}
     if truth is not None and len(truth.poses):
         inside = (run.trajectory_t > begin) & (run.trajectory_t <= end)
         errors = trajectory_errors(run.trajectory_t[inside], run.trajectory[inside], truth)
         values["ate"] = position_rms(errors)
         values["along"], values["across"] = (root_mean_square(column) for column in errors[:, :2].T)
+        if run.reach is not None:
+            values |= reach_values(run.reach[inside])
     cycles = online_cycles(run, begin, end)
     if cycles:
         whole = stage_times(cycles)[0]

@@ -10,9 +10,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, RunResult
+from pathspace_graph.io.results import BatchRun, RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.laps import lap_end_indices
 
@@ -38,9 +39,25 @@ def summarize(result: RunResult, log: Log) -> dict[str, Any]:
         "not_mapped": not_mapped(result.map, log),
         "seconds": _timing(result),
     }
+    state = vehicle_of(result)
+    if state is not None:
+        summary |= _vehicle(state)
     if log.truth is not None:
         summary |= _map_errors(result, log, log.truth) | _trajectory_errors(result, log.truth)
     return summary
+
+
+def vehicle_of(result: RunResult) -> VehicleState | None:
+    """Returns the vehicle's state at the end of the log, where the estimator gives it."""
+    return result.vehicle_state if isinstance(result, BatchResult) else result.vehicle
+
+
+def _vehicle(state: VehicleState) -> dict[str, Any]:
+    """Returns the calibration with its standard deviations (-, rad/s), and that of the last heading (rad)."""
+    (scale, bias), sigmas = state.calibration.tolist(), state.sigmas.tolist()
+    *_, heading_sigma, scale_sigma, bias_sigma = sigmas
+    calibration = {"scale": scale, "bias": bias, "scale_sigma": scale_sigma, "bias_sigma": bias_sigma}
+    return {"calibration": calibration, "heading_sigma": heading_sigma}
 
 
 def versions() -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""The error of a trajectory, by the truth or by another run's trajectory."""
+"""The error of a trajectory, by the truth or by another run's trajectory, and of the vehicle at its end."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import wrap_angle
 from pathspace_graph.io.log import Truth
+from pathspace_graph.io.results import VehicleState
 
 from .table1 import root_mean_square
 
@@ -44,6 +45,29 @@ def trajectory_errors(t: Array, poses: Array, truth: Truth) -> Array:
 def ate(t: Array, poses: Array, truth: Truth) -> float:
     """Returns the absolute trajectory error sqrt(mean |p - p_true|^2) in m, without alignment."""
     return position_rms(trajectory_errors(t, poses, truth))
+
+
+def vehicle_errors(state: VehicleState, t: float, truth: Truth) -> dict[str, float]:
+    """Returns the calibration and the heading at a stamp (s): estimate, truth, claimed sigma and error.
+
+    `KEY_by_sigma` is the error by its claimed standard deviation. What the truth doesn't know is absent.
+    """
+    _, _, sigma_heading, sigma_scale, sigma_bias = state.sigmas.tolist()
+    scale, bias = state.calibration.tolist()
+    values = {"scale": scale, "bias": bias, "scale_sigma": sigma_scale, "bias_sigma": sigma_bias}
+    values["heading_sigma"] = sigma_heading
+    if truth.calibration is not None:
+        values["scale_true"], values["bias_true"] = truth.calibration.tolist()
+        values |= _error("scale", scale - values["scale_true"], sigma_scale)
+        values |= _error("bias", bias - values["bias_true"], sigma_bias)
+    if len(truth.poses) and truth.pose_t[0] <= t <= truth.pose_t[-1]:
+        ((_, _, heading),) = trajectory_errors(np.array([t]), state.pose[None], truth)
+        values |= _error("heading", float(heading), sigma_heading)
+    return values
+
+
+def _error(key: str, error: float, sigma: float) -> dict[str, float]:
+    return {f"{key}_error": error, f"{key}_by_sigma": error / sigma}
 
 
 def position_rms(errors: Array) -> float:

@@ -7,6 +7,8 @@ from typing import Any, Final
 
 import pandas as pd
 
+from pathspace_graph.estimators import DEFAULT_BATCH
+from pathspace_graph.eval.metrics.gap import from_batch
 from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.eval.metrics.summary import versions
 
@@ -35,11 +37,22 @@ def frame_of(study: Study, cells: Sequence[tuple[Cell, Record | None]]) -> pd.Da
         shared = {"study": study.name} | cell.names | _settings_row(study, cell)
         about = {"failure": record["failure"], **record["versions"]}
         rows += [shared | lap | about for lap in record["laps"]] or [shared | {"lap": None} | about]
+    _add_batch(rows)
     settings = _settings_row(study, cells[0][0])
     order = ["study", *RUN, *COMBINATION, *settings, "lap", *METRICS, "failure", *versions()]
     known = dict.fromkeys([*order, *(name for row in rows for name in row)])
     frame = pd.DataFrame(rows, columns=[name for name in known if any(name in row for row in rows)])
     return frame.astype({"lap": "Int64"})
+
+
+def _add_batch(rows: Sequence[dict[str, Any]]) -> None:
+    """Adds how each run compares with the batch on the same log and with the same settings, if it ran."""
+    names = (*RUN, "noise", "variant")
+    batches = {tuple(row[name] for name in names): row for row in rows if row["estimator"] == DEFAULT_BATCH}
+    for row in rows:
+        batch = batches.get(tuple(row[name] for name in names))
+        if batch is not None and row["estimator"] != DEFAULT_BATCH:
+            row.update(from_batch(row, batch))
 
 
 def _settings_row(study: Study, cell: Cell) -> dict[str, Any]:

@@ -11,34 +11,17 @@ from typing import Any, Final
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.eval.harness.attempts import known_estimators
-from pathspace_graph.eval.metrics.measures import METRICS, Metric
+from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings
 
+from .column import column_of
 from .overrides import Overrides, override
 
 DEFAULT: Final = "default"
 """This variant overrides nothing, and it is part of every study."""
-EVERY_LAP: Final = "all"
-"""A column `rmse@all` is the mean over all laps."""
-LATER_LAPS: Final = "later"
-"""A column `rmse@later` is the mean over the laps from the second on."""
 ALL: Final = "all"
 """This name stands for all known estimators."""
-
-
-def column_of(text: str) -> tuple[Metric, str]:
-    """Returns the metric and the laps of a column, such as `rmse`, `rmse@1`, `rmse@later` or `rmse@all`.
-
-    Without laps it is the last lap's value. SettingsError where the metric or the laps are unknown.
-    """
-    key, _, laps = text.partition("@")
-    check_name(key, METRICS, "columns: expected a known metric")
-    if laps and laps not in (EVERY_LAP, LATER_LAPS) and not laps.isdecimal():
-        raise SettingsError(
-            f"columns: expected a lap's number, '{LATER_LAPS}' or '{EVERY_LAP}' after @, found '{text}'"
-        )
-    return METRICS[key], laps
 
 
 @dataclass(frozen=True)
@@ -80,7 +63,8 @@ class Study:
     metrics: tuple[str, ...] = ("rmse", "missed", "size", "ms_mean")
     """The summary compares these metrics with the baseline."""
     columns: tuple[str, ...] = ()
-    """The summary has a table by track of these: `rmse` is the last lap's, `rmse@1` that of lap 1."""
+    """The summary has a table by track of these: `rmse` is the last lap's, `rmse@1` that of lap 1, and
+    `slope(bias, bias_true)` says how much of the truth an estimate has found."""
     yardsticks: bool = False
     """The limit of every run is computed, which takes a landmark batch with oracle associations."""
 

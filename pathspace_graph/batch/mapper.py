@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.graph.elimination import Elimination
+from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_key
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, SplineBoundary
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.detections import DetectionTable
@@ -71,6 +73,19 @@ class BatchResult(BatchRun):
         """
         with threadpool_limits(limits=1):
             return self.system.eliminated(self.optimum).pose_marginals
+
+    @cached_property
+    def vehicle_state(self) -> VehicleState:
+        """Returns the last pose and the calibration, with their joint covariance.
+
+        It is computed when it is first asked for.
+        """
+        variables, last = self.optimum.state.variables, pose_key(len(self.trajectory) - 1)
+        with threadpool_limits(limits=1):
+            linear = self.system.linear_graph(self.optimum)
+            known = Elimination(linear, variables.layout, kept=(last,))
+            covariance = known.joint(np.array([last, CALIBRATION_KEY], np.intp))
+        return VehicleState(self.trajectory[-1].copy(), self.calibration.copy(), covariance)
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Returns the whole problem at the optimum as GTSAM's nonlinear factors (see `nonlinear_graph`)."""
@@ -197,14 +212,14 @@ def own_settings(settings: MapperSettings) -> MapperSettings:
 def _map(state: State, joint: Array, scatter: Scatter) -> Map:
     """Returns the curves with their covariance, to which the scatter of the cones is added."""
     closed = any(boundary.periodic for boundary in state.boundaries.values())
-    boundaries = {}
+    boundaries, joint = {}, joint.copy()
     for label, boundary in state.boundaries.items():
         block = map_block(state, label)
         spline = boundary.spline(state.control_points(label).copy())
         sigma = np.repeat(scatter.sigma(label, boundary.abscissae), 2)
-        covariance = joint[block, block] + np.diag(sigma**2)
-        boundaries[label] = SplineBoundary(spline, covariance)
-    return Map(closed, boundaries)
+        joint[block, block] += np.diag(sigma**2)
+        boundaries[label] = SplineBoundary(spline, joint[block, block].copy())
+    return Map(closed, boundaries, joint)
 
 
 def _records(

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.io.map import Map, SplineBoundary
+from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
+from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
 from pathspace_graph.mapping.path import DrivenPath
@@ -105,4 +106,15 @@ class CkfMapper:
         """Returns the map as it stands, with the joint covariance of each boundary's control points."""
         state = self.state
         curves = {b: SplineBoundary(state.spline(b), state.covariance(b)) for b in state.curves}
+        keys = [state.columns(b, np.arange(curve.size)) for b, curve in sorted(state.curves.items())]
+        columns = np.concatenate([np.zeros(0, np.intp), *keys])
+        return Map(self.closed, curves, state.belief.covariance[np.ix_(columns, columns)])
+
+    def vehicle_state(self) -> VehicleState:
+        """Returns the newest pose and the calibration, with their joint covariance."""
+        return self.state.belief.vehicle_state()
+
+    def outline(self) -> Map:
+        """Returns a copy of the present map without covariances."""
+        curves = {b: SplineBoundary(self.state.spline(b), NO_COVARIANCE) for b in self.state.curves}
         return Map(self.closed, curves)

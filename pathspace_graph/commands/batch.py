@@ -74,7 +74,6 @@ def summarize_batch(result: BatchRun, log: Log, start: Start) -> dict[str, Any]:
     if not isinstance(result, BatchResult):
         return summary
     summary["convergence"] = asdict(result.convergence)
-    summary["calibration"] = {"scale": result.calibration[0], "bias": result.calibration[1]}
     summary["stages"] = result.seconds
     summary["gap"] = None if result.online is None else asdict(gap(result.online, result))
     return summary

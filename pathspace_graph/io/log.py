@@ -30,6 +30,9 @@ TRUTH_POSES_FILE: Final = "truth_poses.csv"
 TRUTH_CONES_FILE: Final = "truth_cones.csv"
 TRUTH_ASSOCIATIONS_FILE: Final = "truth_associations.csv"
 
+CALIBRATION: Final = ("scale", "bias")
+"""The true calibration of the odometry has these names in the log's header."""
+
 MAX_HOLD: Final = 1.0
 """The last twist may be held for this time (s); a perception cycle later than that has no odometry."""
 MIN_RELATIVE_DETERMINANT: Final = 1e-12
@@ -98,6 +101,9 @@ class Truth:
     associations: IntArray | None = None
     """Each detection, in file order, is of the true cone with this index (R,), and of none at -1; None means
     not known."""
+    calibration: FloatArray | None = None
+    """The odometry truly has this calibration (2,): scale error of the speeds (-), bias of the yaw rate
+    (rad/s). None means not known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +143,7 @@ def read_log(folder: Path | str) -> Log:
         odometry_sigma=_odometry_sigma(folder / LOG_FILE, header),
         sensor=_sensor_info(folder / LOG_FILE, header),
         source={key: str(value) for key, value in _section(folder / LOG_FILE, header, "source").items()},
-        truth=_read_truth(folder, len(table)),
+        truth=_read_truth(folder, len(table), _true_calibration(folder / LOG_FILE, header)),
     )
 
 
@@ -199,6 +205,20 @@ def _sensor_info(file: Path, header: dict[str, Any]) -> SensorInfo:
     return SensorInfo(**values)
 
 
+def _true_calibration(file: Path, header: dict[str, Any]) -> FloatArray | None:
+    section = _section(file, header, "truth")
+    if not section:
+        return None
+    values = [section.get(name) for name in CALIBRATION]
+    if not all(_is_number(value) for value in values):
+        raise InputError(file, f"expected numbers as [truth] {' and '.join(CALIBRATION)}, found {values}")
+    return np.array(values, dtype=float)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
 def _is_positive(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
 
@@ -246,14 +266,14 @@ def _labels(table: Table) -> IntArray:
     return np.array([label_from_name(name) for name in table.columns["label"]], dtype=int)
 
 
-def _read_truth(folder: Path, detection_count: int) -> Truth | None:
+def _read_truth(folder: Path, detection_count: int, calibration: FloatArray | None) -> Truth | None:
     files = (folder / TRUTH_POSES_FILE, folder / TRUTH_CONES_FILE, folder / TRUTH_ASSOCIATIONS_FILE)
-    if not any(file.exists() for file in files):
+    if calibration is None and not any(file.exists() for file in files):
         return None
     pose_t, poses = _read_truth_poses(files[0])
     cones, cone_labels = _read_truth_cones(files[1])
     associations = _read_associations(files[2], detection_count, len(cones))
-    return Truth(pose_t, poses, cones, cone_labels, associations)
+    return Truth(pose_t, poses, cones, cone_labels, associations, calibration)
 
 
 def _read_truth_poses(file: Path) -> tuple[FloatArray, FloatArray]:
@@ -289,6 +309,10 @@ def _toml(log: Log) -> str:
     lines += [f"{name} = {float(value)!r}" for name, value in sensor.items() if value is not None]
     lines += ["", "[source]"]
     lines += [f"{_toml_text(key)} = {_toml_text(value)}" for key, value in log.source.items()]
+    if log.truth is not None and log.truth.calibration is not None:
+        lines += ["", "[truth]"]
+        values = zip(CALIBRATION, log.truth.calibration.tolist(), strict=True)
+        lines += [f"{name} = {value!r}" for name, value in values]
     return "\n".join(lines) + "\n"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 
 FORMAT = "pathspace-map/1"
 MAP_FILE = "map.json"
+
+NO_COVARIANCE: Final[Array] = np.zeros((0, 0))
+"""A boundary whose covariance wasn't asked for has this one, and can't be written."""
 
 _SYMMETRY_TOLERANCE = 1e-9
 """A covariance is symmetric to rounding where |P - P^T| <= tolerance * max|P|."""
@@ -72,6 +75,10 @@ class Map:
 
     boundaries: Mapping[int, MapBoundary]
     """Each boundary stands under its label, LEFT or RIGHT; a boundary that could not be mapped is absent."""
+
+    joint_covariance: Array | None = None
+    """This is the joint covariance (2m, 2m) in m^2 of the points of all boundaries, in the order of their
+    labels; it is None where it isn't known, for example because the map was read from a file."""
 
     @property
     def size(self) -> int:

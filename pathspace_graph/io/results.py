@@ -42,6 +42,25 @@ class CycleRecord:
     """The estimated trajectory is in this lap, counted from 1."""
     stages: Mapping[str, float] = field(default_factory=dict)
     """Each stage of the update took this time (s), by the stage's name."""
+    closed: bool = False
+    """The loop has closed by the end of this cycle where this is true."""
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleState:
+    """Holds what an estimator believes of the vehicle: its pose, and the calibration of its odometry."""
+
+    pose: Array
+    """This is the pose [x, y, theta] (3,) in m and rad, map frame; theta isn't wrapped."""
+    calibration: Array
+    """This is the calibration (2,): scale error of the speeds (-), bias of the yaw rate (rad/s)."""
+    covariance: Array
+    """This is the joint covariance (5, 5) of [pose | calibration]."""
+
+    @property
+    def sigmas(self) -> Array:
+        """Returns the standard deviations (5,) of [pose | calibration]."""
+        return np.sqrt(np.diag(self.covariance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +87,14 @@ class RunResult:
     """Each complete lap of the estimated trajectory has its number and the map as it stood at its end."""
     snapshots: tuple[Map, ...] = ()
     """The map is kept as it stood at each of the times that were asked for."""
+    vehicle: VehicleState | None = None
+    """This is the vehicle's state at the end of the log, where the estimator gives it."""
+    reach: Array | None = None
+    """Each perception cycle has a row (n, 3), if an observer knew the truth: the reach ahead of the vehicle
+    (m), the sum of squared distances (m^2) of the true cones on that stretch, and their number. The reach is
+    NaN where the cycle doesn't count."""
+    observing: float = 0.0
+    """The observer took this wall time (s), which is no part of the estimator's."""
 
 
 @dataclass(frozen=True, eq=False)

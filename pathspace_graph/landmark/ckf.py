@@ -24,6 +24,7 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
+from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns, to_vehicle_rows
 from pathspace_graph.mapping.prediction import integrate_odometry, odometry_noise
@@ -132,3 +133,11 @@ class LandmarkCkf:
     def map(self) -> Map:
         """Returns the map as it stands, with the joint covariance of each boundary's landmarks."""
         return point_map(self.belief.points, self.labels, self.belief.covariance[HEAD:, HEAD:], False)
+
+    def vehicle_state(self) -> VehicleState:
+        """Returns the newest pose and the calibration, with their joint covariance."""
+        return self.belief.vehicle_state()
+
+    def outline(self) -> Map:
+        """Returns a copy of the present map without covariances."""
+        return point_map(self.belief.points, self.labels, None, False)

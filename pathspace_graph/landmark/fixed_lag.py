@@ -9,9 +9,10 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
+from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import odometry_noise, predict, smoother_settings
+from pathspace_graph.mapping.prediction import odometry_noise, predict, smoother_settings, vehicle_state
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult, Stopwatch
@@ -160,3 +161,12 @@ class LandmarkFixedLag:
             return Map(self.closed, {})
         joint = self.smoother.last_covariance(state.keys)
         return point_map(state.landmarks, state.labels, joint, self.closed)
+
+    def vehicle_state(self) -> VehicleState:
+        """Returns the newest pose and the calibration, with their joint covariance."""
+        return vehicle_state(self.smoother)
+
+    def outline(self) -> Map:
+        """Returns a copy of the present map without covariances."""
+        state = self.smoother.map.state
+        return point_map(state.landmarks, state.labels, None, self.closed)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.graph.keys import LANDMARK_LETTER, POINT, landmark_keys
 from pathspace_graph.graph.variables import Variables
-from pathspace_graph.io.map import Map, PointBoundary
+from pathspace_graph.io.map import NO_COVARIANCE, Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionColumns
 
@@ -113,12 +113,17 @@ def landmark_counts(labels: IntArray) -> tuple[int, int]:
     return int((labels == LEFT).sum()), int((labels == RIGHT).sum())
 
 
-def point_map(points: Array, labels: IntArray, joint: Array, closed: bool) -> Map:
-    """Returns landmarks (n, 2) by label, each boundary with its block of the joint covariance (2 n, 2 n)."""
-    boundaries = {}
+def point_map(points: Array, labels: IntArray, joint: Array | None, closed: bool) -> Map:
+    """Returns landmarks (n, 2) by label, each boundary with its block of the joint covariance (2 n, 2 n).
+
+    Where the joint covariance is None, the boundaries have none.
+    """
+    boundaries, order = {}, [np.zeros(0, np.intp)]
     for label in BOUNDARIES:
         own = np.flatnonzero(labels == label)
         if len(own):
-            columns = (POINT * own[:, None] + np.arange(POINT)).ravel()
-            boundaries[label] = PointBoundary(points[own].copy(), joint[np.ix_(columns, columns)])
-    return Map(closed, boundaries)
+            order.append((POINT * own[:, None] + np.arange(POINT)).ravel())
+            covariance = NO_COVARIANCE if joint is None else joint[np.ix_(order[-1], order[-1])]
+            boundaries[label] = PointBoundary(points[own].copy(), covariance)
+    columns = np.concatenate(order)
+    return Map(closed, boundaries, None if joint is None else joint[np.ix_(columns, columns)])

@@ -12,6 +12,7 @@ from scipy.linalg import block_diag, lapack
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.keys import POINT, POSE
+from pathspace_graph.io.results import VehicleState
 from pathspace_graph.settings.mapper import OdometrySettings
 
 from .cubature import Transformed, square_root, transform
@@ -56,6 +57,11 @@ class Belief:
     def points(self) -> Array:
         """Returns a view of the mean points (m, 2)."""
         return self.mean[HEAD:].reshape(-1, POINT)
+
+    def vehicle_state(self) -> VehicleState:
+        """Returns a copy of the pose and the calibration, with their joint covariance."""
+        mean, covariance = self.mean[:HEAD].copy(), self.covariance[:HEAD, :HEAD].copy()
+        return VehicleState(mean[:POSE], mean[POSE:], covariance)
 
     def predict(self, odometry: IntegratedOdometry) -> None:
         """Predicts `pose <- pose * delta * (error - J calibration)`; the error is that of the odometry."""

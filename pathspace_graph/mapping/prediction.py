@@ -6,9 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
+from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_key
 from pathspace_graph.graph.smoother import FixedLagSmoother, SmootherSettings
 from pathspace_graph.graph.window import MapRows
 from pathspace_graph.io.log import Odometry
+from pathspace_graph.io.results import VehicleState
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
 from .path import DrivenPath
@@ -49,6 +51,13 @@ def predict(
     path.update(smoother.predict(t, integrated, settings.odometry.sigmas_start))
     path.steer(odometry.twist)
     return integrated
+
+
+def vehicle_state(smoother: FixedLagSmoother[MapRows]) -> VehicleState:
+    """Returns the newest pose and the calibration of a smoother, with their joint covariance."""
+    keys = np.array([pose_key(smoother.next_cycle - 1), CALIBRATION_KEY], np.intp)
+    variables = smoother.variables
+    return VehicleState(variables.poses[-1].copy(), variables.calibration.copy(), smoother.covariance(keys))
 
 
 def smoother_settings(settings: MapperSettings) -> SmootherSettings:

@@ -132,7 +132,9 @@ class Boundary:
 
     def spline(self, control_points: Array) -> BSpline:
         """Returns the curve with control points (m, 2) as a `BSpline`."""
-        return BSpline(self.knots, self.extended(control_points), self.degree, self.periodic)
+        spline = BSpline(self.knots, self.extended(control_points), self.degree, self.periodic)
+        spline.__dict__["tables"] = self.tables
+        return spline
 
     def find(self, control_points: Array, points: Array, low: Array, high: Array) -> FootPoints:
         """Searches the foot points of points (m, 2) in the stretches [low, high], each (m,)."""

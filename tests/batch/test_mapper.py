@@ -16,6 +16,7 @@ from pathspace_graph.cli import main
 from pathspace_graph.commands.batch import NOT_CONVERGED
 from pathspace_graph.eval.metrics.gap import gap
 from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.graph.keys import CALIBRATION_KEY
 from pathspace_graph.io.log import Log, write_log
 from pathspace_graph.io.map import SplineBoundary, read_map
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -165,3 +166,13 @@ def test_a_run_that_did_not_converge_is_written_and_reported(tmp_path: Path) -> 
     assert not summary["convergence"]["converged"]
     assert summary["convergence"]["reason"] == "no round left"
     assert read_map(tmp_path / "map").size > 0
+
+
+def test_the_vehicle_at_the_end_is_known_as_well_as_its_pose() -> None:
+    result = solved("odometry")
+    state = result.vehicle_state
+    np.testing.assert_array_equal(state.pose, result.trajectory[-1])
+    np.testing.assert_array_equal(state.calibration, result.calibration)
+    np.testing.assert_allclose(state.covariance[:3, :3], result.pose_covariances[-1], rtol=1e-6, atol=1e-12)
+    known = result.system.eliminated(result.optimum).joint(np.array([CALIBRATION_KEY], np.intp))
+    np.testing.assert_allclose(state.covariance[3:, 3:], known, rtol=1e-6)

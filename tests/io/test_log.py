@@ -28,7 +28,14 @@ def small_log() -> Log:
     )
     t = np.arange(11) / 50
     poses = rng.normal(size=(11, 3))
-    truth = Truth(t, poses, rng.normal(size=(4, 2)), np.array([0, 1, 2, 0]), np.array([0, 1, -1] * 3))
+    truth = Truth(
+        t,
+        poses,
+        rng.normal(size=(4, 2)),
+        np.array([0, 1, 2, 0]),
+        np.array([0, 1, -1] * 3),
+        rng.normal(size=2),
+    )
     source = {"track": 'a "quoted" \\ name\n', "Umlaut": "Zürich \x7f"}
     sensor = SensorInfo(range_max=15.0, fov=1.9)
     return Log(
@@ -51,7 +58,7 @@ def assert_same(a: Log, b: Log) -> None:
     if a.truth is None or b.truth is None:
         assert a.truth is b.truth
         return
-    for name in ("pose_t", "poses", "cones", "cone_labels", "associations"):
+    for name in ("pose_t", "poses", "cones", "cone_labels", "associations", "calibration"):
         np.testing.assert_array_equal(getattr(a.truth, name), getattr(b.truth, name))
 
 
@@ -169,6 +176,12 @@ BAD_ROWS = [
     ("log.toml", 'format = "pathspace-log/2"\n[odometry]\nsigma = [1, 1, 1]\n', None, "pathspace-log/1"),
     ("log.toml", 'format = "pathspace-log/1"\n[sensor]\nfov = 1\n', None, "sigma"),
     ("log.toml", 'format = "pathspace-log/1"\nodometry = 3\n', None, "section"),
+    (
+        "log.toml",
+        'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1, 1]\n[truth]\nscale = 0.1\n',
+        None,
+        "[truth] scale and bias",
+    ),
     ("log.toml", 'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1]\n', None, "three positive"),
     ("log.toml", 'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 0, 1]\n', None, "three positive"),
     ("log.toml", 'format = "pathspace-log/1"\n[odometry]\nsigma = [1, nan, 1]\n', None, "three positive"),

@@ -9,14 +9,15 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.table1 import cone_distances, lap_metrics
 from pathspace_graph.eval.metrics.trajectory import ate
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
-from pathspace_graph.io.map import Map, SplineBoundary
+from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.run import CycleResult, split_odometry
+from pathspace_graph.run import CycleResult, OutliningEstimator, VehicleEstimator, split_odometry
 from pathspace_graph.settings.mapper import GaugeSettings, GrowthSettings, MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
@@ -116,6 +117,53 @@ def test_a_map_is_a_copy_with_a_joint_covariance(
         assert np.linalg.eigvalsh(boundary.covariance)[0] > 0.0
         boundary.spline.control_points[:] = np.nan
     assert np.isfinite(cone_distances(mapped[0].map(), truth_of(lap))).all()
+
+
+def assert_outline(track: Map, whole: Map) -> None:
+    """An outline has the curves or the points of the whole map, to the bit, and no covariance."""
+    assert (set(track.boundaries), track.closed) == (set(whole.boundaries), whole.closed)
+    for label, boundary in whole.boundaries.items():
+        seen = track.boundaries[label]
+        assert seen.covariance.shape == (0, 0)
+        if isinstance(boundary, SplineBoundary) and isinstance(seen, SplineBoundary):
+            np.testing.assert_array_equal(seen.spline.knots, boundary.spline.knots)
+            np.testing.assert_array_equal(seen.spline.control_points, boundary.spline.control_points)
+        else:
+            assert isinstance(boundary, PointBoundary) and isinstance(seen, PointBoundary)
+            np.testing.assert_array_equal(seen.points, boundary.points)
+
+
+@pytest.mark.parametrize("name", ["fixed-lag", "landmark-fixed-lag", "ckf", "landmark-ckf"])
+def test_every_estimator_has_an_outline_a_vehicle_and_a_joint_covariance(name: str, lap: Log) -> None:
+    estimator = make_online(name, MapperSettings(), lap)
+    for odometry, cycle in list(split_odometry(lap))[:50]:
+        estimator.update(odometry, cycle)
+    assert isinstance(estimator, OutliningEstimator)
+    assert set(estimator.map().boundaries) == {LEFT, RIGHT}
+    assert_outline(estimator.outline(), estimator.map())
+    assert isinstance(estimator, VehicleEstimator)
+    state = estimator.vehicle_state()
+    assert (state.pose.shape, state.calibration.shape, state.covariance.shape) == ((3,), (2,), (5, 5))
+    assert (state.sigmas > 0.0).all()
+    joint = estimator.map().joint_covariance
+    assert joint is not None
+    sizes = np.cumsum([2 * boundary.size for boundary in estimator.map().boundaries.values()])
+    for end, boundary in zip(sizes, estimator.map().boundaries.values(), strict=True):
+        own = slice(end - 2 * boundary.size, end)
+        np.testing.assert_array_equal(joint[own, own], boundary.covariance)
+
+
+def test_an_outline_does_not_update_the_inactive_map(
+    mapped: tuple[FixedLagMapper, list[CycleResult]],
+) -> None:
+    mapper, _ = mapped
+    values = mapper.smoother.variables.values
+    assert len(mapper.smoother.inactive)
+    values[mapper.smoother.variables.layout.entries(mapper.smoother.inactive.keys)] += 1.0
+    before = values.copy()
+    track = mapper.outline()
+    np.testing.assert_array_equal(values, before)
+    assert_outline(track, mapper.map())  # the map has updated it, so that nothing is left moved
 
 
 def test_the_same_log_gives_the_same_map_to_the_bit(lap: Log) -> None:

@@ -116,7 +116,10 @@ def test_odometry_errors() -> None:
     twists = np.tile([10.0, 0.0, 0.5], (5000, 1))
     scales, biases = [], []
     for seed in range(60):
-        error = measure_twists(twists, OdometryNoise(), np.random.default_rng(seed)) - twists
+        measured, calibration = measure_twists(twists, OdometryNoise(), np.random.default_rng(seed))
+        error = measured - twists
+        np.testing.assert_allclose(error[:, 0].mean() / 10.0, calibration[0], atol=5 * 0.025 / np.sqrt(5000))
+        np.testing.assert_allclose(error[:, 2].mean(), calibration[1], atol=5 * 0.035 / np.sqrt(5000))
         np.testing.assert_allclose(error.std(axis=0), [0.25, 0.12, 0.035], rtol=0.06)
         assert abs(np.corrcoef(error[1:, 0], error[:-1, 0])[0, 1]) < 0.06
         scales.append(error[:, 0].mean() / 10.0)

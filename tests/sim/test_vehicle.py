@@ -10,6 +10,7 @@ from scipy.linalg import expm
 from scipy.spatial import cKDTree
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_generator import generate_track
 from pathspace_graph.sim.vehicle import Drive, VehicleSettings, drive, integrate
@@ -97,6 +98,19 @@ def test_drives_its_laps_and_a_little_more(driven: tuple[Track, Drive]) -> None:
     # after two laps it is beyond the start again, where it began
     assert np.linalg.norm(d.poses[-1, :2]) == pytest.approx(10.0, abs=1.5)
     assert d.poses[-1, 0] > 0
+
+
+def test_a_drive_may_end_before_the_line() -> None:
+    track = generated(0)
+    whole, open_drive = (
+        drive(track, 1, VehicleSettings(overrun=overrun), np.random.default_rng(0))
+        for overrun in (0.0, -50.0)
+    )
+    gap = np.hypot(*(open_drive.poses[-1, :2] - whole.poses[-1, :2]))
+    assert 20.0 < gap < 55.0
+    assert len(lap_end_indices(whole.poses)) == 1 and len(lap_end_indices(open_drive.poses)) == 0
+    with pytest.raises(SettingsError, match="overrun: expected a drive"):
+        drive(track, 1, VehicleSettings(overrun=-1e4), np.random.default_rng(0))
 
 
 def test_wander_depends_on_the_seed_and_can_be_none() -> None:

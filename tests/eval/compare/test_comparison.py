@@ -10,11 +10,11 @@ import pytest
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.eval.compare.blind_spot import find_blind_spot
 from pathspace_graph.eval.compare.comparison import NamedLog, choose, choose_reference, compare, read_logs
 from pathspace_graph.eval.compare.differences import paired_frame, with_gaps
 from pathspace_graph.eval.compare.plot import plot_maps
 from pathspace_graph.eval.compare.table import final_table, paper_frame, paper_table, side_by_side
-from pathspace_graph.eval.metrics.blind_spot import find_blind_spot
 from pathspace_graph.eval.metrics.table1 import LapMetrics
 from pathspace_graph.io.log import Log, Truth, read_log
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.gap import gap
+from pathspace_graph.eval.metrics.gap import from_batch, gap
 from pathspace_graph.factors.bspline import clamped_knots
 from pathspace_graph.factors.gauge import greville
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
@@ -76,3 +76,9 @@ def test_landmarks_are_points_of_the_curve() -> None:
     landmarks = PointBoundary(points, np.zeros((2 * len(points), 2 * len(points))))
     found = gap(run({LEFT: landmarks}, drive()), run({LEFT: line(2.0)}, drive()))
     np.testing.assert_allclose(found.curves["left"], 0.5, atol=1e-2)
+
+
+def test_a_turn_and_an_rmse_are_compared_with_those_of_the_batch() -> None:
+    found = from_batch({"turn": 0.003, "rmse": 0.3, "size": 4}, {"turn": -0.001, "rmse": 0.2})
+    assert found == {"turn_from_batch": 0.004, "rmse_by_batch": 0.3 / 0.2}
+    assert from_batch({"rmse": 0.3}, {"turn": -0.001, "rmse": 0.2}) == {}

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.metrics.measures import METRICS, PAPER, Metric, measure
+from pathspace_graph.eval.metrics.measures import METRICS, PAPER, Metric, closes_falsely, measure
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
@@ -112,6 +112,38 @@ def test_landmarks_have_no_band() -> None:
     assert np.isnan(whole.values["inside"]) and np.isnan(whole.values["normalized_error"])
     assert whole.values["nees"] == pytest.approx(1 / 6)
     assert whole.values["nees_low"] < 0.25 and whole.values["nees_inside"] is False
+
+
+@pytest.mark.parametrize(
+    ("closed_at", "false"), [(None, False), (5.0, True), (18.0, True), (20.0, False), (30.0, False)]
+)
+def test_a_loop_closes_falsely_before_the_drive_is_back(closed_at: float | None, false: bool) -> None:
+    """A lap of 125.7 m at 5 m/s ends after 25.1 s; the sensor sees the start some 30 m before."""
+    true = circle_truth()
+    made = run(true)
+    cycles = tuple(
+        replace(record, closed=closed_at is not None and record.t >= closed_at) for record in made.cycles
+    )
+    closed = Map(closed_at is not None, made.map.boundaries)
+    assert closes_falsely(replace(made, cycles=cycles, map=closed), true) is false
+
+
+def test_a_map_that_closes_on_an_open_drive_is_false() -> None:
+    true = circle_truth()
+    part = replace(true, pose_t=true.pose_t[:400], poses=true.poses[:400])
+    made = run(true)
+    batch = BatchRun("made", {}, made.map, STAMPS, made.trajectory, made.cycles, 0)
+    assert closes_falsely(batch, part) and not closes_falsely(batch, true)
+    assert not closes_falsely(replace(batch, map=Map(False, {})), part)
+    (*_, whole) = measure(batch, log(part))
+    assert whole.values["false_closing"] is True
+
+
+def test_a_signed_error_has_a_root_mean_square() -> None:
+    assert METRICS["turn"].over([3.0, -4.0, float("nan")]) == pytest.approx(np.sqrt(12.5))
+    assert METRICS["rmse"].over([3.0, float("nan"), 5.0]) == 4.0
+    assert np.isnan(METRICS["rmse"].over([float("nan")]))
+    assert METRICS["turn"].text(np.deg2rad(0.3)) == "0.30" and METRICS["bias"].text(0.002) == "2.00"
 
 
 def test_a_metric_is_shown_in_its_unit() -> None:

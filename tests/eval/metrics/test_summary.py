@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.eval.metrics.summary import lap_times, laps_of, not_mapped, summarize
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, RunResult
+from pathspace_graph.io.results import BatchRun, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 
 from .straight_maps import line, row, truth
@@ -80,3 +80,14 @@ def test_the_summary_has_the_final_map_beside_the_laps() -> None:
     assert summary["inside_two_sigma"] == 1.0
     assert (summary["seconds"], summary["closed"], summary["lap_count"]) == (None, False, 2)
     assert "laps" not in summarize(RUN, replace(log(), truth=None))
+
+
+def test_the_summary_has_the_calibration_with_its_sigmas_where_it_is_known() -> None:
+    assert "calibration" not in summarize(RUN, log())
+    covariance = np.diag(np.array([1.0, 1.0, 0.3, 0.04, 0.05]) ** 2)
+    known = VehicleState(np.zeros(3), np.array([0.01, 0.02]), covariance)
+    summary = summarize(replace(RUN, vehicle=known), log())
+    assert summary["calibration"] == pytest.approx(
+        {"scale": 0.01, "bias": 0.02, "scale_sigma": 0.04, "bias_sigma": 0.05}
+    )
+    assert summary["heading_sigma"] == pytest.approx(0.3)

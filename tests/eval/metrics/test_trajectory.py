@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.metrics.trajectory import ate, interpolate_poses, trajectory_errors
+from pathspace_graph.eval.metrics.trajectory import (
+    ate,
+    interpolate_poses,
+    trajectory_errors,
+    vehicle_errors,
+)
 from pathspace_graph.io.log import Truth
+from pathspace_graph.io.results import VehicleState
 
 
 def test_trajectory_errors_are_along_and_across_the_true_heading() -> None:
@@ -23,6 +29,33 @@ def test_trajectory_errors_are_along_and_across_the_true_heading() -> None:
     expected = [[0.3, 0, 1.6 - np.pi / 2], [0, 0.4, 0], [0, 0, 0]]
     np.testing.assert_allclose(errors, expected, atol=1e-12)
     assert ate(stamps, poses, true) == pytest.approx(np.sqrt((0.3**2 + 0.4**2) / 3))
+
+
+def test_the_vehicle_at_the_end_is_compared_with_the_truth() -> None:
+    t, nothing = np.array([0.0, 10.0]), (np.zeros((0, 2)), np.zeros(0, dtype=int))
+    true = Truth(t, np.array([[0, 0, 3.1], [0, 0, 3.1]]), *nothing, calibration=np.array([0.01, -0.002]))
+    covariance = np.diag(np.array([9.0, 9.0, 0.1, 0.004, 0.001]) ** 2)
+    state = VehicleState(np.array([1.0, 1.0, -3.1]), np.array([0.012, -0.001]), covariance)
+    values = vehicle_errors(state, 5.0, true)
+    assert values == pytest.approx(
+        {
+            "scale": 0.012,
+            "scale_true": 0.01,
+            "scale_sigma": 0.004,
+            "scale_error": 0.002,
+            "scale_by_sigma": 0.5,
+            "bias": -0.001,
+            "bias_true": -0.002,
+            "bias_sigma": 0.001,
+            "bias_error": 0.001,
+            "bias_by_sigma": 1.0,
+            "heading_sigma": 0.1,
+            "heading_error": 2 * np.pi - 6.2,
+            "heading_by_sigma": (2 * np.pi - 6.2) / 0.1,
+        }
+    )
+    unknown = vehicle_errors(state, 11.0, Truth(t, true.poses, *nothing))
+    assert set(unknown) == {"scale", "scale_sigma", "bias", "bias_sigma", "heading_sigma"}
 
 
 def test_headings_are_interpolated_the_short_way_and_wrap() -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.eval.study.by_track import track_tables
-from pathspace_graph.eval.study.study import Study, column_of
+from pathspace_graph.eval.study.column import column_of
+from pathspace_graph.eval.study.study import Study
 
 RUNS = {  # rmse (m) of laps 1, 2 and 3
     ("oval", 0): (0.6, 0.2, 0.1),
@@ -79,10 +82,37 @@ def test_every_combination_has_a_table_of_its_own() -> None:
     assert track_tables(Study(tracks=(0,)), both) == []
 
 
+def test_errors_with_a_sign_have_root_mean_squares_and_magnitudes() -> None:
+    turned = frame().rename(columns={"rmse": "turn"})
+    turned.loc[turned["track"] == "oval", "turn"] *= -1.0
+    factor = METRICS["turn"].factor
+    found = {name: float(cells[1]) / factor for name, cells in table("turn", of=turned).items()}
+    assert found["oval"] == pytest.approx(np.sqrt((0.1**2 + 0.3**2) / 2), abs=1e-3)
+    assert found["all, mean"] == pytest.approx(np.sqrt((0.1**2 + 0.3**2 + 0.5**2) / 3), abs=1e-3)
+    assert (found["all, median"], found["all, largest"]) == (
+        pytest.approx(0.3, abs=1e-3),
+        pytest.approx(0.5, abs=1e-3),
+    )
+
+
+def test_a_slope_is_of_all_runs_together() -> None:
+    runs = frame().assign(bias_true=[0.1, 0.1, 0.1, 0.3, 0.3, 0.3, -0.5, -0.5, -0.5])
+    found = table("slope(rmse, bias_true)", of=runs)
+    assert found["oval"] == ("2 of 2", "1.00")  # 0.1 on 0.1 and 0.3 on 0.3
+    assert found["all, mean"] == ("3 of 3", f"{(0.1**2 + 0.3**2 - 0.5**2) / 0.35:.2f}")
+    assert found["all, median"] == ("3 of 3", "–")
+    assert (
+        column_of("slope(bias, bias_true)").title
+        == "slope of bias of the yaw rate on bias of the yaw rate, true"
+    )
+    with pytest.raises(SettingsError, match="columns: expected"):
+        column_of("slope(bias, bais)")
+
+
 @pytest.mark.parametrize("column", ["rmsee", "rmse@", "rmse@0.5", "rmse@last"])
 def test_an_unknown_column_is_refused(column: str) -> None:
     if column == "rmse@":
-        assert column_of(column)[1] == ""
+        assert column_of(column).laps == ""
         return
     with pytest.raises(SettingsError, match="columns: expected"):
         Study(tracks=(0,), columns=(column,))

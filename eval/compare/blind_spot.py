@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from pathspace_graph.eval.metrics.table1 import MISSED_DISTANCE, cone_distances
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.labels import BOUNDARIES
-
-from .table1 import MISSED_DISTANCE, cone_distances
 
 Array = NDArray[np.float64]
 
