@@ -38,4 +38,4 @@ def _stretch(row: FloatArray, line: CentreLine, start: float, kept: float) -> Fl
     square = ((row[:, None] - middle) ** 2).sum(axis=2)
     station = np.mod(s[square.argmin(axis=1)] - start, line.length)
     order = np.argsort(station, kind="stable")
-    return row[order[station[order] < kept]]
+    return np.asarray(row[order[station[order] < kept]])

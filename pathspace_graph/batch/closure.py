@@ -7,11 +7,14 @@ patience.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.footpoint import FootPoints
+from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
@@ -20,7 +23,6 @@ from .recurrence import Recurrence
 from .system import Evaluation
 
 Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 
@@ -40,60 +42,55 @@ def is_worth_trying(recurrence: Recurrence, settings: MapperSettings) -> bool:
 class Evidence:
     """Holds what speaks for or against a closed result."""
 
-    converged: bool
-    """This is true where the optimization has found its optimum."""
     closed: bool
     """This is true where both boundaries are closed."""
     used: float
-    """This share of all coloured detections lies on the curves."""
+    """This share of the coloured detections of the first lap lies on the curves."""
     used_again: float
-    """This share of the coloured detections after the first lap lies on the curves."""
+    """This share of those after the first lap does."""
     misfit: float
     """This is the root mean square distance of those detections from their curves, in sigmas."""
     gap: float
     """This is the longest stretch of a boundary on which no detection lies (m)."""
     overlap: float
-    """This length of the boundary that was driven less far has been seen again after the first lap (m)."""
+    """The boundary that was driven less far has been driven again over this length (m)."""
     sigma: float
-    """The detections after the first lap hold their drive in place, beside the curves of the first, by this
-    standard deviation in the worst direction (m). It is infinite on a straight, whose stretches all agree."""
+    """The detections after the first lap hold their drive in place, beside the curves, by this standard
+    deviation in the worst direction (m). It is infinite on a straight, whose stretches all agree."""
 
 
-def evidence(
-    at: Evaluation, detections: DetectionTable, settings: MapperSettings, converged: bool
-) -> Evidence:
+def evidence(at: Evaluation, detections: DetectionTable, settings: MapperSettings) -> Evidence:
     """Returns the evidence for or against an optimum whose curves are closed."""
-    state, both = at.state, len(at.state.boundaries) > 1
+    state = at.state
     coloured = np.isin(detections.label, list(state.boundaries))
-    again = coloured & _after_first_lap(state)[detections.cycle] if both else np.zeros(len(coloured), bool)
-    stretches, gaps, squares = [0.0], [0.0], [np.zeros(0)]
-    normals, points = [np.zeros((0, 2))], [np.zeros((0, 2))]
-    for label, projected in at.projected.items():
-        boundary, chosen = state.boundaries[label], again[projected.rows]
-        gaps.append(_longest_gap(projected.foot.u, boundary.length))
-        stretches.append(_span(state.pose_u[label], boundary.length))
-        squares.append(projected.whitened[chosen] ** 2)
-        normals.append(projected.foot.normal_unit[chosen])
-        points.append(projected.foot.position[chosen])
+    again = _is_after_first_lap(state)[detections.cycle] & coloured
+    chosen = {label: again[projected.rows] for label, projected in at.projected.items()}
+    feet = [p.foot.where(chosen[label]) for label, p in at.projected.items()]
+    whitened = [p.whitened[chosen[label]] for label, p in at.projected.items()]
+    lengths = {label: boundary.length for label, boundary in state.boundaries.items()}
     return Evidence(
-        converged=converged,
-        closed=both and all(boundary.periodic for boundary in state.boundaries.values()),
-        used=_share(detections.used, coloured),
+        closed=set(lengths) == set(BOUNDARIES) and all(b.periodic for b in state.boundaries.values()),
+        used=_share(detections.used, coloured & ~again),
         used_again=_share(detections.used, again),
-        misfit=float(np.sqrt(np.mean(np.concatenate(squares)))) if again.any() else np.inf,
-        gap=max(gaps),
-        overlap=min(stretches[1:], default=0.0),
-        sigma=_sigma(np.concatenate(normals), np.concatenate(points), settings.closing.sigma_reading),
+        misfit=_rms(np.concatenate([np.zeros(0), *whitened])),
+        gap=max(
+            (_longest_gap(p.foot.u, lengths[label]) for label, p in at.projected.items()), default=np.inf
+        ),
+        overlap=min((_driven_again(state.pose_u[b], lengths[b]) for b in lengths), default=0.0),
+        sigma=_sigma_of_motion(feet, settings.closing.sigma_reading),
     )
 
 
-def is_closed_truly(found: Evidence, settings: MapperSettings) -> bool:
-    """Returns whether the evidence is for a closed result, in every respect."""
+def is_true_closure(found: Evidence, settings: MapperSettings) -> bool:
+    """Returns whether the evidence is for a closed result, in every respect.
+
+    A caller that can wait for more of the drive also asks that the optimization has converged.
+    """
     own = settings.batch.closure
     return (
-        found.converged
-        and found.closed
-        and min(found.used, found.used_again) >= own.used
+        found.closed
+        and found.used >= own.used
+        and found.used_again >= own.used_again * found.used
         and found.misfit <= own.misfit
         and found.gap <= own.gap
         and found.overlap >= own.overlap
@@ -101,8 +98,8 @@ def is_closed_truly(found: Evidence, settings: MapperSettings) -> bool:
     )
 
 
-def _after_first_lap(state: State) -> BoolArray:
-    """Returns which poses (P,) are on a stretch that was driven before, on every boundary."""
+def _is_after_first_lap(state: State) -> BoolArray:
+    """Returns which poses (P,) are beside a stretch of every boundary that was driven a lap before."""
     again = np.ones(len(state.poses), bool)
     for label, boundary in state.boundaries.items():
         u = state.pose_u[label]
@@ -110,8 +107,8 @@ def _after_first_lap(state: State) -> BoolArray:
     return again
 
 
-def _span(pose_u: Array, length: float) -> float:
-    """Returns how much of a closed curve was driven again, at most all of it (m)."""
+def _driven_again(pose_u: Array, length: float) -> float:
+    """Returns how much of a closed curve of a length was driven again, at most all of it (m)."""
     return float(np.clip(pose_u[-1] - pose_u[0] - length, 0.0, length))
 
 
@@ -124,20 +121,28 @@ def _longest_gap(u: Array, length: float) -> float:
 
 
 def _share(used: BoolArray, among: BoolArray) -> float:
-    """Returns the share of detections that are used among some, 0 of none."""
+    """Returns the share of some detections that is used, 0 of none."""
     return float(used[among].mean()) if among.any() else 0.0
 
 
-def _sigma(normals: Array, points: Array, sigma_reading: float) -> float:
+def _rms(values: Array) -> float:
+    """Returns the root mean square, infinite of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.inf
+
+
+def _sigma_of_motion(feet: Sequence[FootPoints], sigma_reading: float) -> float:
     """Returns the largest standard deviation (m) of a rigid motion that detections hold across curves.
 
-    normals (m, 2) are those of the curves at the detections' foot points (m, 2), and the motion turns about
-    the mean of these points.
+    The motion turns about the mean of the foot points. Each detection has this sigma (m).
     """
-    if len(points) == 0:
+    normal, point = (
+        np.concatenate([np.zeros((0, 2)), *(getattr(foot, name) for foot in feet)])
+        for name in ("normal_unit", "position")
+    )
+    if len(point) == 0:
         return np.inf
-    arm = points - points.mean(axis=0)
-    by_motion = np.column_stack([normals, normals[:, 1] * arm[:, 0] - normals[:, 0] * arm[:, 1]])
+    arm = point - point.mean(axis=0)
+    by_motion = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
     information = by_motion.T @ by_motion / sigma_reading**2
     if np.linalg.matrix_rank(information) < len(information):
         return np.inf

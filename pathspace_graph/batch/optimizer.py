@@ -219,4 +219,4 @@ def gradient(groups: Sequence[Rows], layout: Layout) -> Array:
     groups = [rows for rows in groups if len(rows)]
     columns = np.concatenate([rows.columns(layout).ravel() for rows in groups])
     slopes = np.concatenate([(rows.jacobian * rows.residual[:, None]).ravel() for rows in groups])
-    return np.bincount(columns, slopes, layout.size)
+    return np.asarray(np.bincount(columns, slopes, layout.size), np.float64)

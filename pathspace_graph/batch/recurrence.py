@@ -35,6 +35,10 @@ class Recurrence:
         """Returns whether a lap was found."""
         return bool(np.isfinite(self.lap))
 
+    def denied(self) -> Recurrence:
+        """Returns the same path without a lap."""
+        return Recurrence(self.driven, np.inf, 0.0, 0.0)
+
     @property
     def whole_turn(self) -> float:
         """Returns the whole turns nearest to the change of the heading in a lap (rad)."""

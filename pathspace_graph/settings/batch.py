@@ -116,9 +116,10 @@ class ClosureSettings(Positive, group="batch.closure"):
     correlation: float = 0.7
     """The loop is tried where the curvature driven agrees with itself a lap later to this degree at least, 1
     where it is the same."""
-    used: float = 0.8
-    """A closed result has at least this share of the coloured detections on its curves, over the whole drive
-    and after the first lap."""
+    used: float = 0.6
+    """A closed result has at least this share of the first lap's coloured detections on its curves."""
+    used_again: float = 0.85
+    """The share of those after the first lap is at least this part of it."""
     misfit: float = 1.5
     """A closed result has detections after the first lap that are this number of sigmas from their curves at
     most (root mean square)."""
