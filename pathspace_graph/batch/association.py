@@ -55,7 +55,9 @@ def associate(
 
     A detection is searched for on the stretch of the curve that its pose sees.
     `strict` means that the curves are about where they belong. Then a detection that fits nowhere in that
-    stretch is searched for on the whole curve, since the sensor sees much later stretches across the infield.
+    stretch is searched for on the whole of a closed curve, since the sensor sees much later stretches across
+    the infield. An open curve has drifted against itself by more than the gate from one stretch to a far one.
+    A detection that happened to fit there would say that it has not, so it isn't compared.
     And a detection of unknown colour goes to the curve that it fits better. It isn't used before, since
     cones that belong to no boundary stand beside the track. A known colour is always believed.
     """
@@ -63,7 +65,9 @@ def associate(
     for whole in (False, True) if strict else (False,):
         unexplained = boundary_of == UNKNOWN
         best = np.full(len(detections), gate)
-        for label in state.boundaries:
+        for label, boundary in state.boundaries.items():
+            if whole and not boundary.periodic:
+                continue
             possible = (detections.label == label) | (strict & (detections.label == UNKNOWN))
             rows = np.flatnonzero(unexplained & possible)
             misfit, foot_u = _misfit(state, detections, settings, label, rows, whole)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.gauge import smoothness_matrix
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.elimination import owners
 from pathspace_graph.graph.keys import POINT, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
@@ -92,6 +93,28 @@ class CurveGauge:
         The numbers are negative, so that they differ from those of cycles.
         """
         return np.asarray(-1 - self.label - 2 * (indices(keys) // POINTS_A_FACTOR))
+
+    def damping(self, control_points: Array, poses: Array, weight: float) -> Rows:
+        """Returns rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
+
+        They damp how a control point moves as seen from the pose beside it, in 1/m^2. A map that swings with
+        its poses, as an error of the yaw rate swings it, is not damped. J is the quarter turn.
+        """
+        arm = control_points - poses[self.cycle, :2]
+        by_point, by_theta = np.tile(np.eye(POINT), (len(arm), 1)), np.column_stack([arm[:, 1], -arm[:, 0]])
+        keys = np.column_stack([self.keys, pose_keys(self.cycle)])
+        return Rows(
+            keys=np.repeat(keys, POINT, axis=0),
+            jacobian=np.sqrt(weight) * np.column_stack([by_point, -by_point, by_theta.ravel()]),
+            residual=np.zeros(POINT * len(arm)),
+            owner=np.repeat(owners(self.cycle, self.label), POINT),
+        )
+
+    def carried(self, control_points: Array, poses: Array, poses_after: Array) -> Array:
+        """Returns control points (m, 2) moved rigidly with the poses beside them, from and to (P, 3)."""
+        before, after = poses[self.cycle], poses_after[self.cycle]
+        turned = np.column_stack([np.zeros((len(before), 2)), after[:, 2] - before[:, 2]])
+        return after[:, :2] + to_map(control_points - before[:, :2], turned)
 
     def cost(self, control_points: Array, poses: Array) -> float:
         """Returns half the sum of the squared residuals at control points (m, 2) and all poses (P, 3)."""

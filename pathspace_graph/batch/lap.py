@@ -116,9 +116,8 @@ def lap_optimum(lap: OpenLap) -> tuple[BatchSystem, Evaluation, Convergence]:
         deepcopy(lap.detections),
     )
     system = BatchSystem(detections, lap.chain, settings, Biweight(settings.batch.loose_gate))
-    optimizer, batch = Optimizer(system, settings.batch), settings.batch
-    state = optimizer.align_poses(_start(lap, settings), batch.pose_steps, batch.loose_gate)
-    at, convergence = find_optimum(optimizer, state, detections, settings)
+    optimizer = Optimizer(system, settings.batch)
+    at, convergence = find_optimum(optimizer, _start(lap, settings), settings)
     return system, at, convergence
 
 

@@ -24,6 +24,7 @@ from .gauge import CurveGauge, curve_gauge
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,9 @@ class Projected:
     """These are their residuals and derivatives."""
     sigma: Array
     """These are their standard deviations (m,) across the curve in m, which a round holds."""
+    inside: BoolArray
+    """Each flag (m,) is set where the foot point was inside the curve when the round began. A round holds it,
+    so that the cost does not jump where an end of an open curve slides past a detection."""
 
     @property
     def whitened(self) -> Array:
@@ -100,6 +104,7 @@ class BatchSystem:
         self.gauges: dict[int, CurveGauge] = {}
         """These are the weak priors of each boundary."""
         self._sigma = np.ones(len(detections))
+        self._inside = np.ones(len(detections), bool)
 
     def begin(self, state: State) -> None:
         """Makes the gauges anew, which hold the control points where they are now.
@@ -114,8 +119,9 @@ class BatchSystem:
     def evaluate(self, state: State, hold: bool = False) -> Evaluation:
         """Returns the problem at a state; foot points are refined from those that the detections have.
 
-        `hold` sets the sigma of each detection across its curve, which later evaluations keep. The
-        derivatives leave out that the sigma depends on the direction of the curve.
+        `hold` sets the sigma of each detection across its curve, and whether its foot point is inside the
+        curve, which later evaluations keep. The derivatives leave out that the sigma depends on the direction
+        of the curve.
         """
         projected = {label: self._project(state, label, hold) for label in state.boundaries}
         odometry = self.chain.terms(state.poses, state.calibration)
@@ -135,12 +141,12 @@ class BatchSystem:
         sigma_model = self.settings.spline.sigma_model
         projection = project(points, detections.covariance[rows], poses, foot, sigma_model)
         if hold:
-            self._sigma[rows] = projection.sigma
-        return Projected(rows, foot, projection, self._sigma[rows])
+            self._sigma[rows], self._inside[rows] = projection.sigma, foot.interior
+        return Projected(rows, foot, projection, self._sigma[rows], self._inside[rows])
 
     def _detections_cost(self, projected: dict[int, Projected]) -> float:
-        used = sum(int(p.foot.interior.sum()) for p in projected.values())
-        losses = sum(float(self.kernel.loss(p.whitened[p.foot.interior]).sum()) for p in projected.values())
+        used = sum(int(p.inside.sum()) for p in projected.values())
+        losses = sum(float(self.kernel.loss(p.whitened[p.inside]).sum()) for p in projected.values())
         return losses + self.kernel.ceiling * (len(self.detections) - used)
 
     # --- linear factors ----------------------------------------------------------------------------------
@@ -169,9 +175,9 @@ class BatchSystem:
         )
 
     def scale(self, projected: Projected) -> Array:
-        """Returns the factor (m,) that whitens and weights each row (1/m); it is zero at a curve's ends."""
+        """Returns the factor (m,) that whitens and weights each row (1/m), zero for those not inside."""
         weights = self.kernel.weights(projected.whitened)
-        return np.asarray(np.sqrt(weights) * projected.foot.interior / projected.sigma)
+        return np.asarray(np.sqrt(weights) * projected.inside / projected.sigma)
 
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
         """Returns all rows as a linear graph, whose solution is the change from the state."""
@@ -181,6 +187,32 @@ class BatchSystem:
         """Returns the linear problem with its poses eliminated."""
         return Elimination(self.linear_graph(at), at.state.variables.layout)
 
+    def damping(self, state: State, weight: float) -> gtsam.GaussianFactorGraph:
+        """Returns factors that damp how control points move as seen from the poses beside them (1/m^2)."""
+        rows = [
+            gauge.damping(state.control_points(label), state.poses, weight)
+            for label, gauge in self.gauges.items()
+        ]
+        return linear_graph(rows, state.variables)
+
+    def retract(self, state: State, step: Array) -> State:
+        """Returns the state after a step (n,), taken in relative coordinates.
+
+        The step changes each pose as seen from the pose before, and each control point as seen from the pose
+        beside it. A map that swings by a large angle keeps its shape then, which the same step in map
+        coordinates would stretch.
+        """
+        linear = moved(state, step)
+        after, poses, goal = linear.copy(), state.poses, linear.poses
+        driven = seen_from(poses[1:, :2], poses[:-1], goal[1:, :2], goal[:-1])
+        after.poses[1:, :2] = goal[0, :2] + np.cumsum(rotated(driven, goal[:-1, 2]), axis=0)
+        for label, gauge in self.gauges.items():
+            points, k = after.control_points(label), gauge.cycle
+            points[:] = to_map(
+                seen_from(state.control_points(label), poses[k], points, goal[k]), after.poses[k]
+            )
+        return after
+
     def poses_alone(self, at: Evaluation) -> Array:
         """Returns the step (3 P,) of the poses while the map and the calibration are held."""
         keys = at.state.variables.keys
@@ -188,8 +220,26 @@ class BatchSystem:
         return Elimination(graph, Layout(keys[are_poses(keys)])).poses_given(np.zeros(0))
 
 
+def seen_from(points: Array, poses: Array, points_after: Array, poses_after: Array) -> Array:
+    """Returns points (m, 2) in the frames of poses (m, 3) after a step, to first order in the step.
+
+    The step leads from points and poses to those after it, all of them in the map frame.
+    """
+    arm, change = points - poses[:, :2], points_after - points - poses_after[:, :2] + poses[:, :2]
+    turn = (poses_after[:, 2] - poses[:, 2])[:, None]
+    return rotated(arm + change + turn * np.column_stack([arm[:, 1], -arm[:, 0]]), -poses[:, 2])
+
+
+def rotated(vectors: Array, angles: Array) -> Array:
+    """Returns vectors (m, 2), each turned by its angle (m,) in rad."""
+    return to_map(vectors, np.column_stack([np.zeros((len(angles), 2)), angles]))
+
+
 def moved(state: State, step: Array) -> State:
-    """Returns the state after a step (n,) of its last n entries: of all variables, or of the poses alone."""
+    """Returns the state after a step (n,) of its last n entries in map coordinates.
+
+    These are all variables, or the poses alone.
+    """
     after = state.copy()
     after.variables.values[len(after.variables.values) - len(step) :] += step
     return after

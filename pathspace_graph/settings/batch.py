@@ -135,6 +135,31 @@ class OpenLapSettings(Positive, group="open_lap"):
 
 
 @dataclass(frozen=True)
+class ClosureSettings(Positive, group="batch.closure"):
+    """Describes when a loop is tried that no registration has closed, and when its result is believed."""
+
+    laps: float = 1.3
+    """The loop is tried where the path driven is at least this number of laps long."""
+    correlation: float = 0.7
+    """The loop is tried where the curvature driven agrees with itself a lap later to this degree at least, 1
+    where it is the same."""
+    used: float = 0.6
+    """A closed result has at least this share of the first lap's coloured detections on its curves."""
+    used_again: float = 0.85
+    """The share of those after the first lap is at least this part of it."""
+    misfit: float = 1.5
+    """A closed result has detections after the first lap that are this number of sigmas from their curves at
+    most (root mean square)."""
+    gap: float = 25.0
+    """A closed result has no longer stretch of a boundary without detections on it than this (m)."""
+    overlap: float = 20.0
+    """A closed result has been driven again over this length at least (m)."""
+    sigma: float = 0.3
+    """The detections after the first lap hold their drive beside the curves by this standard deviation at
+    most (m), in every direction."""
+
+
+@dataclass(frozen=True)
 class BatchSettings(Positive):
     """Describes the batch optimization over a whole log."""
 
@@ -180,7 +205,8 @@ class BatchSettings(Positive):
     gate_factor: float = 0.7
     """The gate is multiplied by this from each round to the next, down to `gate`."""
     damping: float = 1e-2
-    """This is the first damping of control points (1/m^2)."""
+    """This is the first damping of control points (1/m^2). It resists a motion as seen from the pose beside a
+    control point, so a map that swings with its poses isn't damped."""
     damping_up: float = 5.0
     """The damping is multiplied by this after a step that increased the cost."""
     damping_down: float = 0.1
@@ -195,12 +221,14 @@ class BatchSettings(Positive):
     share_most: float = 0.97
     """A step is not extended if its ratio to the step before is larger than this."""
     tolerance_cost: float = 1e-5
-    """The optimization has converged when |cost_before - cost_after| <= tolerance_cost * cost_before, and the
-    other two tolerances hold."""
+    """The optimization has converged when a round's step has made the cost smaller by this share at most, and
+    the other two tolerances hold."""
     tolerance_curve: float = 2e-3
-    """At convergence, no point of a curve moved farther than this across it in a round (m)."""
-    tolerance_pose: float = 2e-3
-    """At convergence, no pose moved farther than this in a round (m, and rad)."""
+    """At convergence, no point of a curve moved farther than this across it in a round, as seen from the
+    poses beside it (m)."""
+    tolerance_decrease: float = 1e-3
+    """At convergence, an undamped step would make the cost smaller by no more than this. A step of one sigma
+    in any direction makes it smaller by 1/2, also where it swings a whole map by metres."""
     min_size_share: float = 0.6
     """The map's curves are tried with at least this share of the largest number of control points."""
     curve_samples: int = 2
@@ -215,5 +243,7 @@ class BatchSettings(Positive):
     """These settings place poses and detections along the curves."""
     foot_points: FootPointSettings = field(default_factory=FootPointSettings)
     """These settings compute foot points."""
+    closure: ClosureSettings = field(default_factory=ClosureSettings)
+    """These settings decide on loops that no registration has closed."""
     scatter: ScatterSettings = field(default_factory=ScatterSettings)
     """These settings measure how far cones lie from the map's curves."""
