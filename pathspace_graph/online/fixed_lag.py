@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.graph.keys import POINT, name, pose_key, pose_keys
+from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.io.log import Detections, Odometry
@@ -23,12 +23,14 @@ from pathspace_graph.mapping.registration import near_start, register
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
+from pathspace_graph.spline.bspline import BSpline
 
 from .activation import deactivate_distant
 from .association import associate
 from .closing import apply_correspondences, optimize_loop, simplify
 from .growth import Growth
 from .nonlinear_graph import window_graph
+from .outlook import Outlook, confirmed, look_ahead
 
 Array = NDArray[np.float64]
 
@@ -169,18 +171,42 @@ class FixedLagMapper:
         return CycleResult(t, self.poses[-1].copy(), (left, right), used, self.closed, stages)
 
     def map(self) -> Map:
-        """Returns a copy of the present map, with the joint covariance of each boundary's control points."""
-        boundaries, shape = {}, self.settings.spline.sigma_shape if self.closed else 0.0
-        state = self.smoother.map.state
-        if not self.boundaries:
+        """Returns a copy of the present map, with the joint covariance of each boundary's control points.
+
+        An open curve goes on beyond its confirmed end, as `outline` says.
+        """
+        state, outlooks = self.smoother.map.state, self._outlooks()
+        if not outlooks:
             return Map(self.closed, {})
-        joint, at = self.smoother.covariance(state.map_keys), 0
-        for label, boundary in self.boundaries.items():
-            block = slice(at, at := at + POINT * boundary.size)
-            covariance = joint[block, block] + shape**2 * np.eye(POINT * boundary.size)
-            spline = boundary.spline(self.control_points(label).copy())
-            boundaries[label] = SplineBoundary(spline, covariance)
+        newest = pose_keys(np.array([self.smoother.next_cycle - 1]))
+        joint = self.smoother.covariance(np.concatenate([state.map_keys, newest]))
+        vehicle, bend = self.poses[-1], self.settings.tentative.sigma_bend
+        boundaries, at = {}, 0
+        for label, outlook in outlooks.items():
+            own = np.arange(at, at := at + POINT * len(outlook.known))
+            entries = np.append(own, np.arange(len(joint) - POSE, len(joint)))
+            covariance = outlook.covariance(joint[np.ix_(entries, entries)], vehicle, bend)
+            if self.closed:
+                covariance = covariance + self.settings.spline.sigma_shape**2 * np.eye(len(covariance))
+            until = outlook.spline.domain[1] if self.closed else outlook.confirmed_until
+            boundaries[label] = SplineBoundary(outlook.spline, covariance, until)
         return Map(self.closed, boundaries)
+
+    def outline(self) -> dict[int, BSpline]:
+        """Returns the present map without covariances: each boundary's curve by label, cheap in every cycle.
+
+        An open curve is confirmed up to the parameter `boundaries[label].confirmed_end`. From there on it is
+        tentative: it leads through cones that were seen less often, and is fitted anew in each call. A curve
+        that has not begun may consist of a tentative stretch alone.
+        """
+        return {label: outlook.spline for label, outlook in self._outlooks().items()}
+
+    def _outlooks(self) -> dict[int, Outlook]:
+        """Returns the curves; open ones have a tentative stretch."""
+        self.smoother.refresh()
+        if self.closed or self.smoother.next_cycle == 0:
+            return confirmed(self.smoother)
+        return look_ahead(self.smoother, self.growth, self.path)
 
     # --- the graph ---------------------------------------------------------------------------------------
 
