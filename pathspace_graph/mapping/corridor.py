@@ -62,9 +62,7 @@ def lead_on(left: Row, right: Row, driven: Array, threshold: float, settings: Te
             waiting = [left, right]
 
 
-def _next(
-    row: Row, other: Row, driven: Array, threshold: float, settings: TentativeSettings
-) -> int | None:
+def _next(row: Row, other: Row, driven: Array, threshold: float, settings: TentativeSettings) -> int | None:
     """Returns the index of the candidate that continues a row, or None."""
     step = row.candidates - row.end
     distance = np.hypot(step[:, 0], step[:, 1])

@@ -1,7 +1,7 @@
 """The outlook: the open curves as they lead on, through tentative tracks beyond their confirmed ends.
 
-The tentative stretch is no part of the graph. It is fitted to the tracks whenever the map is asked for, so it can't
-harm the estimate, and what contradicts it takes it back by itself.
+The tentative stretch is no part of the graph. It is fitted to the tracks whenever the map is asked for, so it
+can't harm the estimate, and it is taken back as soon as the tracks contradict it.
 """
 
 from __future__ import annotations
@@ -105,15 +105,13 @@ def confirmed(smoother: CurveSmoother) -> dict[int, Outlook]:
     """Returns the curves as they are, without a tentative stretch."""
     state, none = smoother.map.state, np.zeros((0, POINT))
     return {
-        label: Outlook(
-            boundary, state.control_points(label), boundary.confirmed_end, none, np.zeros(0), None
-        )
+        label: Outlook(boundary, state.control_points(label), boundary.confirmed_end, none, np.zeros(0), None)
         for label, boundary in state.boundaries.items()
     }
 
 
 def _tracks(smoother: CurveSmoother, growth: Growth, label: int) -> IntArray:
-    """Returns the indices of the tracks that may continue a boundary: confirmed or seen just now, and near."""
+    """Returns the indices of the tracks near the vehicle that are confirmed or were seen just now."""
     settings, tracks, t = smoother.map.settings, growth.tentative[label], smoother.times[-1]
     offset = tracks.points - smoother.variables.poses[-1, :2]
     near = np.hypot(offset[:, 0], offset[:, 1]) < settings.tentative.reach

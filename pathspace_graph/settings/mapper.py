@@ -198,11 +198,11 @@ class TentativeSettings(Positive):
     reach: float = 12.5
     """The stretch leads through tentative tracks up to this far from the vehicle (m)."""
     memory: float = 0.35
-    """A tentative track that is not confirmed counts for this time after it was last detected (s): a detection
-    of nothing is not repeated."""
+    """A tentative track that is not confirmed counts for this time after it was last detected (s), because a
+    detection of nothing is not repeated."""
     gap: float = 11.0
-    """Neighbouring tracks of a row are at most this far apart (m): two regular gaps, since a cone may never be
-    detected."""
+    """Neighbouring tracks of a row are at most this far apart (m); these are two regular gaps, since a cone
+    may never be detected."""
     turn: float = 2.0
     """A row turns by at most this from one track to the next (rad), less what `turn_rate` takes away."""
     turn_rate: float = 0.1
@@ -224,7 +224,7 @@ class TentativeSettings(Positive):
     begin_lateral: float = 1.5
     """The row of a boundary that has not begun is searched from this far beside the vehicle on (m)."""
     sigma_cone: float = 0.1
-    """A cone is this far from a smooth curve (m), as a standard deviation; it is added to each track's own."""
+    """This is the standard deviation of a cone's distance from a smooth curve (m), added to a track's own."""
     sigma_bend: float = 1.0
     """The second difference of the control points has this standard deviation (m) about that of a straight
     line; it widens the band between tracks that are far apart, and beyond the last one."""

@@ -242,7 +242,7 @@ class Boundary:
         matrix = np.zeros((bent, self.size - first))
         np.put_along_axis(matrix, columns - first, values[0], axis=1)
         matrix = np.concatenate([matrix, weight * smoothness_matrix(self.abscissae[first:], None)])
-        fit = np.linalg.pinv(matrix[:, kept - first :])
+        fit = np.asarray(np.linalg.pinv(matrix[:, kept - first :]), float)
         by_known = fit[:, :held] @ self._held_design(columns[:held], values[0][:held], first, old)
         by_known[:, : kept - first] -= fit @ matrix[:, : kept - first]
         return Placement(first, kept, by_known, fit[:, held:bent], weight * fit[:, bent:])
