@@ -133,7 +133,7 @@ def _capped(settings: MapperSettings, own: OpenLapSettings) -> MapperSettings:
             knot_passes=1,
             tolerance_cost=own.tolerance * batch.tolerance_cost,
             tolerance_curve=own.tolerance * batch.tolerance_curve,
-            tolerance_pose=own.tolerance * batch.tolerance_pose,
+            tolerance_decrease=own.tolerance * batch.tolerance_decrease,
         ),
     )
 

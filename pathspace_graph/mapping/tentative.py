@@ -50,6 +50,10 @@ class TentativeTracks:
         """Returns the indices of the tracks with enough detections."""
         return np.flatnonzero(self.counts >= self.settings.sightings)
 
+    def variances(self, indices: IntArray) -> Array:
+        """Returns the variance (k,) of tracks in any direction (m^2): half the trace of their covariance."""
+        return 0.5 / self.weights[indices]
+
     def remove(self, indices: IntArray) -> None:
         """Removes tracks by index."""
         keep = np.ones(len(self.counts), bool)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.graph.keys import POINT, name, pose_key, pose_keys
+from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.io.log import Detections, Odometry
@@ -31,6 +31,7 @@ from .closing import apply_correspondences, optimize_loop, simplify
 from .growth import Growth
 from .nonlinear_graph import window_graph
 from .open_lap import LapBatch, OpenLapRecord
+from .outlook import Outlook, confirmed, look_ahead
 from .swap import go_on_from
 
 Array = NDArray[np.float64]
@@ -225,31 +226,66 @@ class FixedLagMapper:
         return CycleResult(t, self.poses[-1].copy(), (left, right), used, self.closed, stages, jump, notice)
 
     def map(self) -> Map:
-        """Returns a copy of the present map, with the joint covariance of each boundary's control points."""
-        boundaries, shape = {}, self.settings.spline.sigma_shape if self.closed else 0.0
-        state = self.smoother.map.state
-        if not self.boundaries:
+        """Returns a copy of the present map, with the joint covariance of each boundary's control points.
+
+        An open curve goes on beyond its confirmed end, as `outline` says.
+        """
+        state, outlooks = self.smoother.map.state, self._outlooks()
+        if not outlooks:
             return Map(self.closed, {})
-        joint, at = self.smoother.covariance(state.map_keys), 0
+        newest = pose_keys(np.array([self.smoother.next_cycle - 1]))
+        joint = self.smoother.covariance(np.concatenate([state.map_keys, newest]))
+        if self.closed:
+            return self._closed_map(joint[:-POSE, :-POSE])
+        vehicle, bend = self.poses[-1], self.settings.tentative.sigma_bend
+        boundaries, at = {}, 0
+        for label, outlook in outlooks.items():
+            own = np.arange(at, at := at + POINT * len(outlook.known))
+            entries = np.append(own, np.arange(len(joint) - POSE, len(joint)))
+            covariance = outlook.covariance(joint[np.ix_(entries, entries)], vehicle, bend)
+            boundaries[label] = SplineBoundary(outlook.spline, covariance, outlook.confirmed_until)
+        return Map(False, boundaries)
+
+    def _closed_map(self, joint: Array) -> Map:
+        """Returns the closed map, whose control points have a covariance (2m, 2m) from the graph.
+
+        What a curve with few control points cannot follow is added: no number of detections averages it out.
+        """
+        shape, scatter = self.settings.spline.sigma_shape, self.smoother.map.scatter
+        sigma = [scatter.get(b, np.full(at.size, shape)) for b, at in self.boundaries.items()]
+        joint = joint + np.diag(np.repeat(np.concatenate(sigma), POINT) ** 2)
+        boundaries, at = {}, 0
         for label, boundary in self.boundaries.items():
             block = slice(at, at := at + POINT * boundary.size)
-            sigma = self.smoother.map.scatter.get(label, np.full(boundary.size, shape))
-            covariance = joint[block, block] + np.diag(np.repeat(sigma, POINT) ** 2)
             spline = boundary.spline(self.control_points(label).copy())
-            boundaries[label] = SplineBoundary(spline, covariance)
-        return Map(self.closed, boundaries, joint + shape**2 * np.eye(len(joint)))
+            boundaries[label] = SplineBoundary(spline, joint[block, block].copy(), spline.domain[1])
+        return Map(True, boundaries, joint)
 
     def outline(self) -> Map:
-        """Returns a copy of the present map without covariances, which takes a hundredth of the time."""
-        state, values = self.smoother.map.state, self.smoother.variables.values.copy()
-        self.smoother.refresh()
-        splines = {b: at.spline(state.control_points(b).copy()) for b, at in self.boundaries.items()}
+        """Returns a copy of the present map without covariances, which takes a hundredth of the time.
+
+        An open curve is confirmed up to `confirmed_until`. From there on it is tentative: it leads through
+        cones that were seen less often, and is fitted anew in each call. A curve that has not begun may
+        consist of a tentative stretch alone.
+        """
+        values, boundaries = self.smoother.variables.values.copy(), {}
+        for label, outlook in self._outlooks().items():
+            spline = outlook.spline
+            until = spline.domain[1] if self.closed else outlook.confirmed_until
+            boundaries[label] = SplineBoundary(spline, NO_COVARIANCE, until)
         self.smoother.variables.values[:] = values  # to look at the map must not change the estimate
-        return Map(self.closed, {b: SplineBoundary(s, NO_COVARIANCE) for b, s in splines.items()})
+        return Map(self.closed, boundaries)
 
     def vehicle_state(self) -> VehicleState:
         """Returns the newest pose and the calibration, with their joint covariance."""
         return vehicle_state(self.smoother)
+
+    def _outlooks(self) -> dict[int, Outlook]:
+        """Returns the curves; open ones have a tentative stretch."""
+        self.smoother.refresh()
+        if self.closed or self.smoother.next_cycle == 0:
+            return confirmed(self.smoother)
+        return look_ahead(self.smoother, self.growth, self.path)
 
     # --- the graph ---------------------------------------------------------------------------------------
 

@@ -39,6 +39,31 @@ class Gauge:
     """(t, 3) These coefficients give the second difference of a triple in sigmas (1/m)."""
 
 
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Holds how an extension places control points: a linear map of what they are fitted to.
+
+    The control points from index `kept` on are `by_known @ known[first:] + by_target @ targets`, and the
+    second differences that the fit assumes to be zero would move them by `by_bend`.
+    """
+
+    first: int
+    """The fit depends on the known control points from this index on."""
+    kept: int
+    """The control points before this index stay where they are."""
+    by_known: Array
+    """(f, n - first) This is the derivative of the placed control points by the known ones."""
+    by_target: Array
+    """(f, k) This is their derivative by the targets."""
+    by_bend: Array
+    """(f, t) This is their derivative by the second differences."""
+
+    def place(self, known: Array, targets: Array) -> Array:
+        """Returns all control points (n', 2), from the known ones (n, 2) and the targets (k, 2)."""
+        placed = self.by_known @ known[self.first :] + self.by_target @ targets
+        return np.concatenate([known[: self.kept], placed])
+
+
 class Boundary:
     """A boundary is a B-spline that grows until the loop closes; its control points are graph variables.
 
@@ -181,14 +206,21 @@ class Boundary:
         function of the old curve changes. The old control points that act only beyond `confirmed_end` are
         placed again with the new ones.
         """
-        old, spacing = len(control_points), self.settings.spacing
+        return self.extend(len(control_points), targets_u).place(control_points, targets)
+
+    def extend(self, old: int, targets_u: Array) -> Placement:
+        """Extends a curve of `old` control points to targets at parameters (k,), as `grow` does.
+
+        Returns how the control points are to be placed.
+        """
+        spacing = self.settings.spacing
         missing = int(np.ceil((targets_u[-1] - self.tables.high) / spacing - ROUND_OFF))
         if missing > 0:
             last = self.knots[-1] + spacing * np.arange(1, missing + 1)
             self._set_tables(self.tables.extended(np.concatenate([self.knots, last])))
-        placed = self._place(control_points, self.settled(old), targets_u, targets)
+        placement = self._placement(old, targets_u)
         self.confirmed_end = float(targets_u[-1])
-        return placed
+        return placement
 
     def settled(self, size: int) -> int:
         """Returns how many of the first `size` control points act before `confirmed_end`."""
@@ -199,32 +231,30 @@ class Boundary:
         self.confirmed_end = self.cone_parameters[kept - 1]
         del self.observed[kept:], self.cone_parameters[kept:]
 
-    def _place(self, control_points: Array, kept: int, targets_u: Array, targets: Array) -> Array:
-        """Fits the control points from index `kept` on to the targets and to the end of the old curve."""
-        held_u = np.zeros(0)
-        if len(control_points):
+    def _placement(self, old: int, targets_u: Array) -> Placement:
+        """Fits the unsettled control points to targets at parameters (k,) and to the end of the old curve."""
+        kept, held_u = self.settled(old), np.zeros(0)
+        if old:
             start = max(self.confirmed_end - self.nominal[0], 0.0)
             held_u = np.linspace(start, self.confirmed_end, self.settings.fit_held)
-        held = self._held(control_points, held_u)
         values, span = self.tables.evaluate(np.concatenate([held_u, targets_u]))
         columns = self.columns(span)
         first = max(min(int(columns.min()), kept - 2), 0)  # rows before this have no free column
-        smooth = self.settings.fit_smoothness * smoothness_matrix(self.abscissae[first:], None)
-        design = np.zeros((len(span), self.size - first))
-        np.put_along_axis(design, columns - first, values[0], axis=1)
-        matrix = np.concatenate([design, smooth])
-        right = np.concatenate([held, targets, np.zeros((len(smooth), 2))])
-        right = right - matrix[:, : kept - first] @ control_points[first:kept]
-        free = np.linalg.lstsq(matrix[:, kept - first :], right, rcond=None)[0]
-        return np.concatenate([control_points[:kept], free])
+        weight, held, bent = self.settings.fit_smoothness, len(held_u), len(columns)
+        matrix = np.zeros((bent, self.size - first))
+        np.put_along_axis(matrix, columns - first, values[0], axis=1)
+        matrix = np.concatenate([matrix, weight * smoothness_matrix(self.abscissae[first:], None)])
+        fit = np.asarray(np.linalg.pinv(matrix[:, kept - first :]), float)
+        by_known = fit[:, :held] @ self._held_design(columns[:held], values[0][:held], first, old)
+        by_known[:, : kept - first] -= fit @ matrix[:, : kept - first]
+        return Placement(first, kept, by_known, fit[:, held:bent], weight * fit[:, bent:])
 
-    def _held(self, control_points: Array, u: Array) -> Array:
-        """Returns (k, 2) the old curve at u (k,), from the old control points (n, 2) alone."""
-        if len(u) == 0:
-            return np.zeros((0, 2))
-        values, span = self.tables.evaluate(u)
-        columns = np.minimum(self.columns(span), len(control_points) - 1)
-        return np.asarray(np.einsum("mj,mjd->md", values[0], control_points[columns]))
+    def _held_design(self, columns: IntArray, values: Array, first: int, old: int) -> Array:
+        """Returns (k, old - first) the basis of the old curve, whose control points end at index `old`."""
+        design = np.zeros((len(columns), old - first))
+        rows = np.broadcast_to(np.arange(len(columns))[:, None], columns.shape)
+        np.add.at(design, (rows, np.minimum(columns, old - 1) - first), values)
+        return design
 
 
 def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
