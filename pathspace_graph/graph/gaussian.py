@@ -125,6 +125,12 @@ def factorize(graph: gtsam.GaussianFactorGraph, layout: Layout) -> FactoredSyste
     return FactoredSystem(layout, cholesky(normal_equations(graph, layout)[0]))
 
 
+def marginal_covariance(graph: gtsam.GaussianFactorGraph, keys: IntArray) -> Array:
+    """Returns the joint covariance (q, q) of keys (k,), in their order, of a large and sparse graph."""
+    marginal = graph.marginal(keys.tolist())
+    return factorize(marginal, Layout(np.sort(keys))).covariance(keys)
+
+
 # --- factors ---------------------------------------------------------------------------------------------
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic
+from typing import Generic, Protocol
 
 import gtsam
 import numpy as np
@@ -26,6 +26,7 @@ from .gaussian import (
     graph_of,
     half_solve,
     jacobian_factor,
+    marginal_covariance,
     marginalize,
     merge_variables,
     normal_equations,
@@ -33,6 +34,7 @@ from .gaussian import (
     solve,
     substitute_points,
 )
+from .chain import InactiveChain, pose_and_reference
 from .inactive import InactiveMap
 from .keys import (
     CALIBRATION_KEY,
@@ -47,6 +49,7 @@ from .keys import (
     pose_keys,
 )
 from .odometry import calibrated_delta, through_odometry
+from .relative import from_frame, relative_factor
 from .rows import Rows
 from .submaps import Submaps
 from .user_factors import UserFactors
@@ -56,6 +59,9 @@ from .window import M_co, WindowFactors
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
+SIGMA_ANCHOR = 1e-3
+"""An open map is held at its anchor with this standard deviation (m, rad). All else is relative, so that any
+value gives the same step."""
 TIME_TOLERANCE = 1e-9
 """A pose leaves once it is older than the lag by more than this time (s), since stamps have round-off."""
 
@@ -73,6 +79,16 @@ class SmootherSettings:
     """The keyframes of the submaps are this length of path (m) apart."""
     sigma_calibration: tuple[float, float]
     """These are the prior sigmas of the calibration: scale error (-) and bias of the yaw rate (rad/s)."""
+    relative: bool = False
+    """While the loop is open, each part of the map is known in the frame of a pose beside it. The rows of the
+    map must not change under a rigid motion of all variables."""
+
+
+class Follower(Protocol):
+    """Describes what else is in the map frame, and must go where the open map goes."""
+
+    def move(self, motion: Array) -> None:
+        """Moves everything by a rigid motion (3,) of the map frame: a turn (rad) and then a shift (m, m)."""
 
 
 class FixedLagSmoother(Generic[M_co]):
@@ -93,8 +109,10 @@ class FixedLagSmoother(Generic[M_co]):
         """These are the user's own factors."""
         self.prior = gtsam.GaussianFactorGraph()
         """The prior holds the information from everything that has left the window."""
-        self.inactive = InactiveMap()
+        self.inactive = InactiveChain() if settings.relative else InactiveMap()
         """These are the variables that a cycle does not solve for."""
+        self.followers: list[Follower] = []
+        """These are moved together with the open map."""
         self.submaps: Submaps | None = None
         """These hold the prior in submaps, while the loop is open and the user gave no factors on poses."""
         self.last_step: FactoredSystem | None = None
@@ -167,7 +185,7 @@ class FixedLagSmoother(Generic[M_co]):
         expected = f"{window}, of control points and of the calibration"
         if self.user_factors.add(factors, self._is_known, expected):
             self.submaps = None
-        if np.isin(self.user_factors.keys, self.inactive.keys).any():
+        if self.chain is not None or np.isin(self.user_factors.keys, self.inactive.keys).any():
             self.reactivate()
 
     def _is_known(self, key: int) -> bool:
@@ -179,7 +197,7 @@ class FixedLagSmoother(Generic[M_co]):
 
     def remove_information(self, keys: IntArray) -> None:
         """Removes all prior information about map points."""
-        self.reactivate()
+        self.activate(keys)
         self.epoch += 1
         now = self.variables.change(self.variables.layout.entries(keys))
         self.prior = remove_information(self.prior, Layout(keys), now)
@@ -200,8 +218,20 @@ class FixedLagSmoother(Generic[M_co]):
         is also on the inactive variables, which must be up to date.
         """
         own = self.window.fresh(self._cycles, whole)
-        prior = self.inactive.joint_prior(self.prior) if whole else self.prior
+        prior = self._joint_prior() if whole else self.absolute_prior()
         return graph_of(prior, *own, *self.user_factors.linearized(self.variables, whole))
+
+    def _joint_prior(self) -> gtsam.GaussianFactorGraph:
+        """Returns the prior of all variables, and of the anchors of an open map."""
+        if self.chain is not None:
+            return self.chain.joint(self.prior, self.variables)
+        return self.inactive.joint_prior(self.prior)
+
+    def absolute_prior(self) -> gtsam.GaussianFactorGraph:
+        """Returns the prior of the active variables in the map frame; the inactive ones must be up to date."""
+        if self.chain is None or len(self.chain) == 0:
+            return self.prior
+        return self.chain.marginal(self.prior, self.variables)
 
     @property
     def _cycles(self) -> IntArray:
@@ -222,11 +252,10 @@ class FixedLagSmoother(Generic[M_co]):
 
         No variable moves. SingularSystemError where the system is not positive definite.
         """
-        if not self.window.relinearize(self._cycles, self.inactive.members):
-            self.reactivate()  # rare: a detection has moved to where the map is inactive
-            self.window.relinearize(self._cycles, self.inactive.members)
+        while not self.window.relinearize(self._cycles, self.inactive.members) and len(self.inactive):
+            self.activate(self.inactive.newest)  # rare: a detection has moved to where the map is inactive
         user, layout = self.user_factors.linearized(self.variables), self.layout
-        graph = graph_of(self.prior, *self.window.linear, *user)
+        graph = graph_of(self.prior, *self.window.linear, *user, *self._hold_anchor())
         hessian, vector = normal_equations(graph, layout)
         now = self.variables.change(self.variables.layout.entries(layout.keys))
         negative_gradient = vector - hessian @ now
@@ -236,6 +265,13 @@ class FixedLagSmoother(Generic[M_co]):
             hessian[points, points] += sigma_step**-2
         self.last_step = FactoredSystem(layout, cholesky(hessian))
         return negative_gradient
+
+    def _hold_anchor(self) -> list[gtsam.GaussianFactor]:
+        """Returns a factor that holds an open map at its anchor, where it is."""
+        if self.chain is None or len(self.chain) == 0:
+            return []
+        now = self.variables.change(self.variables.layout.entries(self.chain.anchors))
+        return [jacobian_factor(self.chain.anchors, np.eye(POSE) / SIGMA_ANCHOR, now / SIGMA_ANCHOR)]
 
     # --- inactive variables ------------------------------------------------------------------------------
 
@@ -247,7 +283,10 @@ class FixedLagSmoother(Generic[M_co]):
         user = self.user_factors.remove(keys, self.variables)
         keyframes = self.variables.keyframes
         self._finish_submap()
-        self.prior = self.inactive.push(graph_of(self.prior, *user), keys, keyframes, shared)
+        if self.chain is not None:
+            self.prior = self.chain.attach(self.prior, keys, shared, self.variables)
+        else:
+            self.prior = self.inactive.push(graph_of(self.prior, *user), keys, keyframes, shared)
         self.variables.remove(keyframes)
         self.window.drop(self.inactive.members)  # a factor linearized earlier may still hold one of them
 
@@ -255,6 +294,43 @@ class FixedLagSmoother(Generic[M_co]):
         """Finishes the current submap, so that it stays small when other map points become active."""
         if self.submaps is not None:
             self.submaps.finish(self.variables)
+            if self.chain is not None and len(self.chain):
+                anchor = int(self.chain.anchors[0])
+                self.submaps.hang(anchor, self.variables.of(self.chain.anchors))
+
+    @property
+    def chain(self) -> InactiveChain | None:
+        """Returns the inactive part of an open map; it is None where parts are in the map frame."""
+        return self.inactive if isinstance(self.inactive, InactiveChain) else None
+
+    def carry(self) -> None:
+        """Moves an open map so that the drive began at the origin, after its inactive part is updated."""
+        chain = self.chain
+        if chain is None or len(chain) == 0:
+            return
+        self._finish_submap()
+        anchor = int(chain.anchors[0])
+        pose, reference = pose_and_reference(anchor, self.variables)
+        near = relative_factor(self.prior, anchor, pose, reference, self.variables)
+        chain.refresh(self.variables)
+        motion = chain.carry()
+        self.variables.values = from_frame(self.variables.values, motion, self.variables.layout)
+        for follower in self.followers:
+            follower.move(motion)
+        self.prior = graph_of(near.factor(self.variables))
+        self.window.relinearize(self._cycles, self.inactive.members)
+
+    def activate(self, keys: IntArray) -> None:
+        """Makes map points (k,) active, and at least all that depend on them."""
+        if self.chain is None:
+            self.reactivate()
+            return
+        self._finish_submap()
+        self.refresh()
+        while self.chain.holds(keys):
+            back = self.chain.newest
+            self.prior = graph_of(self.prior, self.chain.detach(self.variables))
+            self.map.activate(back)
 
     def refresh(self) -> None:
         """Updates the inactive variables."""
@@ -266,15 +342,25 @@ class FixedLagSmoother(Generic[M_co]):
         Without `with_prior` the prior is left alone, because the submaps will replace it.
         """
         if len(self.inactive) == 0:
+            self.inactive = InactiveMap()
             return
+        self.carry()
         self._finish_submap()
         self.refresh()
-        if with_prior:
+        if self.chain is not None:
+            self._unchain(self.chain)
+        elif with_prior:
             self.prior = self.inactive.joint_prior(self.prior)
         self.inactive = InactiveMap()
         self.user_factors.reactivate()
         self._marginalize_keyframes()
         self.map.activate_all()
+
+    def _unchain(self, chain: InactiveChain) -> None:
+        """Makes the variables of an open map active; its anchors are keyframes."""
+        if self.submaps is not None:
+            self.submaps.carry(chain.poses | {int(key): self.variables.of(key) for key in chain.anchors[:, None]})
+        self.prior = graph_of(self.prior, *(chain.detach(self.variables) for _ in range(len(chain))))
 
     def _marginalize_keyframes(self) -> None:
         keyframes = self.variables.keyframes
@@ -369,6 +455,9 @@ class FixedLagSmoother(Generic[M_co]):
         whole = bool(np.isin(keys, self.inactive.keys).any())
         if whole:
             self.refresh()
+        if self.chain is not None and len(self.chain):
+            self.refresh()
+            return marginal_covariance(self.linear_graph(True), keys)
         layout = self.variables.layout if whole else self.layout
         return factorize(self.linear_graph(whole), layout).covariance(keys)
 
