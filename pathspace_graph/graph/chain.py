@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import compose, inverse
 
-from .gaussian import eliminate, graph_of, jacobian_factor, keys_of, normal_equations, square_root_form
+from .gaussian import (
+    eliminate,
+    graph_of,
+    jacobian_factor,
+    keys_of,
+    normal_equations,
+    sparse_marginal,
+    square_root_form,
+)
 from .inactive import InactiveMap
 from .keys import ORIGIN_KEY, POSE, are_poses, pose_key, sizes
 from .relative import RelativeFactor, by_frame_of, from_frame, relative_factor, rotations, to_frame
@@ -156,19 +164,19 @@ class InactiveChain(InactiveMap):
     # --- as one Gaussian ---------------------------------------------------------------------------------
 
     def joint(self, prior: gtsam.GaussianFactorGraph, variables: Variables) -> gtsam.GaussianFactorGraph:
-        """Returns the prior of all variables and anchors, linearized at the refreshed values.
+        """Returns the prior of all variables and anchors in the map frame, linearized at the refreshed values.
 
-        It is without the `shared` factors of `attach`.
+        The `shared` factors of `attach` are part of it.
         """
         known = self._with_poses(variables)
-        return graph_of(prior, *(factor for link in self.links for factor in self._factors(link, known)))
+        return graph_of(prior, *(link.factor.factor(known) for link in self.links))
 
     def marginal(self, prior: gtsam.GaussianFactorGraph, variables: Variables) -> gtsam.GaussianFactorGraph:
         """Returns the prior of the active variables in the map frame, linearized at the refreshed values."""
-        known = self._with_poses(variables)
-        graph = graph_of(prior, *(link.factor.factor(known) for link in self.links))
-        inactive = np.append(self.keys, [key for key in self.poses if key != ORIGIN_KEY]).astype(np.intp)
-        return graph.marginal(np.setdiff1d(keys_of(graph), inactive).tolist())
+        graph = self.joint(prior, variables)
+        anchors = np.array([key for key in self.poses if key != ORIGIN_KEY], np.intp)
+        inactive = np.append(self.keys, anchors)
+        return sparse_marginal(graph, np.setdiff1d(keys_of(graph), inactive))
 
     def _factors(self, link: Link, known: Variables) -> list[gtsam.GaussianFactor]:
         return [link.factor.factor(known), *(one.factor(known).negate() for one in link.shared)]

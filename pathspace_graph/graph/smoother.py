@@ -21,17 +21,18 @@ from pathspace_graph.factors.se2 import compose
 
 from .gaussian import (
     FactoredSystem,
+    as_rows,
     cholesky,
     factorize,
     graph_of,
     half_solve,
     jacobian_factor,
-    marginal_covariance,
     marginalize,
     merge_variables,
     normal_equations,
     remove_information,
     solve,
+    sparse_marginal,
     substitute_points,
 )
 from .chain import InactiveChain, pose_and_reference
@@ -217,15 +218,12 @@ class FixedLagSmoother(Generic[M_co]):
         The unknowns are `value - reference`, with poses (x, y, theta) in the map frame. If `whole`, the graph
         is also on the inactive variables, which must be up to date.
         """
-        own = self.window.fresh(self._cycles, whole)
-        prior = self._joint_prior() if whole else self.absolute_prior()
-        return graph_of(prior, *own, *self.user_factors.linearized(self.variables, whole))
-
-    def _joint_prior(self) -> gtsam.GaussianFactorGraph:
-        """Returns the prior of all variables, and of the anchors of an open map."""
         if self.chain is not None:
-            return self.chain.joint(self.prior, self.variables)
-        return self.inactive.joint_prior(self.prior)
+            prior = self.chain.joint(self.prior, self.variables) if whole else self.absolute_prior()
+            return graph_of(prior, *self.window.fresh(self._cycles, False))
+        own = self.window.fresh(self._cycles, whole)
+        prior = self.inactive.joint_prior(self.prior) if whole else self.prior
+        return graph_of(prior, *own, *self.user_factors.linearized(self.variables, whole))
 
     def absolute_prior(self) -> gtsam.GaussianFactorGraph:
         """Returns the prior of the active variables in the map frame; the inactive ones must be up to date."""
@@ -329,7 +327,7 @@ class FixedLagSmoother(Generic[M_co]):
         self.refresh()
         while self.chain.holds(keys):
             back = self.chain.newest
-            self.prior = graph_of(self.prior, self.chain.detach(self.variables))
+            self.prior = graph_of(as_rows(graph_of(self.prior, self.chain.detach(self.variables))))
             self.map.activate(back)
 
     def refresh(self) -> None:
@@ -341,16 +339,15 @@ class FixedLagSmoother(Generic[M_co]):
 
         Without `with_prior` the prior is left alone, because the submaps will replace it.
         """
-        if len(self.inactive) == 0:
-            self.inactive = InactiveMap()
-            return
-        self.carry()
-        self._finish_submap()
-        self.refresh()
         if self.chain is not None:
             self._unchain(self.chain)
-        elif with_prior:
-            self.prior = self.inactive.joint_prior(self.prior)
+        elif len(self.inactive) == 0:
+            return
+        else:
+            self._finish_submap()
+            self.refresh()
+            if with_prior:
+                self.prior = self.inactive.joint_prior(self.prior)
         self.inactive = InactiveMap()
         self.user_factors.reactivate()
         self._marginalize_keyframes()
@@ -358,8 +355,13 @@ class FixedLagSmoother(Generic[M_co]):
 
     def _unchain(self, chain: InactiveChain) -> None:
         """Makes the variables of an open map active; its anchors are keyframes."""
+        self.carry()
+        self._finish_submap()
+        self.refresh()
         if self.submaps is not None:
-            self.submaps.carry(chain.poses | {int(key): self.variables.of(key) for key in chain.anchors[:, None]})
+            anchors = np.union1d(chain.anchors, self.variables.keyframes)
+            active = {int(key): self.variables.of(np.array([key])) for key in anchors}
+            self.submaps.carry(chain.poses | active)
         self.prior = graph_of(self.prior, *(chain.detach(self.variables) for _ in range(len(chain))))
 
     def _marginalize_keyframes(self) -> None:
@@ -453,11 +455,11 @@ class FixedLagSmoother(Generic[M_co]):
         It is in the order of the keys, with poses as (x, y, theta) in the map frame (m, m, rad).
         """
         whole = bool(np.isin(keys, self.inactive.keys).any())
-        if whole:
+        if whole or self.chain is not None:
             self.refresh()
-        if self.chain is not None and len(self.chain):
-            self.refresh()
-            return marginal_covariance(self.linear_graph(True), keys)
+        if whole and self.chain is not None:
+            marginal = sparse_marginal(self.linear_graph(True), keys)
+            return factorize(marginal, Layout(np.sort(keys))).covariance(keys)
         layout = self.variables.layout if whole else self.layout
         return factorize(self.linear_graph(whole), layout).covariance(keys)
 
