@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final, Protocol
 
 import gtsam
 import numpy as np
@@ -36,6 +37,18 @@ from .variables import Layout, Variables
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+
+
+SIGMA_ANCHOR: Final = 1e-3
+"""An open map is held at its anchor with this standard deviation (m, rad). All else is relative, so that any
+value gives the same step."""
+
+
+class Follower(Protocol):
+    """Describes what else is in the map frame, and must go where the open map goes."""
+
+    def move(self, motion: Array) -> None:
+        """Moves everything by a rigid motion (3,) of the map frame: a turn (rad) and then a shift (m, m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +124,7 @@ class InactiveChain(InactiveMap):
     def detach(self, variables: Variables) -> gtsam.GaussianFactorGraph:
         """Removes the newest link and returns it as a graph, linearized at the refreshed variables.
 
-        Its anchors become variables again.
+        Its anchors become variables again. The `shared` factors of `attach` are taken out.
         """
         graph, link = graph_of(*self._factors(self.links[-1], self._with_poses(variables))), self.links.pop()
         for key in link.leaving.keys[are_poses(link.leaving.keys)].tolist():
@@ -155,11 +168,31 @@ class InactiveChain(InactiveMap):
         """Returns whether any link is a function of any of some variables."""
         return any(link.holds(keys) for link in self.links)
 
-    def carry(self) -> Array:
-        """Brings the refreshed origin back to (0, 0, 0), and returns the rigid motion (3,) that does it."""
+    # --- the frame ---------------------------------------------------------------------------------------
+
+    def hold(self, variables: Variables) -> list[gtsam.GaussianFactor]:
+        """Returns a factor that holds the anchor where it is, since all other information is relative."""
+        if not self.links:
+            return []
+        now = variables.change(variables.layout.entries(self.anchors))
+        return [jacobian_factor(self.anchors, np.eye(POSE) / SIGMA_ANCHOR, now / SIGMA_ANCHOR)]
+
+    def carry(
+        self, prior: gtsam.GaussianFactorGraph, variables: Variables, followers: Sequence[Follower]
+    ) -> gtsam.GaussianFactorGraph:
+        """Updates the inactive variables, and moves everything so that the origin is at (0, 0, 0) again.
+
+        It returns the prior of the active variables, linearized there.
+        """
+        anchor = int(self.anchors[0])
+        near = relative_factor(prior, anchor, *pose_and_reference(anchor, variables), variables)
+        self.refresh(variables)
         motion = inverse(self.origin)
         self.poses = {key: compose(motion, pose) for key, pose in self.poses.items()}
-        return motion
+        variables.values = from_frame(variables.values, motion, variables.layout)
+        for follower in followers:
+            follower.move(motion)
+        return graph_of(near.factor(variables))
 
     # --- as one Gaussian ---------------------------------------------------------------------------------
 
@@ -231,7 +264,9 @@ def new_link(
         root[:, keys.entries(own.keys)], np.column_stack([-root[:, keys.entries(others.keys)], right])
     )
     weak = tuple(relative_factor(graph_of(one), frame, pose, reference, variables) for one in shared)
-    return Link(factor, weak, own, others, solved[:, :-1], solved[:, -1])
+    return Link(
+        factor, weak, own, others, np.asarray(solved[:, :-1], float), np.asarray(solved[:, -1], float)
+    )
 
 
 def pose_and_reference(key: int, variables: Variables) -> tuple[Array, Array]:

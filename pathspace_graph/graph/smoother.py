@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol
+from typing import Generic
 
 import gtsam
 import numpy as np
@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
 
+from .chain import Follower, InactiveChain
 from .gaussian import (
     FactoredSystem,
     as_rows,
     cholesky,
     factorize,
     graph_of,
-    half_solve,
     jacobian_factor,
     marginalize,
     merge_variables,
@@ -35,7 +35,6 @@ from .gaussian import (
     sparse_marginal,
     substitute_points,
 )
-from .chain import InactiveChain, pose_and_reference
 from .inactive import InactiveMap
 from .keys import (
     CALIBRATION_KEY,
@@ -49,10 +48,10 @@ from .keys import (
     pose_key,
     pose_keys,
 )
-from .odometry import calibrated_delta, through_odometry
-from .relative import from_frame, relative_factor
+from .odometry import calibrated_delta
 from .rows import Rows
 from .submaps import Submaps
+from .uncertainty import predicted_covariance
 from .user_factors import UserFactors
 from .variables import Layout
 from .window import M_co, WindowFactors
@@ -60,9 +59,6 @@ from .window import M_co, WindowFactors
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-SIGMA_ANCHOR = 1e-3
-"""An open map is held at its anchor with this standard deviation (m, rad). All else is relative, so that any
-value gives the same step."""
 TIME_TOLERANCE = 1e-9
 """A pose leaves once it is older than the lag by more than this time (s), since stamps have round-off."""
 
@@ -83,13 +79,6 @@ class SmootherSettings:
     relative: bool = False
     """While the loop is open, each part of the map is known in the frame of a pose beside it. The rows of the
     map must not change under a rigid motion of all variables."""
-
-
-class Follower(Protocol):
-    """Describes what else is in the map frame, and must go where the open map goes."""
-
-    def move(self, motion: Array) -> None:
-        """Moves everything by a rigid motion (3,) of the map frame: a turn (rad) and then a shift (m, m)."""
 
 
 class FixedLagSmoother(Generic[M_co]):
@@ -253,7 +242,8 @@ class FixedLagSmoother(Generic[M_co]):
         while not self.window.relinearize(self._cycles, self.inactive.members) and len(self.inactive):
             self.activate(self.inactive.newest)  # rare: a detection has moved to where the map is inactive
         user, layout = self.user_factors.linearized(self.variables), self.layout
-        graph = graph_of(self.prior, *self.window.linear, *user, *self._hold_anchor())
+        held = self.chain.hold(self.variables) if self.chain is not None else []
+        graph = graph_of(self.prior, *self.window.linear, *user, *held)
         hessian, vector = normal_equations(graph, layout)
         now = self.variables.change(self.variables.layout.entries(layout.keys))
         negative_gradient = vector - hessian @ now
@@ -263,13 +253,6 @@ class FixedLagSmoother(Generic[M_co]):
             hessian[points, points] += sigma_step**-2
         self.last_step = FactoredSystem(layout, cholesky(hessian))
         return negative_gradient
-
-    def _hold_anchor(self) -> list[gtsam.GaussianFactor]:
-        """Returns a factor that holds an open map at its anchor, where it is."""
-        if self.chain is None or len(self.chain) == 0:
-            return []
-        now = self.variables.change(self.variables.layout.entries(self.chain.anchors))
-        return [jacobian_factor(self.chain.anchors, np.eye(POSE) / SIGMA_ANCHOR, now / SIGMA_ANCHOR)]
 
     # --- inactive variables ------------------------------------------------------------------------------
 
@@ -303,19 +286,10 @@ class FixedLagSmoother(Generic[M_co]):
 
     def carry(self) -> None:
         """Moves an open map so that the drive began at the origin, after its inactive part is updated."""
-        chain = self.chain
-        if chain is None or len(chain) == 0:
+        if self.chain is None or len(self.chain) == 0:
             return
         self._finish_submap()
-        anchor = int(chain.anchors[0])
-        pose, reference = pose_and_reference(anchor, self.variables)
-        near = relative_factor(self.prior, anchor, pose, reference, self.variables)
-        chain.refresh(self.variables)
-        motion = chain.carry()
-        self.variables.values = from_frame(self.variables.values, motion, self.variables.layout)
-        for follower in self.followers:
-            follower.move(motion)
-        self.prior = graph_of(near.factor(self.variables))
+        self.prior = self.chain.carry(self.prior, self.variables, self.followers)
         self.window.relinearize(self._cycles, self.inactive.members)
 
     def activate(self, keys: IntArray) -> None:
@@ -470,21 +444,6 @@ class FixedLagSmoother(Generic[M_co]):
         not in that step, so it is replaced by its prediction from the pose before. An inactive map point
         contributes nothing.
         """
-        step = self.last_step
-        assert step is not None
-        gradient, row = np.zeros((step.layout.size, len(rows)), order="F"), np.arange(len(rows))
-        columns = rows.columns(step.layout)
-        known = columns >= 0
-        gradient[columns[known], np.broadcast_to(row[:, None], columns.shape)[known]] = rows.jacobian[known]
-        noise, on_newest = np.zeros((len(rows), POSE)), columns[:, 0] < 0
-        if on_newest.any():
-            by_previous, by_calibration, noise[on_newest] = through_odometry(
-                rows.jacobian[on_newest, :POSE], self.variables.poses[-2:], self.window.odometry
-            )
-            previous = pose_keys(np.array([self.next_cycle - 2]))
-            gradient[step.layout.entries(previous)[:, None], row[on_newest]] += by_previous.T
-            calibration = step.layout.block(CALIBRATION_LETTER)
-            gradient[calibration, row[on_newest]] += by_calibration.T
-        half = half_solve(step.factor, gradient).T.reshape(-1, together, step.layout.size)
-        own = noise.reshape(-1, together, POSE)
-        return np.asarray(half @ half.transpose(0, 2, 1) + own @ own.transpose(0, 2, 1))
+        assert self.last_step is not None
+        newest = self.variables.poses[-2:], self.window.odometry, self.next_cycle - 1
+        return predicted_covariance(self.last_step, rows, *newest, together)

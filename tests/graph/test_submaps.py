@@ -14,8 +14,8 @@ from pathspace_graph.factors.odometry import odometry_residuals
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, keys_of, normal_equations
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
-from pathspace_graph.graph.rows import Rows, jacobian_factors
 from pathspace_graph.graph.relative import RelativeFactor
+from pathspace_graph.graph.rows import Rows, jacobian_factors
 from pathspace_graph.graph.submaps import Submaps
 from pathspace_graph.graph.variables import Layout, Variables
 
