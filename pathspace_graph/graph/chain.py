@@ -1,12 +1,13 @@
 """The inactive part of an open map: a chain of stretches, each in the frame of the pose where it was left.
 
-While the loop is open, nothing ties the map to the place where the drive began but the drive itself. A bias of
-the yaw rate bends the whole chain: a thousand metres on, a thousandth of a radian per second is tens of metres.
-So the active part of the map is held at an anchor pose near the vehicle, and the stretches behind hang on it,
-one on the next, like a chain. Each is given by its conditional in the frame of its own anchor. However far the
-chain swings, no stretch is bent by more than the measurements say.
+While the loop is open, nothing ties the map to the place where the drive began but the drive itself. A bias
+of the yaw rate bends the whole of it: after a thousand metres, a thousandth of a radian per second is tens of
+metres. So the active part of the map is held at an anchor pose near the vehicle, and the stretches behind
+hang on it, one on the next, like a chain. Each is given by its conditional in the frame of its own anchor.
+However far the chain swings, no stretch is bent by more than the measurements say.
 
-The last link holds the origin of the map frame. To bring it back to (0, 0, 0), the whole map is moved rigidly.
+The oldest link holds the origin of the map frame. To bring it back to (0, 0, 0), the whole map is moved
+rigidly.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ class InactiveChain(InactiveMap):
         shared: Sequence[gtsam.GaussianFactor],
         variables: Variables,
     ) -> gtsam.GaussianFactorGraph:
-        """Moves map points (k,) and all keyframes from a prior to a new link, and returns the remaining prior.
+        """Moves map points (k,) and all keyframes from a prior to a new link, and returns the prior left.
 
         The anchor is the oldest pose of the window. The factors `shared` are moved with them.
         """
@@ -197,9 +198,9 @@ class InactiveChain(InactiveMap):
     # --- as one Gaussian ---------------------------------------------------------------------------------
 
     def joint(self, prior: gtsam.GaussianFactorGraph, variables: Variables) -> gtsam.GaussianFactorGraph:
-        """Returns the prior of all variables and anchors in the map frame, linearized at the refreshed values.
+        """Returns the prior of all variables and anchors in the map frame.
 
-        The `shared` factors of `attach` are part of it.
+        It is linearized at the refreshed values. The `shared` factors of `attach` are part of it.
         """
         known = self._with_poses(variables)
         return graph_of(prior, *(link.factor.factor(known) for link in self.links))

@@ -81,8 +81,8 @@ def relative_factor(
 ) -> RelativeFactor:
     """Returns a graph of relative measurements as a factor in the frame of a pose.
 
-    The pose of the frame is at `pose` (3,) and its unknown is measured from `reference` (3,). In the frame of a
-    fixed pose the variables are linear functions of the unknowns, so the change of frame is exact.
+    The pose of the frame is at `pose` (3,), and its unknown is measured from `reference` (3,). In the frame
+    of a fixed pose the variables are linear functions of the unknowns, so the change of frame is exact.
     """
     held = keys_of(graph)
     keys = Layout(held[held != frame])

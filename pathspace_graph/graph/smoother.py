@@ -215,7 +215,10 @@ class FixedLagSmoother(Generic[M_co]):
         return graph_of(prior, *own, *self.user_factors.linearized(self.variables, whole))
 
     def absolute_prior(self) -> gtsam.GaussianFactorGraph:
-        """Returns the prior of the active variables in the map frame; the inactive ones must be up to date."""
+        """Returns the prior of the active variables in the map frame.
+
+        The inactive variables must be up to date.
+        """
         if self.chain is None or len(self.chain) == 0:
             return self.prior
         return self.chain.marginal(self.prior, self.variables)

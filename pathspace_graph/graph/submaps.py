@@ -66,7 +66,7 @@ class Submaps:
             self._graph = None
 
     def hang(self, anchor: int, pose: Array) -> None:
-        """Hangs all new keyframes on an anchor, by its key, which is at a pose (3,); they go where it goes."""
+        """Hangs all new keyframes on an anchor, by its key, which is at a pose (3,); they move with it."""
         for key, (keyframe, _) in self.keyframes.items():
             if key not in self._hung:
                 self._hung[key] = anchor, compose(inverse(pose), keyframe)
