@@ -111,14 +111,15 @@ class InactiveChain(InactiveMap):
 
         The anchor is the oldest pose of the window. The factors `shared` are moved with them.
         """
+        known = variables
         if not self.links:
-            prior = on_origin(prior, variables)
+            prior, known = on_origin(prior, variables), self._with_poses(variables)
         keyframes = variables.keyframes
         graph, leaving = graph_of(prior, *shared), np.concatenate([keys, keyframes])
         frontals = np.intersect1d(np.append(leaving, ORIGIN_KEY), keys_of(graph))
         conditional, remaining = eliminate(graph, frontals)
         anchor = pose_key(variables.first_cycle)
-        self.links.append(new_link(conditional, frontals, shared, anchor, self._with_poses(variables)))
+        self.links.append(new_link(conditional, frontals, shared, anchor, known))
         self._changed()
         return remaining
 
