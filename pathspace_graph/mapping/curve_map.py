@@ -86,6 +86,18 @@ class CurveMap:
             self.detections.refine(*self._found)
             self.detections.mark_linearized()
 
+    def activate(self, keys: IntArray) -> None:
+        """Makes control points active, which lie next to the active ones."""
+        for label, indices in self.state.active_stretch.items():
+            numbers = self.state.keys(label)[:1] + np.arange(indices[0])
+            back = np.flatnonzero(np.isin(numbers, keys))
+            self.state.active_stretch[label] = np.append(back, indices)
+
+    def move(self, motion: Array) -> None:
+        """Moves the cones that the curves were grown through by a rigid motion (3,) of the map frame."""
+        for boundary in self.state.boundaries.values():
+            boundary.move(motion)
+
     def activate_all(self) -> None:
         """Makes every control point active."""
         self.state.active_stretch = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.settings.mapper import GrowthSettings
 
 Array = NDArray[np.float64]
@@ -66,6 +67,10 @@ class TentativeTracks:
         self.weights = np.append(self.weights, np.ones(len(points)))
         self.counts = np.append(self.counts, np.full(len(points), self.settings.sightings))
         self.last_t = np.append(self.last_t, np.full(len(points), t))
+
+    def move(self, motion: Array) -> None:
+        """Moves all tracks by a rigid motion (3,) of the map frame."""
+        self.points = move_points(motion, self.points)
 
     def clear(self) -> None:
         """Removes all tracks."""

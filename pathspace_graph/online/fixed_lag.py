@@ -73,6 +73,7 @@ class FixedLagMapper:
         """This is the path that the vehicle has driven."""
         self.growth = Growth(self.settings.growth)
         """The open curves grow through the tentative tracks that are collected here."""
+        self.smoother.followers = [self.smoother.map, self.path, self.growth]
         self.closed = False
         """The flag is set when the loop has closed: the map has its final size."""
         self.corrected_poses: Array = np.zeros((0, 3))
@@ -165,6 +166,7 @@ class FixedLagMapper:
         if length - self._closing_tried < settings.check_interval:
             return False
         self._closing_tried = length
+        self.smoother.carry()
         self.smoother.refresh()
         covariance = self.smoother.covariance(pose_keys(np.array([self.smoother.next_cycle - 1])))
         beginning = self.path.beginning

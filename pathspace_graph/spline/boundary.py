@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_foot_points
 from pathspace_graph.factors.gauge import greville, smoothness_coefficients, smoothness_matrix
+from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.factors.spans import SpanPolynomials, Spans, lay_out
 from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 
@@ -225,6 +226,11 @@ class Boundary:
     def settled(self, size: int) -> int:
         """Returns how many of the first `size` control points act before `confirmed_end`."""
         return max(int(np.searchsorted(self.knots[:size], self.confirmed_end - ROUND_OFF)) - 1, 0)
+
+    def move(self, motion: Array) -> None:
+        """Moves the observed cones by a rigid motion (3,) of the map frame."""
+        if self.observed:
+            self.observed = [*move_points(motion, np.array(self.observed))]
 
     def take_back(self, kept: int) -> None:
         """Removes all observed cones but the first `kept`; the curve is confirmed up to the last of these."""
