@@ -9,7 +9,6 @@ import pytest
 
 from pathspace_graph.graph.keys import CALIBRATION_KEY
 from pathspace_graph.io.log import Odometry
-from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import ahead, corridor, exact_log, map_log
