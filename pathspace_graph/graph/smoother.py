@@ -301,8 +301,11 @@ class FixedLagSmoother(Generic[M_co]):
         if self.chain is None:
             self.reactivate()
             return
+        if not self.chain.holds(keys):
+            return
         self._finish_submap()
         self.refresh()
+        self._place_keyframes(self.chain)
         while self.chain.holds(keys):
             back = self.chain.newest
             self.prior = graph_of(as_rows(graph_of(self.prior, self.chain.detach(self.variables))))
@@ -336,11 +339,15 @@ class FixedLagSmoother(Generic[M_co]):
         self.carry()
         self._finish_submap()
         self.refresh()
+        self._place_keyframes(chain)
+        self.prior = graph_of(self.prior, *(chain.detach(self.variables) for _ in range(len(chain))))
+
+    def _place_keyframes(self, chain: InactiveChain) -> None:
+        """Places the keyframes of the submaps beside their anchors, which may be no anchors from now on."""
         if self.submaps is not None:
             anchors = np.union1d(chain.anchors, self.variables.keyframes)
             active = {int(key): self.variables.of(np.array([key])) for key in anchors}
             self.submaps.carry(chain.poses | active)
-        self.prior = graph_of(self.prior, *(chain.detach(self.variables) for _ in range(len(chain))))
 
     def _marginalize_keyframes(self) -> None:
         keyframes = self.variables.keyframes

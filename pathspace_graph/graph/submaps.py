@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import compose, inverse
+from pathspace_graph.factors.se2 import compose, relative
 
 from .gaussian import graph_of, marginalize
 from .relative import RelativeFactor, relative_factor
@@ -69,7 +69,7 @@ class Submaps:
         """Hangs all new keyframes on an anchor, by its key, which is at a pose (3,); they move with it."""
         for key, (keyframe, _) in self.keyframes.items():
             if key not in self._hung:
-                self._hung[key] = anchor, compose(inverse(pose), keyframe)
+                self._hung[key] = anchor, relative(pose, keyframe)
 
     def carry(self, anchors: Mapping[int, Array]) -> None:
         """Places all hung keyframes anew, given the poses (3,) of their anchors."""

