@@ -111,13 +111,22 @@ def confirmed(smoother: CurveSmoother) -> dict[int, Outlook]:
 
 
 def _tracks(smoother: CurveSmoother, growth: Growth, label: int) -> IntArray:
-    """Returns the indices of the tracks near the vehicle that are confirmed or were seen just now."""
+    """Returns the indices of the tracks near the vehicle that are confirmed or were seen just now.
+
+    A track at a cone that the curve has already is left out: across an infield, the sensor sees the row of an
+    earlier stretch again.
+    """
     settings, tracks, t = smoother.map.settings, growth.tentative[label], smoother.times[-1]
     offset = tracks.points - smoother.variables.poses[-1, :2]
     near = np.hypot(offset[:, 0], offset[:, 1]) < settings.tentative.reach
     believed = tracks.counts >= settings.growth.sightings
     believed |= tracks.last_t > t - settings.tentative.memory
     indices = np.flatnonzero(near & believed)
+    if label in smoother.map.state.boundaries:
+        mapped = np.array(smoother.map.state.boundaries[label].observed).reshape(-1, POINT)
+        offset = tracks.points[indices, None] - mapped
+        distance = np.hypot(offset[:, :, 0], offset[:, :, 1])
+        indices = indices[(distance > settings.growth.threshold).all(axis=1)]
     radius = settings.growth.merge_radius
     return indices[undisputed(smoother, label, tracks.points[indices], radius)]
 

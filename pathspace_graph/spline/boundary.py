@@ -204,28 +204,38 @@ class Boundary:
         """Extends the curve through targets (k, 2) at parameters (k,) and returns its control points (n', 2).
 
         Knots are appended until the domain holds the last parameter, which becomes `confirmed_end`. No basis
-        function of the old curve changes. The old control points that act only beyond `confirmed_end` are
-        placed again with the new ones.
+        function of the old curve changes. The old control points that act only beyond the last cone before
+        `confirmed_end` are placed again with the new ones: the direction at the end was a guess as long as
+        nothing was known beyond it, and over a long gap it would lead the curve astray.
         """
-        return self.extend(len(control_points), targets_u).place(control_points, targets)
+        placement = self.extend(len(control_points), targets_u, self._last_cone_before_end())
+        return placement.place(control_points, targets)
 
-    def extend(self, old: int, targets_u: Array) -> Placement:
+    def _last_cone_before_end(self) -> float:
+        """Returns the parameter of the last cone before the confirmed end, or the end if there is none."""
+        before = int(np.searchsorted(self.cone_parameters, self.confirmed_end - ROUND_OFF))
+        return self.cone_parameters[before - 1] if before else self.confirmed_end
+
+    def extend(self, old: int, targets_u: Array, from_u: float | None = None) -> Placement:
         """Extends a curve of `old` control points to targets at parameters (k,), as `grow` does.
 
-        Returns how the control points are to be placed.
+        The curve is placed anew from `from_u` on, by default from its confirmed end on; its end stays where
+        it is. Returns how the control points are to be placed.
         """
         spacing = self.settings.spacing
         missing = int(np.ceil((targets_u[-1] - self.tables.high) / spacing - ROUND_OFF))
         if missing > 0:
             last = self.knots[-1] + spacing * np.arange(1, missing + 1)
             self._set_tables(self.tables.extended(np.concatenate([self.knots, last])))
-        placement = self._placement(old, targets_u)
+        from_u = self.confirmed_end if from_u is None else from_u
+        placement = self._placement(old, targets_u, from_u)
         self.confirmed_end = float(targets_u[-1])
         return placement
 
-    def settled(self, size: int) -> int:
-        """Returns how many of the first `size` control points act before `confirmed_end`."""
-        return max(int(np.searchsorted(self.knots[:size], self.confirmed_end - ROUND_OFF)) - 1, 0)
+    def settled(self, size: int, u: float | None = None) -> int:
+        """Returns how many of the first `size` control points act before u, by default `confirmed_end`."""
+        u = self.confirmed_end if u is None else u
+        return max(int(np.searchsorted(self.knots[:size], u - ROUND_OFF)) - 1, 0)
 
     def move(self, motion: Array) -> None:
         """Moves the observed cones by a rigid motion (3,) of the map frame."""
@@ -237,12 +247,13 @@ class Boundary:
         self.confirmed_end = self.cone_parameters[kept - 1]
         del self.observed[kept:], self.cone_parameters[kept:]
 
-    def _placement(self, old: int, targets_u: Array) -> Placement:
-        """Fits the unsettled control points to targets at parameters (k,) and to the end of the old curve."""
-        kept, held_u = self.settled(old), np.zeros(0)
+    def _placement(self, old: int, targets_u: Array, from_u: float) -> Placement:
+        """Fits the control points that act beyond `from_u` to targets at parameters (k,) and to the curve."""
+        kept, held_u = self.settled(old, from_u), np.zeros(0)
         if old:
-            start = max(self.confirmed_end - self.nominal[0], 0.0)
-            held_u = np.linspace(start, self.confirmed_end, self.settings.fit_held)
+            held_u = np.linspace(max(from_u - self.nominal[0], 0.0), from_u, self.settings.fit_held)
+            if from_u < self.confirmed_end:
+                held_u = np.append(held_u, self.confirmed_end)
         values, span = self.tables.evaluate(np.concatenate([held_u, targets_u]))
         columns = self.columns(span)
         first = max(min(int(columns.min()), kept - 2), 0)  # rows before this have no free column

@@ -86,6 +86,14 @@ def test_a_detection_that_is_not_repeated_is_taken_back() -> None:
     assert [end > 27.0 for end in ends[at : at + 6]] == [True] * 4 + [False] * 2
 
 
+def test_a_cone_that_the_curve_has_already_is_not_led_through_again(log: Log) -> None:
+    """The cone at (48, 2) is one of an earlier stretch, as in a hairpin whose rows are close."""
+    mapper, _ = map_log(log)
+    assert outlook(mapper).tracks[-1, 0] == pytest.approx(48.0, abs=0.1)
+    mapper.boundaries[LEFT].observed.append(np.array([48.1, 2.1]))
+    assert outlook(mapper).tracks[:, 0].max(initial=0.0) < 45.0
+
+
 def test_a_boundary_that_has_not_begun_has_a_stretch_that_is_not_confirmed() -> None:
     log = exact_log(ahead(8.0, 5.0), *corridor(100.0))
     mapper, _ = map_log(replace(log, cycles=log.cycles[:1]))
