@@ -28,9 +28,9 @@ class CurveGauge:
     """Holds the residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` and `R_k' D c / sigma_smoothness`.
 
     p_k is the position of the pose that control point c_j of the curve began beside, h_k is its heading, and
-    R_k its rotation. D is `smoothness_matrix`. A detection constrains nothing along a curve, so control points
-    would slide along it, by metres in a hundred steps. Held beside a pose they don't, and the map is as free
-    as before: wherever that pose goes, they go with it.
+    R_k its rotation. D is `smoothness_matrix`. A detection constrains nothing along a curve, so control
+    points would slide along it, by metres in a hundred steps. Held beside a pose they don't, and the map is
+    as free as before: wherever that pose goes, they go with it.
     """
 
     label: int

@@ -80,6 +80,9 @@ class AssociationSettings(Positive, group="batch.association"):
     """Nearest points of a curve are first searched for at this step (m along the curve)."""
     direction_penalty: float = 100.0
     """A stretch of curve that runs against a pose's heading counts as this much farther away (m)."""
+    room: float = 2.0
+    """Along an open curve, the place of a pose is at most this farther from that of the pose before than was
+    driven between them (m)."""
 
 
 @dataclass(frozen=True)
