@@ -58,7 +58,9 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
     used = detections.used[rows] & (detections.boundary[rows] == label)
     beside, on_curve, u = used.copy(), used.copy(), detections.u[rows].copy()
-    beside[~used], on_curve[~used], u[~used] = _beside(state, points[~used], label, settings)
+    beside[~used], on_curve[~used], u[~used] = _beside(
+        state, points[~used], detections.cycle[rows[~used]], label, settings
+    )
     u = np.mod(u - begin, boundary.length) if boundary.periodic else u - begin
     weight = 1.0 / np.trace(detections.covariance[rows], axis1=1, axis2=2)
 
@@ -109,14 +111,21 @@ def in_order_of_drive(cones: Cones, lap: Array) -> Cones:
 
 
 def _beside(
-    state: State, points: Array, label: int, settings: MapperSettings
+    state: State, points: Array, cycles: IntArray, label: int, settings: MapperSettings
 ) -> tuple[BoolArray, BoolArray, Array]:
     """Returns which points (m, 2) lie beside a curve, which lie about its end, and their foot points u (m,).
 
-    Half of the detections of the cone at which an open curve ends lie beyond its end.
+    Half of the detections of the cone at which an open curve ends lie beyond its end. On an open curve, a
+    point lies on the stretch that the pose of its cycle (m,) sees.
     """
-    boundary = state.boundaries[label]
-    foot = find_anywhere(boundary, state.control_points(label), points)
+    boundary, control_points = state.boundaries[label], state.control_points(label)
+    if boundary.periodic:
+        foot = find_anywhere(boundary, control_points, points)
+    else:
+        u = state.pose_u[label][cycles]
+        low, high = u - settings.gate.view_behind, u + settings.gate.view_ahead
+        ends = boundary.tables.low, boundary.tables.high
+        foot = boundary.find(control_points, points, np.clip(low, *ends), np.clip(high, *ends))
     distance = np.hypot(*(points - foot.position).T)
     beside = foot.interior & (distance < settings.gate.rough)
     return beside, ~foot.interior & (distance < settings.growth.merge_radius), foot.u

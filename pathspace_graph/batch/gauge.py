@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.gauge import smoothness_matrix
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.elimination import owners
-from pathspace_graph.graph.keys import POINT, indices, pose_keys
+from pathspace_graph.graph.keys import POINT, POSE, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.mapping.state import State
 from pathspace_graph.spline.boundary import Boundary
@@ -25,12 +25,12 @@ would join the whole curve in the elimination. The number changes the speed, not
 
 @dataclass(frozen=True, eq=False)
 class CurveGauge:
-    """Holds the residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` and `D c / sigma_smoothness` of a curve.
+    """Holds the residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` and `R_k' D c / sigma_smoothness`.
 
-    p_k is the position of the pose that control point c_j began beside, and h_k is its heading. D is
-    `smoothness_matrix`. A detection constrains nothing along a curve, so control points would slide along it,
-    by metres in a hundred steps. Held beside a pose they don't, and the map is as free as before: wherever
-    that pose goes, they go with it.
+    p_k is the position of the pose that control point c_j of the curve began beside, h_k is its heading, and
+    R_k its rotation. D is `smoothness_matrix`. A detection constrains nothing along a curve, so control
+    points would slide along it, by metres in a hundred steps. Held beside a pose they don't, and the map is
+    as free as before: wherever that pose goes, they go with it.
     """
 
     label: int
@@ -72,14 +72,44 @@ class CurveGauge:
             owner=owners(self.cycle, self.label),
         )
 
-    def smooth(self, control_points: Array) -> Rows:
-        """Returns whitened second differences of three neighbours each, one row for x and one for y."""
-        neighbours = (np.arange(len(self.smoothness))[:, None] + np.arange(3)) % len(self.keys)
+    def bending(self, control_points: Array, poses: Array) -> tuple[Array, Array, Array]:
+        """Returns the second differences as the poses beside their middles see them, whitened (r, 2).
+
+        Also returns their derivatives by the three control points (r, 2, 6) and by the pose (r, 2, 3). In the
+        map frame a second difference turns with the map, and Gauss-Newton would take that turn for a change
+        of shape. It would know the heading at the end of a winding road better than any measurement does.
+        """
+        neighbours, theta = self.neighbours, poses[self.middle_cycle, 2]
+        c, s = np.cos(theta), np.sin(theta)
+        turned = np.moveaxis(np.array([[c, s], [-s, c]]), 2, 0)
         weights = np.take_along_axis(self.smoothness, neighbours, axis=1) / self.sigma_smoothness
-        keys = np.repeat(self.keys[neighbours], POINT, axis=0)
-        jacobian = (weights[:, None, :, None] * np.eye(POINT)[:, None, :]).reshape(-1, 3 * POINT)
-        residual = (self.smoothness @ control_points).ravel() / self.sigma_smoothness
-        return Rows(keys, jacobian, residual, self._owners(keys[:, 0]))
+        in_map = (weights[:, :, None] * control_points[neighbours]).sum(axis=1)
+        residual = (turned @ in_map[:, :, None])[:, :, 0]
+        by_control = weights[:, None, :, None] * turned[:, :, None, :]
+        by_pose = np.zeros((len(residual), POINT, POSE))
+        by_pose[:, 0, 2], by_pose[:, 1, 2] = residual[:, 1], -residual[:, 0]
+        return residual, by_control.reshape(len(residual), POINT, -1), by_pose
+
+    @property
+    def neighbours(self) -> IntArray:
+        """Returns the three control points (r, 3) of each second difference, by index."""
+        return np.asarray((np.arange(len(self.smoothness))[:, None] + np.arange(3)) % len(self.keys))
+
+    @property
+    def middle_cycle(self) -> IntArray:
+        """Returns the cycle (r,) of the pose beside the middle of each second difference."""
+        return np.asarray(self.cycle[self.neighbours[:, 1]])
+
+    def smooth(self, control_points: Array, poses: Array) -> Rows:
+        """Returns the same as rows on [three control points | pose], two rows for each second difference."""
+        residual, by_control, by_pose = self.bending(control_points, poses)
+        keys = np.column_stack([self.keys[self.neighbours], pose_keys(self.middle_cycle)])
+        return Rows(
+            keys=np.repeat(keys, POINT, axis=0),
+            jacobian=np.concatenate([by_control, by_pose], axis=2).reshape(residual.size, -1),
+            residual=residual.ravel(),
+            owner=np.repeat(owners(self.middle_cycle, self.label), POINT),
+        )
 
     def anchor(self) -> Rows:
         """Returns rows that hold each control point where it is."""

@@ -158,7 +158,7 @@ class BatchSystem:
         for label, gauge in self.gauges.items():
             points = state.control_points(label)
             groups += [self.detection_rows(at, label), gauge.beside(points, state.poses)]
-            groups += [gauge.smooth(points), gauge.anchor()]
+            groups += [gauge.smooth(points, state.poses), gauge.anchor()]
         return groups
 
     def detection_rows(self, at: Evaluation, label: int) -> Rows:

@@ -21,8 +21,9 @@ class RecurrenceSettings(Positive, group="batch.recurrence"):
     correlation_share: float = 0.8
     """The curvature is correlated with itself a lag later. A lap is about the shortest lag whose correlation
     is at least this share of the largest one."""
-    min_overlap: float = 5.0
-    """The path must go on for this length (m) after a lap, or else the lap isn't found."""
+    min_overlap: float = 20.0
+    """The path must go on for this length (m) after a lap, or else the lap isn't found. Over less, straights
+    agree with straights."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,9 @@ class AssociationSettings(Positive, group="batch.association"):
     """Nearest points of a curve are first searched for at this step (m along the curve)."""
     direction_penalty: float = 100.0
     """A stretch of curve that runs against a pose's heading counts as this much farther away (m)."""
+    room: float = 2.0
+    """Along an open curve, the place of a pose is at most this farther from that of the pose before than was
+    driven between them (m)."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +156,7 @@ class ClosureSettings(Positive, group="batch.closure"):
     most (root mean square)."""
     gap: float = 25.0
     """A closed result has no longer stretch of a boundary without detections on it than this (m)."""
-    overlap: float = 20.0
+    overlap: float = 15.0
     """A closed result has been driven again over this length at least (m)."""
     sigma: float = 0.3
     """The detections after the first lap hold their drive beside the curves by this standard deviation at

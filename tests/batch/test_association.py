@@ -73,6 +73,17 @@ def test_in_a_hairpin_a_pose_is_beside_the_leg_of_its_own_direction(heading: flo
     np.testing.assert_allclose(beside[0], [20.0, y], atol=0.5)
 
 
+def test_an_open_curve_that_lies_over_itself_is_followed_in_the_order_of_the_drive() -> None:
+    """It turns by a whole turn and a quarter; the second time the poses are nearer to the first stretch."""
+    phi = np.linspace(0.0, 2.5 * np.pi, 120)
+    radius = 20.0 + 0.5 * phi / phi[-1]
+    spiral = radius[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])
+    poses = np.column_stack([17.0 * np.column_stack([np.cos(phi), np.sin(phi)]), phi + 0.5 * np.pi])
+    state = state_of({LEFT: spiral}, poses)
+    expected = np.append(0.0, np.cumsum(np.hypot(*np.diff(spiral, axis=0).T)))
+    np.testing.assert_allclose(state.pose_u[LEFT], expected, atol=1.5)
+
+
 def test_a_foot_point_is_found_anywhere_on_a_curve() -> None:
     state = corridor_state()
     points = np.array([[3.0, 5.0], [57.0, -1.0]])
