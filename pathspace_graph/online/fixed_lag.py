@@ -14,7 +14,7 @@ from pathspace_graph.graph.keys import POINT, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
+from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
@@ -181,7 +181,7 @@ class FixedLagMapper:
             covariance = joint[block, block] + shape**2 * np.eye(POINT * boundary.size)
             spline = boundary.spline(self.control_points(label).copy())
             boundaries[label] = SplineBoundary(spline, covariance)
-        return Map(self.closed, boundaries, joint + shape**2 * np.eye(len(joint)))
+        return Map(self.closed, boundaries, joint_covariance(joint, boundaries))
 
     def outline(self) -> Map:
         """Returns a copy of the present map without covariances, which takes a hundredth of the time."""
