@@ -191,6 +191,8 @@ class _Run:
                 lap=lap,
                 stages=dict(result.stages),
                 closed=result.closed,
+                jump=None if result.jump is None else tuple(np.asarray(result.jump).tolist()),
+                notice=result.notice,
             )
         )
         if self._observer is not None:

@@ -193,6 +193,19 @@ def test_an_observer_sees_each_cycle_with_the_map_as_it_stands_then() -> None:
     assert run(5)[0].observing == 0.0
 
 
+def test_closing_and_jumps_are_recorded() -> None:
+    class Closing(Counting):
+        def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+            result = super().update(odometry, detections)
+            jump = np.array([0.1, 0.2, 0.0]) if self.count == 4 else None
+            return replace(result, closed=self.count >= 3, jump=jump, notice="hm" if self.count == 2 else "")
+
+    result = run_online(make_log(np.array([0.0]), np.arange(5) / 10.0), Closing())
+    assert [record.closed for record in result.cycles] == [False, False, True, True, True]
+    assert [record.jump for record in result.cycles] == [None, None, None, (0.1, 0.2, 0.0), None]
+    assert result.cycles[1].notice == "hm"
+
+
 def test_an_outline_is_preferred_to_a_map() -> None:
     class Outlining(Counting):
         def outline(self) -> Map:

@@ -3,16 +3,21 @@
 GTSAM's figure is of the ordering that was fastest on average in the run. Ratios are of means over all cycles
 from the first sample on, the closing one included. The landmark graph gets every cycle right after the
 mapper. BLAS has one thread.
+
+From closing until the map is replaced by one that was solved as a batch, the cycles come as they do in a car,
+since another process solves meanwhile.
 """
 
 from __future__ import annotations
 
+import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pathspace_graph.estimators import make_online
 from pathspace_graph.io.log import Log
@@ -24,6 +29,8 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .gtsam_window import linear_window, time_gtsam
 from .metric import Metric
+
+Array = NDArray[np.float64]
 
 RIVAL: Final = "landmark-fixed-lag"
 """This estimator gets the same cycles in turn."""
@@ -42,6 +49,10 @@ LAP_RATIO: Final = 1.1
 """A mean cycle of the last lap takes at most this many times that of lap 2."""
 CLOSING_MILLISECONDS: Final = 100.0
 """The cycle that closes the loop takes at most this."""
+MEANWHILE_RATIO: Final = 1.1
+"""While the batch of the lap is being solved, a mean cycle takes at most this many times one before it."""
+SWAP_MILLISECONDS: Final = 100.0
+"""The cycle that replaces the map takes at most this."""
 
 MEAN_TOLERANCE: Final = 0.2
 """A ratio of two means over the whole run may be worse than its baseline by this share."""
@@ -79,6 +90,8 @@ class Measurement:
     """These are GTSAM's times."""
     rival: tuple[float, ...]
     """Each update of the landmark graph took this time (s)."""
+    swap: int | None = None
+    """This cycle replaced the map by one that was solved as a batch; it is None where none did."""
 
 
 class _Sampler:
@@ -89,17 +102,29 @@ class _Sampler:
         self._cycles, self._rival = split_odometry(log), make_online(RIVAL, mapper.settings, log)
         self._timings: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
         self.rival: list[float] = []
-        self.closing: int | None = None
+        self.closing: CycleRecord | None = None
+        self.swap: CycleRecord | None = None
+        self._interval = log.cycles[-1].t / len(log.cycles)
 
     def __call__(self, record: CycleRecord) -> None:
-        if self._mapper.closed and self.closing is None:
-            self.closing = record.cycle
-        if record.cycle >= WARM_UP and record.cycle % self._every == 0 and self._mapper.boundaries:
+        if record.closed and self.closing is None:
+            self.closing = record
+        if record.jump is not None:
+            self.swap = record
+        sampled = record.cycle >= WARM_UP and record.cycle % self._every == 0
+        if self._solves(record):
+            time.sleep(self._interval)
+        elif sampled and self._mapper.boundaries:
             for ordering, times in time_gtsam(linear_window(self._mapper)).items():
                 self._timings[ordering].append(times)
         _, seconds = timed_update(self._rival, *next(self._cycles))
         self.rival.append(seconds)
         self._advance()
+
+    def _solves(self, record: CycleRecord) -> bool:
+        """Returns whether a batch of the lap may be under way, which is always shorter than the lag."""
+        since = np.inf if self.closing is None else record.t - self.closing.t
+        return self.swap is None and since < self._mapper.settings.lag
 
     def fastest(self) -> Gtsam:
         """Returns GTSAM's times in the ordering with the least mean."""
@@ -116,7 +141,8 @@ def measure(log: Log, settings: MapperSettings, every: int = SAMPLE_EVERY) -> Me
     with progress("benchmark", len(log.cycles)) as advance:
         sampler = _Sampler(mapper, log, every, advance)
         result = run_online(log, mapper, on_cycle=sampler)
-    return Measurement(result.cycles, result.laps, sampler.closing, sampler.fastest(), tuple(sampler.rival))
+    closing, swap = (None if at is None else at.cycle for at in (sampler.closing, sampler.swap))
+    return Measurement(result.cycles, result.laps, closing, sampler.fastest(), tuple(sampler.rival), swap)
 
 
 def metrics(measurement: Measurement) -> tuple[Metric, ...]:
@@ -134,6 +160,7 @@ def metrics(measurement: Measurement) -> tuple[Metric, ...]:
         Metric("p99", 1e3 * p99, "ms", bound=P99_MILLISECONDS),
         Metric("last_lap_by_lap_2", slowdown, "", bound=LAP_RATIO, tolerance=LAP_TOLERANCE),
         Metric("closing", 1e3 * closing, "ms", bound=CLOSING_MILLISECONDS),
+        *_swap_metrics(measurement, times),
         Metric("p99_by_mean", p99 / mean, "", tolerance=TAIL_TOLERANCE),
         Metric("closing_by_mean", closing / mean, "", tolerance=TAIL_TOLERANCE),
         Metric("mean", 1e3 * _mean(times), "ms"),
@@ -146,6 +173,19 @@ def metrics(measurement: Measurement) -> tuple[Metric, ...]:
         *(Metric(f"mean_lap_{lap}", 1e3 * value, "ms") for lap, value in enumerate(laps, start=1)),
         *(Metric(f"mean_{stage}", 1e3 * value, "ms") for stage, value in _stage_means(cycles).items()),
     )
+
+
+def _swap_metrics(measurement: Measurement, times: Array) -> Iterator[Metric]:
+    """Yields what it takes to replace the map, where it was replaced."""
+    closing, swap = measurement.closing, measurement.swap
+    if closing is None or swap is None:
+        return
+    meanwhile = times[closing + 1 : swap]
+    before = times[max(closing - len(meanwhile), 0) : closing]
+    ratio = _mean(meanwhile) / _mean(before)
+    yield Metric("meanwhile_by_before", ratio, "", bound=MEANWHILE_RATIO, tolerance=TAIL_TOLERANCE)
+    yield Metric("swap", 1e3 * float(times[swap]), "ms", bound=SWAP_MILLISECONDS)
+    yield Metric("meanwhile_by_after", _mean(meanwhile) / _mean(times[swap + 1 :][: len(meanwhile)]), "")
 
 
 def _lap_means(cycles: Sequence[CycleRecord], laps: int) -> list[float]:

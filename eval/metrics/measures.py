@@ -144,6 +144,7 @@ _ALL: Final = (
     ),
     Metric("closed", "loop closed", "%", 0),
     Metric("false_closing", "loop closed falsely", "%", 1, scope="run"),
+    Metric("jump", "jump of the pose where the map is replaced", "m", 2, scope="run"),
     Metric("scale", "scale error of the speeds", "%", 2, scope="run"),
     Metric("scale_true", "scale error of the speeds, true", "%", 2, scope="run"),
     Metric("scale_sigma", "scale error of the speeds, claimed sigma", "%", 2, scope="run", average="rms"),
@@ -308,7 +309,8 @@ def _turn_values(track: Map, truth: Truth) -> dict[str, float]:
 
 
 def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
-    """Returns what is known of the vehicle at the end of the log, and whether the loop has closed falsely."""
+    """Returns what is known of the vehicle at the end of the log, how far its pose jumped where the map was
+    replaced (m), and whether the loop has closed falsely."""
     values: dict[str, float] = {}
     if truth is None or len(run.trajectory) == 0:
         return values
@@ -317,7 +319,8 @@ def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
         values |= vehicle_errors(state, float(run.trajectory_t[-1]), truth)
     if len(truth.poses):
         values["false_closing"] = closes_falsely(run, truth)
-    return values
+    jumps = [np.hypot(*record.jump[:2]) for record in run.cycles if record.jump is not None]
+    return values | ({"jump": float(max(jumps))} if jumps else {})
 
 
 def closes_falsely(run: RunResult, truth: Truth) -> bool:

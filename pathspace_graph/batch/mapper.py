@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.graph.elimination import Elimination
-from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_key
+from pathspace_graph.graph.elimination import eliminated_system
+from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
+from pathspace_graph.graph.keys import CALIBRATION_KEY, are_poses, pose_key
+from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
-from pathspace_graph.io.map import Map, SplineBoundary
+from pathspace_graph.io.map import Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
@@ -83,9 +85,11 @@ class BatchResult(BatchRun):
         """
         variables, last = self.optimum.state.variables, pose_key(len(self.trajectory) - 1)
         with threadpool_limits(limits=1):
-            linear = self.system.linear_graph(self.optimum)
-            known = Elimination(linear, variables.layout, kept=(last,))
-            covariance = known.joint(np.array([last, CALIBRATION_KEY], np.intp))
+            keys = variables.layout.keys
+            kept = Layout(keys[~are_poses(keys) | (keys == last)])
+            information, _ = eliminated_system(self.system.linear_graph(self.optimum), kept)
+            system = FactoredSystem(kept, cholesky(information))
+            covariance = system.covariance(np.array([last, CALIBRATION_KEY], np.intp))
         return VehicleState(self.trajectory[-1].copy(), self.calibration.copy(), covariance)
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -228,14 +232,14 @@ def own_settings(settings: MapperSettings) -> MapperSettings:
 
 def _map(state: State, joint: Array, scatter: Scatter) -> Map:
     """Returns the curves with their covariance, to which the scatter of the cones is added."""
-    boundaries, joint = {}, joint.copy()
+    boundaries = {}
     for label, boundary in state.boundaries.items():
         block = map_block(state, label)
         spline = boundary.spline(state.control_points(label).copy())
         sigma = np.repeat(scatter.sigma(label, boundary.abscissae), 2)
-        joint[block, block] += np.diag(sigma**2)
-        boundaries[label] = SplineBoundary(spline, joint[block, block].copy())
-    return Map(is_closed(state), boundaries, joint)
+        covariance = joint[block, block] + np.diag(sigma**2)
+        boundaries[label] = SplineBoundary(spline, covariance)
+    return Map(is_closed(state), boundaries, joint_covariance(joint, boundaries))
 
 
 def is_closed(state: State) -> bool:

@@ -66,14 +66,13 @@ def fix_map(groups: Sequence[Rows]) -> list[Rows]:
 class Elimination:
     """Holds a linear problem whose poses have been eliminated."""
 
-    def __init__(self, graph: gtsam.GaussianFactorGraph, layout: Layout, kept: tuple[int, ...] = ()) -> None:
+    def __init__(self, graph: gtsam.GaussianFactorGraph, layout: Layout) -> None:
         """Eliminates the poses of a graph on the variables of a layout.
 
-        Poses whose keys are `kept` are not eliminated. They count as variables of the map, for covariances.
         SingularSystemError where the graph does not determine the poses, or holds no factor on a variable.
         """
         require_keys(graph, layout)
-        poses = are_poses(layout.keys) & ~np.isin(layout.keys, kept)
+        poses = are_poses(layout.keys)
         self.poses = Layout(layout.keys[poses])
         """These are the columns of the poses."""
         self.map = Layout(layout.keys[~poses])

@@ -91,6 +91,18 @@ class Map:
         return sum(boundary.size for boundary in self.boundaries.values())
 
 
+def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Array:
+    """Returns a joint covariance (2m, 2m) with each boundary's own covariance as its diagonal block.
+
+    A boundary's covariance may hold what the others don't share, such as the scatter of its cones.
+    """
+    joint, at = joint.copy(), 0
+    for _, boundary in sorted(boundaries.items()):
+        own = slice(at, at := at + len(boundary.covariance))
+        joint[own, own] = boundary.covariance
+    return joint
+
+
 # --- JSON ------------------------------------------------------------------------------------------------
 
 

@@ -44,6 +44,10 @@ class CycleRecord:
     """Each stage of the update took this time (s), by the stage's name."""
     closed: bool = False
     """The loop has closed by the end of this cycle where this is true."""
+    jump: tuple[float, float, float] | None = None
+    """The newest pose jumped by this [m, m, rad], map frame, where the map was replaced in this cycle."""
+    notice: str = ""
+    """This says what a user should know of the cycle; it is empty if there is nothing."""
 
 
 @dataclass(frozen=True, eq=False)

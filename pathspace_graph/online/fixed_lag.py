@@ -14,7 +14,7 @@ from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
+from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
@@ -254,14 +254,14 @@ class FixedLagMapper:
         What a curve with few control points cannot follow is added: no number of detections averages it out.
         """
         shape, scatter = self.settings.spline.sigma_shape, self.smoother.map.scatter
-        sigma = [scatter.get(b, np.full(at.size, shape)) for b, at in self.boundaries.items()]
-        joint = joint + np.diag(np.repeat(np.concatenate(sigma), POINT) ** 2)
         boundaries, at = {}, 0
         for label, boundary in self.boundaries.items():
             block = slice(at, at := at + POINT * boundary.size)
+            sigma = scatter.get(label, np.full(boundary.size, shape))
+            covariance = joint[block, block] + np.diag(np.repeat(sigma, POINT) ** 2)
             spline = boundary.spline(self.control_points(label).copy())
-            boundaries[label] = SplineBoundary(spline, joint[block, block].copy(), spline.domain[1])
-        return Map(True, boundaries, joint)
+            boundaries[label] = SplineBoundary(spline, covariance, spline.domain[1])
+        return Map(True, boundaries, joint_covariance(joint, boundaries))
 
     def outline(self) -> Map:
         """Returns a copy of the present map without covariances, which takes a hundredth of the time.

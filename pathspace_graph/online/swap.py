@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.batch.lap import LapMarginal
-from pathspace_graph.factors.se2 import compose, inverse
+from pathspace_graph.factors.se2 import compose, relative
 from pathspace_graph.graph.keys import CALIBRATION_KEY, control_keys, pose_keys
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.spline.boundary import Boundary
@@ -52,7 +52,7 @@ def go_on_from(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
 def _move_poses(poses: Array, solved: Array) -> None:
     """Sets the first poses of the window (P, 3) to the solved ones (k, 3), and moves the others rigidly."""
     last = len(solved) - 1
-    later = [compose(inverse(poses[last]), pose) for pose in poses[last + 1 :]]
+    later = [relative(poses[last], pose) for pose in poses[last + 1 :]]
     poses[: last + 1] = solved
     for slot, delta in enumerate(later, start=last + 1):
         poses[slot] = compose(poses[last], delta)

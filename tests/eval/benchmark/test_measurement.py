@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -43,3 +45,16 @@ def test_figures_by_hand() -> None:
     assert figures["last_lap_by_lap_2"].value == pytest.approx(4.0 / 3.0)
     assert figures["mean_update"].value == pytest.approx(0.5 * figures["mean"].value)
     assert {key for key, metric in figures.items() if not metric.holds} == {"last_lap_by_lap_2"}
+
+
+def test_the_swap_is_compared_with_the_cycles_around_it() -> None:
+    """It closes in cycle 99 and swaps in cycle 120; the 20 updates between take 3 ms, 2 before, 4 after."""
+    cycles = [record(k, 0.002 if k < 99 else 0.003 if k < 120 else 0.004, 1) for k in range(200)]
+    cycles[120] = replace(record(120, 0.050, 1), jump=(0.1, 0.0, 0.0))
+    shared = (1, 99, Gtsam("any", 0.0015, 0.0005, 25), (0.008,) * 200)
+    figures = {metric.key: metric for metric in metrics(Measurement(tuple(cycles), *shared, swap=120))}
+    assert figures["swap"].value == pytest.approx(50.0)
+    assert figures["meanwhile_by_before"].value == pytest.approx(1.5)
+    assert figures["meanwhile_by_after"].value == pytest.approx(0.75)
+    assert not figures["meanwhile_by_before"].holds and figures["swap"].holds
+    assert "swap" not in {metric.key for metric in metrics(Measurement(tuple(cycles), *shared))}

@@ -128,6 +128,16 @@ def test_a_loop_closes_falsely_before_the_drive_is_back(closed_at: float | None,
     assert closes_falsely(replace(made, cycles=cycles, map=closed), true) is false
 
 
+def test_the_jump_is_that_of_the_cycle_that_replaced_the_map() -> None:
+    true = circle_truth()
+    made = run(true)
+    (*_, plain) = measure(made, log(true))
+    assert "jump" not in plain.values
+    cycles = (*made.cycles[:30], replace(made.cycles[30], jump=(0.3, -0.4, 0.1)), *made.cycles[31:])
+    (*_, whole) = measure(replace(made, cycles=cycles), log(true))
+    assert whole.values["jump"] == pytest.approx(0.5)
+
+
 def test_a_map_that_closes_on_an_open_drive_is_false() -> None:
     true = circle_truth()
     part = replace(true, pose_t=true.pose_t[:400], poses=true.poses[:400])
