@@ -119,6 +119,8 @@ class Optimizer:
         if not strict:
             locate_poses(state, self.settings.association)
         associate(state, system.detections, system.settings, gate, strict)
+        if strict and system.settings.place.use == "cones":
+            system.place(state)
         return system.evaluate(state, hold=True)
 
     def _is_still(self, movement: Movement, gain: float, cost: float, tolerance: float) -> bool:

@@ -126,6 +126,7 @@ class FixedLagMapper:
         new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
         if self.boundaries:
             associate(self.smoother, self._grown)
+            self.smoother.map.place_detections(new.start)
         if not self.closed:
             self.growth.observe(self.smoother, new, detections.t)
 
