@@ -26,7 +26,8 @@ class PlaceRows:
     @property
     def jacobian(self) -> Array:
         """Returns the derivatives (m, 3 + 2 (degree + 1)) by the pose, and by the control points."""
-        return np.concatenate([self.by_pose, self.by_control.reshape(-1, 2 * self.by_control.shape[1])], axis=1)
+        by_control = self.by_control.reshape(-1, 2 * self.by_control.shape[1])
+        return np.concatenate([self.by_pose, by_control], axis=1)
 
 
 def along_from_place(

@@ -16,9 +16,9 @@ from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph
 from pathspace_graph.graph.keys import are_poses, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
+from pathspace_graph.mapping.cone_places import ConePlaces, lay_out_places
 from pathspace_graph.mapping.detections import NOWHERE, DetectionTable
 from pathspace_graph.mapping.log_odometry import LogOdometry
-from pathspace_graph.mapping.places import Places, lay_out_places
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
@@ -122,7 +122,7 @@ class BatchSystem:
         self.kernel = kernel
         self.gauges: dict[int, CurveGauge] = {}
         """These are the weak priors of each boundary."""
-        self.places: Places | None = None
+        self.places: ConePlaces | None = None
         """These are the cones' places along the curves, where the settings ask for them."""
         self._sigma, self._sigma_along = np.ones(len(detections)), np.ones(len(detections))
 
@@ -175,7 +175,7 @@ class BatchSystem:
         u = boundary.tables.inside(self.detections.u[rows]) - low
         return low + places(u, weight, boundary.length, boundary.periodic, self.settings)
 
-    def _placed(self, state: State, places: Places, hold: bool) -> Placed:
+    def _placed(self, state: State, places: ConePlaces, hold: bool) -> Placed:
         detections = self.detections
         rows = np.flatnonzero(detections.used & (detections.place != NOWHERE))
         poses = state.variables.poses_at(detections.cycle[rows])

@@ -19,8 +19,8 @@ from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Gauge
 
+from .cone_places import ConePlaces, lay_out_places
 from .detections import NOWHERE, DetectionTable
-from .places import Places, lay_out_places
 from .state import State
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ class CurveMap:
         """The table holds the detections of the poses in the window."""
         self.reached_inactive = False
         """The flag is set when a foot point of the latest `rows` has slid to an inactive part of a curve."""
-        self.places: Places | None = None
+        self.places: ConePlaces | None = None
         """These are the cones' places along the closed curves, once they are known."""
         self._found: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
 
@@ -81,7 +81,7 @@ class CurveMap:
             groups.append(self._place_rows(self.places, rows, points, poses))
         return groups
 
-    def _place_rows(self, places: Places, rows: IntArray, points: Array, poses: Array) -> Rows:
+    def _place_rows(self, places: ConePlaces, rows: IntArray, points: Array, poses: Array) -> Rows:
         """Returns `w_i t . (R z_i + t - S(u_k)) / sigma_i` for the detections (m,) that are of a place u_k.
 
         The keys are [pose | control points of the place's span]. points (m, 2) and poses (m, 3) are in the

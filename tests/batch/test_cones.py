@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.cones import Cones, cluster, cones_of_curve, in_order_of_drive, places, without_folds
+from pathspace_graph.batch.cones import (
+    Cones,
+    cluster,
+    cones_of_curve,
+    in_order_of_drive,
+    places,
+    without_folds,
+)
 from pathspace_graph.labels import LEFT
 from pathspace_graph.settings.mapper import MapperSettings
 

@@ -41,7 +41,11 @@ def test_jacobians_far_from_the_place(degree: int, seed: int) -> None:
 
 def test_it_is_the_distance_past_the_place_along_a_straight_curve() -> None:
     """The curve runs along y; half way between its control points lies the place (2, 5)."""
-    control, basis, slope = np.array([[[2.0, 4.0], [2.0, 6.0]]]), np.array([[0.5, 0.5]]), np.array([[-0.5, 0.5]])
+    control, basis, slope = (
+        np.array([[[2.0, 4.0], [2.0, 6.0]]]),
+        np.array([[0.5, 0.5]]),
+        np.array([[-0.5, 0.5]]),
+    )
     pose = np.array([[1.0, 1.0, np.pi / 2.0]])
     rows = along_from_place(np.array([[1.4, 5.7]]), pose, control, basis, slope)
     np.testing.assert_allclose(rows.residual, [0.7])

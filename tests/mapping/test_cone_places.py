@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.bspline import periodic_knots
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.mapping.cone_places import ConePlaces, lay_out_places
 from pathspace_graph.mapping.detections import NOWHERE
-from pathspace_graph.mapping.places import Places, lay_out_places
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 from pathspace_graph.spline.boundary import Boundary
@@ -31,11 +31,11 @@ def circles() -> State:
 
 
 @pytest.fixture(scope="module")
-def places() -> Places:
+def places() -> ConePlaces:
     return lay_out_places(circles().curves, U)
 
 
-def test_a_place_is_the_point_of_its_curve_at_its_parameter(places: Places) -> None:
+def test_a_place_is_the_point_of_its_curve_at_its_parameter(places: ConePlaces) -> None:
     state = circles()
     for label, own in ((LEFT, slice(0, 4)), (RIGHT, slice(4, 6))):
         for order, basis in enumerate((places.basis, places.basis_slope)):
@@ -45,7 +45,7 @@ def test_a_place_is_the_point_of_its_curve_at_its_parameter(places: Places) -> N
         np.testing.assert_array_equal(np.isin(places.keys[own], state.keys(label)), True)
 
 
-def test_a_detection_past_its_place_has_a_positive_residual(places: Places) -> None:
+def test_a_detection_past_its_place_has_a_positive_residual(places: ConePlaces) -> None:
     state = circles()
     boundary, points = state.boundaries[RIGHT], state.control_points(RIGHT)
     seen = boundary.evaluate(points, U[RIGHT] + np.array([0.1, -0.2]))
@@ -67,6 +67,6 @@ def test_a_detection_past_its_place_has_a_positive_residual(places: Places) -> N
         (RIGHT, 1.4, 4),
     ],
 )
-def test_a_detection_is_of_the_place_next_to_it(places: Places, label: int, u: float, place: int) -> None:
+def test_a_detection_is_of_the_place_next_to_it(places: ConePlaces, label: int, u: float, place: int) -> None:
     curve = circles().curves.number(np.array([label]))
     assert places.nearest(curve, np.array([u]), 1.0, 1.4).tolist() == [place]

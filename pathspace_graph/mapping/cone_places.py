@@ -18,7 +18,7 @@ IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class ConePlaces:
     """Holds one parameter for each cone of the curves, curve by curve."""
 
     u: Array
@@ -62,7 +62,7 @@ class Places:
         return along_from_place(points, poses, control_points, self.basis[place], self.basis_slope[place])
 
 
-def lay_out_places(curves: Curves, u: Mapping[int, Array]) -> Places:
+def lay_out_places(curves: Curves, u: Mapping[int, Array]) -> ConePlaces:
     """Returns the places at parameters (k,) of each curve, by label."""
     parameters, columns, bases, at = [], [], [], 0
     for label, boundary in zip(curves.labels.tolist(), curves.boundaries, strict=True):
@@ -73,7 +73,7 @@ def lay_out_places(curves: Curves, u: Mapping[int, Array]) -> Places:
         bases.append(basis)
         at += boundary.size
     (basis, slope), rows = np.concatenate(bases, axis=1), np.concatenate(columns)
-    return Places(
+    return ConePlaces(
         u=np.concatenate(parameters),
         starts=np.cumsum([0, *map(len, parameters)]),
         lengths=np.array([b.length if b.periodic else np.inf for b in curves.boundaries]),
