@@ -168,6 +168,13 @@ class BatchSystem:
         u = self.detections.u[rows]
         self.detections.put(rows, self.places.nearest(curve, u, settings.room, settings.apart))
 
+    def places_by_label(self, state: State) -> dict[int, Array]:
+        """Returns the parameters (k,) of the places on each curve, none where the settings ask for none."""
+        if self.places is None:
+            return {}
+        starts = self.places.starts
+        return {label: self.places.u[starts[c] : starts[c + 1]] for c, label in enumerate(state.boundaries)}
+
     def _places_of(self, boundary: Boundary, label: int) -> Array:
         """Returns the places (k,) of the cones of a boundary on its curve."""
         rows, low = self.detections.used_on(label), boundary.tables.low

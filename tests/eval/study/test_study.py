@@ -177,6 +177,7 @@ def test_the_studies_listed_are_the_files_on_disk_and_are_shipped() -> None:
         "lag",
         "online",
         "paper",
+        "places",
         "relinearize",
         "residual",
         "robust",
