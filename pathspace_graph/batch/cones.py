@@ -148,13 +148,41 @@ def cluster(
     u (m,) in [0, length] are the parameters of the detections (m), and weight (m,) is their information
     (1/m^2). A cone has at least `growth.sightings` detections.
     """
-    peaks = _peaks(u, weight, length, periodic, settings)
-    member = _nearest_peak(u, peaks, length if periodic else np.inf, settings.growth.merge_radius)
+    peaks, member = _clusters(u, weight, length, periodic, settings)
     count = np.bincount(member[member >= 0], minlength=len(peaks))
-    typical = float(np.median(count)) if len(count) else 0.0
     cones = Cones(_means(points, weight, member, len(peaks)), peaks, count)
-    enough = count >= max(settings.growth.sightings, settings.batch.cones.min_share * typical)
+    enough = _often_seen(count, settings)
     return without_folds(cones.where(enough), periodic, settings.batch.cones)
+
+
+def places(u: Array, weight: Array, length: float, periodic: bool, settings: MapperSettings) -> Array:
+    """Returns the places (k,) of cones along a curve (m): the weighted means of their detections' u (m,).
+
+    u is in [0, length], and weight (m,) is the information of the detections (1/m^2).
+    """
+    peaks, member = _clusters(u, weight, length, periodic, settings)
+    inside = member >= 0
+    u, weight, member = u[inside], weight[inside], member[inside]
+    offset = u - peaks[member]
+    if periodic:
+        offset -= length * np.round(offset / length)
+    total, moment = (np.bincount(member, terms, len(peaks)) for terms in (weight, weight * offset))
+    mean = peaks + moment / np.maximum(total, np.finfo(float).tiny)
+    return np.asarray(mean[_often_seen(np.bincount(member, minlength=len(peaks)), settings)])
+
+
+def _clusters(
+    u: Array, weight: Array, length: float, periodic: bool, settings: MapperSettings
+) -> tuple[Array, IntArray]:
+    """Returns the peaks (k,) of the density of detections along a curve, and the peak (m,) next to each."""
+    peaks = _peaks(u, weight, length, periodic, settings)
+    return peaks, _nearest_peak(u, peaks, length if periodic else np.inf, settings.growth.merge_radius)
+
+
+def _often_seen(count: IntArray, settings: MapperSettings) -> BoolArray:
+    """Returns (k,) whether clusters with this number of detections (k,) are cones."""
+    typical = float(np.median(count)) if len(count) else 0.0
+    return np.asarray(count >= max(settings.growth.sightings, settings.batch.cones.min_share * typical))
 
 
 def without_folds(cones: Cones, periodic: bool, settings: ConeSettings) -> Cones:

@@ -28,7 +28,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
-from .association import add_drive, associate, locate_poses
+from .association import add_drive, associate, find_anywhere, locate_poses
 from .gauge import curve_gauge
 from .knots import exact_settings
 from .mapper import find_optimum, own_settings
@@ -81,6 +81,8 @@ class LapMarginal:
     """(n,) This is the mean of the marginal."""
     information: Array
     """(n, n) This is the information of the marginal, the inverse of its covariance."""
+    places: dict[int, Array]
+    """For each boundary, its cones have these parameters (k,) on the simplified curve (m)."""
     scatter: dict[int, Array]
     """For each boundary, cones scatter about the curve by this sigma (m,) at each control point (m)."""
 
@@ -105,6 +107,7 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             first_kept=lap.first_kept,
             mean=mean,
             information=information,
+            places=places_on(few, at.state, system),
             scatter={label: scatter.sigma(label, b.abscissae) for label, b in few.boundaries.items()},
         )
 
@@ -170,6 +173,15 @@ def marginal_of(
     return np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), np.float64), here + T @ shift
 
 
+def places_on(few: State, dense: State, system: BatchSystem) -> dict[int, Array]:
+    """Returns the parameters (k,) of the cones' places on the curves that were simplified, by label."""
+    found = {}
+    for label, u in system.places_by_label(dense).items():
+        points = dense.boundaries[label].evaluate(dense.control_points(label), u)
+        found[label] = find_anywhere(few.boundaries[label], few.control_points(label), points).u
+    return found
+
+
 def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Rows]:
     """Returns the rows of the batch that hold a pose before `first_kept` or no pose at all.
 
@@ -181,7 +193,9 @@ def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Ro
         gauge = curve_gauge(state, label, system.settings.batch.sigma_slide, first_kept)
         points = state.control_points(label)
         groups += [system.detection_rows(at, label), gauge.beside(points, state.poses)]
-        groups += [gauge.smooth(points), gauge.anchor()]
+        groups += [gauge.smooth(points, state.poses), gauge.anchor()]
+    if at.placed is not None:
+        groups.append(system.place_rows(at, at.placed))
     return [rows.where(_is_before(rows.keys, first_kept)) for rows in groups if len(rows)]
 
 

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POINT, POSE, pose_key, pose_keys
@@ -37,8 +38,10 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     across the curve, divided by the root of their robust weights. So it is a graph of plain least squares.
     Each control point is anchored where it is. At an optimum the gradient is zero, and the linearization is
     that of the optimization. But the error isn't its robust cost, and some decimetres away from the optimum
-    the weights would be others.
+    the weights would be others. There is no such factor for places of cones, where SettingsError is raised.
     """
+    if system.places is not None:
+        raise SettingsError(f"graph: expected place.use none, found {system.settings.place.use}")
     graph = gtsam.NonlinearFactorGraph()
     for factor in _odometry(system.chain):
         graph.add(factor)
@@ -116,7 +119,7 @@ def bending_factor(gauge: CurveGauge, row: int) -> gtsam.CustomFactor:
         if H is not None:
             H[0], H[1], H[2] = np.split(by_control[0], 3, axis=1)
             H[3] = by_pose[0]
-        return residual[0]
+        return np.asarray(residual[0])
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(POINT), keys, error)
 

@@ -112,6 +112,8 @@ class Optimizer:
         if not strict:
             locate_poses(state, self.settings.association)
         associate(state, system.detections, system.settings, gate, strict)
+        if strict and system.settings.place.use == "cones":
+            system.place(state)
         return system.evaluate(state, hold=True)
 
     def _is_still(self, before: Evaluation, after: Evaluation, tolerance: float) -> bool:

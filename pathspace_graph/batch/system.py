@@ -8,18 +8,22 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.cone_place import PlaceRows
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.projection import ProjectionRows, project
+from pathspace_graph.factors.projection import ProjectionRows, project, sigma_across
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
 from pathspace_graph.graph.keys import are_poses, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
-from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.cone_places import ConePlaces, lay_out_places
+from pathspace_graph.mapping.detections import NOWHERE, DetectionTable
 from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import Boundary
 
+from .cones import places
 from .gauge import CurveGauge, curve_gauge
 
 Array = NDArray[np.float64]
@@ -78,6 +82,23 @@ class Projected:
 
 
 @dataclass(frozen=True, eq=False)
+class Placed:
+    """Holds the detections that are of a cone's place, and how far past it they lie at a state."""
+
+    rows: IntArray
+    """These are the rows (m,) of the detections in their table."""
+    along: PlaceRows
+    """These are their residuals and derivatives."""
+    sigma: Array
+    """These are their standard deviations (m,) along the curve in m."""
+
+    @property
+    def whitened(self) -> Array:
+        """Returns the residuals (m,) in sigmas."""
+        return np.asarray(self.along.residual / self.sigma)
+
+
+@dataclass(frozen=True, eq=False)
 class Evaluation:
     """Holds the problem at one state."""
 
@@ -85,6 +106,8 @@ class Evaluation:
     """This is the state."""
     projected: dict[int, Projected]
     """These are the used detections of each boundary."""
+    placed: Placed | None
+    """These are the detections that are of a place, or none if there are no places."""
     odometry: tuple[Array, Array]
     """These are the residuals and derivatives of `LogOdometry.terms`."""
     cost: float
@@ -103,7 +126,9 @@ class BatchSystem:
         self.kernel = kernel
         self.gauges: dict[int, CurveGauge] = {}
         """These are the weak priors of each boundary."""
-        self._sigma = np.ones(len(detections))
+        self.places: ConePlaces | None = None
+        """These are the cones' places along the curves, where the settings ask for them."""
+        self._sigma, self._sigma_along = np.ones(len(detections)), np.ones(len(detections))
         self._inside = np.ones(len(detections), bool)
 
     def begin(self, state: State) -> None:
@@ -111,7 +136,7 @@ class BatchSystem:
 
         The optimizer calls this when knots have changed.
         """
-        sigma = self.settings.batch.sigma_slide
+        sigma, self.places = self.settings.batch.sigma_slide, None
         self.gauges = {label: curve_gauge(state, label, sigma) for label in state.boundaries}
 
     # --- cost --------------------------------------------------------------------------------------------
@@ -124,13 +149,55 @@ class BatchSystem:
         of the curve.
         """
         projected = {label: self._project(state, label, hold) for label in state.boundaries}
+        placed = None if self.places is None else self._placed(state, self.places, hold)
         odometry = self.chain.terms(state.poses, state.calibration)
         cost = self._detections_cost(projected) + 0.5 * float((odometry[0] ** 2).sum())
         cost += sum(
             self.gauges[label].cost(state.control_points(label), state.poses) for label in state.boundaries
         )
         cost += self.chain.prior_cost(state.poses[0], state.calibration)
-        return Evaluation(state, projected, odometry, cost)
+        if placed is not None:
+            cost += float(self.kernel.loss(placed.whitened).sum())
+        return Evaluation(state, projected, placed, odometry, cost)
+
+    def place(self, state: State) -> None:
+        """Associates the detections in use with the cones' places, which are found first if there are none.
+
+        A place is the mean of the parameters of a cone's detections, and then a constant: that the cone lies
+        elsewhere along the track is left to the control points, of which there is about one for each cone.
+        """
+        if self.places is None:
+            own = {label: self._places_of(boundary, label) for label, boundary in state.boundaries.items()}
+            self.places = lay_out_places(state.curves, own)
+        rows, settings = np.flatnonzero(self.detections.used), self.settings.place
+        curve = state.curves.number(self.detections.boundary[rows])
+        u = self.detections.u[rows]
+        self.detections.put(rows, self.places.nearest(curve, u, settings.room, settings.apart))
+
+    def places_by_label(self, state: State) -> dict[int, Array]:
+        """Returns the parameters (k,) of the places on each curve, none where the settings ask for none."""
+        if self.places is None:
+            return {}
+        starts = self.places.starts
+        return {label: self.places.u[starts[c] : starts[c + 1]] for c, label in enumerate(state.boundaries)}
+
+    def _places_of(self, boundary: Boundary, label: int) -> Array:
+        """Returns the places (k,) of the cones of a boundary on its curve."""
+        rows, low = self.detections.used_on(label), boundary.tables.low
+        weight = 1.0 / np.trace(self.detections.covariance[rows], axis1=1, axis2=2)
+        u = boundary.tables.inside(self.detections.u[rows]) - low
+        return low + places(u, weight, boundary.length, boundary.periodic, self.settings)
+
+    def _placed(self, state: State, places: ConePlaces, hold: bool) -> Placed:
+        detections = self.detections
+        rows = np.flatnonzero(detections.used & (detections.place != NOWHERE))
+        poses = state.variables.poses_at(detections.cycle[rows])
+        points = to_map(detections.point[rows], poses)
+        along = places.along(detections.place[rows], state.map_points, points, poses)
+        if hold:
+            covariances, sigma = detections.covariance[rows], self.settings.place.sigma
+            self._sigma_along[rows] = sigma_across(along.tangent_unit, covariances, poses, sigma)
+        return Placed(rows, along, self._sigma_along[rows])
 
     def _project(self, state: State, label: int, hold: bool) -> Projected:
         detections = self.detections
@@ -159,6 +226,8 @@ class BatchSystem:
             points = state.control_points(label)
             groups += [self.detection_rows(at, label), gauge.beside(points, state.poses)]
             groups += [gauge.smooth(points, state.poses), gauge.anchor()]
+        if at.placed is not None:
+            groups.append(self.place_rows(at, at.placed))
         return groups
 
     def detection_rows(self, at: Evaluation, label: int) -> Rows:
@@ -172,6 +241,20 @@ class BatchSystem:
             jacobian=np.column_stack([by_control, p.projection.by_pose]) * scale[:, None],
             residual=p.projection.residual * scale,
             owner=owners(cycle, label),
+        )
+
+    def place_rows(self, at: Evaluation, placed: Placed) -> Rows:
+        """Returns the rows of the detections of a place on [control points of the place's span | pose]."""
+        assert self.places is not None
+        place, cycle = self.detections.place[placed.rows], self.detections.cycle[placed.rows]
+        scale = np.sqrt(self.kernel.weights(placed.whitened)) / placed.sigma
+        by_control = placed.along.by_control.reshape(len(cycle), -1)
+        keys = self.places.keys[place]
+        return Rows(
+            keys=np.column_stack([keys, pose_keys(cycle)]),
+            jacobian=np.column_stack([by_control, placed.along.by_pose]) * scale[:, None],
+            residual=placed.along.residual * scale,
+            owner=owners(cycle, self.detections.boundary[placed.rows]),
         )
 
     def scale(self, projected: Projected) -> Array:

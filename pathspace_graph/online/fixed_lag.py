@@ -148,6 +148,7 @@ class FixedLagMapper:
         new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
         if self.boundaries:
             associate(self.smoother, self._grown)
+            self.smoother.map.place_detections(new.start)
         if not self.closed:
             self.growth.observe(self.smoother, new, detections.t)
 
@@ -296,12 +297,14 @@ class FixedLagMapper:
 
         The factors hold the active variables, which `values` returns. The graph shares nothing with the
         mapper: optimize it, print its errors, or compute its marginals with GTSAM's own classes. There is no
-        such factor for `spline.residual` "point", where SettingsError is raised.
+        such factor for `spline.residual` "point" or for places of cones, where SettingsError is raised.
         """
         if self.settings.spline.residual != "across":
             raise SettingsError(
                 f"graph: expected spline.residual across, found {self.settings.spline.residual}"
             )
+        if self.settings.place.use != "none":
+            raise SettingsError(f"graph: expected place.use none, found {self.settings.place.use}")
         return window_graph(self.smoother)
 
     def values(self) -> gtsam.Values:

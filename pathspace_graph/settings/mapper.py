@@ -122,6 +122,22 @@ class GateSettings(Positive):
 
 
 @dataclass(frozen=True)
+class PlaceSettings(Positive):
+    """Describes the places of the cones along a closed curve, which hold the vehicle along the track."""
+
+    use: Literal["none", "cones"] = "none"
+    """With `cones`, each cone has a place on the closed curve: an arc length, with which detections are
+    associated along the curve only. With `none`, detections say nothing along the curve."""
+    sigma: float = 0.1
+    """This is the standard deviation (m) of a cone's place along the curve. Its square is added to the
+    variance of each detection along the curve."""
+    room: float = 1.0
+    """A detection is of the place next to its foot point if that is nearer than this (m along the curve)."""
+    apart: float = 2.0
+    """The second nearest place must be farther away than the nearest one by this factor."""
+
+
+@dataclass(frozen=True)
 class PathSettings(Positive):
     """Describes the driven path, and the prediction of the path ahead."""
 
@@ -382,6 +398,8 @@ class MapperSettings(Positive):
     """These settings describe the weak priors on what detections leave free."""
     gate: GateSettings = field(default_factory=GateSettings)
     """These settings describe which detections are used, and how much they weigh."""
+    place: PlaceSettings = field(default_factory=PlaceSettings)
+    """These settings describe the places of the cones along a closed curve."""
     path: PathSettings = field(default_factory=PathSettings)
     """These settings describe the driven path and the predicted path ahead."""
     growth: GrowthSettings = field(default_factory=GrowthSettings)
