@@ -116,7 +116,7 @@ def bending_factor(gauge: CurveGauge, row: int) -> gtsam.CustomFactor:
         if H is not None:
             H[0], H[1], H[2] = np.split(by_control[0], 3, axis=1)
             H[3] = by_pose[0]
-        return residual[0]
+        return np.asarray(residual[0])
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(POINT), keys, error)
 
