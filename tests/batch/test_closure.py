@@ -26,7 +26,8 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.log_odometry import integrate_log
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.batch import COURSE, course_log, noisy
+from ..scenes.batch import COURSE, course_log
+from ..scenes.drives import noisy
 
 Array = NDArray[np.float64]
 

@@ -29,8 +29,7 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings, PlaceSettings
 from pathspace_graph.spline.knots import fit_spline
 
-from ..scenes.batch import noisy
-from ..scenes.drives import bean_track, lap_log, true_poses
+from ..scenes.drives import bean_track, lap_log, noisy, true_poses
 
 Array = NDArray[np.float64]
 WINDOW = 15

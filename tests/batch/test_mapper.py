@@ -22,8 +22,7 @@ from pathspace_graph.io.map import SplineBoundary, read_map
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.batch import noisy
-from ..scenes.drives import ahead, bean_track, corridor, exact_log, lap_log, true_poses
+from ..scenes.drives import ahead, bean_track, corridor, exact_log, lap_log, noisy, true_poses
 
 Array = NDArray[np.float64]
 

@@ -22,8 +22,7 @@ from pathspace_graph.online.open_lap import LapBatch, OpenLapRecord
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings, PlaceSettings
 
-from ..scenes.batch import noisy
-from ..scenes.drives import bean_track, lap_log, map_log
+from ..scenes.drives import bean_track, lap_log, map_log, noisy
 
 Array = NDArray[np.float64]
 

@@ -135,13 +135,3 @@ def detections_of(points_vehicle: Array, labels: IntArray, sigma: float) -> Dete
     covariances, table = np.tile(sigma**2 * np.eye(2), (len(labels), 1, 1)), DetectionTable()
     table.append(Detections(0.0, points_vehicle, covariances, labels), 0)
     return table
-
-
-def noisy(log: Log, seed: int, sigma: float = 0.1) -> Log:
-    """Returns the log with noise on its detections."""
-    rng = np.random.default_rng(seed)
-    cycles = tuple(
-        replace(c, points_vehicle=c.points_vehicle + rng.normal(0.0, sigma, c.points_vehicle.shape))
-        for c in log.cycles
-    )
-    return replace(log, cycles=cycles)
