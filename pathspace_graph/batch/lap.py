@@ -8,6 +8,7 @@ about the simplified map, the calibration and the oldest pose of the window.
 
 from __future__ import annotations
 
+import time
 from copy import deepcopy
 from dataclasses import dataclass, replace
 
@@ -83,10 +84,13 @@ class LapMarginal:
     """(n, n) This is the information of the marginal, the inverse of its covariance."""
     scatter: dict[int, Array]
     """For each boundary, cones scatter about the curve by this sigma (m,) at each control point (m)."""
+    seconds: float
+    """The solution took this wall time (s)."""
 
 
 def solve_lap(lap: OpenLap) -> LapMarginal:
     """Returns the marginal of an open lap at the optimum of its batch. It uses one thread."""
+    begin = time.perf_counter()
     with threadpool_limits(limits=1):
         system, at, convergence = lap_optimum(lap)
         settings, detections = system.settings, system.detections
@@ -106,6 +110,7 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             mean=mean,
             information=information,
             scatter={label: scatter.sigma(label, b.abscissae) for label, b in few.boundaries.items()},
+            seconds=time.perf_counter() - begin,
         )
 
 
