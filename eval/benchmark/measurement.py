@@ -51,6 +51,8 @@ CLOSING_MILLISECONDS: Final = 100.0
 """The cycle that closes the loop takes at most this."""
 MEANWHILE_RATIO: Final = 1.1
 """While the batch of the lap is being solved, a mean cycle takes at most this many times one before it."""
+SOLVE_SECONDS: Final = 1.5
+"""The batch of the lap takes at most this time (s) in its own process."""
 SWAP_MILLISECONDS: Final = 100.0
 """The cycle that replaces the map takes at most this."""
 
@@ -92,6 +94,8 @@ class Measurement:
     """Each update of the landmark graph took this time (s)."""
     swap: int | None = None
     """This cycle replaced the map by one that was solved as a batch; it is None where none did."""
+    solve: float = float("nan")
+    """That batch took this time (s) in its own process."""
 
 
 class _Sampler:
@@ -142,7 +146,9 @@ def measure(log: Log, settings: MapperSettings, every: int = SAMPLE_EVERY) -> Me
         sampler = _Sampler(mapper, log, every, advance)
         result = run_online(log, mapper, on_cycle=sampler)
     closing, swap = (None if at is None else at.cycle for at in (sampler.closing, sampler.swap))
-    return Measurement(result.cycles, result.laps, closing, sampler.fastest(), tuple(sampler.rival), swap)
+    return Measurement(
+        result.cycles, result.laps, closing, sampler.fastest(), tuple(sampler.rival), swap, mapper.lap_seconds
+    )
 
 
 def metrics(measurement: Measurement) -> tuple[Metric, ...]:
@@ -184,6 +190,7 @@ def _swap_metrics(measurement: Measurement, times: Array) -> Iterator[Metric]:
     before = times[max(closing - len(meanwhile), 0) : closing]
     ratio = _mean(meanwhile) / _mean(before)
     yield Metric("meanwhile_by_before", ratio, "", bound=MEANWHILE_RATIO, tolerance=TAIL_TOLERANCE)
+    yield Metric("solve", measurement.solve, "s", bound=SOLVE_SECONDS)
     yield Metric("swap", 1e3 * float(times[swap]), "ms", bound=SWAP_MILLISECONDS)
     yield Metric("meanwhile_by_after", _mean(meanwhile) / _mean(times[swap + 1 :][: len(meanwhile)]), "")
 

@@ -8,6 +8,7 @@ about the simplified map, the calibration and the oldest pose of the window.
 
 from __future__ import annotations
 
+import time
 from copy import deepcopy
 from dataclasses import dataclass, replace
 
@@ -85,10 +86,13 @@ class LapMarginal:
     """For each boundary, its cones have these parameters (k,) on the simplified curve (m)."""
     scatter: dict[int, Array]
     """For each boundary, cones scatter about the curve by this sigma (m,) at each control point (m)."""
+    seconds: float
+    """The solution took this wall time (s)."""
 
 
 def solve_lap(lap: OpenLap) -> LapMarginal:
     """Returns the marginal of an open lap at the optimum of its batch. It uses one thread."""
+    begin = time.perf_counter()
     with threadpool_limits(limits=1):
         system, at, convergence = lap_optimum(lap)
         settings, detections = system.settings, system.detections
@@ -109,6 +113,7 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             information=information,
             places=places_on(few, at.state, system),
             scatter={label: scatter.sigma(label, b.abscissae) for label, b in few.boundaries.items()},
+            seconds=time.perf_counter() - begin,
         )
 
 

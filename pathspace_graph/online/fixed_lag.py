@@ -78,6 +78,8 @@ class FixedLagMapper:
         """The flag is set when the loop has closed: the map has its final size."""
         self.corrected_poses: Array = np.zeros((0, 3))
         """(k, 3) These are the poses of the first k cycles as the closing of the loop has corrected them."""
+        self.lap_seconds = float("nan")
+        """The batch of the lap took this wall time (s) in its own process, once it has replaced the prior."""
         self._open_lap = OpenLapRecord(self.settings)
         if self.settings.open_lap.prior == "window" or solver is not None:
             self._open_lap.give_up("no batch of the lap was asked for")
@@ -218,7 +220,7 @@ class FixedLagMapper:
         self._lap_batch, marginal = None, batch.marginal()
         if isinstance(marginal, str):
             return None, f"{OWN_PRIOR}: {marginal}"
-        self.corrected_poses = marginal.poses
+        self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds
         return go_on_from(self.smoother, marginal), ""
 
     def _result(self, t: float, stages: dict[str, float], jump: Array | None, notice: str) -> CycleResult:

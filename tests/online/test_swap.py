@@ -55,6 +55,7 @@ def test_the_swap_comes_the_set_number_of_cycles_after_closing_and_is_reported()
     assert np.isfinite(jump).all()
     assert np.hypot(*jump[:2]) > 0.0
     assert not any(result.notice for result in results)
+    assert mapper.lap_seconds > 0.0
 
 
 def test_the_map_is_within_the_noise() -> None:

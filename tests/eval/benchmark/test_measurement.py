@@ -52,8 +52,8 @@ def test_the_swap_is_compared_with_the_cycles_around_it() -> None:
     cycles = [record(k, 0.002 if k < 99 else 0.003 if k < 120 else 0.004, 1) for k in range(200)]
     cycles[120] = replace(record(120, 0.050, 1), jump=(0.1, 0.0, 0.0))
     shared = (1, 99, Gtsam("any", 0.0015, 0.0005, 25), (0.008,) * 200)
-    figures = {metric.key: metric for metric in metrics(Measurement(tuple(cycles), *shared, swap=120))}
-    assert figures["swap"].value == pytest.approx(50.0)
+    figures = {metric.key: metric for metric in metrics(Measurement(tuple(cycles), *shared, 120, 1.2))}
+    assert (figures["swap"].value, figures["solve"].value) == (pytest.approx(50.0), 1.2)
     assert figures["meanwhile_by_before"].value == pytest.approx(1.5)
     assert figures["meanwhile_by_after"].value == pytest.approx(0.75)
     assert not figures["meanwhile_by_before"].holds and figures["swap"].holds
