@@ -153,6 +153,10 @@ class OpenLapSettings(Positive, group="open_lap"):
     rounds: int = 8
     """The second optimization, on knots that follow the result of the first, has at most this number of
     rounds."""
+    rounds_from_odometry: int = 24
+    """The same for a lap whose loop no registration has closed: its batch begins at odometry."""
+    retry: float = 20.0
+    """Such a loop is tried again after this length of path (m) where the detections were against it."""
     tolerance: float = 10.0
     """The tolerances of the batch are multiplied by this."""
     max_cycles: float = 6000.0
@@ -230,7 +234,7 @@ class BatchSettings(Positive):
     tolerance_curve: float = 2e-3
     """At convergence, no point of a curve moved farther than this across it in a round, as seen from the
     poses beside it (m)."""
-    tolerance_decrease: float = 1e-3
+    tolerance_decrease: float = 5e-3
     """At convergence, an undamped step would make the cost smaller by no more than this. A step of one sigma
     in any direction makes it smaller by 1/2, also where it swings a whole map by metres."""
     min_size_share: float = 0.6
