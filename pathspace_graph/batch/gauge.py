@@ -13,7 +13,6 @@ from pathspace_graph.graph.elimination import owners
 from pathspace_graph.graph.keys import POINT, POSE, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.mapping.state import State
-from pathspace_graph.spline.boundary import Boundary
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -159,10 +158,9 @@ def curve_gauge(state: State, label: int, sigma: float, until: int | None = None
     Only poses of the cycles before `until` hold control points.
     """
     boundary, control_points, poses = state.boundaries[label], state.control_points(label), state.poses
-    poses = poses[:until]
-    cycle = _nearest_poses(boundary, control_points, poses)
-    heading = np.column_stack([np.cos(poses[cycle, 2]), np.sin(poses[cycle, 2])])
     mean_spacing = boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)
+    cycle = _nearest_poses(state, label, until, mean_spacing)
+    heading = np.column_stack([np.cos(poses[cycle, 2]), np.sin(poses[cycle, 2])])
     return CurveGauge(
         label=label,
         keys=state.keys(label),
@@ -175,12 +173,20 @@ def curve_gauge(state: State, label: int, sigma: float, until: int | None = None
     )
 
 
-def _nearest_poses(boundary: Boundary, control_points: Array, poses: Array) -> IntArray:
-    """Returns (m,) the pose nearest to where each control point acts, of those with the curve's direction."""
+def _nearest_poses(state: State, label: int, until: int | None, room: float) -> IntArray:
+    """Returns (m,) the pose nearest to where each control point acts, of those with the curve's direction.
+
+    On an open curve, it is one of those whose places along the curve are nearest, give or take `room` (m): a
+    curve that has drifted over itself would else be tied to a pose of another stretch.
+    """
+    boundary, points, poses = state.boundaries[label], state.control_points(label), state.poses[:until]
     u = boundary.abscissae
-    position, tangent = (boundary.evaluate(control_points, u, order) for order in (0, 1))
+    position, tangent = (boundary.evaluate(points, u, order) for order in (0, 1))
     dx, dy = position[:, :1] - poses[:, 0], position[:, 1:] - poses[:, 1]
     along = tangent[:, :1] * np.cos(poses[:, 2]) + tangent[:, 1:] * np.sin(poses[:, 2])
     square = dx**2 + dy**2
     square[along <= 0.0] += square.max(initial=0.0)
+    if not boundary.periodic:
+        away = np.abs(u[:, None] - state.pose_u[label][:until])
+        square[away > away.min(axis=1, keepdims=True) + room] = np.inf
     return np.asarray(square.argmin(axis=1))

@@ -78,8 +78,8 @@ class Optimizer:
         may the optimization end. Each round takes one step.
         """
         system, gate = self.system, schedule.gate
-        system.begin(state)
         locate_poses(state, self.settings.association)
+        system.begin(state)
         self._last_step = None
         at: Evaluation | None = None
         for number in range(1, schedule.rounds + 1):

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.batch.lap import ClosedMap
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
@@ -16,7 +17,7 @@ from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import VehicleState
-from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import odometry_noise, predict, smoother_settings, vehicle_state
@@ -86,6 +87,7 @@ class FixedLagMapper:
         self._lap_batch: LapBatch | None = None
         self._grown: frozenset[int] = frozenset()
         self._closing_tried = 0.0
+        self._loop_tried = 0.0
 
     def update(
         self,
@@ -192,16 +194,33 @@ class FixedLagMapper:
 
         Returns a notice that says why it cannot be solved, or an empty one.
         """
-        smoother, record, cycle = self.smoother, self._open_lap, self.smoother.next_cycle - 1
+        smoother, record = self.smoother, self._open_lap
         self.corrected_poses = record.corrected(smoother)
         cones = len(smoother.map.state.map_keys) / self.settings.spline.size_share
         if cones > self.settings.open_lap.max_cones:
             record.give_up("the lap has too many cones for a batch")
         if record.unsolvable is not None:
             return f"{OWN_PRIOR}: {record.unsolvable}"
-        wait = min(self.settings.open_lap.cycles, cycle - smoother.first_cycle)
-        self._lap_batch = LapBatch(record.lap(smoother, smoother.first_cycle + wait), cycle + wait)
+        self._begin_batch(record.closed_map(smoother))
         return ""
+
+    def _begin_batch(self, closed: ClosedMap | None) -> None:
+        """Sends the lap to its batch, which begins at a map that has just been closed, or at odometry."""
+        first, cycle = self.smoother.first_cycle, self.smoother.next_cycle - 1
+        wait = min(self.settings.open_lap.cycles, cycle - first)
+        self._lap_batch = LapBatch(self._open_lap.lap(first + wait, closed), cycle + wait)
+
+    def _try_loop(self) -> None:
+        """Sends the lap to a batch from odometry where the drive says that it is over.
+
+        That happens where the registration keeps refusing to close the loop.
+        """
+        if self.path.length < self._loop_tried or set(self.boundaries) != set(BOUNDARIES):
+            return
+        self._loop_tried = self.path.length + self.settings.closing.check_interval
+        if self._open_lap.is_over():
+            self._loop_tried = self.path.length + self.settings.open_lap.retry
+            self._begin_batch(None)
 
     def _go_on(self, closes: bool) -> tuple[Array | None, str]:
         """Records the open lap, has it solved when it closes, and goes on from the result when it is due.
@@ -215,11 +234,16 @@ class FixedLagMapper:
             self._open_lap.estimated(self.smoother.map.state)
             if self.path.length > self.settings.closing.min_path:
                 self._open_lap.prepare()
+                if batch is None:
+                    self._try_loop()
         if batch is None or self.smoother.next_cycle - 1 < batch.due:
             return None, ""
         self._lap_batch, marginal = None, batch.marginal()
         if isinstance(marginal, str):
-            return None, f"{OWN_PRIOR}: {marginal}"
+            return None, f"{OWN_PRIOR}: {marginal}" if self.closed else ""
+        if not self.closed:
+            self.closed, self.smoother.window.exact = True, False
+            self.growth.clear()
         self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds
         return go_on_from(self.smoother, marginal), ""
 

@@ -10,10 +10,13 @@ import numpy as np
 from joblib.externals.loky import get_reusable_executor
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
+from pathspace_graph.batch.closure import is_worth_trying
+from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
+from pathspace_graph.batch.recurrence import find_recurrence
 from pathspace_graph.batch.start import unwrap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.odometry import IntegratedOdometry
+from pathspace_graph.factors.se2 import compose
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.detections import DetectionTable
@@ -42,6 +45,7 @@ class OpenLapRecord:
         self._odometry: list[IntegratedOdometry] = []
         self._detections: list[Detections] = []
         self._places: dict[int, list[Place]] = {}
+        self._reckoned: list[Array] = []
         self._prepared = False
 
     def give_up(self, reason: str) -> None:
@@ -57,6 +61,8 @@ class OpenLapRecord:
         self._stamps.append(t)
         self._odometry.append(odometry)
         self._detections.append(detections)
+        last = self._reckoned[-1] if self._reckoned else np.zeros(3)
+        self._reckoned.append(compose(last, odometry.delta))
         if len(self._stamps) > self.settings.open_lap.max_cycles:
             self.give_up("the lap is too long for a batch")
 
@@ -68,6 +74,12 @@ class OpenLapRecord:
             u = state.pose_u[label][-1:]
             (pose,) = curve_poses(boundary, state.control_points(label), u)
             self._places.setdefault(label, []).append(Place(cycle, float(u[0]), pose))
+
+    def is_over(self) -> bool:
+        """Returns whether the path driven says, by odometry alone, that the lap is over."""
+        if self.unsolvable is not None or not self._reckoned:
+            return False
+        return is_worth_trying(find_recurrence(np.array(self._reckoned), self.settings), self.settings)
 
     def prepare(self) -> None:
         """Starts the process that solves laps, once, so that it is ready when the loop closes.
@@ -84,20 +96,23 @@ class OpenLapRecord:
         poses = unwrap(np.array([*self.poses[:window], *smoother.variables.poses]))
         return in_final_map(poses, window, self._places, smoother.map.state, self.settings)
 
-    def lap(self, smoother: CurveSmoother, first_kept: int) -> OpenLap:
-        """Returns the lap, beginning at the map that has just been closed."""
+    def closed_map(self, smoother: CurveSmoother) -> ClosedMap:
+        """Returns the map that has just been closed, with the poses of all cycles beside it."""
         state = smoother.map.state
+        splines = {
+            label: boundary.spline(state.control_points(label).copy())
+            for label, boundary in state.boundaries.items()
+        }
+        return ClosedMap(splines, self.corrected(smoother), state.calibration.copy())
+
+    def lap(self, first_kept: int, closed: ClosedMap | None) -> OpenLap:
+        """Returns the lap, whose search begins at a map that has just been closed, or at odometry."""
         return OpenLap(
             settings=self.settings,
             chain=chained(self._stamps, self._odometry, self.settings.odometry),
             detections=DetectionTable.of(self._detections),
-            splines={
-                label: boundary.spline(state.control_points(label).copy())
-                for label, boundary in state.boundaries.items()
-            },
-            poses=self.corrected(smoother),
-            calibration=state.calibration.copy(),
             first_kept=first_kept,
+            closed=closed,
         )
 
 
@@ -109,7 +124,7 @@ class LapBatch:
         """The marginal replaces the prior in this cycle."""
         self.first_kept = lap.first_kept
         """The window holds the poses from this cycle on until then."""
-        self._future: Future[LapMarginal] = _worker().submit(solve_lap, lap)
+        self._future: Future[LapMarginal | None] = _worker().submit(solve_lap, lap)
 
     def marginal(self) -> LapMarginal | str:
         """Waits for the solution and returns it, or says why there is none."""
@@ -119,6 +134,8 @@ class LapBatch:
             return str(error)
         except BrokenProcessPool:
             return "the process of the batch has died"
+        if solved is None:
+            return "the detections are against the loop"
         return solved if solved.convergence.converged else "the batch of the lap has not converged"
 
 

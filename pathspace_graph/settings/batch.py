@@ -112,33 +112,6 @@ class ScatterSettings(Positive, group="batch.scatter"):
 
 
 @dataclass(frozen=True)
-class OpenLapSettings(Positive, group="open_lap"):
-    """Describes how the open lap is solved as a batch when the loop closes online."""
-
-    UNLIMITED = ("max_cycles", "max_cones")
-
-    prior: Literal["batch", "window"] = "batch"
-    """After closing, the map goes on from a batch over the open lap, or with `window` from what the window
-    has marginalized."""
-    cycles: int = 20
-    """The batch replaces the prior this number of cycles after the loop has closed, or as many as the window
-    holds. The update waits for it, so that the same log always gives the same map."""
-    rough_rounds: int = 8
-    """The first optimization has at most this number of rounds."""
-    rounds: int = 12
-    """The second optimization, on knots that follow the result of the first, has at most this number of
-    rounds."""
-    tolerance: float = 10.0
-    """The tolerances of the batch are multiplied by this."""
-    max_cycles: float = 6000.0
-    """Measurements of the open lap are kept up to this number of cycles. After a longer lap the map goes on
-    from what the window has marginalized."""
-    max_cones: float = 700.0
-    """A lap with more cones than this goes on from what the window has marginalized, since its batch would
-    not be in time."""
-
-
-@dataclass(frozen=True)
 class ClosureSettings(Positive, group="batch.closure"):
     """Describes when a loop is tried that no registration has closed, and when its result is believed."""
 
@@ -161,6 +134,37 @@ class ClosureSettings(Positive, group="batch.closure"):
     sigma: float = 0.3
     """The detections after the first lap hold their drive beside the curves by this standard deviation at
     most (m), in every direction."""
+
+
+@dataclass(frozen=True)
+class OpenLapSettings(Positive, group="open_lap"):
+    """Describes how the open lap is solved as a batch when the loop closes online."""
+
+    UNLIMITED = ("max_cycles", "max_cones")
+
+    prior: Literal["batch", "window"] = "batch"
+    """After closing, the map goes on from a batch over the open lap, or with `window` from what the window
+    has marginalized."""
+    cycles: int = 20
+    """The batch replaces the prior this number of cycles after the loop has closed, or as many as the window
+    holds. The update waits for it, so that the same log always gives the same map."""
+    rough_rounds: int = 8
+    """The first optimization has at most this number of rounds."""
+    rounds: int = 12
+    """The second optimization, on knots that follow the result of the first, has at most this number of
+    rounds."""
+    rounds_from_odometry: int = 24
+    """The same for a lap whose loop no registration has closed: its batch begins at odometry."""
+    retry: float = 20.0
+    """Such a loop is tried again after this length of path (m) where the detections were against it."""
+    tolerance: float = 10.0
+    """The tolerances of the batch are multiplied by this."""
+    max_cycles: float = 6000.0
+    """Measurements of the open lap are kept up to this number of cycles. After a longer lap the map goes on
+    from what the window has marginalized."""
+    max_cones: float = 700.0
+    """A lap with more cones than this goes on from what the window has marginalized, since its batch would
+    not be in time."""
 
 
 @dataclass(frozen=True)
@@ -230,7 +234,7 @@ class BatchSettings(Positive):
     tolerance_curve: float = 2e-3
     """At convergence, no point of a curve moved farther than this across it in a round, as seen from the
     poses beside it (m)."""
-    tolerance_decrease: float = 1e-3
+    tolerance_decrease: float = 5e-3
     """At convergence, an undamped step would make the cost smaller by no more than this. A step of one sigma
     in any direction makes it smaller by 1/2, also where it swings a whole map by metres."""
     min_size_share: float = 0.6

@@ -130,3 +130,14 @@ def test_a_hairpin_holds_each_control_point_beside_the_leg_of_its_own_direction(
     points = np.column_stack([x, np.full(len(x), 2.0)])
     gauge = curve_gauge(state_of({0: points}, np.concatenate([there, back])), 0, 0.2)
     assert gauge.cycle.max() < len(there)
+
+
+def test_an_open_curve_over_itself_is_held_by_the_poses_of_its_own_stretch() -> None:
+    """It turns by a whole turn and a quarter; the second time the poses are nearer to the first stretch."""
+    phi = np.linspace(0.0, 2.5 * np.pi, 120)
+    spiral = (20.0 + 0.5 * phi / phi[-1])[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])
+    driven = 22.0 - 0.5 * phi / phi[-1]
+    poses = np.column_stack([driven * np.cos(phi), driven * np.sin(phi), phi + 0.5 * np.pi])
+    gauge = curve_gauge(state_of({0: spiral}, poses), 0, 0.2)
+    assert (np.diff(gauge.cycle) >= 0).all()
+    assert np.abs(gauge.ahead).max() < 3.0

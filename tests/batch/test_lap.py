@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.lap import LapMarginal, OpenLap, lap_optimum, marginal_of, rows_before, solve_lap
+from pathspace_graph.batch.lap import (
+    ClosedMap,
+    LapMarginal,
+    OpenLap,
+    lap_optimum,
+    marginal_of,
+    rows_before,
+    solve_lap,
+)
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.system import BatchSystem, Evaluation
 from pathspace_graph.eval.metrics.table1 import lap_metrics
@@ -29,6 +37,7 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings, PlaceSettings
 from pathspace_graph.spline.knots import fit_spline
 
+from ..scenes.batch import COURSE, course_log
 from ..scenes.drives import bean_track, lap_log, noisy, true_poses
 
 Array = NDArray[np.float64]
@@ -53,16 +62,16 @@ def open_lap(settings: MapperSettings | None = None) -> OpenLap:
         settings=settings,
         chain=integrate_log(drive, drive.odometry_sigma, settings.odometry),
         detections=DetectionTable.of(drive.cycles),
-        splines=splines,
-        poses=true_poses(drive),
-        calibration=np.zeros(2),
         first_kept=len(drive.cycles) - WINDOW,
+        closed=ClosedMap(splines, true_poses(drive), np.zeros(2)),
     )
 
 
 @cache
 def solved() -> LapMarginal:
-    return solve_lap(open_lap())
+    marginal = solve_lap(open_lap())
+    assert marginal is not None
+    return marginal
 
 
 @cache
@@ -148,12 +157,31 @@ def test_the_cones_have_their_places_on_the_simplified_curves() -> None:
 def test_few_rounds_do_not_converge() -> None:
     settings = MapperSettings()
     hurried = replace(settings, open_lap=replace(settings.open_lap, rough_rounds=1, rounds=1))
-    assert not solve_lap(open_lap(hurried)).convergence.converged
+    marginal = solve_lap(open_lap(hurried))
+    assert marginal is not None
+    assert not marginal.convergence.converged
 
 
 def test_the_lap_itself_is_not_changed() -> None:
     lap = open_lap()
-    used, poses = deepcopy(lap.detections.used), lap.poses.copy()
+    assert lap.closed is not None
+    used, poses = deepcopy(lap.detections.used), lap.closed.poses.copy()
     solve_lap(lap)
     assert (lap.detections.used == used).all()
-    assert (lap.poses == poses).all()
+    assert (lap.closed.poses == poses).all()
+
+
+@pytest.mark.parametrize(("laps", "closes"), [(1.35, True), (0.9, False)])
+def test_a_search_from_odometry_has_a_result_where_the_loop_is_driven_again(
+    laps: float, closes: bool
+) -> None:
+    drive, settings = noisy(course_log(laps), seed=3), MapperSettings()
+    chain = integrate_log(drive, drive.odometry_sigma, settings.odometry)
+    lap = OpenLap(settings, chain, DetectionTable.of(drive.cycles), len(drive.cycles) - WINDOW)
+    marginal = solve_lap(lap)
+    assert (marginal is not None) == closes
+    if marginal is not None:
+        assert marginal.convergence.converged
+        assert all(spline.periodic for spline in marginal.splines.values())
+        for spline in marginal.splines.values():
+            np.testing.assert_allclose(spline.length(), COURSE, atol=13.0)
