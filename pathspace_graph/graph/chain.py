@@ -65,17 +65,14 @@ class Link:
     others: Layout
     """The link depends on these variables and on its anchor."""
     gain: Array
-    """In the frame of the anchor the mean is `y = y0 + G (z - z0) + e`, with G (n, m) for the others z."""
+    """In the frame of the anchor the mean is `y = G z + e`, with G (n, m) for the others z."""
     offset: Array
     """This is e (n,)."""
 
     def solve(self, variables: Variables, frame: Array) -> Array:
         """Returns the mean (n,) of the leaving variables in the map frame, with the anchor at a pose (3,)."""
-        local, keys = self.factor.local, self.factor.keys
         others = to_frame(variables.of(self.others.keys), frame, self.others)
-        change = others - local[keys.entries(self.others.keys)]
-        own = local[keys.entries(self.leaving.keys)] + self.gain @ change + self.offset
-        return from_frame(own, frame, self.leaving)
+        return from_frame(self.gain @ others + self.offset, frame, self.leaving)
 
     def holds(self, keys: IntArray) -> bool:
         """Returns whether the link is a function of any of some variables."""
@@ -266,9 +263,10 @@ def new_link(
         root[:, keys.entries(own.keys)], np.column_stack([-root[:, keys.entries(others.keys)], right])
     )
     weak = tuple(relative_factor(graph_of(one), frame, pose, reference, variables) for one in shared)
-    return Link(
-        factor, weak, own, others, np.asarray(solved[:, :-1], float), np.asarray(solved[:, -1], float)
-    )
+    gain = np.asarray(solved[:, :-1], float)
+    offset = factor.local[keys.entries(own.keys)] - gain @ factor.local[keys.entries(others.keys)]
+    offset += solved[:, -1]
+    return Link(factor, weak, own, others, gain, offset)
 
 
 def pose_and_reference(key: int, variables: Variables) -> tuple[Array, Array]:

@@ -24,7 +24,7 @@ from .gaussian import (
     remove_information,
     square_root_form,
 )
-from .keys import CALIBRATION_KEY, ORIGIN_KEY, POSE, are_poses
+from .keys import ORIGIN_KEY, POSE
 from .variables import Layout, Variables, rotation_blocks
 
 Array = NDArray[np.float64]
@@ -102,48 +102,38 @@ def relative_factor(
 # --- coordinates in the frame of a pose ------------------------------------------------------------------
 
 
-def _turning(keys: Layout) -> IntArray:
-    """Returns the columns of the x of all points and poses, which turn with the frame."""
-    return np.asarray(keys.starts[keys.keys != CALIBRATION_KEY])
-
-
-def _headings(keys: Layout) -> IntArray:
-    """Returns the columns of the headings of all poses."""
-    return np.asarray(keys.starts[are_poses(keys.keys)] + POSE - 1)
-
-
 def rotations(keys: Layout, heading: float) -> Array:
     """Returns the rotation (q, q) of points and poses from a frame with a heading (rad) to the map frame."""
-    x = _turning(keys)
+    x = keys.turning
     return rotation_blocks(keys.size, x, np.full(len(x), heading))
 
 
 def to_frame(values: Array, frame: Array, keys: Layout) -> Array:
     """Returns values (q,) of keys, which are in the map frame, in the frame of a pose (3,)."""
     c, s = np.cos(frame[2]), np.sin(frame[2])
-    local, x = values.copy(), _turning(keys)
+    local, x = values.copy(), keys.turning
     dx, dy = values[x] - frame[0], values[x + 1] - frame[1]
     local[x], local[x + 1] = c * dx + s * dy, -s * dx + c * dy
-    local[_headings(keys)] -= frame[2]
+    local[keys.headings] -= frame[2]
     return local
 
 
 def from_frame(local: Array, frame: Array, keys: Layout) -> Array:
     """Returns values (q,) of keys, which are in the frame of a pose (3,), in the map frame."""
     c, s = np.cos(frame[2]), np.sin(frame[2])
-    values, x = local.copy(), _turning(keys)
+    values, x = local.copy(), keys.turning
     values[x] = frame[0] + c * local[x] - s * local[x + 1]
     values[x + 1] = frame[1] + s * local[x] + c * local[x + 1]
-    values[_headings(keys)] += frame[2]
+    values[keys.headings] += frame[2]
     return values
 
 
 def by_frame_of(values: Array, frame: Array, keys: Layout) -> Array:
     """Returns the derivative (q, 3) of `to_frame` by the pose of the frame."""
     c, s = np.cos(frame[2]), np.sin(frame[2])
-    matrix, x = np.zeros((keys.size, POSE)), _turning(keys)
+    matrix, x = np.zeros((keys.size, POSE)), keys.turning
     dx, dy = values[x] - frame[0], values[x + 1] - frame[1]
     matrix[x, 0], matrix[x, 1], matrix[x, 2] = -c, -s, -s * dx + c * dy
     matrix[x + 1, 0], matrix[x + 1, 1], matrix[x + 1, 2] = s, -c, -c * dx - s * dy
-    matrix[_headings(keys), 2] = -1.0
+    matrix[keys.headings, 2] = -1.0
     return matrix

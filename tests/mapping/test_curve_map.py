@@ -151,3 +151,14 @@ def test_a_drive_without_noise_is_mapped_with_either() -> None:
             curve = boundary.spline.evaluate(np.linspace(*boundary.spline.domain, 50))
             np.testing.assert_allclose(np.abs(curve[:, 1]), 2.0, atol=0.02)
         assert set(found.map().boundaries) == set(BOUNDARIES)
+
+
+def test_the_cones_of_a_curve_move_with_the_map() -> None:
+    """A quarter turn and a shift."""
+    found, _ = map_log(exact_log(ahead(6.0, 4.0), *corridor(40.0)))
+    curves = found.smoother.map
+    before = {label: np.array(boundary.observed) for label, boundary in curves.state.boundaries.items()}
+    curves.move(np.array([2.0, -1.0, 0.5 * np.pi]))
+    for label, boundary in curves.state.boundaries.items():
+        x, y = before[label].T
+        np.testing.assert_allclose(boundary.observed, np.column_stack([2.0 - y, x - 1.0]), atol=1e-12)
