@@ -30,6 +30,14 @@ def compose(pose: Array, delta: Array) -> Array:
     return np.stack(moved, axis=-1)
 
 
+def relative(pose: Array, other: Array) -> Array:
+    """Returns `pose^-1 * other` on SE(2): another pose (3,) in the frame of a pose (3,).
+
+    Headings are subtracted and not wrapped.
+    """
+    return np.append(rotation(pose[2]).T @ (other[:2] - pose[:2]), other[2] - pose[2])
+
+
 def to_map(points_vehicle: Array, poses: Array) -> Array:
     """Returns `p = R z + t` (m, 2) in the map frame.
 

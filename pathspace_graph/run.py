@@ -37,6 +37,11 @@ class CycleResult:
     """This says whether the loop has closed."""
     stages: Mapping[str, float] = field(default_factory=dict)
     """Each stage of the update took this time (s), by the stage's name."""
+    jump: Array | None = None
+    """The newest pose jumped by this (3,) [m, m, rad] in the map frame, where the map was replaced in this
+    cycle by one that was solved as a batch."""
+    notice: str = ""
+    """This says what a user should know of the cycle; it is empty if there is nothing."""
 
 
 class OnlineEstimator(Protocol):

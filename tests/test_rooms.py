@@ -34,6 +34,7 @@ ARROWS: dict[str, set[str]] = {
     "run": {"io", "laps"},
     "mapping": BELOW_MAPPING,
     **dict.fromkeys(ESTIMATORS, BELOW_ESTIMATORS),
+    "online": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes
     "estimators": BELOW_ESTIMATORS | ESTIMATORS,
     "eval.metrics": BELOW_EVAL,
     "eval.figures": BELOW_EVAL | {"eval.metrics"},

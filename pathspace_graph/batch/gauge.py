@@ -100,9 +100,13 @@ class CurveGauge:
         return 0.5 * float(beside @ beside + (smooth**2).sum())
 
 
-def curve_gauge(state: State, label: int, sigma: float) -> CurveGauge:
-    """Returns the gauge of a curve that holds each control point where it is now beside its pose."""
+def curve_gauge(state: State, label: int, sigma: float, until: int | None = None) -> CurveGauge:
+    """Returns the gauge of a curve that holds each control point where it is now beside its pose.
+
+    Only poses of the cycles before `until` hold control points.
+    """
     boundary, control_points, poses = state.boundaries[label], state.control_points(label), state.poses
+    poses = poses[:until]
     cycle = _nearest_poses(boundary, control_points, poses)
     heading = np.column_stack([np.cos(poses[cycle, 2]), np.sin(poses[cycle, 2])])
     mean_spacing = boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)

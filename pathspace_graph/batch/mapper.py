@@ -125,7 +125,7 @@ class BatchMapper:
         watch.lap("start")
         state = optimizer.align_poses(state, batch.pose_steps, batch.loose_gate)
         watch.lap("poses")
-        at, convergence = _optimum(optimizer, state, detections, settings, on_round)
+        at, convergence = find_optimum(optimizer, state, detections, settings, on_round)
         watch.lap("optimum")
         joint = system.eliminated(at).joint(at.state.map_keys)
         watch.lap("covariance")
@@ -161,12 +161,12 @@ class BatchMapper:
         return start_online(log, self.online(self.settings, self.odometry_sigma))
 
 
-def _optimum(
+def find_optimum(
     optimizer: Optimizer,
     state: State,
     detections: DetectionTable,
     settings: MapperSettings,
-    on_round: Callable[[], None] | None,
+    on_round: Callable[[], None] | None = None,
 ) -> tuple[Evaluation, Convergence]:
     """Returns the optimum on curves with about one knot for each cone, which meet the cones.
 

@@ -34,15 +34,21 @@ def simplify(
     decimetre, on the same side in every lap, which no number of detections averages out. In the first seconds
     that turns the vehicle, and with it the whole map, by up to a degree, several times its claimed sigma.
     """
-    simplified = reknot(state, detections, settings)
-    change = np.zeros((simplified.map_points.size, state.map_points.size))
+    few, change = simplified(state, detections, settings)
+    locate_poses(few, settings.batch.association)
+    associate(few, detections, settings, settings.batch.gate, strict=True)
+    return few, change @ covariance @ change.T
+
+
+def simplified(state: State, detections: DetectionTable, settings: MapperSettings) -> tuple[State, Array]:
+    """Returns the same poses beside curves on few knots, and the change F (k, n) of the control points."""
+    few = reknot(state, detections, settings)
+    change = np.zeros((few.map_points.size, state.map_points.size))
     for label, boundary in state.boundaries.items():
-        new, new_points = simplified.boundaries[label], simplified.control_points(label)
+        new, new_points = few.boundaries[label], few.control_points(label)
         F = new_from_old(boundary, state.control_points(label), new, new_points)
-        change[map_block(simplified, label), map_block(state, label)] = np.kron(F, np.eye(POINT))
-    locate_poses(simplified, settings.batch.association)
-    associate(simplified, detections, settings, settings.batch.gate, strict=True)
-    return simplified, change @ covariance @ change.T
+        change[map_block(few, label), map_block(state, label)] = np.kron(F, np.eye(POINT))
+    return few, change
 
 
 def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:

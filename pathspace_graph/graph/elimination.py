@@ -20,7 +20,7 @@ from scipy.linalg import lapack
 
 from pathspace_graph.errors import SingularSystemError
 
-from .gaussian import cholesky, factors_of, graph_of, normal_equations, require_keys, solve
+from .gaussian import cholesky, factors_of, graph_of, keys_of, normal_equations, require_keys, solve
 from .keys import POINT, POSE, are_poses, sizes
 from .rows import Rows, jacobian_factors
 from .variables import Layout, Variables
@@ -195,6 +195,16 @@ class _Clique:
     """These are the columns (f, p) of T for the poses of y."""
     by_map: Array
     """These are the columns (f, m) of T for the map variables of y."""
+
+
+def eliminated_system(graph: gtsam.GaussianFactorGraph, kept: Layout) -> tuple[Array, Array]:
+    """Returns H (n, n) and g (n,) of `1/2 d' H d - g' d` on a layout, with all other variables eliminated.
+
+    Raises as `Elimination` does.
+    """
+    others = len(keys_of(graph)) - len(kept.keys)
+    _, remaining = _eliminated(graph, kept, others)
+    return normal_equations(remaining, kept)
 
 
 def _eliminated(

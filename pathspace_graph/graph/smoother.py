@@ -21,6 +21,7 @@ from pathspace_graph.factors.se2 import compose
 
 from .gaussian import (
     FactoredSystem,
+    as_hessian_factor,
     cholesky,
     factorize,
     graph_of,
@@ -283,9 +284,11 @@ class FixedLagSmoother(Generic[M_co]):
 
     # --- marginalization ---------------------------------------------------------------------------------
 
-    def marginalize(self) -> None:
-        """Marginalizes poses that are older than the lag."""
+    def marginalize(self, held_from: int | None = None) -> None:
+        """Marginalizes poses that are older than the lag, but none of the cycles from `held_from` on."""
         while len(self.times) > 1 and self.times[-1] - self.times[0] > self.settings.lag + TIME_TOLERANCE:
+            if self.first_cycle == held_from:
+                return
             self._marginalize_oldest()
 
     def _marginalize_oldest(self) -> None:
@@ -353,6 +356,30 @@ class FixedLagSmoother(Generic[M_co]):
         self.prior = merge_variables(graph_of(self.prior, *user), removed, kept, offset)
         self.variables.remove(removed)
         self.window.clear()
+
+    def restart(self, first_cycle: int, removed: IntArray, added: IntArray, points: Array) -> None:
+        """Replaces map points `removed` (n,) by `added` (k,) at `points` (k, 2), and drops the prior.
+
+        Poses before `first_cycle` leave the window, and what is known of them is dropped as well. The window
+        keeps its later poses with their odometry. A new prior must be set, on all that remains.
+        """
+        self.epoch, self.submaps, self.inactive = self.epoch + 1, None, InactiveMap()
+        self.prior, keyframes = gtsam.GaussianFactorGraph(), self.variables.keyframes
+        leaving = np.arange(self.first_cycle, first_cycle)
+        for cycle in leaving.tolist():
+            self.times.pop(0)
+            self.window.odometry.drop_first()
+            self.map.drop_cycle(cycle)
+        self.variables.first_cycle = first_cycle
+        self.variables.remove(np.concatenate([keyframes, pose_keys(leaving), removed]))
+        self.variables.insert(added, points.ravel())
+        self.window.clear()
+
+    def set_prior(self, keys: IntArray, mean: Array, information: Array) -> None:
+        """Sets the prior to a Gaussian of ascending keys (k,), with mean (n,) and information (n, n)."""
+        root = np.asarray(np.linalg.cholesky(information).T, np.float64)
+        change = mean - self.variables.reference[self.variables.layout.entries(keys)]
+        self.prior = graph_of(as_hessian_factor(graph_of(jacobian_factor(keys, root, root @ change))))
 
     # --- covariances -------------------------------------------------------------------------------------
 

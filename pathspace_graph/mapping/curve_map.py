@@ -40,6 +40,11 @@ class CurveMap:
         self.variables = self.state.variables
         self.detections = DetectionTable()
         """The table holds the detections of the poses in the window."""
+        self.held_by_prior = False
+        """The prior holds the spacing and the shape of the curves, which the window then does not."""
+        self.scatter: dict[int, Array] = {}
+        """Cones scatter about a boundary's curve by this sigma (m,) at each control point (m), where it is
+        known."""
         self.reached_inactive = False
         """The flag is set when a foot point of the latest `rows` has slid to an inactive part of a curve."""
         self._found: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
@@ -102,7 +107,7 @@ class CurveMap:
 
         The rows hold the active control points, or all of them if `whole`.
         """
-        if not self.state.boundaries:
+        if not self.state.boundaries or self.held_by_prior:
             return []
         found = []
         for label, gauge in self._gauges(whole):
@@ -126,11 +131,12 @@ class CurveMap:
         for label, gauge in self._gauges(whole):
             points, held = self.state.control_points(label), np.eye(2) / self.settings.gauge.sigma_anchor
             bent = (gauge.bending[:, :, None] * points[gauge.triples]).sum(axis=1)
-            smooth.append(self._rows(label, gauge.triples, _by_axis(gauge.bending), bent.ravel()))
+            if not self.held_by_prior:
+                smooth.append(self._rows(label, gauge.triples, _by_axis(gauge.bending), bent.ravel()))
             active = gauge.points[:, None]
             held = np.tile(held, (len(active), 1))
             anchors.append(self._rows(label, active, held, np.zeros(len(held))))
-        return [_stacked(smooth), _stacked(anchors)] if smooth else []
+        return [_stacked(groups) for groups in (smooth, anchors) if groups]
 
     def _gauges(self, whole: bool) -> Iterator[tuple[int, Gauge]]:
         for label, boundary in self.state.boundaries.items():

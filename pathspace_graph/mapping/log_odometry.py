@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.elimination import owners
 from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_key
@@ -80,8 +82,15 @@ def integrate_log(log: Log, sigma: Array, settings: OdometrySettings) -> LogOdom
     sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s).
     """
     steps = [integrate_odometry(odometry, cycle.t, sigma) for odometry, cycle in split_odometry(log)]
+    return chained([cycle.t for cycle in log.cycles], steps, settings)
+
+
+def chained(
+    stamps: Sequence[float], steps: Sequence[IntegratedOdometry], settings: OdometrySettings
+) -> LogOdometry:
+    """Returns the odometry of cycles with these stamps (s); each step leads to the pose of its cycle."""
     return LogOdometry(
-        stamps=np.array([cycle.t for cycle in log.cycles]),
+        stamps=np.array(stamps),
         first=compose(np.zeros(3), steps[0].delta),
         first_information=np.linalg.inv(steps[0].covariance + np.diag(settings.sigmas_start) ** 2),
         odometry=OdometryChain(steps[1:]),

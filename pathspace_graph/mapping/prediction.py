@@ -39,13 +39,16 @@ def predict(
     t: float,
     sigma: Array,
     settings: MapperSettings,
-) -> None:
+) -> IntegratedOdometry:
     """Adds the pose at t (s) by the calibrated odometry since the newest one, and extends the driven path.
 
-    sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s).
+    sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s). The integrated odometry is
+    returned.
     """
-    path.update(smoother.predict(t, integrate_odometry(odometry, t, sigma), settings.odometry.sigmas_start))
+    integrated = integrate_odometry(odometry, t, sigma)
+    path.update(smoother.predict(t, integrated, settings.odometry.sigmas_start))
     path.steer(odometry.twist)
+    return integrated
 
 
 def smoother_settings(settings: MapperSettings) -> SmootherSettings:

@@ -29,13 +29,46 @@ def associate(smoother: CurveSmoother, retest: frozenset[int]) -> None:
     whose curves have grown, all of the window that are not in use. A detection of unknown colour is used only
     if exactly one curve accepts it. The newest pose's parameter on each curve is found in the same search.
     """
-    detections, state, gate = smoother.map.detections, smoother.map.state, smoother.map.settings.gate
+    detections, state = smoother.map.detections, smoother.map.state
     rows, curve = _untested(smoother, retest)
-    poses = state.variables.poses_at(detections.cycle[rows])
-    points = to_map(detections.point[rows], poses)
+    points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
     foot = _find(smoother, rows, curve, points)
-    if len(rows) == 0 or smoother.last_step is None:
-        return
+    if len(rows) and smoother.last_step is not None:
+        _accept(smoother, rows, curve, points, foot)
+
+
+def reassociate(smoother: CurveSmoother) -> None:
+    """Associates all detections of the window anew, after the curves were replaced.
+
+    The poses must have their parameters on the new curves. The uncertainty is that of the prior and the
+    odometry alone, since no detection is in use.
+    """
+    detections, state = smoother.map.detections, smoother.map.state
+    detections.release(np.arange(len(detections)))
+    smoother.factorize()
+    rows, curve = _untested(smoother, frozenset(state.boundaries))
+    points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
+    pose_u = np.array([state.pose_u[label] for label in state.boundaries])
+    low, high = _view(smoother, rows, curve, pose_u)
+    _accept(smoother, rows, curve, points, state.curves.find(state.map_points, points, curve, low, high))
+
+
+def _view(smoother: CurveSmoother, rows: IntArray, curve: IntArray, pose_u: Array) -> tuple[Array, Array]:
+    """Returns the stretch [low, high] of its curve (m,) that each detection may belong to.
+
+    `pose_u` (k, P) are the parameters of the window's poses on every curve.
+    """
+    gate = smoother.map.settings.gate
+    seen_from = pose_u[curve, smoother.map.detections.cycle[rows] - smoother.first_cycle]
+    return seen_from - gate.view_behind, seen_from + gate.view_ahead
+
+
+def _accept(
+    smoother: CurveSmoother, rows: IntArray, curve: IntArray, points: Array, foot: FootPoints
+) -> None:
+    """Puts those detections (m,) into use that pass the gate of their curve (m,)."""
+    detections, state, gate = smoother.map.detections, smoother.map.state, smoother.map.settings.gate
+    poses = state.variables.poses_at(detections.cycle[rows])
     covariances, sigma_model = detections.covariance[rows], smoother.map.settings.spline.sigma_model
     sigma = sigma_across(foot.normal_unit, covariances, poses, sigma_model)
     variance, unknown = sigma**2 + gate.sigma_floor**2, detections.label[rows] == UNKNOWN
@@ -74,15 +107,14 @@ def _find(smoother: CurveSmoother, rows: IntArray, curve: IntArray, points: Arra
     curves, pose = state.curves, state.poses[-1]
     pose_u = np.array([state.pose_u[label] for label in state.boundaries])
     pose_u = np.append(pose_u, pose_u[:, -1:], axis=1)  # the newest pose is near the one before
-    slot = smoother.map.detections.cycle[rows] - smoother.first_cycle
-    seen_from, all_curves = pose_u[curve, slot], np.arange(len(pose_u))
+    (low, high), all_curves = _view(smoother, rows, curve, pose_u), np.arange(len(pose_u))
     behind, ahead = _search_room(state, smoother.map.settings)
     foot = curves.find(
         state.map_points,
         np.concatenate([points, np.broadcast_to(pose[:2], (len(pose_u), 2))]),
         np.append(curve, all_curves),
-        np.append(seen_from - gate.view_behind, pose_u[:, -1] - behind),
-        np.append(seen_from + gate.view_ahead, pose_u[:, -1] + ahead),
+        np.append(low, pose_u[:, -1] - behind),
+        np.append(high, pose_u[:, -1] + ahead),
     )
     beside = foot.where(slice(len(rows), None))
     along = beside.tangent_unit @ np.array([np.cos(pose[2]), np.sin(pose[2])])

@@ -30,9 +30,15 @@ from .association import associate
 from .closing import apply_correspondences, optimize_loop, simplify
 from .growth import Growth
 from .nonlinear_graph import window_graph
+from .open_lap import LapBatch, OpenLapRecord
 from .outlook import Outlook, confirmed, look_ahead
+from .swap import go_on_from
 
 Array = NDArray[np.float64]
+
+
+OWN_PRIOR = "the map goes on from the window's own prior"
+"""This begins the notice of a cycle in which the batch of the lap does not replace the prior."""
 
 
 class Solver(Protocol):
@@ -69,6 +75,12 @@ class FixedLagMapper:
         """The open curves grow through the tentative tracks that are collected here."""
         self.closed = False
         """The flag is set when the loop has closed: the map has its final size."""
+        self.corrected_poses: Array = np.zeros((0, 3))
+        """(k, 3) These are the poses of the first k cycles as the closing of the loop has corrected them."""
+        self._open_lap = OpenLapRecord(self.settings)
+        if self.settings.open_lap.prior == "window" or solver is not None:
+            self._open_lap.give_up("no batch of the lap was asked for")
+        self._lap_batch: LapBatch | None = None
         self._grown: frozenset[int] = frozenset()
         self._closing_tried = 0.0
 
@@ -88,7 +100,9 @@ class FixedLagMapper:
         """
         watch = Stopwatch()
         self.smoother.add_factors(factors)
-        self._predict(odometry, detections.t)
+        if factors:
+            self._open_lap.give_up("the batch of the lap does not know the user's factors")
+        self._predict(odometry, detections)
         watch.lap("predict")
         self._classify(detections)  # detections that no curve explains may expand one
         watch.lap("classify")
@@ -104,9 +118,11 @@ class FixedLagMapper:
         if closes:
             self._simplify()
         watch.lap("simplify")
-        self.smoother.marginalize()
+        jump, notice = self._go_on(closes)
+        watch.lap("swap")
+        self.smoother.marginalize(self._lap_batch.first_kept if self._lap_batch else None)
         watch.lap("marginalize")
-        return self._result(detections.t, watch.laps)
+        return self._result(detections.t, watch.laps, jump, notice)
 
     def _step(self) -> None:
         """Takes one Gauss-Newton step, relinearized at the current estimate, or the solver's step."""
@@ -117,9 +133,12 @@ class FixedLagMapper:
 
     # --- the steps of the paper --------------------------------------------------------------------------
 
-    def _predict(self, odometry: Odometry, t: float) -> None:
-        """Adds the pose at t (s) by the calibrated odometry, and extends the driven path."""
-        predict(self.smoother, self.path, odometry, t, self.odometry_sigma, self.settings)
+    def _predict(self, odometry: Odometry, detections: Detections) -> None:
+        """Adds the pose of the cycle by the calibrated odometry, and extends the driven path."""
+        sigma, t = self.odometry_sigma, detections.t
+        integrated = predict(self.smoother, self.path, odometry, t, sigma, self.settings)
+        if not self.closed:
+            self._open_lap.measured(t, integrated, detections)
         if self.solver is not None:
             self.smoother.submaps = None  # another solver's loop closure relinearizes no submap
 
@@ -163,12 +182,48 @@ class FixedLagMapper:
         self.growth.clear()
         self.smoother.window.exact = False  # hardly anything moves from now on
 
-    def _result(self, t: float, stages: dict[str, float]) -> CycleResult:
+    def _solve_lap(self) -> str:
+        """Sends the lap to be solved as a batch in the cycle in which the loop has closed.
+
+        Returns a notice that says why it cannot be solved, or an empty one.
+        """
+        smoother, record, cycle = self.smoother, self._open_lap, self.smoother.next_cycle - 1
+        self.corrected_poses = record.corrected(smoother)
+        cones = len(smoother.map.state.map_keys) / self.settings.spline.size_share
+        if cones > self.settings.open_lap.max_cones:
+            record.give_up("the lap has too many cones for a batch")
+        if record.unsolvable is not None:
+            return f"{OWN_PRIOR}: {record.unsolvable}"
+        wait = min(self.settings.open_lap.cycles, cycle - smoother.first_cycle)
+        self._lap_batch = LapBatch(record.lap(smoother, smoother.first_cycle + wait), cycle + wait)
+        return ""
+
+    def _go_on(self, closes: bool) -> tuple[Array | None, str]:
+        """Records the open lap, has it solved when it closes, and goes on from the result when it is due.
+
+        Returns the jump (3,) of the newest pose if the map was replaced, and a notice if it was not.
+        """
+        batch = self._lap_batch
+        if closes:
+            return None, self._solve_lap()
+        if not self.closed:
+            self._open_lap.estimated(self.smoother.map.state)
+            if self.path.length > self.settings.closing.min_path:
+                self._open_lap.prepare()
+        if batch is None or self.smoother.next_cycle - 1 < batch.due:
+            return None, ""
+        self._lap_batch, marginal = None, batch.marginal()
+        if isinstance(marginal, str):
+            return None, f"{OWN_PRIOR}: {marginal}"
+        self.corrected_poses = marginal.poses
+        return go_on_from(self.smoother, marginal), ""
+
+    def _result(self, t: float, stages: dict[str, float], jump: Array | None, notice: str) -> CycleResult:
         """Returns the newest pose, the sizes of the boundaries, and the cycle's detections in use."""
         detections = self.smoother.map.detections
         used = int(detections.used[detections.cycle.searchsorted(self.smoother.next_cycle - 1) :].sum())
         left, right = (self.boundaries[b].size if b in self.boundaries else 0 for b in (LEFT, RIGHT))
-        return CycleResult(t, self.poses[-1].copy(), (left, right), used, self.closed, stages)
+        return CycleResult(t, self.poses[-1].copy(), (left, right), used, self.closed, stages, jump, notice)
 
     def map(self) -> Map:
         """Returns a copy of the present map, with the joint covariance of each boundary's control points.
@@ -181,13 +236,14 @@ class FixedLagMapper:
         newest = pose_keys(np.array([self.smoother.next_cycle - 1]))
         joint = self.smoother.covariance(np.concatenate([state.map_keys, newest]))
         vehicle, bend = self.poses[-1], self.settings.tentative.sigma_bend
-        boundaries, at = {}, 0
+        boundaries, at, shape = {}, 0, self.settings.spline.sigma_shape
         for label, outlook in outlooks.items():
             own = np.arange(at, at := at + POINT * len(outlook.known))
             entries = np.append(own, np.arange(len(joint) - POSE, len(joint)))
             covariance = outlook.covariance(joint[np.ix_(entries, entries)], vehicle, bend)
             if self.closed:
-                covariance = covariance + self.settings.spline.sigma_shape**2 * np.eye(len(covariance))
+                sigma = self.smoother.map.scatter.get(label, np.full(outlook.boundary.size, shape))
+                covariance = covariance + np.diag(np.repeat(sigma, POINT) ** 2)
             until = outlook.spline.domain[1] if self.closed else outlook.confirmed_until
             boundaries[label] = SplineBoundary(outlook.spline, covariance, until)
         return Map(self.closed, boundaries)

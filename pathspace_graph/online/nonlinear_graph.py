@@ -38,7 +38,8 @@ def window_graph(smoother: CurveSmoother) -> gtsam.NonlinearFactorGraph:
         rows = detections.used_on(label)
         room = _room(boundary, active, detections.u[rows], settings.spline.refine_room)
         _add(graph, detection_factors(label, boundary, detections, rows, settings, room))
-        _add(graph, gauge_factors(label, boundary, active, settings.gauge))
+        if not smoother.map.held_by_prior:
+            _add(graph, gauge_factors(label, boundary, active, settings.gauge))
         anchor = gtsam.noiseModel.Isotropic.Sigma(2, settings.gauge.sigma_anchor)
         points = state.control_points(label)[active]
         for key, point in zip(control_keys(label, boundary.first + active).tolist(), points, strict=True):

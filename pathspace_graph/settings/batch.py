@@ -108,6 +108,33 @@ class ScatterSettings(Positive, group="batch.scatter"):
 
 
 @dataclass(frozen=True)
+class OpenLapSettings(Positive, group="open_lap"):
+    """Describes how the open lap is solved as a batch when the loop closes online."""
+
+    UNLIMITED = ("max_cycles", "max_cones")
+
+    prior: Literal["batch", "window"] = "batch"
+    """After closing, the map goes on from a batch over the open lap, or with `window` from what the window
+    has marginalized."""
+    cycles: int = 20
+    """The batch replaces the prior this number of cycles after the loop has closed, or as many as the window
+    holds. The update waits for it, so that the same log always gives the same map."""
+    rough_rounds: int = 8
+    """The first optimization has at most this number of rounds."""
+    rounds: int = 8
+    """The second optimization, on knots that follow the result of the first, has at most this number of
+    rounds."""
+    tolerance: float = 10.0
+    """The tolerances of the batch are multiplied by this."""
+    max_cycles: float = 6000.0
+    """Measurements of the open lap are kept up to this number of cycles. After a longer lap the map goes on
+    from what the window has marginalized."""
+    max_cones: float = 700.0
+    """A lap with more cones than this goes on from what the window has marginalized, since its batch would
+    not be in time."""
+
+
+@dataclass(frozen=True)
 class BatchSettings(Positive):
     """Describes the batch optimization over a whole log."""
 

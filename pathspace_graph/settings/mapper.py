@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from .batch import BatchSettings
+from .batch import BatchSettings, OpenLapSettings
 from .checked import Positive
 from .comparison import CkfSettings, LandmarkSettings
 from .knots import Knots
@@ -390,6 +390,8 @@ class MapperSettings(Positive):
     """These settings describe the tentative stretch beyond the confirmed end of an open curve."""
     closing: ClosingSettings = field(default_factory=ClosingSettings)
     """These settings describe loop closing."""
+    open_lap: OpenLapSettings = field(default_factory=OpenLapSettings)
+    """These settings describe how the open lap is solved as a batch when the loop closes."""
     far: FarSettings = field(default_factory=FarSettings)
     """These settings describe the inactive part of the map, which is not solved for in every cycle."""
     relinearize: RelinearizeSettings = field(default_factory=RelinearizeSettings)

@@ -21,19 +21,9 @@ from pathspace_graph.io.map import SplineBoundary, read_map
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.drives import ahead, bean_track, corridor, exact_log, lap_log, true_poses
+from ..scenes.drives import ahead, bean_track, corridor, exact_log, lap_log, noisy, true_poses
 
 Array = NDArray[np.float64]
-
-
-def noisy(log: Log, seed: int, sigma: float = 0.1) -> Log:
-    """Returns the log with noise on its detections."""
-    rng = np.random.default_rng(seed)
-    cycles = tuple(
-        replace(c, points_vehicle=c.points_vehicle + rng.normal(0.0, sigma, c.points_vehicle.shape))
-        for c in log.cycles
-    )
-    return replace(log, cycles=cycles)
 
 
 @cache

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -88,6 +90,16 @@ def lap_log(track: Track, overrun: float = 10.0) -> Log:
     track = to_map_frame(track)
     driven = drive(track, 1, settings, np.random.default_rng(0))
     return exact_log(driven.twists, track.cones, track.cone_labels.astype(np.intp))
+
+
+def noisy(log: Log, seed: int, sigma: float = 0.1) -> Log:
+    """Returns the log with noise on its detections."""
+    rng = np.random.default_rng(seed)
+    cycles = tuple(
+        replace(c, points_vehicle=c.points_vehicle + rng.normal(0.0, sigma, c.points_vehicle.shape))
+        for c in log.cycles
+    )
+    return replace(log, cycles=cycles)
 
 
 def map_log(log: Log, mapper: FixedLagMapper | None = None) -> tuple[FixedLagMapper, list[CycleResult]]:

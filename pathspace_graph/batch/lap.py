@@ -1,0 +1,193 @@
+"""The batch of the open lap: what an online mapper goes on from after its loop has closed.
+
+Online, every measurement of the first lap is linearized while the map is still open, and the curves are
+sparse. Both turn the map by several tenths of a degree. Here the same measurements are solved again as a
+batch, on curves that meet the cones. The result is a marginal: what the poses that have left the window know
+about the simplified map, the calibration and the oldest pose of the window.
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from threadpoolctl import threadpool_limits
+
+from pathspace_graph.graph.elimination import eliminated_system, linear_graph
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POINT, POSE, are_poses, indices, pose_keys
+from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.variables import Layout
+from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.log_odometry import LogOdometry
+from pathspace_graph.mapping.state import State
+from pathspace_graph.settings.batch import BatchSettings, OpenLapSettings
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import Boundary
+from pathspace_graph.spline.bspline import BSpline
+
+from .association import add_drive, associate, locate_poses
+from .gauge import curve_gauge
+from .knots import exact_settings
+from .mapper import find_optimum, own_settings
+from .optimizer import Convergence, Optimizer
+from .simplification import scatter_of_cones, simplified
+from .system import BatchSystem, Biweight, Evaluation
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class OpenLap:
+    """Holds everything measured from the start to the closing cycle, and the closed map to begin with."""
+
+    settings: MapperSettings
+    """These are the settings of the online mapper."""
+    chain: LogOdometry
+    """This is the odometry between all cycles."""
+    detections: DetectionTable
+    """These are the detections of all cycles; their associations are found anew."""
+    splines: dict[int, BSpline]
+    """These are the closed curves by label, map frame."""
+    poses: Array
+    """(P, 3) These are the poses of all cycles, map frame."""
+    calibration: Array
+    """(2,) This is the calibration: scale error (-) and yaw-rate bias (rad/s)."""
+    first_kept: int
+    """The poses from this cycle on stay variables of the window."""
+
+
+@dataclass(frozen=True, eq=False)
+class LapMarginal:
+    """Holds the batch's map on few knots, and what the poses before `first_kept` know about it.
+
+    The marginal is a Gaussian of [calibration | control points, left first | pose of `first_kept`].
+    """
+
+    convergence: Convergence
+    """This is how the optimization ended."""
+    splines: dict[int, BSpline]
+    """These are the simplified closed curves by label, map frame."""
+    calibration: Array
+    """(2,) This is the calibration at the optimum."""
+    poses: Array
+    """(P, 3) These are the poses of all cycles of the lap, map frame."""
+    first_kept: int
+    """The marginal has all measurements of the poses before this cycle, and none of later ones."""
+    mean: Array
+    """(n,) This is the mean of the marginal."""
+    information: Array
+    """(n, n) This is the information of the marginal, the inverse of its covariance."""
+    scatter: dict[int, Array]
+    """For each boundary, cones scatter about the curve by this sigma (m,) at each control point (m)."""
+
+
+def solve_lap(lap: OpenLap) -> LapMarginal:
+    """Returns the marginal of an open lap at the optimum of its batch. It uses one thread."""
+    with threadpool_limits(limits=1):
+        system, at, convergence = lap_optimum(lap)
+        settings, detections = system.settings, system.detections
+        few, change = simplified(at.state, detections, settings)
+        information, mean = marginal_of(system, at, few, change, lap.first_kept)
+        locate_poses(few, settings.batch.association)
+        associate(few, detections, settings, settings.batch.gate, strict=True)
+        scatter = scatter_of_cones(few, detections, settings)
+        return LapMarginal(
+            convergence=convergence,
+            splines={
+                label: b.spline(few.control_points(label).copy()) for label, b in few.boundaries.items()
+            },
+            calibration=at.state.calibration.copy(),
+            poses=at.state.poses.copy(),
+            first_kept=lap.first_kept,
+            mean=mean,
+            information=information,
+            scatter={label: scatter.sigma(label, b.abscissae) for label, b in few.boundaries.items()},
+        )
+
+
+def lap_optimum(lap: OpenLap) -> tuple[BatchSystem, Evaluation, Convergence]:
+    """Returns the problem of a lap, its optimum on curves that meet the cones, and how it was found."""
+    settings, detections = (
+        _capped(own_settings(lap.settings), lap.settings.open_lap),
+        deepcopy(lap.detections),
+    )
+    system = BatchSystem(detections, lap.chain, settings, Biweight(settings.batch.loose_gate))
+    optimizer, batch = Optimizer(system, settings.batch), settings.batch
+    state = optimizer.align_poses(_start(lap, settings), batch.pose_steps, batch.loose_gate)
+    at, convergence = find_optimum(optimizer, state, detections, settings)
+    return system, at, convergence
+
+
+def _capped(settings: MapperSettings, own: OpenLapSettings) -> MapperSettings:
+    """Returns the batch's settings with fewer rounds and looser tolerances, so that the result is in time."""
+    batch: BatchSettings = settings.batch
+    return replace(
+        settings,
+        batch=replace(
+            batch,
+            rough_rounds=own.rough_rounds,
+            max_rounds=own.rounds,
+            knot_passes=1,
+            tolerance_cost=own.tolerance * batch.tolerance_cost,
+            tolerance_curve=own.tolerance * batch.tolerance_curve,
+            tolerance_pose=own.tolerance * batch.tolerance_pose,
+        ),
+    )
+
+
+def _start(lap: OpenLap, settings: MapperSettings) -> State:
+    """Returns the closed curves of the online map with all poses beside them."""
+    state, exact = State(), exact_settings(settings.spline, settings.batch)
+    for label, spline in lap.splines.items():
+        boundary = Boundary(spline.knots, True, exact, settings.gauge)
+        boundary.confirmed_end = boundary.tables.high
+        state.add_boundary(label, boundary, spline.distinct_control_points)
+    add_drive(state, lap.poses, lap.calibration, settings.batch.association)
+    return state
+
+
+def marginal_of(
+    system: BatchSystem, at: Evaluation, few: State, change: Array, first_kept: int
+) -> tuple[Array, Array]:
+    """Returns information (n, n) and mean (n,) of [calibration | few control points | oldest kept pose].
+
+    Only factors of poses before `first_kept` are summed, linearized at the optimum, since the window has the
+    others. `change` F maps the dense control points to the few. So the covariance is `T Sigma T'` with
+    `T = diag(I, F, I)`, where Sigma is the inverse of the dense marginal's information.
+    """
+    state = at.state
+    kept = np.concatenate([[CALIBRATION_KEY], state.map_keys, pose_keys(np.array([first_kept]))])
+    graph = linear_graph(rows_before(system, at, first_kept), state.variables)
+    information, vector = eliminated_system(graph, Layout(kept))
+    covariance = np.linalg.inv(information)
+    shift = covariance @ vector
+    T = block_diag(np.eye(POINT), change, np.eye(POSE))
+    covariance = T @ covariance @ T.T
+    here = np.concatenate([state.calibration, few.map_points.ravel(), state.poses[first_kept]])
+    return np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), np.float64), here + T @ shift
+
+
+def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Rows]:
+    """Returns the rows of the batch that hold a pose before `first_kept` or no pose at all.
+
+    The rows that hold each control point beside a pose are made anew with poses that leave, so that none of
+    them is lost.
+    """
+    state, groups = at.state, system.chain.rows(at.odometry, at.state.poses[0], at.state.calibration)
+    for label in state.boundaries:
+        gauge = curve_gauge(state, label, system.settings.batch.sigma_slide, first_kept)
+        points = state.control_points(label)
+        groups += [system.detection_rows(at, label), gauge.beside(points, state.poses)]
+        groups += [gauge.smooth(points), gauge.anchor()]
+    return [rows.where(_is_before(rows.keys, first_kept)) for rows in groups if len(rows)]
+
+
+def _is_before(keys: IntArray, cycle: int) -> NDArray[np.bool_]:
+    """Returns whether each row's first pose is of an earlier cycle than this, or it has no pose."""
+    cycles = np.where(are_poses(keys), indices(keys), -1)
+    first = np.where(are_poses(keys), cycles, np.iinfo(np.intp).max).min(axis=1)
+    return np.asarray((first < cycle) | ~are_poses(keys).any(axis=1))

@@ -1,0 +1,131 @@
+"""The open lap is kept as it was measured, and is solved again as a batch when the loop closes."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any
+
+import numpy as np
+from joblib.externals.loky import get_reusable_executor
+from numpy.typing import NDArray
+
+from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
+from pathspace_graph.batch.start import unwrap
+from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.factors.odometry import IntegratedOdometry
+from pathspace_graph.io.log import Detections
+from pathspace_graph.mapping.curve_map import CurveSmoother
+from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.log_odometry import chained
+from pathspace_graph.mapping.state import State
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .places import Place, curve_poses, in_final_map
+
+Array = NDArray[np.float64]
+
+WORKER_IDLE = 600
+"""The process that solves laps ends when it has had nothing to do for this time (s)."""
+
+
+class OpenLapRecord:
+    """Keeps the odometry, the detections and the poses of every cycle until the loop closes."""
+
+    def __init__(self, settings: MapperSettings) -> None:
+        self.settings = settings
+        self.unsolvable: str | None = None
+        """This says why the lap cannot be solved as a batch; it is None if it can be."""
+        self.poses: list[Array] = []
+        """Each cycle had this pose (3,), map frame, as it was estimated then."""
+        self._stamps: list[float] = []
+        self._odometry: list[IntegratedOdometry] = []
+        self._detections: list[Detections] = []
+        self._places: dict[int, list[Place]] = {}
+        self._prepared = False
+
+    def give_up(self, reason: str) -> None:
+        """Drops the measurements, since the lap cannot be solved for this reason."""
+        if self.unsolvable is None:
+            self.unsolvable = reason
+        self._stamps, self._odometry, self._detections = [], [], []
+
+    def measured(self, t: float, odometry: IntegratedOdometry, detections: Detections) -> None:
+        """Adds the odometry that leads to the pose at t (s), and the detections there."""
+        if self.unsolvable is not None:
+            return
+        self._stamps.append(t)
+        self._odometry.append(odometry)
+        self._detections.append(detections)
+        if len(self._stamps) > self.settings.open_lap.max_cycles:
+            self.give_up("the lap is too long for a batch")
+
+    def estimated(self, state: State) -> None:
+        """Adds the newest pose, and its place along each of the curves."""
+        cycle = len(self.poses)
+        self.poses.append(state.poses[-1].copy())
+        for label, boundary in state.boundaries.items():
+            u = state.pose_u[label][-1:]
+            (pose,) = curve_poses(boundary, state.control_points(label), u)
+            self._places.setdefault(label, []).append(Place(cycle, float(u[0]), pose))
+
+    def prepare(self) -> None:
+        """Starts the process that solves laps, once, so that it is ready when the loop closes.
+
+        This does not wait for it.
+        """
+        if not self._prepared and self.unsolvable is None:
+            self._prepared = True
+            _worker().submit(_nothing)
+
+    def corrected(self, smoother: CurveSmoother) -> Array:
+        """Returns the poses (P, 3) of all cycles in the frame of the map that has just been closed."""
+        window = smoother.first_cycle
+        poses = unwrap(np.array([*self.poses[:window], *smoother.variables.poses]))
+        return in_final_map(poses, window, self._places, smoother.map.state, self.settings)
+
+    def lap(self, smoother: CurveSmoother, first_kept: int) -> OpenLap:
+        """Returns the lap, beginning at the map that has just been closed."""
+        state = smoother.map.state
+        return OpenLap(
+            settings=self.settings,
+            chain=chained(self._stamps, self._odometry, self.settings.odometry),
+            detections=DetectionTable.of(self._detections),
+            splines={
+                label: boundary.spline(state.control_points(label).copy())
+                for label, boundary in state.boundaries.items()
+            },
+            poses=self.corrected(smoother),
+            calibration=state.calibration.copy(),
+            first_kept=first_kept,
+        )
+
+
+class LapBatch:
+    """A lap is being solved in a process of its own, while the mapper goes on."""
+
+    def __init__(self, lap: OpenLap, due: int) -> None:
+        self.due = due
+        """The marginal replaces the prior in this cycle."""
+        self.first_kept = lap.first_kept
+        """The window holds the poses from this cycle on until then."""
+        self._future: Future[LapMarginal] = _worker().submit(solve_lap, lap)
+
+    def marginal(self) -> LapMarginal | str:
+        """Waits for the solution and returns it, or says why there is none."""
+        try:
+            solved = self._future.result()
+        except SingularSystemError as error:
+            return str(error)
+        except BrokenProcessPool:
+            return "the process of the batch has died"
+        return solved if solved.convergence.converged else "the batch of the lap has not converged"
+
+
+def _worker() -> Any:
+    """Returns the executor of this program, which has one process and imports no module of the program's."""
+    return get_reusable_executor(max_workers=1, timeout=WORKER_IDLE)
+
+
+def _nothing() -> None:
+    """Does nothing: the process has imported what it needs by then."""

@@ -1,0 +1,146 @@
+"""The batch of an open lap: its marginal is that of the whole problem, its map as good as the batch's."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.batch.lap import LapMarginal, OpenLap, lap_optimum, marginal_of, rows_before, solve_lap
+from pathspace_graph.batch.mapper import BatchMapper
+from pathspace_graph.batch.system import BatchSystem, Evaluation
+from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.graph.elimination import eliminated_system, linear_graph
+from pathspace_graph.graph.gaussian import graph_of, jacobian_factor
+from pathspace_graph.graph.keys import CALIBRATION_KEY, are_poses, indices, pose_keys
+from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.variables import Layout
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.map import Map, SplineBoundary
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.log_odometry import integrate_log
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.knots import fit_spline
+
+from ..scenes.drives import bean_track, lap_log, noisy, true_poses
+
+Array = NDArray[np.float64]
+WINDOW = 15
+
+
+@cache
+def log() -> Log:
+    return noisy(lap_log(bean_track(), overrun=25.0), seed=3)
+
+
+def open_lap(settings: MapperSettings | None = None) -> OpenLap:
+    """Returns the lap with curves through the true cones, whose poses are those of the truth."""
+    drive, settings = log(), settings or MapperSettings()
+    truth = drive.truth
+    assert truth is not None
+    splines = {}
+    for label in BOUNDARIES:
+        cones = truth.cones[truth.cone_labels == label]
+        splines[label] = fit_spline(cones, len(cones) // 2, periodic=True)
+    return OpenLap(
+        settings=settings,
+        chain=integrate_log(drive, drive.odometry_sigma, settings.odometry),
+        detections=DetectionTable.of(drive.cycles),
+        splines=splines,
+        poses=true_poses(drive),
+        calibration=np.zeros(2),
+        first_kept=len(drive.cycles) - WINDOW,
+    )
+
+
+@cache
+def solved() -> LapMarginal:
+    return solve_lap(open_lap())
+
+
+@cache
+def optimum() -> tuple[BatchSystem, Evaluation]:
+    system, at, _ = lap_optimum(open_lap())
+    return system, at
+
+
+def later(rows: Rows, cycle: int) -> Rows:
+    """Returns the rows whose first pose is of a cycle or a later one."""
+    poses = are_poses(rows.keys)
+    first = np.where(poses, indices(rows.keys), np.iinfo(np.intp).max).min(axis=1)
+    return rows.where(np.asarray(poses.any(axis=1) & (first >= cycle)))
+
+
+def test_the_marginal_and_the_window_are_the_whole_problem() -> None:
+    system, at = optimum()
+    state, first = at.state, len(log().cycles) - WINDOW
+    unchanged = np.eye(state.map_points.size)
+    information, mean = marginal_of(system, at, state, unchanged, first)
+    here = np.concatenate([state.calibration, state.map_points.ravel(), state.poses[first]])
+    keys = np.concatenate([[CALIBRATION_KEY], state.map_keys, pose_keys(np.array([first]))])
+    root = np.linalg.cholesky(information).T
+    window = [later(rows, first) for rows in system.rows(at) if len(rows) and not is_slide(rows)]
+    measured = linear_graph(window, state.variables)
+    kept = Layout(keys[:-1])
+    marginal = jacobian_factor(keys, root, root @ (mean - here))
+    found, vector = eliminated_system(graph_of(marginal, measured), kept)
+    early = linear_graph(rows_before(system, at, first), state.variables)
+    expected, right = eliminated_system(graph_of(early, measured), kept)
+    scale = np.sqrt(np.diagonal(expected))
+    assert found / np.outer(scale, scale) == pytest.approx(expected / np.outer(scale, scale), abs=1e-7)
+    assert vector / scale == pytest.approx(right / scale, abs=1e-5)
+
+
+def is_slide(rows: Rows) -> bool:
+    """Returns whether these rows hold a control point beside a pose."""
+    return rows.keys.shape[1] == 2 and not are_poses(rows.keys[0, 0]) and bool(are_poses(rows.keys[0, 1]))
+
+
+def test_no_measurement_of_the_window_is_in_the_marginal() -> None:
+    system, at = optimum()
+    first = len(log().cycles) - WINDOW
+    for rows in rows_before(system, at, first):
+        poses = are_poses(rows.keys)
+        assert (indices(rows.keys)[poses] <= first).all()
+
+
+def test_the_map_is_as_good_as_that_of_the_batch_over_the_same_log() -> None:
+    batch = BatchMapper(None, log().odometry_sigma, FixedLagMapper).solve(log(), "odometry")
+    truth, marginal = log().truth, solved()
+    assert truth is not None
+    boundaries = {
+        label: SplineBoundary(spline, np.eye(2 * len(spline.distinct_control_points)))
+        for label, spline in marginal.splines.items()
+    }
+    assert marginal.convergence.converged
+    rmse = lap_metrics(Map(True, boundaries), truth, 0).rmse
+    assert rmse < 1.1 * lap_metrics(batch.map, truth, 0).rmse
+
+
+def test_the_mean_of_the_marginal_is_near_the_optimum_by_its_own_covariance() -> None:
+    marginal = solved()
+    points = [spline.distinct_control_points.ravel() for spline in marginal.splines.values()]
+    first = marginal.first_kept
+    optimum = np.concatenate([marginal.calibration, *points, marginal.poses[first]])
+    off = optimum - marginal.mean
+    assert off @ marginal.information @ off < len(off)
+
+
+def test_few_rounds_do_not_converge() -> None:
+    settings = MapperSettings()
+    hurried = replace(settings, open_lap=replace(settings.open_lap, rough_rounds=1, rounds=1))
+    assert not solve_lap(open_lap(hurried)).convergence.converged
+
+
+def test_the_lap_itself_is_not_changed() -> None:
+    lap = open_lap()
+    used, poses = deepcopy(lap.detections.used), lap.poses.copy()
+    solve_lap(lap)
+    assert (lap.detections.used == used).all()
+    assert (lap.poses == poses).all()
