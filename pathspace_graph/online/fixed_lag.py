@@ -267,7 +267,7 @@ class FixedLagMapper:
         if self.closed:
             return self._closed_map(joint[:-POSE, :-POSE])
         vehicle, bend = self.poses[-1], self.settings.tentative.sigma_bend
-        boundaries, at = {}, 0
+        boundaries, at, shape = {}, 0, self.settings.spline.sigma_shape
         for label, outlook in outlooks.items():
             own = np.arange(at, at := at + POINT * len(outlook.known))
             entries = np.append(own, np.arange(len(joint) - POSE, len(joint)))
