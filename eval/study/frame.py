@@ -37,7 +37,7 @@ def frame_of(study: Study, cells: Sequence[tuple[Cell, Record | None]]) -> pd.Da
         shared = {"study": study.name} | cell.names | _settings_row(study, cell)
         about = {"failure": record["failure"], **record["versions"]}
         rows += [shared | lap | about for lap in record["laps"]] or [shared | {"lap": None} | about]
-    _add_batch(rows)
+    add_batch(rows)
     settings = _settings_row(study, cells[0][0])
     order = ["study", *RUN, *COMBINATION, *settings, "lap", *METRICS, "failure", *versions()]
     known = dict.fromkeys([*order, *(name for row in rows for name in row)])
@@ -45,7 +45,7 @@ def frame_of(study: Study, cells: Sequence[tuple[Cell, Record | None]]) -> pd.Da
     return frame.astype({"lap": "Int64"})
 
 
-def _add_batch(rows: Sequence[dict[str, Any]]) -> None:
+def add_batch(rows: Sequence[dict[str, Any]]) -> None:
     """Adds how each run compares with the batch on the same log and with the same settings, if it ran."""
     names = (*RUN, "noise", "variant")
     batches = {tuple(row[name] for name in names): row for row in rows if row["estimator"] == DEFAULT_BATCH}
