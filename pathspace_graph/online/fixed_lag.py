@@ -32,7 +32,7 @@ from .closing import apply_correspondences, optimize_loop, simplify
 from .growth import Growth
 from .nonlinear_graph import window_graph
 from .open_lap import LapBatch, OpenLapRecord
-from .outlook import Outlook, confirmed, look_ahead
+from .outlook import Outlook, confirmed, joint_covariance_of, look_ahead
 from .swap import go_on_from
 
 Array = NDArray[np.float64]
@@ -266,14 +266,14 @@ class FixedLagMapper:
         joint = self.smoother.covariance(np.concatenate([state.map_keys, newest]))
         if self.closed:
             return self._closed_map(joint[:-POSE, :-POSE])
-        vehicle, bend = self.poses[-1], self.settings.tentative.sigma_bend
-        boundaries, at, shape = {}, 0, self.settings.spline.sigma_shape
-        for label, outlook in outlooks.items():
-            own = np.arange(at, at := at + POINT * len(outlook.known))
-            entries = np.append(own, np.arange(len(joint) - POSE, len(joint)))
-            covariance = outlook.covariance(joint[np.ix_(entries, entries)], vehicle, bend)
-            boundaries[label] = SplineBoundary(outlook.spline, covariance, outlook.confirmed_until)
-        return Map(False, boundaries)
+        joint, blocks = joint_covariance_of(
+            list(outlooks.values()), joint, self.poses[-1], self.settings.tentative.sigma_bend
+        )
+        boundaries = {
+            label: SplineBoundary(outlook.spline, joint[block, block].copy(), outlook.confirmed_until)
+            for (label, outlook), block in zip(outlooks.items(), blocks, strict=True)
+        }
+        return Map(False, boundaries, joint)
 
     def _closed_map(self, joint: Array) -> Map:
         """Returns the closed map, whose control points have a covariance (2m, 2m) from the graph.

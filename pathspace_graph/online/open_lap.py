@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any
+from functools import cache
+from typing import Any, cast
 
 import numpy as np
-from joblib.externals.loky import get_reusable_executor
+from joblib.externals.loky import ProcessPoolExecutor
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.closure import is_worth_trying
@@ -88,7 +90,7 @@ class OpenLapRecord:
         """
         if not self._prepared and self.unsolvable is None:
             self._prepared = True
-            _worker().submit(_nothing)
+            _submit(_nothing)
 
     def corrected(self, smoother: CurveSmoother) -> Array:
         """Returns the poses (P, 3) of all cycles in the frame of the map that has just been closed."""
@@ -124,7 +126,7 @@ class LapBatch:
         """The marginal replaces the prior in this cycle."""
         self.first_kept = lap.first_kept
         """The window holds the poses from this cycle on until then."""
-        self._future: Future[LapMarginal | None] = _worker().submit(solve_lap, lap)
+        self._future: Future[LapMarginal | None] = _submit(solve_lap, lap)
 
     def marginal(self) -> LapMarginal | str:
         """Waits for the solution and returns it, or says why there is none."""
@@ -139,9 +141,19 @@ class LapBatch:
         return solved if solved.convergence.converged else "the batch of the lap has not converged"
 
 
+def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    """Hands work to the process that solves laps; a new process takes the place of one that has died."""
+    try:
+        return cast("Future[Any]", _worker().submit(work, *arguments))
+    except BrokenProcessPool:
+        _worker.cache_clear()
+        return cast("Future[Any]", _worker().submit(work, *arguments))
+
+
+@cache
 def _worker() -> Any:
     """Returns the executor of this program, which has one process and imports no module of the program's."""
-    return get_reusable_executor(max_workers=1, timeout=WORKER_IDLE)
+    return ProcessPoolExecutor(max_workers=1, timeout=WORKER_IDLE)
 
 
 def _nothing() -> None:

@@ -6,22 +6,24 @@ can't harm the estimate, and it is taken back as soon as the tracks contradict i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.candidates import SIDES
-from pathspace_graph.mapping.corridor import Row, lead_on
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary, Placement, open_boundary
 from pathspace_graph.spline.bspline import BSpline
 
+from .corridor import Row, lead_on
 from .growth import Growth, undisputed
 
 Array = NDArray[np.float64]
@@ -60,27 +62,48 @@ class Outlook:
         """Returns the curve."""
         return self.boundary.spline(self.control_points)
 
-    def covariance(self, joint: Array, vehicle: Array, sigma_bend: float) -> Array:
-        """Returns the joint covariance (2m, 2m) of the control points in m^2.
+    def linear(self, vehicle: Array, sigma_bend: float) -> tuple[Array, Array]:
+        """Returns A (2m, 2n + 3) and N (2m, 2m): the control points have the covariance `A Sigma A' + N`.
 
-        `joint` (2n + 3, 2n + 3) is that of the known control points and of the newest pose `vehicle` (3,),
-        from which the tracks were seen. The placement is linear in both, in the tracks' own errors, and in
-        the second differences, which have the standard deviation `sigma_bend` (m).
+        Sigma is the joint covariance of the known control points and of the newest pose `vehicle` (3,), from
+        which the tracks were seen. The placement is linear in both, in the tracks' own errors, and in the
+        second differences, which have the standard deviation `sigma_bend` (m).
         """
-        placement, eye = self.placement, np.eye(POINT)
+        placement, eye, size = self.placement, np.eye(POINT), self.known.size
         if placement is None:
-            return joint[:-POSE, :-POSE]
-        by_track = np.kron(placement.by_target, eye)
-        change = np.zeros((len(by_track), len(joint)))
-        change[:, POINT * placement.first : -POSE] = np.kron(placement.by_known, eye)
-        change[:, -POSE:] = by_track @ _by_pose(self.tracks, vehicle)
-        kept = POINT * placement.kept
-        cross = change @ joint[:, :kept]
-        noise = (placement.by_target * self.variances) @ placement.by_target.T
-        noise += sigma_bend**2 * placement.by_bend @ placement.by_bend.T
-        own = change @ joint @ change.T + np.kron(noise, eye)
-        covariance = np.block([[joint[:kept, :kept], cross.T], [cross, own]])
-        return np.asarray(0.5 * (covariance + covariance.T))
+            return np.eye(size, size + POSE), np.zeros((size, size))
+        kept, by_track = POINT * placement.kept, np.kron(placement.by_target, eye)
+        A = np.zeros((kept + len(by_track), size + POSE))
+        A[:kept, :kept] = np.eye(kept)
+        A[kept:, POINT * placement.first : size] = np.kron(placement.by_known, eye)
+        A[kept:, size:] = by_track @ _by_pose(self.tracks, vehicle)
+        own = (placement.by_target * self.variances) @ placement.by_target.T
+        own += sigma_bend**2 * placement.by_bend @ placement.by_bend.T
+        N = np.zeros((len(A), len(A)))
+        N[kept:, kept:] = np.kron(own, eye)
+        return A, N
+
+
+def joint_covariance_of(
+    outlooks: Sequence[Outlook], joint: Array, vehicle: Array, sigma_bend: float
+) -> tuple[Array, list[slice]]:
+    """Returns the joint covariance of the control points of all curves, and the block of each curve.
+
+    `joint` is the covariance of the known control points of all curves and, last, of the pose `vehicle` (3,).
+    """
+    changes, noises, blocks, begin, end = [], [], [], 0, 0
+    for outlook in outlooks:
+        A, N = outlook.linear(vehicle, sigma_bend)
+        size = outlook.known.size
+        change = np.zeros((len(A), len(joint)))
+        change[:, begin : begin + size], change[:, -POSE:] = A[:, :size], A[:, size:]
+        changes.append(change)
+        noises.append(N)
+        blocks.append(slice(end, end + len(A)))
+        begin, end = begin + size, end + len(A)
+    T = np.concatenate(changes)
+    covariance = T @ joint @ T.T + block_diag(*noises)
+    return np.asarray(0.5 * (covariance + covariance.T)), blocks
 
 
 def look_ahead(smoother: CurveSmoother, growth: Growth, path: DrivenPath) -> dict[int, Outlook]:

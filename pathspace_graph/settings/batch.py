@@ -154,7 +154,8 @@ class OpenLapSettings(Positive, group="open_lap"):
     """The second optimization, on knots that follow the result of the first, has at most this number of
     rounds."""
     rounds_from_odometry: int = 24
-    """The same for a lap whose loop no registration has closed: its batch begins at odometry."""
+    """A batch that begins at odometry, since no registration has closed the loop, has at most this number of
+    rounds in each optimization."""
     retry: float = 20.0
     """Such a loop is tried again after this length of path (m) where the detections were against it."""
     tolerance: float = 10.0

@@ -13,7 +13,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.online.outlook import Outlook, look_ahead
+from pathspace_graph.online.outlook import Outlook, joint_covariance_of, look_ahead
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -149,7 +149,9 @@ def test_the_covariance_is_that_of_the_fit_by_differences(mapper: FixedLagMapper
     by_track, by_bend = found.placement.by_target, found.placement.by_bend
     own = by_track @ np.diag(found.variances) @ by_track.T + bend**2 * by_bend @ by_bend.T
     expected[kept:, kept:] += np.kron(own, np.eye(2))
-    np.testing.assert_allclose(found.covariance(joint, vehicle, bend), expected, atol=1e-8)
+    covariance, (block,) = joint_covariance_of([found], joint, vehicle, bend)
+    assert block == slice(0, len(covariance))
+    np.testing.assert_allclose(covariance, expected, atol=1e-8)
 
 
 def test_the_band_widens_along_the_stretch(mapper: FixedLagMapper) -> None:

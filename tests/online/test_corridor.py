@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.mapping.corridor import Row, crosses, lead_on
+from pathspace_graph.online.corridor import Row, crosses, lead_on
 from pathspace_graph.settings.mapper import TentativeSettings
 
 SETTINGS = TentativeSettings(gap=9.0, turn=2.0, turn_rate=0.1, min_width=1.5)

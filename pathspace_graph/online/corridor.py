@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.mapping.path import along_and_across
 from pathspace_graph.settings.mapper import TentativeSettings
-
-from .path import along_and_across
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
