@@ -82,16 +82,18 @@ class Optimizer:
         system.begin(state)
         self._last_step = None
         at: Evaluation | None = None
+        cost = np.inf
         for number in range(1, schedule.rounds + 1):
             gate = max(gate, self.settings.gate)
             strict = gate <= self.settings.gate
             system.kernel = Biweight(gate)
             before = self._refreshed(state, gate, strict)
             at = self._step(before)
-            state = at.state
+            state, gain, cost = at.state, abs(cost - at.cost), at.cost
             if on_round is not None:
                 on_round()
-            if strict and self._is_still(before, at, schedule.tolerance):
+            if strict and self._is_still(before, at, gain, schedule.tolerance):
+                at = self._refreshed(state, gate, strict)
                 decrease = self.predicted_decrease(at)
                 if decrease <= schedule.tolerance * self.settings.tolerance_decrease:
                     return at, self._report(at, number, "nothing changes any more", decrease)
@@ -116,11 +118,11 @@ class Optimizer:
             system.place(state)
         return system.evaluate(state, hold=True)
 
-    def _is_still(self, before: Evaluation, after: Evaluation, tolerance: float) -> bool:
+    def _is_still(self, before: Evaluation, after: Evaluation, gain: float, tolerance: float) -> bool:
         """Returns whether a round has changed neither the curves, as their poses see them, nor the cost."""
         settings = self.settings
         still = self._movement(before.state, after.state) <= tolerance * settings.tolerance_curve
-        return still and before.cost - after.cost <= tolerance * settings.tolerance_cost * after.cost
+        return still and gain <= tolerance * settings.tolerance_cost * after.cost
 
     def _movement(self, before: State, after: State) -> float:
         """Returns how far a curve has moved across itself (m), seen from the poses beside its control points.

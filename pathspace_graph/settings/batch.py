@@ -230,8 +230,8 @@ class BatchSettings(Positive):
     share_most: float = 0.97
     """A step is not extended if its ratio to the step before is larger than this."""
     tolerance_cost: float = 1e-5
-    """The optimization has converged when a round's step has made the cost smaller by this share at most, and
-    the other two tolerances hold."""
+    """The optimization has converged when |cost_before - cost_after| <= tolerance_cost * cost_after over a
+    round, and the other two tolerances hold."""
     tolerance_curve: float = 2e-3
     """At convergence, no point of a curve moved farther than this across it in a round, as seen from the
     poses beside it (m)."""
