@@ -143,6 +143,7 @@ _ALL: Final = (
         scope="run",
     ),
     Metric("closed", "loop closed", "%", 0),
+    Metric("closed_at_end", "loop closed at the end of the log", "%", 0, scope="run"),
     Metric("false_closing", "loop closed falsely", "%", 1, scope="run"),
     Metric("jump", "jump of the pose where the map is replaced", "m", 2, scope="run"),
     Metric("scale", "scale error of the speeds", "%", 2, scope="run"),
@@ -207,7 +208,7 @@ def measure(
         rows.append(Row(lap, values | _drive_values(run, log.truth, begin, end)))
     values = _map_values(run.map, log.truth, ghost_settings, marginals)
     values |= _drive_values(run, log.truth, -np.inf, np.inf)
-    values |= _end_values(run, log.truth)
+    values |= {"closed_at_end": bool(run.map.closed)} | _end_values(run, log.truth)
     if isinstance(run, BatchRun):
         values |= {"converged": run.converged, "cost": run.cost}
     if isinstance(run, BatchResult) and log.truth is not None and has_cones(log.truth):

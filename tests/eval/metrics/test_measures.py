@@ -51,7 +51,11 @@ def test_every_lap_has_a_row_and_the_whole_run_is_the_last() -> None:
     true = circle_truth()
     lap, whole = measure(run(true), log(true), 7.0)
     assert (lap.lap, whole.lap) == (1, None)
-    assert (lap.values["closed"], whole.values["closed"]) == (False, True)
+    assert (lap.values["closed"], whole.values["closed"], whole.values["closed_at_end"]) == (
+        False,
+        True,
+        True,
+    )
     assert [r.values["rmse"] for r in (lap, whole)] == [pytest.approx(0.4), pytest.approx(0.3)]
     assert [r.values["missed"] for r in (lap, whole)] == [0.5, 0.5]  # the right boundary isn't mapped
     assert (whole.values["size"], whole.values["cones"], whole.values["size_share"]) == (4, 6, 4 / 6)
@@ -88,7 +92,7 @@ def test_without_truth_only_what_needs_none_is_measured() -> None:
     true = circle_truth()
     lap, whole = measure(run(true), log(None))
     keys = {"size", "closed", "bytes", "bytes_covariance", "ms_mean", "ms_median", "ms_p99"}
-    assert set(lap.values) == set(whole.values) == keys
+    assert set(lap.values) == keys == set(whole.values) - {"closed_at_end"}
     bare = log(Truth(true.pose_t, true.poses, np.zeros((0, 2)), np.zeros(0, dtype=int)))
     assert set(measure(run(true), bare)[0].values) == keys | {"ate", "along", "across"}
 
