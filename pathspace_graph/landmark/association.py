@@ -15,7 +15,7 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.keys import POINT
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.settings.comparison import LandmarkSettings
-from pathspace_graph.settings.mapper import GrowthSettings
+from pathspace_graph.settings.growth import GrowthSettings
 
 from .landmark_map import LandmarkSmoother, two_rows
 from .state import AMBIGUOUS, UNASSOCIATED

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import move_points
-from pathspace_graph.settings.mapper import PathSettings
+from pathspace_graph.settings.growth import PathSettings
 
 Array = NDArray[np.float64]
 

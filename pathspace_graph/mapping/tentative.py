@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import move_points
-from pathspace_graph.settings.mapper import GrowthSettings
+from pathspace_graph.settings.growth import GrowthSettings
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.mapping.path import along_and_across
-from pathspace_graph.settings.mapper import TentativeSettings
+from pathspace_graph.settings.growth import TentativeSettings
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -195,13 +195,14 @@ class FixedLagMapper:
         Returns a notice that says why it cannot be solved, or an empty one.
         """
         smoother, record = self.smoother, self._open_lap
-        self.corrected_poses = record.corrected(smoother)
+        closed = record.closed_map(smoother)
+        self.corrected_poses = closed.poses
         cones = len(smoother.map.state.map_keys) / self.settings.spline.size_share
         if cones > self.settings.open_lap.max_cones:
             record.give_up("the lap has too many cones for a batch")
         if record.unsolvable is not None:
             return f"{OWN_PRIOR}: {record.unsolvable}"
-        self._begin_batch(record.closed_map(smoother))
+        self._begin_batch(closed)
         return ""
 
     def _begin_batch(self, closed: ClosedMap | None) -> None:

@@ -11,7 +11,7 @@ from pathspace_graph.mapping.candidates import SIDES, Candidates, End, chain
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.path import PathAhead
 from pathspace_graph.mapping.tentative import TentativeTracks
-from pathspace_graph.settings.mapper import GrowthSettings
+from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
 Array = NDArray[np.float64]

@@ -25,7 +25,7 @@ from pathspace_graph.landmark.association import (
 )
 from pathspace_graph.landmark.state import AMBIGUOUS, UNASSOCIATED
 from pathspace_graph.settings.comparison import LandmarkSettings
-from pathspace_graph.settings.mapper import GrowthSettings
+from pathspace_graph.settings.growth import GrowthSettings
 
 from ..scenes.drives import detections
 from .scenes import SPEED, drive_on, driven, with_covariance

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pathspace_graph.mapping.candidates import Candidates, End, chain
-from pathspace_graph.settings.mapper import GrowthSettings
+from pathspace_graph.settings.growth import GrowthSettings
 
 SETTINGS = GrowthSettings(lateral_change=1.5, lateral_rate=0.2, beside=2.0, lateral_gap=0.8)
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pathspace_graph.mapping.path import DrivenPath, PathAhead, along_and_across
-from pathspace_graph.settings.mapper import PathSettings
+from pathspace_graph.settings.growth import PathSettings
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.mapping.tentative import TentativeTracks
-from pathspace_graph.settings.mapper import GrowthSettings
+from pathspace_graph.settings.growth import GrowthSettings
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.online.corridor import Row, crosses, lead_on
-from pathspace_graph.settings.mapper import TentativeSettings
+from pathspace_graph.settings.growth import TentativeSettings
 
 SETTINGS = TentativeSettings(gap=9.0, turn=2.0, turn_rate=0.1, min_width=1.5)
 THRESHOLD = 0.7
