@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
+from functools import cache
 from typing import Any
 
 import numpy as np
-from joblib.externals.loky import get_reusable_executor
+from joblib.externals.loky import ProcessPoolExecutor
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
@@ -118,13 +119,18 @@ class LapBatch:
         except SingularSystemError as error:
             return str(error)
         except BrokenProcessPool:
+            _worker.cache_clear()
             return "the process of the batch has died"
         return solved if solved.convergence.converged else "the batch of the lap has not converged"
 
 
+@cache
 def _worker() -> Any:
-    """Returns the executor of this program, which has one process and imports no module of the program's."""
-    return get_reusable_executor(max_workers=1, timeout=WORKER_IDLE)
+    """Returns the executor of this program, which has one process and imports no module of the program's.
+
+    It is not the one that joblib reuses, since joblib's own would not work beside a mapper then.
+    """
+    return ProcessPoolExecutor(max_workers=1, timeout=WORKER_IDLE)
 
 
 def _nothing() -> None:
