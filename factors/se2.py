@@ -30,12 +30,23 @@ def compose(pose: Array, delta: Array) -> Array:
     return np.stack(moved, axis=-1)
 
 
+def inverse(pose: Array) -> Array:
+    """Returns the pose (3,) with `pose * inverse = 0`; its heading is not wrapped."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return np.array([-c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]])
+
+
 def relative(pose: Array, other: Array) -> Array:
     """Returns `pose^-1 * other` on SE(2): another pose (3,) in the frame of a pose (3,).
 
     Headings are subtracted and not wrapped.
     """
     return np.append(rotation(pose[2]).T @ (other[:2] - pose[:2]), other[2] - pose[2])
+
+
+def move_points(motion: Array, points: Array) -> Array:
+    """Returns `R p + t` (m, 2): points (m, 2) after the rigid motion (3,) of the map frame."""
+    return np.asarray(points @ rotation(motion[2]).T + motion[:2])
 
 
 def to_map(points_vehicle: Array, poses: Array) -> Array:

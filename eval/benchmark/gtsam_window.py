@@ -17,7 +17,7 @@ from functools import partial
 import gtsam
 import numpy as np
 
-from pathspace_graph.graph.gaussian import as_hessian_factor, factors_of, graph_of, jacobian_factor
+from pathspace_graph.graph.gaussian import as_hessian_factor, factors_of, graph_of, jacobian_factor, keys_of
 from pathspace_graph.graph.keys import are_poses
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -41,7 +41,8 @@ def linear_window(mapper: FixedLagMapper) -> LinearWindow:
     cycles = [factor for factor in factors if _is_of_cycle(factor)]
     priors = [factor for factor in factors if not _is_of_cycle(factor)]
     combined_priors = as_hessian_factor(graph_of(_damping(mapper), *priors))
-    return LinearWindow(graph_of(combined_priors, *cycles), smoother.variables.layout)
+    graph = graph_of(combined_priors, *cycles)
+    return LinearWindow(graph, Layout(keys_of(graph)))  # an open map hangs on poses of its own
 
 
 def _is_of_cycle(factor: gtsam.GaussianFactor) -> bool:

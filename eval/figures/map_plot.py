@@ -46,6 +46,9 @@ _TRAJECTORY_COLOR: Final = GREEN
 _BAND_ALPHA: Final = 0.35
 """The uncertainty band has this opacity."""
 
+_TENTATIVE_DASHES: Final = (0, (4, 2))
+"""The stretch of a curve that is not confirmed has these dashes."""
+
 
 @dataclass(frozen=True, slots=True)
 class MapStyle:
@@ -110,7 +113,11 @@ def _draw_spline(
 ) -> None:
     color, name, spline = _COLORS[label], NAMES[label], boundary.spline
     draw_band(axes, boundary, color, f"{name} {_band_name(band_scale)}", band_scale, _BAND_ALPHA)
-    draw_curve(axes, spline, color, f"{name} boundary", style.curve_width, zorder=4)
+    until = boundary.confirmed_until
+    draw_curve(axes, spline, color, f"{name} boundary", style.curve_width, (-np.inf, until), zorder=4)
+    if until < spline.domain[1]:
+        text, dashed = f"{name} tentative", {"linestyle": _TENTATIVE_DASHES, "zorder": 4}
+        draw_curve(axes, spline, color, text, style.curve_width, (until, np.inf), **dashed)
     squares = {"markersize": style.marker_size, "markeredgewidth": 0.6, "zorder": 5}
     points, text = spline.distinct_control_points, f"{name} control points"
     draw_control_points(axes, points, color, text, polygon=False, **squares)

@@ -55,10 +55,18 @@ def point_blocks(covariance: Array) -> Array:
 
 
 def draw_curve(
-    axes: Axes, spline: BSpline, color: str, label: str | None = None, width: float = CURVE_WIDTH, **line: Any
+    axes: Axes,
+    spline: BSpline,
+    color: str,
+    label: str | None = None,
+    width: float = CURVE_WIDTH,
+    stretch: tuple[float, float] = (-np.inf, np.inf),
+    **line: Any,
 ) -> None:
-    """Draws a spline over its whole domain."""
-    points = spline.evaluate(curve_parameters(spline))
+    """Draws a spline over its whole domain, or over a stretch of it, from one parameter to another."""
+    u = curve_parameters(spline)
+    low, high = np.clip(stretch, u[0], u[-1])
+    points = spline.evaluate(np.concatenate([[low], u[(u > low) & (u < high)], [high]]))
     axes.plot(*points.T, color=color, linewidth=width, label=label, **{"zorder": 3, **line})
 
 

@@ -39,6 +39,9 @@ def summarize(result: RunResult, log: Log) -> dict[str, Any]:
         "not_mapped": not_mapped(result.map, log),
         "seconds": _timing(result),
     }
+    events = _events(result)
+    if events:
+        summary["events"] = events
     state = vehicle_of(result)
     if state is not None:
         summary |= _vehicle(state)
@@ -58,6 +61,15 @@ def _vehicle(state: VehicleState) -> dict[str, Any]:
     *_, heading_sigma, scale_sigma, bias_sigma = sigmas
     calibration = {"scale": scale, "bias": bias, "scale_sigma": scale_sigma, "bias_sigma": bias_sigma}
     return {"calibration": calibration, "heading_sigma": heading_sigma}
+
+
+def _events(result: RunResult) -> list[dict[str, Any]]:
+    """Returns the cycles in which the map was replaced, with the jump of the pose, or that have a notice."""
+    return [
+        {"cycle": record.cycle, "t": record.t, "jump": record.jump, "notice": record.notice}
+        for record in result.cycles
+        if record.jump is not None or record.notice
+    ]
 
 
 def versions() -> dict[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.projection import project
@@ -31,7 +32,8 @@ def locate_poses(state: State, settings: AssociationSettings) -> None:
     """Sets `pose_u`: the parameter of each curve's nearest point that runs in the direction of each pose.
 
     Without the heading, a pose in a hairpin could be put beside the other leg. On a closed curve the
-    parameter goes on from lap to lap.
+    parameter goes on from lap to lap. On an open one it goes on with the drive: where the curve has drifted
+    over a stretch of itself, the poses are not put beside that stretch.
     """
     for label, boundary in state.boundaries.items():
         count = int(np.ceil(boundary.length / settings.step))
@@ -44,8 +46,27 @@ def locate_poses(state: State, settings: AssociationSettings) -> None:
         heading = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
         square = offset_x**2 + offset_y**2
         square[heading @ tangent.T < SAME_DIRECTION] += settings.direction_penalty**2
-        nearest = u[square.argmin(axis=1)]
-        state.pose_u[label] = np.unwrap(nearest, period=boundary.length) if boundary.periodic else nearest
+        if boundary.periodic:
+            state.pose_u[label] = np.unwrap(u[square.argmin(axis=1)], period=boundary.length)
+        else:
+            driven = np.hypot(*np.diff(poses[:, :2], axis=0).T) + settings.room
+            state.pose_u[label] = u[_along(square, driven * count / boundary.length)]
+
+
+def _along(square: Array, steps: Array) -> IntArray:
+    """Returns the samples (P,) beside which the poses are, of least total squared distance (P, n).
+
+    From a pose to the next, the sample changes by no more than the next of `steps` (P - 1,).
+    """
+    total, reach = square.copy(), np.ceil(steps).astype(np.intp)
+    for k in range(1, len(total)):
+        total[k] += minimum_filter1d(total[k - 1], 2 * int(reach[k - 1]) + 1, mode="nearest")
+    samples = np.empty(len(total), np.intp)
+    samples[-1:] = total[-1:].argmin(axis=1)
+    for k in range(len(total) - 1, 0, -1):
+        low = max(samples[k] - reach[k - 1], 0)
+        samples[k - 1] = low + total[k - 1, low : samples[k] + reach[k - 1] + 1].argmin()
+    return samples
 
 
 def associate(
@@ -55,7 +76,9 @@ def associate(
 
     A detection is searched for on the stretch of the curve that its pose sees.
     `strict` means that the curves are about where they belong. Then a detection that fits nowhere in that
-    stretch is searched for on the whole curve, since the sensor sees much later stretches across the infield.
+    stretch is searched for on the whole of a closed curve, since the sensor sees much later stretches across
+    the infield. An open curve has drifted against itself by more than the gate from one stretch to a far one.
+    A detection that happened to fit there would say that it has not, so it isn't compared.
     And a detection of unknown colour goes to the curve that it fits better. It isn't used before, since
     cones that belong to no boundary stand beside the track. A known colour is always believed.
     """
@@ -63,7 +86,9 @@ def associate(
     for whole in (False, True) if strict else (False,):
         unexplained = boundary_of == UNKNOWN
         best = np.full(len(detections), gate)
-        for label in state.boundaries:
+        for label, boundary in state.boundaries.items():
+            if whole and not boundary.periodic:
+                continue
             possible = (detections.label == label) | (strict & (detections.label == UNKNOWN))
             rows = np.flatnonzero(unexplained & possible)
             misfit, foot_u = _misfit(state, detections, settings, label, rows, whole)

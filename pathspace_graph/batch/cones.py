@@ -58,7 +58,9 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
     used = detections.used[rows] & (detections.boundary[rows] == label)
     beside, on_curve, u = used.copy(), used.copy(), detections.u[rows].copy()
-    beside[~used], on_curve[~used], u[~used] = _beside(state, points[~used], label, settings)
+    beside[~used], on_curve[~used], u[~used] = _beside(
+        state, points[~used], detections.cycle[rows[~used]], label, settings
+    )
     u = np.mod(u - begin, boundary.length) if boundary.periodic else u - begin
     weight = 1.0 / np.trace(detections.covariance[rows], axis1=1, axis2=2)
 
@@ -109,14 +111,21 @@ def in_order_of_drive(cones: Cones, lap: Array) -> Cones:
 
 
 def _beside(
-    state: State, points: Array, label: int, settings: MapperSettings
+    state: State, points: Array, cycles: IntArray, label: int, settings: MapperSettings
 ) -> tuple[BoolArray, BoolArray, Array]:
     """Returns which points (m, 2) lie beside a curve, which lie about its end, and their foot points u (m,).
 
-    Half of the detections of the cone at which an open curve ends lie beyond its end.
+    Half of the detections of the cone at which an open curve ends lie beyond its end. On an open curve, a
+    point lies on the stretch that the pose of its cycle (m,) sees.
     """
-    boundary = state.boundaries[label]
-    foot = find_anywhere(boundary, state.control_points(label), points)
+    boundary, control_points = state.boundaries[label], state.control_points(label)
+    if boundary.periodic:
+        foot = find_anywhere(boundary, control_points, points)
+    else:
+        u = state.pose_u[label][cycles]
+        low, high = u - settings.gate.view_behind, u + settings.gate.view_ahead
+        ends = boundary.tables.low, boundary.tables.high
+        foot = boundary.find(control_points, points, np.clip(low, *ends), np.clip(high, *ends))
     distance = np.hypot(*(points - foot.position).T)
     beside = foot.interior & (distance < settings.gate.rough)
     return beside, ~foot.interior & (distance < settings.growth.merge_radius), foot.u
@@ -139,13 +148,41 @@ def cluster(
     u (m,) in [0, length] are the parameters of the detections (m), and weight (m,) is their information
     (1/m^2). A cone has at least `growth.sightings` detections.
     """
-    peaks = _peaks(u, weight, length, periodic, settings)
-    member = _nearest_peak(u, peaks, length if periodic else np.inf, settings.growth.merge_radius)
+    peaks, member = _clusters(u, weight, length, periodic, settings)
     count = np.bincount(member[member >= 0], minlength=len(peaks))
-    typical = float(np.median(count)) if len(count) else 0.0
     cones = Cones(_means(points, weight, member, len(peaks)), peaks, count)
-    enough = count >= max(settings.growth.sightings, settings.batch.cones.min_share * typical)
+    enough = _often_seen(count, settings)
     return without_folds(cones.where(enough), periodic, settings.batch.cones)
+
+
+def places(u: Array, weight: Array, length: float, periodic: bool, settings: MapperSettings) -> Array:
+    """Returns the places (k,) of cones along a curve (m): the weighted means of their detections' u (m,).
+
+    u is in [0, length], and weight (m,) is the information of the detections (1/m^2).
+    """
+    peaks, member = _clusters(u, weight, length, periodic, settings)
+    inside = member >= 0
+    u, weight, member = u[inside], weight[inside], member[inside]
+    offset = u - peaks[member]
+    if periodic:
+        offset -= length * np.round(offset / length)
+    total, moment = (np.bincount(member, terms, len(peaks)) for terms in (weight, weight * offset))
+    mean = peaks + moment / np.maximum(total, np.finfo(float).tiny)
+    return np.asarray(mean[_often_seen(np.bincount(member, minlength=len(peaks)), settings)])
+
+
+def _clusters(
+    u: Array, weight: Array, length: float, periodic: bool, settings: MapperSettings
+) -> tuple[Array, IntArray]:
+    """Returns the peaks (k,) of the density of detections along a curve, and the peak (m,) next to each."""
+    peaks = _peaks(u, weight, length, periodic, settings)
+    return peaks, _nearest_peak(u, peaks, length if periodic else np.inf, settings.growth.merge_radius)
+
+
+def _often_seen(count: IntArray, settings: MapperSettings) -> BoolArray:
+    """Returns (k,) whether clusters with this number of detections (k,) are cones."""
+    typical = float(np.median(count)) if len(count) else 0.0
+    return np.asarray(count >= max(settings.growth.sightings, settings.batch.cones.min_share * typical))
 
 
 def without_folds(cones: Cones, periodic: bool, settings: ConeSettings) -> Cones:

@@ -32,14 +32,19 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 
-def start_odometry(chain: LogOdometry, detections: DetectionTable, settings: MapperSettings) -> State:
+def start_odometry(
+    chain: LogOdometry, detections: DetectionTable, settings: MapperSettings, closes: bool = True
+) -> State:
     """Returns poses by dead reckoning, and curves through the cones that were seen in the first lap.
 
-    Where the path recurs, the drift of the odometry is taken out first: every lap passes the same places.
+    Where the path recurs, the drift of the odometry is taken out first: every lap passes the same places. The
+    curves are closed then. They are open where the path doesn't recur, or where `closes` is false.
     """
     calibration = np.zeros(CALIBRATION_SIZE)
     poses = chain.dead_reckoned(calibration)
     recurrence = find_recurrence(poses, settings)
+    if not closes:
+        recurrence = recurrence.denied()
     if recurrence.recurs:
         poses, calibration = align_laps(chain, recurrence, settings.batch.laps)
     state = State()

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.gauge import smoothness_matrix
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.elimination import owners
-from pathspace_graph.graph.keys import POINT, indices, pose_keys
+from pathspace_graph.graph.keys import POINT, POSE, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.mapping.state import State
-from pathspace_graph.spline.boundary import Boundary
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -24,12 +24,12 @@ would join the whole curve in the elimination. The number changes the speed, not
 
 @dataclass(frozen=True, eq=False)
 class CurveGauge:
-    """Holds the residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` and `D c / sigma_smoothness` of a curve.
+    """Holds the residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` and `R_k' D c / sigma_smoothness`.
 
-    p_k is the position of the pose that control point c_j began beside, and h_k is its heading. D is
-    `smoothness_matrix`. A detection constrains nothing along a curve, so control points would slide along it,
-    by metres in a hundred steps. Held beside a pose they don't, and the map is as free as before: wherever
-    that pose goes, they go with it.
+    p_k is the position of the pose that control point c_j of the curve began beside, h_k is its heading, and
+    R_k its rotation. D is `smoothness_matrix`. A detection constrains nothing along a curve, so control
+    points would slide along it, by metres in a hundred steps. Held beside a pose they don't, and the map is
+    as free as before: wherever that pose goes, they go with it.
     """
 
     label: int
@@ -71,14 +71,44 @@ class CurveGauge:
             owner=owners(self.cycle, self.label),
         )
 
-    def smooth(self, control_points: Array) -> Rows:
-        """Returns whitened second differences of three neighbours each, one row for x and one for y."""
-        neighbours = (np.arange(len(self.smoothness))[:, None] + np.arange(3)) % len(self.keys)
+    def bending(self, control_points: Array, poses: Array) -> tuple[Array, Array, Array]:
+        """Returns the second differences as the poses beside their middles see them, whitened (r, 2).
+
+        Also returns their derivatives by the three control points (r, 2, 6) and by the pose (r, 2, 3). In the
+        map frame a second difference turns with the map, and Gauss-Newton would take that turn for a change
+        of shape. It would know the heading at the end of a winding road better than any measurement does.
+        """
+        neighbours, theta = self.neighbours, poses[self.middle_cycle, 2]
+        c, s = np.cos(theta), np.sin(theta)
+        turned = np.moveaxis(np.array([[c, s], [-s, c]]), 2, 0)
         weights = np.take_along_axis(self.smoothness, neighbours, axis=1) / self.sigma_smoothness
-        keys = np.repeat(self.keys[neighbours], POINT, axis=0)
-        jacobian = (weights[:, None, :, None] * np.eye(POINT)[:, None, :]).reshape(-1, 3 * POINT)
-        residual = (self.smoothness @ control_points).ravel() / self.sigma_smoothness
-        return Rows(keys, jacobian, residual, self._owners(keys[:, 0]))
+        in_map = (weights[:, :, None] * control_points[neighbours]).sum(axis=1)
+        residual = (turned @ in_map[:, :, None])[:, :, 0]
+        by_control = weights[:, None, :, None] * turned[:, :, None, :]
+        by_pose = np.zeros((len(residual), POINT, POSE))
+        by_pose[:, 0, 2], by_pose[:, 1, 2] = residual[:, 1], -residual[:, 0]
+        return residual, by_control.reshape(len(residual), POINT, -1), by_pose
+
+    @property
+    def neighbours(self) -> IntArray:
+        """Returns the three control points (r, 3) of each second difference, by index."""
+        return np.asarray((np.arange(len(self.smoothness))[:, None] + np.arange(3)) % len(self.keys))
+
+    @property
+    def middle_cycle(self) -> IntArray:
+        """Returns the cycle (r,) of the pose beside the middle of each second difference."""
+        return np.asarray(self.cycle[self.neighbours[:, 1]])
+
+    def smooth(self, control_points: Array, poses: Array) -> Rows:
+        """Returns the same as rows on [three control points | pose], two rows for each second difference."""
+        residual, by_control, by_pose = self.bending(control_points, poses)
+        keys = np.column_stack([self.keys[self.neighbours], pose_keys(self.middle_cycle)])
+        return Rows(
+            keys=np.repeat(keys, POINT, axis=0),
+            jacobian=np.concatenate([by_control, by_pose], axis=2).reshape(residual.size, -1),
+            residual=residual.ravel(),
+            owner=np.repeat(owners(self.middle_cycle, self.label), POINT),
+        )
 
     def anchor(self) -> Rows:
         """Returns rows that hold each control point where it is."""
@@ -93,6 +123,28 @@ class CurveGauge:
         """
         return np.asarray(-1 - self.label - 2 * (indices(keys) // POINTS_A_FACTOR))
 
+    def damping(self, control_points: Array, poses: Array, weight: float) -> Rows:
+        """Returns rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
+
+        They damp how a control point moves as seen from the pose beside it, in 1/m^2. A map that swings with
+        its poses, as an error of the yaw rate swings it, is not damped. J is the quarter turn.
+        """
+        arm = control_points - poses[self.cycle, :2]
+        by_point, by_theta = np.tile(np.eye(POINT), (len(arm), 1)), np.column_stack([arm[:, 1], -arm[:, 0]])
+        keys = np.column_stack([self.keys, pose_keys(self.cycle)])
+        return Rows(
+            keys=np.repeat(keys, POINT, axis=0),
+            jacobian=np.sqrt(weight) * np.column_stack([by_point, -by_point, by_theta.ravel()]),
+            residual=np.zeros(POINT * len(arm)),
+            owner=np.repeat(owners(self.cycle, self.label), POINT),
+        )
+
+    def carried(self, control_points: Array, poses: Array, poses_after: Array) -> Array:
+        """Returns control points (m, 2) moved rigidly with the poses beside them, from and to (P, 3)."""
+        before, after = poses[self.cycle], poses_after[self.cycle]
+        turned = np.column_stack([np.zeros((len(before), 2)), after[:, 2] - before[:, 2]])
+        return after[:, :2] + to_map(control_points - before[:, :2], turned)
+
     def cost(self, control_points: Array, poses: Array) -> float:
         """Returns half the sum of the squared residuals at control points (m, 2) and all poses (P, 3)."""
         beside, _, _ = self.terms(control_points, poses[self.cycle])
@@ -106,10 +158,9 @@ def curve_gauge(state: State, label: int, sigma: float, until: int | None = None
     Only poses of the cycles before `until` hold control points.
     """
     boundary, control_points, poses = state.boundaries[label], state.control_points(label), state.poses
-    poses = poses[:until]
-    cycle = _nearest_poses(boundary, control_points, poses)
-    heading = np.column_stack([np.cos(poses[cycle, 2]), np.sin(poses[cycle, 2])])
     mean_spacing = boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)
+    cycle = _nearest_poses(state, label, until, mean_spacing)
+    heading = np.column_stack([np.cos(poses[cycle, 2]), np.sin(poses[cycle, 2])])
     return CurveGauge(
         label=label,
         keys=state.keys(label),
@@ -122,12 +173,20 @@ def curve_gauge(state: State, label: int, sigma: float, until: int | None = None
     )
 
 
-def _nearest_poses(boundary: Boundary, control_points: Array, poses: Array) -> IntArray:
-    """Returns (m,) the pose nearest to where each control point acts, of those with the curve's direction."""
+def _nearest_poses(state: State, label: int, until: int | None, room: float) -> IntArray:
+    """Returns (m,) the pose nearest to where each control point acts, of those with the curve's direction.
+
+    On an open curve, it is one of those whose places along the curve are nearest, give or take `room` (m): a
+    curve that has drifted over itself would else be tied to a pose of another stretch.
+    """
+    boundary, points, poses = state.boundaries[label], state.control_points(label), state.poses[:until]
     u = boundary.abscissae
-    position, tangent = (boundary.evaluate(control_points, u, order) for order in (0, 1))
+    position, tangent = (boundary.evaluate(points, u, order) for order in (0, 1))
     dx, dy = position[:, :1] - poses[:, 0], position[:, 1:] - poses[:, 1]
     along = tangent[:, :1] * np.cos(poses[:, 2]) + tangent[:, 1:] * np.sin(poses[:, 2])
     square = dx**2 + dy**2
     square[along <= 0.0] += square.max(initial=0.0)
+    if not boundary.periodic:
+        away = np.abs(u[:, None] - state.pose_u[label][:until])
+        square[away > away.min(axis=1, keepdims=True) + room] = np.inf
     return np.asarray(square.argmin(axis=1))

@@ -36,7 +36,8 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
         if len(points) < settings.batch.cones.min_count:
             continue
         if dense:
-            spline = dense_fit_through(points, boundary.periodic, settings)
+            beyond = 0.0 if boundary.periodic else settings.growth.merge_radius
+            spline = dense_fit_through(extended(points, beyond), boundary.periodic, settings)
         else:
             spline = fit_through(points, boundary.periodic, settings, share)
         state.replace_boundary(label, *boundary_of(spline, settings))
@@ -63,6 +64,21 @@ def dense_fit_through(points: Array, periodic: bool, settings: MapperSettings) -
     """Returns a curve through cones (k, 2) on nearly a knot for each."""
     size = max(settings.spline.min_size, int(settings.batch.dense_share * len(points)))
     return _fit(points, periodic, settings, size, size)
+
+
+def extended(points: Array, beyond: float) -> Array:
+    """Returns cones (k, 2) with a point before the first and one after the last, `beyond` metres straight on.
+
+    There are at least two cones. Detections scatter about their cone, so that half of those of the last one
+    lie beyond it. Without that much of the curve after it, any motion of its end would put some of them into
+    use and others out of it. Nothing is added where `beyond` is zero.
+    """
+    if beyond == 0.0:
+        return points
+    ends, inner = points[[0, -1]], points[[1, -2]]
+    ahead = (ends - inner) / np.maximum(np.hypot(*(ends - inner).T), np.finfo(float).tiny)[:, None]
+    first, last = ends + beyond * ahead
+    return np.concatenate([first[None], points, last[None]])
 
 
 def _fit(points: Array, periodic: bool, settings: MapperSettings, least: int, most: int) -> BSpline:

@@ -1,5 +1,8 @@
 """The batch of the open lap: what an online mapper goes on from after its loop has closed.
 
+Where no registration closes the loop, though the drive says that a lap is over, the batch begins at odometry
+and closes it. Its result counts only if the detections are for it.
+
 Online, every measurement of the first lap is linearized while the map is still open, and the curves are
 sparse. Both turn the map by several tenths of a degree. Here the same measurements are solved again as a
 batch, on curves that meet the cones. The result is a marginal: what the poses that have left the window know
@@ -24,12 +27,14 @@ from pathspace_graph.graph.variables import Layout
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.batch import BatchSettings, OpenLapSettings
+from pathspace_graph.settings.batch import BatchSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
-from .association import add_drive, associate, locate_poses
+from .association import add_drive, associate, find_anywhere, locate_poses
+from .closure import evidence, is_true_closure
+from .dead_reckoning import start_odometry
 from .gauge import curve_gauge
 from .knots import exact_settings
 from .mapper import find_optimum, own_settings
@@ -42,8 +47,20 @@ IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
+class ClosedMap:
+    """Holds a map that has just been closed, and the poses beside it."""
+
+    splines: dict[int, BSpline]
+    """These are the closed curves by label, map frame."""
+    poses: Array
+    """(P, 3) These are the poses of all cycles, map frame."""
+    calibration: Array
+    """(2,) This is the calibration: scale error (-) and yaw-rate bias (rad/s)."""
+
+
+@dataclass(frozen=True, eq=False)
 class OpenLap:
-    """Holds everything measured from the start to the closing cycle, and the closed map to begin with."""
+    """Holds everything measured from the start to the closing cycle, and what to begin with."""
 
     settings: MapperSettings
     """These are the settings of the online mapper."""
@@ -51,14 +68,10 @@ class OpenLap:
     """This is the odometry between all cycles."""
     detections: DetectionTable
     """These are the detections of all cycles; their associations are found anew."""
-    splines: dict[int, BSpline]
-    """These are the closed curves by label, map frame."""
-    poses: Array
-    """(P, 3) These are the poses of all cycles, map frame."""
-    calibration: Array
-    """(2,) This is the calibration: scale error (-) and yaw-rate bias (rad/s)."""
     first_kept: int
     """The poses from this cycle on stay variables of the window."""
+    closed: ClosedMap | None = None
+    """The search begins at this map, or at odometry alone, where the path driven recurs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,18 +95,25 @@ class LapMarginal:
     """(n,) This is the mean of the marginal."""
     information: Array
     """(n, n) This is the information of the marginal, the inverse of its covariance."""
+    places: dict[int, Array]
+    """For each boundary, its cones have these parameters (k,) on the simplified curve (m)."""
     scatter: dict[int, Array]
     """For each boundary, cones scatter about the curve by this sigma (m,) at each control point (m)."""
     seconds: float
     """The solution took this wall time (s)."""
 
 
-def solve_lap(lap: OpenLap) -> LapMarginal:
-    """Returns the marginal of an open lap at the optimum of its batch. It uses one thread."""
+def solve_lap(lap: OpenLap) -> LapMarginal | None:
+    """Returns the marginal of an open lap at the optimum of its batch. It uses one thread.
+
+    The result is None where the search begins at odometry and ends at a loop that the detections are against.
+    """
     begin = time.perf_counter()
     with threadpool_limits(limits=1):
         system, at, convergence = lap_optimum(lap)
         settings, detections = system.settings, system.detections
+        if lap.closed is None and not is_true_closure(evidence(at, detections, settings), settings):
+            return None
         few, change = simplified(at.state, detections, settings)
         information, mean = marginal_of(system, at, few, change, lap.first_kept)
         locate_poses(few, settings.batch.association)
@@ -109,6 +129,7 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             first_kept=lap.first_kept,
             mean=mean,
             information=information,
+            places=places_on(few, at.state, system),
             scatter={label: scatter.sigma(label, b.abscissae) for label, b in few.boundaries.items()},
             seconds=time.perf_counter() - begin,
         )
@@ -116,42 +137,41 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
 
 def lap_optimum(lap: OpenLap) -> tuple[BatchSystem, Evaluation, Convergence]:
     """Returns the problem of a lap, its optimum on curves that meet the cones, and how it was found."""
-    settings, detections = (
-        _capped(own_settings(lap.settings), lap.settings.open_lap),
-        deepcopy(lap.detections),
-    )
+    settings, detections = _capped(lap), deepcopy(lap.detections)
     system = BatchSystem(detections, lap.chain, settings, Biweight(settings.batch.loose_gate))
-    optimizer, batch = Optimizer(system, settings.batch), settings.batch
-    state = optimizer.align_poses(_start(lap, settings), batch.pose_steps, batch.loose_gate)
-    at, convergence = find_optimum(optimizer, state, detections, settings)
+    optimizer = Optimizer(system, settings.batch)
+    at, convergence = find_optimum(optimizer, _start(lap, settings), settings)
     return system, at, convergence
 
 
-def _capped(settings: MapperSettings, own: OpenLapSettings) -> MapperSettings:
+def _capped(lap: OpenLap) -> MapperSettings:
     """Returns the batch's settings with fewer rounds and looser tolerances, so that the result is in time."""
+    settings, own = own_settings(lap.settings), lap.settings.open_lap
     batch: BatchSettings = settings.batch
     return replace(
         settings,
         batch=replace(
             batch,
-            rough_rounds=own.rough_rounds,
-            max_rounds=own.rounds,
+            rough_rounds=own.rough_rounds if lap.closed else batch.rough_rounds,
+            max_rounds=own.rounds if lap.closed else own.rounds_from_odometry,
             knot_passes=1,
             tolerance_cost=own.tolerance * batch.tolerance_cost,
             tolerance_curve=own.tolerance * batch.tolerance_curve,
-            tolerance_pose=own.tolerance * batch.tolerance_pose,
+            tolerance_decrease=own.tolerance * batch.tolerance_decrease,
         ),
     )
 
 
 def _start(lap: OpenLap, settings: MapperSettings) -> State:
-    """Returns the closed curves of the online map with all poses beside them."""
+    """Returns the closed curves of the online map with all poses beside them, or the start from odometry."""
+    if lap.closed is None:
+        return start_odometry(lap.chain, lap.detections, settings)
     state, exact = State(), exact_settings(settings.spline, settings.batch)
-    for label, spline in lap.splines.items():
+    for label, spline in lap.closed.splines.items():
         boundary = Boundary(spline.knots, True, exact, settings.gauge)
         boundary.confirmed_end = boundary.tables.high
         state.add_boundary(label, boundary, spline.distinct_control_points)
-    add_drive(state, lap.poses, lap.calibration, settings.batch.association)
+    add_drive(state, lap.closed.poses, lap.closed.calibration, settings.batch.association)
     return state
 
 
@@ -176,6 +196,15 @@ def marginal_of(
     return np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), np.float64), here + T @ shift
 
 
+def places_on(few: State, dense: State, system: BatchSystem) -> dict[int, Array]:
+    """Returns the parameters (k,) of the cones' places on the curves that were simplified, by label."""
+    found = {}
+    for label, u in system.places_by_label(dense).items():
+        points = dense.boundaries[label].evaluate(dense.control_points(label), u)
+        found[label] = find_anywhere(few.boundaries[label], few.control_points(label), points).u
+    return found
+
+
 def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Rows]:
     """Returns the rows of the batch that hold a pose before `first_kept` or no pose at all.
 
@@ -187,7 +216,9 @@ def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Ro
         gauge = curve_gauge(state, label, system.settings.batch.sigma_slide, first_kept)
         points = state.control_points(label)
         groups += [system.detection_rows(at, label), gauge.beside(points, state.poses)]
-        groups += [gauge.smooth(points), gauge.anchor()]
+        groups += [gauge.smooth(points, state.poses), gauge.anchor()]
+    if at.placed is not None:
+        groups.append(system.place_rows(at, at.placed))
     return [rows.where(_is_before(rows.keys, first_kept)) for rows in groups if len(rows)]
 
 

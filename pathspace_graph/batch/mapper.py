@@ -30,6 +30,7 @@ from pathspace_graph.run import Stopwatch, settings_dict
 from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import MapperSettings
 
+from .closure import evidence, is_true_closure
 from .cones import cone_counts
 from .dead_reckoning import start_odometry
 from .knots import reknot
@@ -138,13 +139,12 @@ class BatchMapper:
         optimizer = Optimizer(system, batch)
         watch.lap("integrate")
         if start == "odometry":
-            state, online = start_odometry(chain, detections, settings), None
+            online = None
+            at, convergence = find_optimum_from_odometry(optimizer, settings, on_round)
         else:
             state, online = self._start_online(log)
-        watch.lap("start")
-        state = optimizer.align_poses(state, batch.pose_steps, batch.loose_gate)
-        watch.lap("poses")
-        at, convergence = find_optimum(optimizer, state, detections, settings, on_round)
+            watch.lap("start")
+            at, convergence = find_optimum(optimizer, state, settings, on_round)
         watch.lap("optimum")
         joint = system.eliminated(at).joint(at.state.map_keys)
         watch.lap("covariance")
@@ -180,18 +180,35 @@ class BatchMapper:
         return start_online(log, self.online(self.settings, self.odometry_sigma))
 
 
+def find_optimum_from_odometry(
+    optimizer: Optimizer, settings: MapperSettings, on_round: Callable[[], None] | None = None
+) -> tuple[Evaluation, Convergence]:
+    """Returns the optimum whose search begins at odometry alone.
+
+    Where the path recurs, the loop is closed, and it stays closed if the detections are for it.
+    """
+    chain, detections = optimizer.system.chain, optimizer.system.detections
+    state = start_odometry(chain, detections, settings)
+    at, convergence = find_optimum(optimizer, state, settings, on_round)
+    if not is_closed(state) or is_true_closure(evidence(at, detections, settings), settings):
+        return at, convergence
+    state = start_odometry(chain, detections, settings, closes=False)
+    return find_optimum(optimizer, state, settings, on_round)
+
+
 def find_optimum(
     optimizer: Optimizer,
     state: State,
-    detections: DetectionTable,
     settings: MapperSettings,
     on_round: Callable[[], None] | None = None,
 ) -> tuple[Evaluation, Convergence]:
     """Returns the optimum on curves with about one knot for each cone, which meet the cones.
 
-    It is searched again if the number of cones has changed: then one was missing or was a duplicate.
+    The poses are first aligned beside the map of the start. The optimum is searched again if the number of
+    cones has changed: then one was missing or was a duplicate.
     """
-    batch = settings.batch
+    batch, detections = settings.batch, optimizer.system.detections
+    state = optimizer.align_poses(state, batch.pose_steps, batch.loose_gate)
     rough = Schedule(batch.loose_gate, batch.rough_rounds, batch.rough_tolerance)
     at, _ = optimizer.run(reknot(state, detections, settings, dense=True), rough, on_round)
     fine = Schedule(batch.gate, batch.max_rounds)
@@ -215,7 +232,6 @@ def own_settings(settings: MapperSettings) -> MapperSettings:
 
 def _map(state: State, joint: Array, scatter: Scatter) -> Map:
     """Returns the curves with their covariance, to which the scatter of the cones is added."""
-    closed = any(boundary.periodic for boundary in state.boundaries.values())
     boundaries = {}
     for label, boundary in state.boundaries.items():
         block = map_block(state, label)
@@ -223,7 +239,12 @@ def _map(state: State, joint: Array, scatter: Scatter) -> Map:
         sigma = np.repeat(scatter.sigma(label, boundary.abscissae), 2)
         covariance = joint[block, block] + np.diag(sigma**2)
         boundaries[label] = SplineBoundary(spline, covariance)
-    return Map(closed, boundaries, joint_covariance(joint, boundaries))
+    return Map(is_closed(state), boundaries, joint_covariance(joint, boundaries))
+
+
+def is_closed(state: State) -> bool:
+    """Returns whether a boundary of the state is closed."""
+    return any(boundary.periodic for boundary in state.boundaries.values())
 
 
 def _records(

@@ -9,9 +9,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.gtsam_factors import pose_array, smoothness_factors, spline_projection_factors
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.se2 import rotation, to_map
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_key, pose_keys
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POINT, POSE, pose_key, pose_keys
 from pathspace_graph.graph.odometry import odometry_factor
 from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.spline.boundary import Boundary
@@ -37,8 +38,10 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     across the curve, divided by the root of their robust weights. So it is a graph of plain least squares.
     Each control point is anchored where it is. At an optimum the gradient is zero, and the linearization is
     that of the optimization. But the error isn't its robust cost, and some decimetres away from the optimum
-    the weights would be others.
+    the weights would be others. There is no such factor for places of cones, where SettingsError is raised.
     """
+    if system.places is not None:
+        raise SettingsError(f"graph: expected place.use none, found {system.settings.place.use}")
     graph = gtsam.NonlinearFactorGraph()
     for factor in _odometry(system.chain):
         graph.add(factor)
@@ -77,7 +80,8 @@ def _gauge(gauge: CurveGauge, control_points: Array) -> Iterator[gtsam.Nonlinear
     for j, (key, point) in enumerate(zip(keys, control_points, strict=True)):
         yield beside_factor(gauge, j)
         yield gtsam.PriorFactorPoint2(key, point, anchor)
-    yield from smoothness_factors(keys, gauge.smoothness, gauge.sigma_smoothness)
+    for row in range(len(gauge.smoothness)):
+        yield bending_factor(gauge, row)
 
 
 def beside_factor(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
@@ -95,6 +99,29 @@ def beside_factor(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
         return residual
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), keys, error)
+
+
+def bending_factor(gauge: CurveGauge, row: int) -> gtsam.CustomFactor:
+    """Returns the factor of a second difference of a curve, as the pose beside it sees it."""
+    chosen, cycle = gauge.neighbours[row], int(gauge.middle_cycle[row])
+    only = replace(
+        gauge,
+        keys=gauge.keys[chosen],
+        cycle=np.zeros(3, np.intp),
+        smoothness=gauge.smoothness[row, chosen][None],
+    )
+    keys = [*gauge.keys[chosen].tolist(), pose_key(cycle)]
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: MutableSequence[Array] | None) -> Array:
+        points = np.array([values.atPoint2(key) for key in keys[:3]])
+        pose = pose_array(values.atPose2(keys[3]))
+        residual, by_control, by_pose = only.bending(points, pose[None])
+        if H is not None:
+            H[0], H[1], H[2] = np.split(by_control[0], 3, axis=1)
+            H[3] = by_pose[0]
+        return np.asarray(residual[0])
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(POINT), keys, error)
 
 
 def _projections(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.CustomFactor]:

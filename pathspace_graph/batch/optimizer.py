@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.graph.elimination import Elimination
-from pathspace_graph.graph.keys import CALIBRATION_LETTER
+from pathspace_graph.graph.gaussian import graph_of
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.mapping.state import State
@@ -20,16 +21,6 @@ from .association import associate, locate_poses
 from .system import BatchSystem, Biweight, Evaluation, moved
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Movement:
-    """Holds how far a state has moved."""
-
-    curve: float
-    """This is the largest movement of a curve across itself (m)."""
-    pose: float
-    """This is the largest movement of a pose (m or rad, whichever is larger)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +38,9 @@ class Convergence:
     cost: float
     """This is half the sum of squares with robust losses at the end."""
     gradient: float
-    """This is the norm of the gradient at the end, each entry in units of its own sigma."""
+    """This is the norm `sqrt(g' H^-1 g)` of the gradient g at the end, with H the information of all
+    variables. It is the distance of the linear problem's optimum in joint sigmas. A slow common motion of the
+    whole map counts as much in it as that of a control point."""
 
 
 @dataclass(frozen=True)
@@ -85,26 +78,26 @@ class Optimizer:
         may the optimization end. Each round takes one step.
         """
         system, gate = self.system, schedule.gate
-        system.begin(state)
         locate_poses(state, self.settings.association)
+        system.begin(state)
         self._last_step = None
         at: Evaluation | None = None
-        cost = np.inf
         for number in range(1, schedule.rounds + 1):
             gate = max(gate, self.settings.gate)
             strict = gate <= self.settings.gate
             system.kernel = Biweight(gate)
-            before, cost_before = state, cost
-            at = self._step(self._refreshed(state, gate, strict))
-            state, cost = at.state, at.cost
+            before = self._refreshed(state, gate, strict)
+            at = self._step(before)
+            state = at.state
             if on_round is not None:
                 on_round()
-            movement, gain = self._movement(before, state), abs(cost_before - cost)
-            if strict and self._is_still(movement, gain, cost, schedule.tolerance):
-                return at, self._report(at, number, "nothing changes any more", True)
+            if strict and self._is_still(before, at, schedule.tolerance):
+                decrease = self.predicted_decrease(at)
+                if decrease <= schedule.tolerance * self.settings.tolerance_decrease:
+                    return at, self._report(at, number, "nothing changes any more", decrease)
             gate *= self.settings.gate_factor
         assert at is not None
-        return at, self._report(at, schedule.rounds, "no round left", False)
+        return at, self._report(at, schedule.rounds, "no round left", self.predicted_decrease(at), False)
 
     def align_poses(self, state: State, steps: int, gate: float) -> State:
         """Returns the state after Gauss-Newton steps of the poses alone, beside its map and calibration."""
@@ -119,33 +112,50 @@ class Optimizer:
         if not strict:
             locate_poses(state, self.settings.association)
         associate(state, system.detections, system.settings, gate, strict)
+        if strict and system.settings.place.use == "cones":
+            system.place(state)
         return system.evaluate(state, hold=True)
 
-    def _is_still(self, movement: Movement, gain: float, cost: float, tolerance: float) -> bool:
-        """Returns whether a round has changed neither the curves nor the poses nor the cost."""
+    def _is_still(self, before: Evaluation, after: Evaluation, tolerance: float) -> bool:
+        """Returns whether a round has changed neither the curves, as their poses see them, nor the cost."""
         settings = self.settings
-        curve, pose = tolerance * settings.tolerance_curve, tolerance * settings.tolerance_pose
-        still = movement.curve <= curve and movement.pose <= pose
-        return still and gain <= tolerance * settings.tolerance_cost * cost
+        still = self._movement(before.state, after.state) <= tolerance * settings.tolerance_curve
+        return still and before.cost - after.cost <= tolerance * settings.tolerance_cost * after.cost
 
-    def _movement(self, before: State, after: State) -> Movement:
-        """Returns how far a state has moved; that of a curve along itself doesn't count."""
-        curve = 0.0
-        for label, boundary in after.boundaries.items():
+    def _movement(self, before: State, after: State) -> float:
+        """Returns how far a curve has moved across itself (m), seen from the poses beside its control points.
+
+        A motion along itself doesn't count, nor a motion of the curve with its poses: `predicted_decrease`
+        judges the latter in sigmas, since the end of a long open road swings by metres within its own.
+        """
+        farthest = 0.0
+        for label, gauge in self.system.gauges.items():
+            boundary, points = before.boundaries[label], before.control_points(label)
+            offset = gauge.carried(points, before.poses, after.poses) - after.control_points(label)
             count = max(int(self.settings.curve_samples * boundary.size), 2)
             u = np.linspace(boundary.tables.low, boundary.tables.high, count)
             tangent = boundary.evaluate(after.control_points(label), u, 1)
             normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
             normal /= np.maximum(np.hypot(*normal.T), np.finfo(float).tiny)[:, None]
-            points = (boundary.evaluate(s.control_points(label), u) for s in (before, after))
-            offset = next(points) - next(points)
-            curve = max(curve, float(np.abs((offset * normal).sum(axis=1)).max()))
-        pose = float(np.abs(after.poses - before.poses).max()) if len(after.poses) else 0.0
-        return Movement(curve, pose)
+            across = (boundary.evaluate(offset, u) * normal).sum(axis=1)
+            farthest = max(farthest, float(np.abs(across).max()))
+        return farthest
 
-    def _report(self, at: Evaluation, rounds: int, reason: str, converged: bool) -> Convergence:
-        gradient = gradient_norm(self.system.rows(at), at.state.variables.layout)
-        return Convergence(converged, reason, rounds, self.steps, at.cost, gradient)
+    def predicted_decrease(self, at: Evaluation) -> float:
+        """Returns by how much an undamped step would make the cost smaller, if the problem were linear.
+
+        This is half of `g' H^-1 g`, with gradient g and information H: a step of one sigma in any direction
+        has 1/2, however far it leads in metres.
+        """
+        problem, layout = self.system.eliminated(at), at.state.variables.layout
+        step = problem.step(np.zeros(problem.map.size))
+        return -0.5 * float(gradient(self.system.rows(at), layout) @ step)
+
+    def _report(
+        self, at: Evaluation, rounds: int, reason: str, decrease: float, converged: bool = True
+    ) -> Convergence:
+        norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
+        return Convergence(converged, reason, rounds, self.steps, at.cost, norm)
 
     # --- steps -------------------------------------------------------------------------------------------
 
@@ -156,11 +166,10 @@ class Optimizer:
         """
         settings = self.settings
         self._keep_foot_points(at)
-        problem = self.system.eliminated(at)
-        unit = unit_damping(problem.map)
+        graph = self.system.linear_graph(at)
         while self._damping <= settings.damping_most:
             self.steps += 1
-            trial = self._trial(at, problem, self._damping * unit)
+            trial = self._trial(at, graph, self._damping)
             if trial is not None:
                 self._damping = max(settings.damping_down * self._damping, settings.damping_least)
                 self._keep_foot_points(trial)
@@ -169,19 +178,23 @@ class Optimizer:
         self._damping = settings.damping
         return at
 
-    def _trial(self, at: Evaluation, problem: Elimination, damping: Array) -> Evaluation | None:
-        """Returns the problem after a step with the damping (n,), or None if the cost has grown."""
+    def _trial(self, at: Evaluation, graph: gtsam.GaussianFactorGraph, damping: float) -> Evaluation | None:
+        """Returns the problem after a damped step (1/m^2), or None if the cost has grown."""
+        state = at.state
         try:
-            step = problem.step(damping)
+            problem = Elimination(
+                graph_of(graph, self.system.damping(state, damping)), state.variables.layout
+            )
+            step = problem.step(np.zeros(problem.map.size))
         except SingularSystemError:
             return None
-        trial = self.system.evaluate(moved(at.state, step))
+        trial = self.system.evaluate(self.system.retract(state, step))
         if trial.cost > at.cost:
             return None
         before, self._last_step = self._last_step, step[: problem.map.size]
         factor = 1.0 if before is None else extrapolation_factor(self._last_step, before, self.settings)
         if factor > 1.0:
-            farther = self.system.evaluate(moved(at.state, factor * step))
+            farther = self.system.evaluate(self.system.retract(state, factor * step))
             trial = min(trial, farther, key=lambda evaluation: evaluation.cost)
         return trial
 
@@ -203,18 +216,9 @@ def extrapolation_factor(step: Array, before: Array, settings: BatchSettings) ->
     return 1.0 / (1.0 - share) if settings.share_least < share < settings.share_most else 1.0
 
 
-def unit_damping(layout: Layout) -> Array:
-    """Returns a unit of damping (n,): ones for the control points, zeros for the calibration."""
-    unit = np.ones(layout.size)
-    unit[layout.block(CALIBRATION_LETTER)] = 0.0
-    return unit
-
-
-def gradient_norm(groups: Sequence[Rows], layout: Layout) -> float:
-    """Returns the norm of `J' r`, each entry divided by the square root of that of `diag(J' J)`."""
+def gradient(groups: Sequence[Rows], layout: Layout) -> Array:
+    """Returns the gradient `J' r` (n,) of all rows, by the columns of the layout."""
     groups = [rows for rows in groups if len(rows)]
     columns = np.concatenate([rows.columns(layout).ravel() for rows in groups])
     slopes = np.concatenate([(rows.jacobian * rows.residual[:, None]).ravel() for rows in groups])
-    squares = np.concatenate([rows.jacobian.ravel() ** 2 for rows in groups])
-    gradient, information = (np.bincount(columns, terms, layout.size) for terms in (slopes, squares))
-    return float(np.linalg.norm(gradient / np.sqrt(information)))
+    return np.asarray(np.bincount(columns, slopes, layout.size), np.float64)

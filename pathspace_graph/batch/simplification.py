@@ -54,13 +54,19 @@ def simplified(state: State, detections: DetectionTable, settings: MapperSetting
 def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:
     """Returns F (m_new, m_old): least squares over points of the old curve and their foot points on the new.
 
-    old_points (m_old, 2) and new_points (m_new, 2) are the curves' control points.
+    old_points (m_old, 2) and new_points (m_new, 2) are the curves' control points. An open dense curve goes
+    on beyond the ends of the new one, which doesn't count.
     """
 
     def foot_on_new(u: Array) -> Array:
         return find_anywhere(new, new_points, old.evaluate(old_points, u)).u
 
-    return refit(old.spline(old_points), new.spline(new_points), foot_on_new).new_from_old
+    within = (-np.inf, np.inf)
+    if not new.periodic:
+        ends = new.evaluate(new_points, np.array([new.tables.low, new.tables.high]))
+        first, last = find_anywhere(old, old_points, ends).u.tolist()
+        within = (first, last)
+    return refit(old.spline(old_points), new.spline(new_points), foot_on_new, within).new_from_old
 
 
 def map_block(state: State, label: int) -> slice:

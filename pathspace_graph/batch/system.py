@@ -8,22 +8,27 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.cone_place import PlaceRows
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.projection import ProjectionRows, project
+from pathspace_graph.factors.projection import ProjectionRows, project, sigma_across
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
 from pathspace_graph.graph.keys import are_poses, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
-from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.cone_places import ConePlaces, lay_out_places
+from pathspace_graph.mapping.detections import NOWHERE, DetectionTable
 from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import Boundary
 
+from .cones import places
 from .gauge import CurveGauge, curve_gauge
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -66,11 +71,31 @@ class Projected:
     """These are their residuals and derivatives."""
     sigma: Array
     """These are their standard deviations (m,) across the curve in m, which a round holds."""
+    inside: BoolArray
+    """Each flag (m,) is set where the foot point was inside the curve when the round began. A round holds it,
+    so that the cost does not jump where an end of an open curve slides past a detection."""
 
     @property
     def whitened(self) -> Array:
         """Returns the residuals (m,) in sigmas."""
         return np.asarray(self.projection.residual / self.sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Holds the detections that are of a cone's place, and how far past it they lie at a state."""
+
+    rows: IntArray
+    """These are the rows (m,) of the detections in their table."""
+    along: PlaceRows
+    """These are their residuals and derivatives."""
+    sigma: Array
+    """These are their standard deviations (m,) along the curve in m."""
+
+    @property
+    def whitened(self) -> Array:
+        """Returns the residuals (m,) in sigmas."""
+        return np.asarray(self.along.residual / self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +106,8 @@ class Evaluation:
     """This is the state."""
     projected: dict[int, Projected]
     """These are the used detections of each boundary."""
+    placed: Placed | None
+    """These are the detections that are of a place, or none if there are no places."""
     odometry: tuple[Array, Array]
     """These are the residuals and derivatives of `LogOdometry.terms`."""
     cost: float
@@ -99,14 +126,17 @@ class BatchSystem:
         self.kernel = kernel
         self.gauges: dict[int, CurveGauge] = {}
         """These are the weak priors of each boundary."""
-        self._sigma = np.ones(len(detections))
+        self.places: ConePlaces | None = None
+        """These are the cones' places along the curves, where the settings ask for them."""
+        self._sigma, self._sigma_along = np.ones(len(detections)), np.ones(len(detections))
+        self._inside = np.ones(len(detections), bool)
 
     def begin(self, state: State) -> None:
         """Makes the gauges anew, which hold the control points where they are now.
 
         The optimizer calls this when knots have changed.
         """
-        sigma = self.settings.batch.sigma_slide
+        sigma, self.places = self.settings.batch.sigma_slide, None
         self.gauges = {label: curve_gauge(state, label, sigma) for label in state.boundaries}
 
     # --- cost --------------------------------------------------------------------------------------------
@@ -114,17 +144,60 @@ class BatchSystem:
     def evaluate(self, state: State, hold: bool = False) -> Evaluation:
         """Returns the problem at a state; foot points are refined from those that the detections have.
 
-        `hold` sets the sigma of each detection across its curve, which later evaluations keep. The
-        derivatives leave out that the sigma depends on the direction of the curve.
+        `hold` sets the sigma of each detection across its curve, and whether its foot point is inside the
+        curve, which later evaluations keep. The derivatives leave out that the sigma depends on the direction
+        of the curve.
         """
         projected = {label: self._project(state, label, hold) for label in state.boundaries}
+        placed = None if self.places is None else self._placed(state, self.places, hold)
         odometry = self.chain.terms(state.poses, state.calibration)
         cost = self._detections_cost(projected) + 0.5 * float((odometry[0] ** 2).sum())
         cost += sum(
             self.gauges[label].cost(state.control_points(label), state.poses) for label in state.boundaries
         )
         cost += self.chain.prior_cost(state.poses[0], state.calibration)
-        return Evaluation(state, projected, odometry, cost)
+        if placed is not None:
+            cost += float(self.kernel.loss(placed.whitened).sum())
+        return Evaluation(state, projected, placed, odometry, cost)
+
+    def place(self, state: State) -> None:
+        """Associates the detections in use with the cones' places, which are found first if there are none.
+
+        A place is the mean of the parameters of a cone's detections, and then a constant: that the cone lies
+        elsewhere along the track is left to the control points, of which there is about one for each cone.
+        """
+        if self.places is None:
+            own = {label: self._places_of(boundary, label) for label, boundary in state.boundaries.items()}
+            self.places = lay_out_places(state.curves, own)
+        rows, settings = np.flatnonzero(self.detections.used), self.settings.place
+        curve = state.curves.number(self.detections.boundary[rows])
+        u = self.detections.u[rows]
+        self.detections.put(rows, self.places.nearest(curve, u, settings.room, settings.apart))
+
+    def places_by_label(self, state: State) -> dict[int, Array]:
+        """Returns the parameters (k,) of the places on each curve, none where the settings ask for none."""
+        if self.places is None:
+            return {}
+        starts = self.places.starts
+        return {label: self.places.u[starts[c] : starts[c + 1]] for c, label in enumerate(state.boundaries)}
+
+    def _places_of(self, boundary: Boundary, label: int) -> Array:
+        """Returns the places (k,) of the cones of a boundary on its curve."""
+        rows, low = self.detections.used_on(label), boundary.tables.low
+        weight = 1.0 / np.trace(self.detections.covariance[rows], axis1=1, axis2=2)
+        u = boundary.tables.inside(self.detections.u[rows]) - low
+        return low + places(u, weight, boundary.length, boundary.periodic, self.settings)
+
+    def _placed(self, state: State, places: ConePlaces, hold: bool) -> Placed:
+        detections = self.detections
+        rows = np.flatnonzero(detections.used & (detections.place != NOWHERE))
+        poses = state.variables.poses_at(detections.cycle[rows])
+        points = to_map(detections.point[rows], poses)
+        along = places.along(detections.place[rows], state.map_points, points, poses)
+        if hold:
+            covariances, sigma = detections.covariance[rows], self.settings.place.sigma
+            self._sigma_along[rows] = sigma_across(along.tangent_unit, covariances, poses, sigma)
+        return Placed(rows, along, self._sigma_along[rows])
 
     def _project(self, state: State, label: int, hold: bool) -> Projected:
         detections = self.detections
@@ -135,12 +208,12 @@ class BatchSystem:
         sigma_model = self.settings.spline.sigma_model
         projection = project(points, detections.covariance[rows], poses, foot, sigma_model)
         if hold:
-            self._sigma[rows] = projection.sigma
-        return Projected(rows, foot, projection, self._sigma[rows])
+            self._sigma[rows], self._inside[rows] = projection.sigma, foot.interior
+        return Projected(rows, foot, projection, self._sigma[rows], self._inside[rows])
 
     def _detections_cost(self, projected: dict[int, Projected]) -> float:
-        used = sum(int(p.foot.interior.sum()) for p in projected.values())
-        losses = sum(float(self.kernel.loss(p.whitened[p.foot.interior]).sum()) for p in projected.values())
+        used = sum(int(p.inside.sum()) for p in projected.values())
+        losses = sum(float(self.kernel.loss(p.whitened[p.inside]).sum()) for p in projected.values())
         return losses + self.kernel.ceiling * (len(self.detections) - used)
 
     # --- linear factors ----------------------------------------------------------------------------------
@@ -152,7 +225,9 @@ class BatchSystem:
         for label, gauge in self.gauges.items():
             points = state.control_points(label)
             groups += [self.detection_rows(at, label), gauge.beside(points, state.poses)]
-            groups += [gauge.smooth(points), gauge.anchor()]
+            groups += [gauge.smooth(points, state.poses), gauge.anchor()]
+        if at.placed is not None:
+            groups.append(self.place_rows(at, at.placed))
         return groups
 
     def detection_rows(self, at: Evaluation, label: int) -> Rows:
@@ -168,10 +243,24 @@ class BatchSystem:
             owner=owners(cycle, label),
         )
 
+    def place_rows(self, at: Evaluation, placed: Placed) -> Rows:
+        """Returns the rows of the detections of a place on [control points of the place's span | pose]."""
+        assert self.places is not None
+        place, cycle = self.detections.place[placed.rows], self.detections.cycle[placed.rows]
+        scale = np.sqrt(self.kernel.weights(placed.whitened)) / placed.sigma
+        by_control = placed.along.by_control.reshape(len(cycle), -1)
+        keys = self.places.keys[place]
+        return Rows(
+            keys=np.column_stack([keys, pose_keys(cycle)]),
+            jacobian=np.column_stack([by_control, placed.along.by_pose]) * scale[:, None],
+            residual=placed.along.residual * scale,
+            owner=owners(cycle, self.detections.boundary[placed.rows]),
+        )
+
     def scale(self, projected: Projected) -> Array:
-        """Returns the factor (m,) that whitens and weights each row (1/m); it is zero at a curve's ends."""
+        """Returns the factor (m,) that whitens and weights each row (1/m), zero for those not inside."""
         weights = self.kernel.weights(projected.whitened)
-        return np.asarray(np.sqrt(weights) * projected.foot.interior / projected.sigma)
+        return np.asarray(np.sqrt(weights) * projected.inside / projected.sigma)
 
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
         """Returns all rows as a linear graph, whose solution is the change from the state."""
@@ -181,6 +270,32 @@ class BatchSystem:
         """Returns the linear problem with its poses eliminated."""
         return Elimination(self.linear_graph(at), at.state.variables.layout)
 
+    def damping(self, state: State, weight: float) -> gtsam.GaussianFactorGraph:
+        """Returns factors that damp how control points move as seen from the poses beside them (1/m^2)."""
+        rows = [
+            gauge.damping(state.control_points(label), state.poses, weight)
+            for label, gauge in self.gauges.items()
+        ]
+        return linear_graph(rows, state.variables)
+
+    def retract(self, state: State, step: Array) -> State:
+        """Returns the state after a step (n,), taken in relative coordinates.
+
+        The step changes each pose as seen from the pose before, and each control point as seen from the pose
+        beside it. A map that swings by a large angle keeps its shape then, which the same step in map
+        coordinates would stretch.
+        """
+        linear = moved(state, step)
+        after, poses, goal = linear.copy(), state.poses, linear.poses
+        driven = seen_from(poses[1:, :2], poses[:-1], goal[1:, :2], goal[:-1])
+        after.poses[1:, :2] = goal[0, :2] + np.cumsum(rotated(driven, goal[:-1, 2]), axis=0)
+        for label, gauge in self.gauges.items():
+            points, k = after.control_points(label), gauge.cycle
+            points[:] = to_map(
+                seen_from(state.control_points(label), poses[k], points, goal[k]), after.poses[k]
+            )
+        return after
+
     def poses_alone(self, at: Evaluation) -> Array:
         """Returns the step (3 P,) of the poses while the map and the calibration are held."""
         keys = at.state.variables.keys
@@ -188,8 +303,26 @@ class BatchSystem:
         return Elimination(graph, Layout(keys[are_poses(keys)])).poses_given(np.zeros(0))
 
 
+def seen_from(points: Array, poses: Array, points_after: Array, poses_after: Array) -> Array:
+    """Returns points (m, 2) in the frames of poses (m, 3) after a step, to first order in the step.
+
+    The step leads from points and poses to those after it, all of them in the map frame.
+    """
+    arm, change = points - poses[:, :2], points_after - points - poses_after[:, :2] + poses[:, :2]
+    turn = (poses_after[:, 2] - poses[:, 2])[:, None]
+    return rotated(arm + change + turn * np.column_stack([arm[:, 1], -arm[:, 0]]), -poses[:, 2])
+
+
+def rotated(vectors: Array, angles: Array) -> Array:
+    """Returns vectors (m, 2), each turned by its angle (m,) in rad."""
+    return to_map(vectors, np.column_stack([np.zeros((len(angles), 2)), angles]))
+
+
 def moved(state: State, step: Array) -> State:
-    """Returns the state after a step (n,) of its last n entries: of all variables, or of the poses alone."""
+    """Returns the state after a step (n,) of its last n entries in map coordinates.
+
+    These are all variables, or the poses alone.
+    """
     after = state.copy()
     after.variables.values[len(after.variables.values) - len(step) :] += step
     return after

@@ -67,6 +67,11 @@ def report(result: RunResult, log: Log) -> None:
     if laps:
         console.print(laps_table(laps))
     console.print(outline(result), highlight=False)
+    for record in result.cycles:
+        if record.notice:
+            console.print(
+                f"at {record.t:.1f} s: {record.notice}", highlight=False, soft_wrap=True, markup=False
+            )
     missing = not_mapped(result.map, log)
     if missing:
         Console(stderr=True).print("; ".join(missing), highlight=False, soft_wrap=True, markup=False)

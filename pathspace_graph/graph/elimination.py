@@ -33,7 +33,7 @@ POSES_IN_FACTOR: Final = 8
 makes it wider. Between 5 and 10 the time hardly changes."""
 
 
-def owners(cycles: IntArray, side: int = 0) -> IntArray:
+def owners(cycles: IntArray, side: IntArray | int = 0) -> IntArray:
     """Returns the number of the factor that the rows of poses belong to, by perception cycles of any shape.
 
     Rows on the left (0) and the right (1) boundary have no key of the map in common, so each side has its own

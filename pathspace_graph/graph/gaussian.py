@@ -144,7 +144,7 @@ def square_root_form(information: Array, vector: Array) -> tuple[Array, Array]:
     A is a Cholesky factor with pivoting, of L scaled to a diagonal of ones. A direction whose information is
     below `RANK_TOLERANCE` of that has no row.
     """
-    scale = np.sqrt(np.diagonal(information))
+    scale = np.sqrt(np.maximum(np.diagonal(information), 0.0))
     scale = np.where(scale > 0.0, scale, 1.0)
     factor, pivots, rank, _ = lapack.dpstrf(information / np.outer(scale, scale), tol=RANK_TOLERANCE, lower=1)
     order, lower = pivots - 1, np.tril(factor)[:, :rank]
@@ -152,6 +152,15 @@ def square_root_form(information: Array, vector: Array) -> tuple[Array, Array]:
     root = np.empty((rank, len(scale)))
     root[:, order] = lower.T
     return root * scale, np.asarray(right)
+
+
+def as_rows(graph: gtsam.GaussianFactorGraph) -> gtsam.GaussianConditional:
+    """Returns one factor of rows on all keys of a graph.
+
+    Where round-off has left a direction with negative information, the rows have none about it.
+    """
+    keys = Layout(keys_of(graph))
+    return jacobian_factor(keys.keys, *square_root_form(*normal_equations(graph, keys)))
 
 
 # --- elimination -----------------------------------------------------------------------------------------
@@ -181,6 +190,14 @@ def marginalize(graph: gtsam.GaussianFactorGraph, keys: IntArray) -> gtsam.Gauss
     if len(held) == 0:
         return graph
     _, remaining = graph.eliminatePartialSequential(gtsam.Ordering(held.tolist()))
+    return remaining
+
+
+def sparse_marginal(graph: gtsam.GaussianFactorGraph, keys: IntArray) -> gtsam.GaussianFactorGraph:
+    """Returns the graph of some of the keys (k,) of a large and sparse graph, all others marginalized out."""
+    order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, keys.tolist(), False)
+    others = gtsam.Ordering([order.at(i) for i in range(order.size() - len(keys))])
+    _, remaining = graph.eliminatePartialMultifrontal(others)
     return remaining
 
 

@@ -47,6 +47,11 @@ class InactiveMap:
     def __len__(self) -> int:
         return int(self.net.size())
 
+    @property
+    def newest(self) -> IntArray:
+        """Returns the keys (k,) of the variables that become active again together, which are all."""
+        return self.keys
+
     def active(self, layout: Layout) -> Layout:
         """Returns the layout of the active variables, given that of all variables."""
         if len(self.keys) == 0:

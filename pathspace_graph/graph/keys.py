@@ -5,6 +5,7 @@
     m_i   landmark i of the landmark graphs (m, m), map frame
     r_j   control point j of the right boundary (m, m), map frame
     x_k   pose of perception cycle k (m, m, rad), map frame
+    y_0   the origin of the map frame, as a pose: the open map hangs on it, and it does not move
 
 A control point keeps its key while its boundary grows; a curve on new knots has new keys. A pose is
 `(x, y, theta)` with theta unwrapped, and it changes by addition: its unknowns are not the tangent of
@@ -52,6 +53,8 @@ def letter_keys(letter: str) -> tuple[int, int]:
 
 FIRST_POSE: Final = letter_keys(POSE_LETTER)[0]
 """Poses have the last keys: every key from this one on belongs to a pose."""
+ORIGIN_KEY: Final = int(gtsam.symbol("y", 0))
+"""This is the key of the origin of the map frame, which is a pose at (0, 0, 0) by definition."""
 _FIRST_LANDMARK: Final = letter_keys(LANDMARK_LETTER)[0]
 _FIRST_CONTROL: Final = tuple(letter_keys(letter)[0] for letter in CONTROL_LETTERS)
 

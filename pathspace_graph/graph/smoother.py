@@ -19,19 +19,21 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
 
+from .chain import Follower, InactiveChain
 from .gaussian import (
     FactoredSystem,
     as_hessian_factor,
+    as_rows,
     cholesky,
     factorize,
     graph_of,
-    half_solve,
     jacobian_factor,
     marginalize,
     merge_variables,
     normal_equations,
     remove_information,
     solve,
+    sparse_marginal,
     substitute_points,
 )
 from .inactive import InactiveMap
@@ -47,9 +49,10 @@ from .keys import (
     pose_key,
     pose_keys,
 )
-from .odometry import calibrated_delta, through_odometry
+from .odometry import calibrated_delta
 from .rows import Rows
 from .submaps import Submaps
+from .uncertainty import predicted_covariance
 from .user_factors import UserFactors
 from .variables import Layout
 from .window import M_co, WindowFactors
@@ -74,6 +77,9 @@ class SmootherSettings:
     """The keyframes of the submaps are this length of path (m) apart."""
     sigma_calibration: tuple[float, float]
     """These are the prior sigmas of the calibration: scale error (-) and bias of the yaw rate (rad/s)."""
+    relative: bool = False
+    """While the loop is open, each part of the map is known in the frame of a pose beside it. The rows of the
+    map must not change under a rigid motion of all variables."""
 
 
 class FixedLagSmoother(Generic[M_co]):
@@ -94,8 +100,10 @@ class FixedLagSmoother(Generic[M_co]):
         """These are the user's own factors."""
         self.prior = gtsam.GaussianFactorGraph()
         """The prior holds the information from everything that has left the window."""
-        self.inactive = InactiveMap()
+        self.inactive = InactiveChain() if settings.relative else InactiveMap()
         """These are the variables that a cycle does not solve for."""
+        self.followers: list[Follower] = []
+        """These are moved together with the open map."""
         self.submaps: Submaps | None = None
         """These hold the prior in submaps, while the loop is open and the user gave no factors on poses."""
         self.last_step: FactoredSystem | None = None
@@ -168,7 +176,7 @@ class FixedLagSmoother(Generic[M_co]):
         expected = f"{window}, of control points and of the calibration"
         if self.user_factors.add(factors, self._is_known, expected):
             self.submaps = None
-        if np.isin(self.user_factors.keys, self.inactive.keys).any():
+        if self.chain is not None or np.isin(self.user_factors.keys, self.inactive.keys).any():
             self.reactivate()
 
     def _is_known(self, key: int) -> bool:
@@ -180,7 +188,7 @@ class FixedLagSmoother(Generic[M_co]):
 
     def remove_information(self, keys: IntArray) -> None:
         """Removes all prior information about map points."""
-        self.reactivate()
+        self.activate(keys)
         self.epoch += 1
         now = self.variables.change(self.variables.layout.entries(keys))
         self.prior = remove_information(self.prior, Layout(keys), now)
@@ -200,9 +208,21 @@ class FixedLagSmoother(Generic[M_co]):
         The unknowns are `value - reference`, with poses (x, y, theta) in the map frame. If `whole`, the graph
         is also on the inactive variables, which must be up to date.
         """
+        if self.chain is not None:
+            prior = self.chain.joint(self.prior, self.variables) if whole else self.absolute_prior()
+            return graph_of(prior, *self.window.fresh(self._cycles, False))
         own = self.window.fresh(self._cycles, whole)
         prior = self.inactive.joint_prior(self.prior) if whole else self.prior
         return graph_of(prior, *own, *self.user_factors.linearized(self.variables, whole))
+
+    def absolute_prior(self) -> gtsam.GaussianFactorGraph:
+        """Returns the prior of the active variables in the map frame.
+
+        The inactive variables must be up to date.
+        """
+        if self.chain is None or len(self.chain) == 0:
+            return self.prior
+        return self.chain.marginal(self.prior, self.variables)
 
     @property
     def _cycles(self) -> IntArray:
@@ -223,11 +243,11 @@ class FixedLagSmoother(Generic[M_co]):
 
         No variable moves. SingularSystemError where the system is not positive definite.
         """
-        if not self.window.relinearize(self._cycles, self.inactive.members):
-            self.reactivate()  # rare: a detection has moved to where the map is inactive
-            self.window.relinearize(self._cycles, self.inactive.members)
+        while not self.window.relinearize(self._cycles, self.inactive.members) and len(self.inactive):
+            self.activate(self.inactive.newest)  # rare: a detection has moved to where the map is inactive
         user, layout = self.user_factors.linearized(self.variables), self.layout
-        graph = graph_of(self.prior, *self.window.linear, *user)
+        held = self.chain.hold(self.variables) if self.chain is not None else []
+        graph = graph_of(self.prior, *self.window.linear, *user, *held)
         hessian, vector = normal_equations(graph, layout)
         now = self.variables.change(self.variables.layout.entries(layout.keys))
         negative_gradient = vector - hessian @ now
@@ -248,7 +268,10 @@ class FixedLagSmoother(Generic[M_co]):
         user = self.user_factors.remove(keys, self.variables)
         keyframes = self.variables.keyframes
         self._finish_submap()
-        self.prior = self.inactive.push(graph_of(self.prior, *user), keys, keyframes, shared)
+        if self.chain is not None:
+            self.prior = self.chain.attach(self.prior, keys, shared, self.variables)
+        else:
+            self.prior = self.inactive.push(graph_of(self.prior, *user), keys, keyframes, shared)
         self.variables.remove(keyframes)
         self.window.drop(self.inactive.members)  # a factor linearized earlier may still hold one of them
 
@@ -256,6 +279,37 @@ class FixedLagSmoother(Generic[M_co]):
         """Finishes the current submap, so that it stays small when other map points become active."""
         if self.submaps is not None:
             self.submaps.finish(self.variables)
+            if self.chain is not None and len(self.chain):
+                anchor = int(self.chain.anchors[0])
+                self.submaps.hang(anchor, self.variables.of(self.chain.anchors))
+
+    @property
+    def chain(self) -> InactiveChain | None:
+        """Returns the inactive part of an open map; it is None where parts are in the map frame."""
+        return self.inactive if isinstance(self.inactive, InactiveChain) else None
+
+    def carry(self) -> None:
+        """Moves an open map so that the drive began at the origin, after its inactive part is updated."""
+        if self.chain is None or len(self.chain) == 0:
+            return
+        self._finish_submap()
+        self.prior = self.chain.carry(self.prior, self.variables, self.followers)
+        self.window.relinearize(self._cycles, self.inactive.members)
+
+    def activate(self, keys: IntArray) -> None:
+        """Makes map points (k,) active, and at least all that depend on them."""
+        if self.chain is None:
+            self.reactivate()
+            return
+        if not self.chain.holds(keys):
+            return
+        self._finish_submap()
+        self.refresh()
+        self._place_keyframes(self.chain)
+        while self.chain.holds(keys):
+            back = self.chain.newest
+            self.prior = graph_of(as_rows(graph_of(self.prior, self.chain.detach(self.variables))))
+            self.map.activate(back)
 
     def refresh(self) -> None:
         """Updates the inactive variables."""
@@ -266,16 +320,34 @@ class FixedLagSmoother(Generic[M_co]):
 
         Without `with_prior` the prior is left alone, because the submaps will replace it.
         """
-        if len(self.inactive) == 0:
+        if self.chain is not None:
+            self._unchain(self.chain)
+        elif len(self.inactive) == 0:
             return
-        self._finish_submap()
-        self.refresh()
-        if with_prior:
-            self.prior = self.inactive.joint_prior(self.prior)
+        else:
+            self._finish_submap()
+            self.refresh()
+            if with_prior:
+                self.prior = self.inactive.joint_prior(self.prior)
         self.inactive = InactiveMap()
         self.user_factors.reactivate()
         self._marginalize_keyframes()
         self.map.activate_all()
+
+    def _unchain(self, chain: InactiveChain) -> None:
+        """Makes the variables of an open map active; its anchors are keyframes."""
+        self.carry()
+        self._finish_submap()
+        self.refresh()
+        self._place_keyframes(chain)
+        self.prior = graph_of(self.prior, *(chain.detach(self.variables) for _ in range(len(chain))))
+
+    def _place_keyframes(self, chain: InactiveChain) -> None:
+        """Places the keyframes of the submaps beside their anchors, which may be no anchors from now on."""
+        if self.submaps is not None:
+            anchors = np.union1d(chain.anchors, self.variables.keyframes)
+            active = {int(key): self.variables.of(np.array([key])) for key in anchors}
+            self.submaps.carry(chain.poses | active)
 
     def _marginalize_keyframes(self) -> None:
         keyframes = self.variables.keyframes
@@ -394,8 +466,11 @@ class FixedLagSmoother(Generic[M_co]):
         It is in the order of the keys, with poses as (x, y, theta) in the map frame (m, m, rad).
         """
         whole = bool(np.isin(keys, self.inactive.keys).any())
-        if whole:
+        if whole or self.chain is not None:
             self.refresh()
+        if whole and self.chain is not None:
+            marginal = sparse_marginal(self.linear_graph(True), keys)
+            return factorize(marginal, Layout(np.sort(keys))).covariance(keys)
         layout = self.variables.layout if whole else self.layout
         return factorize(self.linear_graph(whole), layout).covariance(keys)
 
@@ -406,21 +481,6 @@ class FixedLagSmoother(Generic[M_co]):
         not in that step, so it is replaced by its prediction from the pose before. An inactive map point
         contributes nothing.
         """
-        step = self.last_step
-        assert step is not None
-        gradient, row = np.zeros((step.layout.size, len(rows)), order="F"), np.arange(len(rows))
-        columns = rows.columns(step.layout)
-        known = columns >= 0
-        gradient[columns[known], np.broadcast_to(row[:, None], columns.shape)[known]] = rows.jacobian[known]
-        noise, on_newest = np.zeros((len(rows), POSE)), columns[:, 0] < 0
-        if on_newest.any():
-            by_previous, by_calibration, noise[on_newest] = through_odometry(
-                rows.jacobian[on_newest, :POSE], self.variables.poses[-2:], self.window.odometry
-            )
-            previous = pose_keys(np.array([self.next_cycle - 2]))
-            gradient[step.layout.entries(previous)[:, None], row[on_newest]] += by_previous.T
-            calibration = step.layout.block(CALIBRATION_LETTER)
-            gradient[calibration, row[on_newest]] += by_calibration.T
-        half = half_solve(step.factor, gradient).T.reshape(-1, together, step.layout.size)
-        own = noise.reshape(-1, together, POSE)
-        return np.asarray(half @ half.transpose(0, 2, 1) + own @ own.transpose(0, 2, 1))
+        assert self.last_step is not None
+        newest = self.variables.poses[-2:], self.window.odometry, self.next_cycle - 1
+        return predicted_covariance(self.last_step, rows, *newest, together)

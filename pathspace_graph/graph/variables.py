@@ -9,7 +9,18 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .keys import CALIBRATION_LETTER, FIRST_POSE, POINT, POSE, are_poses, letter_keys, name, pose_key, sizes
+from .keys import (
+    CALIBRATION_KEY,
+    CALIBRATION_LETTER,
+    FIRST_POSE,
+    POINT,
+    POSE,
+    are_poses,
+    letter_keys,
+    name,
+    pose_key,
+    sizes,
+)
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -38,6 +49,16 @@ class Layout:
     def ordering(self) -> gtsam.Ordering:
         """Returns the keys as an ordering of GTSAM."""
         return gtsam.Ordering(self.keys.tolist())
+
+    @cached_property
+    def turning(self) -> IntArray:
+        """Returns the columns of the x of all points and poses, which a rigid motion turns with y."""
+        return np.asarray(self.starts[self.keys != CALIBRATION_KEY])
+
+    @cached_property
+    def headings(self) -> IntArray:
+        """Returns the columns of the headings of all poses."""
+        return np.asarray(self.starts[are_poses(self.keys)] + POSE - 1)
 
     def positions(self, keys: IntArray) -> IntArray:
         """Returns the index of each key, in any shape; it is UNKNOWN for a key that is not in the layout."""

@@ -53,6 +53,9 @@ class MapRows(Protocol):
     def linear_gauge(self, whole: bool) -> list[Rows]:
         """Returns the linear weak priors, which are made again only when `structure` changes."""
 
+    def activate(self, keys: IntArray) -> None:
+        """Makes some map points active, which lie next to the active ones."""
+
     def activate_all(self) -> None:
         """Makes every map point active."""
 

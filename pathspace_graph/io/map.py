@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,10 @@ class SplineBoundary:
     covariance: Array
     """This is the joint covariance (2m, 2m) in m^2 of the m distinct control points, in the order x0, y0, x1,
     y1 and so on."""
+
+    confirmed_until: float = math.inf
+    """The curve is confirmed up to this parameter; beyond, it is tentative, and may be taken back. The whole
+    of a curve is confirmed where this is infinite or the end of its domain."""
 
     @property
     def size(self) -> int:
@@ -119,6 +124,7 @@ def _boundary_to_json(boundary: MapBoundary) -> dict[str, Any]:
         "periodic": bool(spline.periodic),
         "knots": spline.knots.tolist(),
         "control_points": spline.control_points.tolist(),
+        "confirmed_until": float(min(boundary.confirmed_until, spline.domain[1])),
         **shared,
     }
 
@@ -192,7 +198,17 @@ class _Reader:
             points = self.array(fields["points"], f"{where}.points", columns=2)
             return PointBoundary(points, self.covariance(fields, len(points), where))
         spline = self.spline(fields, where)
-        return SplineBoundary(spline, self.covariance(fields, spline.size, where))
+        covariance = self.covariance(fields, spline.size, where)
+        return SplineBoundary(spline, covariance, self.confirmed_until(fields, spline, where))
+
+    def confirmed_until(self, fields: dict[str, Any], spline: BSpline, where: str) -> float:
+        """Returns the parameter up to which a curve is confirmed: all of it where that isn't said."""
+        low, high = spline.domain
+        until = self.array([fields.get("confirmed_until", high)], f"{where}.confirmed_until").item()
+        if not low <= until <= high:
+            message = f"expected a parameter from {low:g} to {high:g}, found {until:g}"
+            raise self.error(f"{where}.confirmed_until: {message}")
+        return until
 
     def spline(self, fields: dict[str, Any], where: str) -> BSpline:
         degree = self.integer(self.get(fields, "degree", where), f"{where}.degree", least=1)

@@ -73,6 +73,9 @@ class LandmarkMap:
         residual = (pairs[:, 0] - pairs[:, 1]).ravel() / sigma
         return [Rows(keys, np.tile(axes, (len(pairs), 1)), residual, keys[:, 0])]
 
+    def activate(self, keys: IntArray) -> None:
+        """Does nothing, since every landmark is always active."""
+
     def activate_all(self) -> None:
         """Does nothing, since every landmark is always active."""
 

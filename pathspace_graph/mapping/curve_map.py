@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.gauge import pair_residuals
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.projection import offset_from_foot_point, project
+from pathspace_graph.factors.projection import offset_from_foot_point, project, sigma_across
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.keys import CONTROL_LETTERS, POSE, control_keys, pose_keys
 from pathspace_graph.graph.rows import Rows
@@ -19,7 +19,8 @@ from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Gauge
 
-from .detections import DetectionTable
+from .cone_places import ConePlaces, lay_out_places
+from .detections import NOWHERE, DetectionTable
 from .state import State
 
 Array = NDArray[np.float64]
@@ -47,6 +48,8 @@ class CurveMap:
         known."""
         self.reached_inactive = False
         """The flag is set when a foot point of the latest `rows` has slid to an inactive part of a curve."""
+        self.places: ConePlaces | None = None
+        """These are the cones' places along the closed curves, once they are known."""
         self._found: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
 
     # --- detections --------------------------------------------------------------------------------------
@@ -78,13 +81,59 @@ class CurveMap:
         )
         keys = np.concatenate([pose_keys(cycle)[:, None], curves.keys[foot.columns]], axis=1)
         doubled = len(residual) // max(len(rows), 1)
-        return [Rows(np.repeat(keys, doubled, axis=0), jacobian, residual, np.repeat(cycle, doubled))]
+        groups = [Rows(np.repeat(keys, doubled, axis=0), jacobian, residual, np.repeat(cycle, doubled))]
+        if self.places is not None:
+            groups.append(self._place_rows(self.places, rows, points, poses))
+        return groups
+
+    def _place_rows(self, places: ConePlaces, rows: IntArray, points: Array, poses: Array) -> Rows:
+        """Returns `w_i t . (R z_i + t - S(u_k)) / sigma_i` for the detections (m,) that are of a place u_k.
+
+        The keys are [pose | control points of the place's span]. points (m, 2) and poses (m, 3) are in the
+        map frame.
+        """
+        detections, settings = self.detections, self.settings
+        placed = np.flatnonzero(detections.place[rows] != NOWHERE)
+        rows, points, poses = rows[placed], points[placed], poses[placed]
+        place, cycle = detections.place[rows], detections.cycle[rows]
+        along = places.along(place, self.state.map_points, points, poses)
+        sigma = sigma_across(along.tangent_unit, detections.covariance[rows], poses, settings.place.sigma)
+        weight = np.sqrt(huber_weights(along.residual / sigma, settings.gate.huber)) / sigma
+        keys = np.concatenate([pose_keys(cycle)[:, None], places.keys[place]], axis=1)
+        return Rows(keys, along.jacobian * weight[:, None], along.residual * weight, cycle)
+
+    def set_places(self, u: Mapping[int, Array]) -> None:
+        """Sets the cones' places on each closed curve, by label, and associates the window's detections."""
+        self.places = lay_out_places(self.state.curves, u)
+        self.place_detections(0)
+
+    def place_detections(self, since: int) -> None:
+        """Associates the detections in use, from the row `since` on, with the places along their curves."""
+        if self.places is None:
+            return
+        detections, settings = self.detections, self.settings.place
+        rows = since + np.flatnonzero(detections.used[since:])
+        curve = self.state.curves.number(detections.boundary[rows])
+        place = self.places.nearest(curve, detections.u[rows], settings.room, settings.apart)
+        detections.put(rows, place)
 
     def linearized(self, cycles: IntArray) -> None:
         """Accepts the latest `rows`, of these cycles: the graph holds them from now on."""
         if len(cycles) and self.state.boundaries:
             self.detections.refine(*self._found)
             self.detections.mark_linearized()
+
+    def activate(self, keys: IntArray) -> None:
+        """Makes control points active, which lie next to the active ones."""
+        for label, indices in self.state.active_stretch.items():
+            numbers = self.state.keys(label)[:1] + np.arange(indices[0])
+            back = np.flatnonzero(np.isin(numbers, keys))
+            self.state.active_stretch[label] = np.append(back, indices)
+
+    def move(self, motion: Array) -> None:
+        """Moves the cones that the curves were grown through by a rigid motion (3,) of the map frame."""
+        for boundary in self.state.boundaries.values():
+            boundary.move(motion)
 
     def activate_all(self) -> None:
         """Makes every control point active."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.settings.mapper import PathSettings
 
 Array = NDArray[np.float64]
@@ -73,6 +74,11 @@ class DrivenPath:
             self.stations = np.append(self.stations, self.length)
             keep = self.stations >= self.length - self.settings.memory
             self.points, self.stations = self.points[keep], self.stations[keep]
+
+    def move(self, motion: Array) -> None:
+        """Moves the path behind the vehicle by a rigid motion (3,) of the map frame; its beginning stays."""
+        self.points = move_points(motion, self.points)
+        self._last = move_points(motion, self._last[None])[0]
 
     def _take_back(self, pose: Array) -> None:
         """Shortens the path if the vehicle drove backwards to `pose` (3,)."""

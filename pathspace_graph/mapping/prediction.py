@@ -67,4 +67,5 @@ def smoother_settings(settings: MapperSettings) -> SmootherSettings:
         tolerances=(settings.relinearize.point, settings.relinearize.heading),
         keyframe_interval=settings.closing.keyframe_interval,
         sigma_calibration=(settings.odometry.sigma_scale, settings.odometry.sigma_bias),
+        relative=True,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.settings.mapper import GrowthSettings
 
 Array = NDArray[np.float64]
@@ -50,6 +51,10 @@ class TentativeTracks:
         """Returns the indices of the tracks with enough detections."""
         return np.flatnonzero(self.counts >= self.settings.sightings)
 
+    def variances(self, indices: IntArray) -> Array:
+        """Returns the variance (k,) of tracks in any direction (m^2): half the trace of their covariance."""
+        return 0.5 / self.weights[indices]
+
     def remove(self, indices: IntArray) -> None:
         """Removes tracks by index."""
         keep = np.ones(len(self.counts), bool)
@@ -62,6 +67,10 @@ class TentativeTracks:
         self.weights = np.append(self.weights, np.ones(len(points)))
         self.counts = np.append(self.counts, np.full(len(points), self.settings.sightings))
         self.last_t = np.append(self.last_t, np.full(len(points), t))
+
+    def move(self, motion: Array) -> None:
+        """Moves all tracks by a rigid motion (3,) of the map frame."""
+        self.points = move_points(motion, self.points)
 
     def clear(self) -> None:
         """Removes all tracks."""

@@ -22,7 +22,7 @@ def deactivate_distant(smoother: CurveSmoother) -> None:
         _holds(state.active(label), indices, state.boundaries[label].size)
         for label, indices in needed.items()
     ):
-        smoother.reactivate()
+        smoother.activate(np.concatenate([state.keys(label)[own] for label, own in needed.items()]))
     elif not _worthwhile(smoother, needed):
         return
     active = {label: _needed(smoother, label, room) for label in state.boundaries}
@@ -32,6 +32,7 @@ def deactivate_distant(smoother: CurveSmoother) -> None:
     keys = [state.keys(label)[indices] for label, indices in zip(active, leaving, strict=True)]
     smoother.deactivate(np.concatenate(keys))
     state.active_stretch = active
+    smoother.carry()
 
 
 def _holds(active: IntArray, needed: IntArray, size: int) -> bool:

@@ -9,14 +9,15 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.batch.lap import ClosedMap
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.graph.keys import POINT, name, pose_key, pose_keys
+from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import VehicleState
-from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import odometry_noise, predict, smoother_settings, vehicle_state
@@ -31,6 +32,7 @@ from .closing import apply_correspondences, optimize_loop, simplify
 from .growth import Growth
 from .nonlinear_graph import window_graph
 from .open_lap import LapBatch, OpenLapRecord
+from .outlook import Outlook, confirmed, joint_covariance_of, look_ahead
 from .swap import go_on_from
 
 Array = NDArray[np.float64]
@@ -72,6 +74,7 @@ class FixedLagMapper:
         """This is the path that the vehicle has driven."""
         self.growth = Growth(self.settings.growth)
         """The open curves grow through the tentative tracks that are collected here."""
+        self.smoother.followers = [self.smoother.map, self.path, self.growth]
         self.closed = False
         """The flag is set when the loop has closed: the map has its final size."""
         self.corrected_poses: Array = np.zeros((0, 3))
@@ -84,6 +87,7 @@ class FixedLagMapper:
         self._lap_batch: LapBatch | None = None
         self._grown: frozenset[int] = frozenset()
         self._closing_tried = 0.0
+        self._loop_tried = 0.0
 
     def update(
         self,
@@ -148,6 +152,7 @@ class FixedLagMapper:
         new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
         if self.boundaries:
             associate(self.smoother, self._grown)
+            self.smoother.map.place_detections(new.start)
         if not self.closed:
             self.growth.observe(self.smoother, new, detections.t)
 
@@ -166,6 +171,7 @@ class FixedLagMapper:
         if length - self._closing_tried < settings.check_interval:
             return False
         self._closing_tried = length
+        self.smoother.carry()
         self.smoother.refresh()
         covariance = self.smoother.covariance(pose_keys(np.array([self.smoother.next_cycle - 1])))
         beginning = self.path.beginning
@@ -188,16 +194,33 @@ class FixedLagMapper:
 
         Returns a notice that says why it cannot be solved, or an empty one.
         """
-        smoother, record, cycle = self.smoother, self._open_lap, self.smoother.next_cycle - 1
+        smoother, record = self.smoother, self._open_lap
         self.corrected_poses = record.corrected(smoother)
         cones = len(smoother.map.state.map_keys) / self.settings.spline.size_share
         if cones > self.settings.open_lap.max_cones:
             record.give_up("the lap has too many cones for a batch")
         if record.unsolvable is not None:
             return f"{OWN_PRIOR}: {record.unsolvable}"
-        wait = min(self.settings.open_lap.cycles, cycle - smoother.first_cycle)
-        self._lap_batch = LapBatch(record.lap(smoother, smoother.first_cycle + wait), cycle + wait)
+        self._begin_batch(record.closed_map(smoother))
         return ""
+
+    def _begin_batch(self, closed: ClosedMap | None) -> None:
+        """Sends the lap to its batch, which begins at a map that has just been closed, or at odometry."""
+        first, cycle = self.smoother.first_cycle, self.smoother.next_cycle - 1
+        wait = min(self.settings.open_lap.cycles, cycle - first)
+        self._lap_batch = LapBatch(self._open_lap.lap(first + wait, closed), cycle + wait)
+
+    def _try_loop(self) -> None:
+        """Sends the lap to a batch from odometry where the drive says that it is over.
+
+        That happens where the registration keeps refusing to close the loop.
+        """
+        if self.path.length < self._loop_tried or set(self.boundaries) != set(BOUNDARIES):
+            return
+        self._loop_tried = self.path.length + self.settings.closing.check_interval
+        if self._open_lap.is_over():
+            self._loop_tried = self.path.length + self.settings.open_lap.retry
+            self._begin_batch(None)
 
     def _go_on(self, closes: bool) -> tuple[Array | None, str]:
         """Records the open lap, has it solved when it closes, and goes on from the result when it is due.
@@ -211,11 +234,16 @@ class FixedLagMapper:
             self._open_lap.estimated(self.smoother.map.state)
             if self.path.length > self.settings.closing.min_path:
                 self._open_lap.prepare()
+                if batch is None:
+                    self._try_loop()
         if batch is None or self.smoother.next_cycle - 1 < batch.due:
             return None, ""
         self._lap_batch, marginal = None, batch.marginal()
         if isinstance(marginal, str):
-            return None, f"{OWN_PRIOR}: {marginal}"
+            return None, f"{OWN_PRIOR}: {marginal}" if self.closed else ""
+        if not self.closed:
+            self.closed, self.smoother.window.exact = True, False
+            self.growth.clear()
         self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds
         return go_on_from(self.smoother, marginal), ""
 
@@ -227,31 +255,66 @@ class FixedLagMapper:
         return CycleResult(t, self.poses[-1].copy(), (left, right), used, self.closed, stages, jump, notice)
 
     def map(self) -> Map:
-        """Returns a copy of the present map, with the joint covariance of each boundary's control points."""
-        boundaries, shape = {}, self.settings.spline.sigma_shape if self.closed else 0.0
-        state = self.smoother.map.state
-        if not self.boundaries:
+        """Returns a copy of the present map, with the joint covariance of each boundary's control points.
+
+        An open curve goes on beyond its confirmed end, as `outline` says.
+        """
+        state, outlooks = self.smoother.map.state, self._outlooks()
+        if not outlooks:
             return Map(self.closed, {})
-        joint, at = self.smoother.covariance(state.map_keys), 0
+        newest = pose_keys(np.array([self.smoother.next_cycle - 1]))
+        joint = self.smoother.covariance(np.concatenate([state.map_keys, newest]))
+        if self.closed:
+            return self._closed_map(joint[:-POSE, :-POSE])
+        joint, blocks = joint_covariance_of(
+            list(outlooks.values()), joint, self.poses[-1], self.settings.tentative.sigma_bend
+        )
+        boundaries = {
+            label: SplineBoundary(outlook.spline, joint[block, block].copy(), outlook.confirmed_until)
+            for (label, outlook), block in zip(outlooks.items(), blocks, strict=True)
+        }
+        return Map(False, boundaries, joint)
+
+    def _closed_map(self, joint: Array) -> Map:
+        """Returns the closed map, whose control points have a covariance (2m, 2m) from the graph.
+
+        What a curve with few control points cannot follow is added: no number of detections averages it out.
+        """
+        shape, scatter = self.settings.spline.sigma_shape, self.smoother.map.scatter
+        boundaries, at = {}, 0
         for label, boundary in self.boundaries.items():
             block = slice(at, at := at + POINT * boundary.size)
-            sigma = self.smoother.map.scatter.get(label, np.full(boundary.size, shape))
+            sigma = scatter.get(label, np.full(boundary.size, shape))
             covariance = joint[block, block] + np.diag(np.repeat(sigma, POINT) ** 2)
             spline = boundary.spline(self.control_points(label).copy())
-            boundaries[label] = SplineBoundary(spline, covariance)
-        return Map(self.closed, boundaries, joint_covariance(joint, boundaries))
+            boundaries[label] = SplineBoundary(spline, covariance, spline.domain[1])
+        return Map(True, boundaries, joint_covariance(joint, boundaries))
 
     def outline(self) -> Map:
-        """Returns a copy of the present map without covariances, which takes a hundredth of the time."""
-        state, values = self.smoother.map.state, self.smoother.variables.values.copy()
-        self.smoother.refresh()
-        splines = {b: at.spline(state.control_points(b).copy()) for b, at in self.boundaries.items()}
+        """Returns a copy of the present map without covariances, which takes a hundredth of the time.
+
+        An open curve is confirmed up to `confirmed_until`. From there on it is tentative: it leads through
+        cones that were seen less often, and is fitted anew in each call. A curve that has not begun may
+        consist of a tentative stretch alone.
+        """
+        values, boundaries = self.smoother.variables.values.copy(), {}
+        for label, outlook in self._outlooks().items():
+            spline = outlook.spline
+            until = spline.domain[1] if self.closed else outlook.confirmed_until
+            boundaries[label] = SplineBoundary(spline, NO_COVARIANCE, until)
         self.smoother.variables.values[:] = values  # to look at the map must not change the estimate
-        return Map(self.closed, {b: SplineBoundary(s, NO_COVARIANCE) for b, s in splines.items()})
+        return Map(self.closed, boundaries)
 
     def vehicle_state(self) -> VehicleState:
         """Returns the newest pose and the calibration, with their joint covariance."""
         return vehicle_state(self.smoother)
+
+    def _outlooks(self) -> dict[int, Outlook]:
+        """Returns the curves; open ones have a tentative stretch."""
+        self.smoother.refresh()
+        if self.closed or self.smoother.next_cycle == 0:
+            return confirmed(self.smoother)
+        return look_ahead(self.smoother, self.growth, self.path)
 
     # --- the graph ---------------------------------------------------------------------------------------
 
@@ -260,12 +323,14 @@ class FixedLagMapper:
 
         The factors hold the active variables, which `values` returns. The graph shares nothing with the
         mapper: optimize it, print its errors, or compute its marginals with GTSAM's own classes. There is no
-        such factor for `spline.residual` "point", where SettingsError is raised.
+        such factor for `spline.residual` "point" or for places of cones, where SettingsError is raised.
         """
         if self.settings.spline.residual != "across":
             raise SettingsError(
                 f"graph: expected spline.residual across, found {self.settings.spline.residual}"
             )
+        if self.settings.place.use != "none":
+            raise SettingsError(f"graph: expected place.use none, found {self.settings.place.use}")
         return window_graph(self.smoother)
 
     def values(self) -> gtsam.Values:

@@ -47,6 +47,11 @@ class Growth:
                 grown.add(label)
         return frozenset(grown)
 
+    def move(self, motion: Array) -> None:
+        """Moves all tentative tracks by a rigid motion (3,) of the map frame."""
+        for tentative in self.tentative.values():
+            tentative.move(motion)
+
     def clear(self) -> None:
         """Removes all tentative tracks."""
         for tentative in self.tentative.values():

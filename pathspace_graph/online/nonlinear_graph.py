@@ -47,7 +47,9 @@ def window_graph(smoother: CurveSmoother) -> gtsam.NonlinearFactorGraph:
     for slot, interval in enumerate(smoother.window.odometry.intervals):
         graph.add(odometry_factor(smoother.first_cycle + slot, interval))
     _add(graph, smoother.user_factors.factors)
-    _add(graph, [as_nonlinear(factor, smoother.variables) for factor in factors_of(smoother.prior)])
+    _add(
+        graph, [as_nonlinear(factor, smoother.variables) for factor in factors_of(smoother.absolute_prior())]
+    )
     return graph
 
 

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from joblib.externals.loky import ProcessPoolExecutor
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
+from pathspace_graph.batch.closure import is_worth_trying
+from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
+from pathspace_graph.batch.recurrence import find_recurrence
 from pathspace_graph.batch.start import unwrap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.odometry import IntegratedOdometry
+from pathspace_graph.factors.se2 import compose
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.detections import DetectionTable
@@ -43,6 +47,7 @@ class OpenLapRecord:
         self._odometry: list[IntegratedOdometry] = []
         self._detections: list[Detections] = []
         self._places: dict[int, list[Place]] = {}
+        self._reckoned: list[Array] = []
         self._prepared = False
 
     def give_up(self, reason: str) -> None:
@@ -58,6 +63,8 @@ class OpenLapRecord:
         self._stamps.append(t)
         self._odometry.append(odometry)
         self._detections.append(detections)
+        last = self._reckoned[-1] if self._reckoned else np.zeros(3)
+        self._reckoned.append(compose(last, odometry.delta))
         if len(self._stamps) > self.settings.open_lap.max_cycles:
             self.give_up("the lap is too long for a batch")
 
@@ -70,6 +77,12 @@ class OpenLapRecord:
             (pose,) = curve_poses(boundary, state.control_points(label), u)
             self._places.setdefault(label, []).append(Place(cycle, float(u[0]), pose))
 
+    def is_over(self) -> bool:
+        """Returns whether the path driven says, by odometry alone, that the lap is over."""
+        if self.unsolvable is not None or not self._reckoned:
+            return False
+        return is_worth_trying(find_recurrence(np.array(self._reckoned), self.settings), self.settings)
+
     def prepare(self) -> None:
         """Starts the process that solves laps, once, so that it is ready when the loop closes.
 
@@ -77,7 +90,7 @@ class OpenLapRecord:
         """
         if not self._prepared and self.unsolvable is None:
             self._prepared = True
-            _worker().submit(_nothing)
+            _submit(_nothing)
 
     def corrected(self, smoother: CurveSmoother) -> Array:
         """Returns the poses (P, 3) of all cycles in the frame of the map that has just been closed."""
@@ -85,20 +98,23 @@ class OpenLapRecord:
         poses = unwrap(np.array([*self.poses[:window], *smoother.variables.poses]))
         return in_final_map(poses, window, self._places, smoother.map.state, self.settings)
 
-    def lap(self, smoother: CurveSmoother, first_kept: int) -> OpenLap:
-        """Returns the lap, beginning at the map that has just been closed."""
+    def closed_map(self, smoother: CurveSmoother) -> ClosedMap:
+        """Returns the map that has just been closed, with the poses of all cycles beside it."""
         state = smoother.map.state
+        splines = {
+            label: boundary.spline(state.control_points(label).copy())
+            for label, boundary in state.boundaries.items()
+        }
+        return ClosedMap(splines, self.corrected(smoother), state.calibration.copy())
+
+    def lap(self, first_kept: int, closed: ClosedMap | None) -> OpenLap:
+        """Returns the lap, whose search begins at a map that has just been closed, or at odometry."""
         return OpenLap(
             settings=self.settings,
             chain=chained(self._stamps, self._odometry, self.settings.odometry),
             detections=DetectionTable.of(self._detections),
-            splines={
-                label: boundary.spline(state.control_points(label).copy())
-                for label, boundary in state.boundaries.items()
-            },
-            poses=self.corrected(smoother),
-            calibration=state.calibration.copy(),
             first_kept=first_kept,
+            closed=closed,
         )
 
 
@@ -110,7 +126,7 @@ class LapBatch:
         """The marginal replaces the prior in this cycle."""
         self.first_kept = lap.first_kept
         """The window holds the poses from this cycle on until then."""
-        self._future: Future[LapMarginal] = _worker().submit(solve_lap, lap)
+        self._future: Future[LapMarginal | None] = _submit(solve_lap, lap)
 
     def marginal(self) -> LapMarginal | str:
         """Waits for the solution and returns it, or says why there is none."""
@@ -119,17 +135,24 @@ class LapBatch:
         except SingularSystemError as error:
             return str(error)
         except BrokenProcessPool:
-            _worker.cache_clear()
             return "the process of the batch has died"
+        if solved is None:
+            return "the detections are against the loop"
         return solved if solved.convergence.converged else "the batch of the lap has not converged"
+
+
+def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    """Hands work to the process that solves laps; a new process takes the place of one that has died."""
+    try:
+        return cast("Future[Any]", _worker().submit(work, *arguments))
+    except BrokenProcessPool:
+        _worker.cache_clear()
+        return cast("Future[Any]", _worker().submit(work, *arguments))
 
 
 @cache
 def _worker() -> Any:
-    """Returns the executor of this program, which has one process and imports no module of the program's.
-
-    It is not the one that joblib reuses, since joblib's own would not work beside a mapper then.
-    """
+    """Returns the executor of this program, which has one process and imports no module of the program's."""
     return ProcessPoolExecutor(max_workers=1, timeout=WORKER_IDLE)
 
 

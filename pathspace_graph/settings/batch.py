@@ -21,8 +21,9 @@ class RecurrenceSettings(Positive, group="batch.recurrence"):
     correlation_share: float = 0.8
     """The curvature is correlated with itself a lag later. A lap is about the shortest lag whose correlation
     is at least this share of the largest one."""
-    min_overlap: float = 5.0
-    """The path must go on for this length (m) after a lap, or else the lap isn't found."""
+    min_overlap: float = 20.0
+    """The path must go on for this length (m) after a lap, or else the lap isn't found. Over less, straights
+    agree with straights."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,9 @@ class AssociationSettings(Positive, group="batch.association"):
     """Nearest points of a curve are first searched for at this step (m along the curve)."""
     direction_penalty: float = 100.0
     """A stretch of curve that runs against a pose's heading counts as this much farther away (m)."""
+    room: float = 2.0
+    """Along an open curve, the place of a pose is at most this farther from that of the pose before than was
+    driven between them (m)."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,31 @@ class ScatterSettings(Positive, group="batch.scatter"):
 
 
 @dataclass(frozen=True)
+class ClosureSettings(Positive, group="batch.closure"):
+    """Describes when a loop is tried that no registration has closed, and when its result is believed."""
+
+    laps: float = 1.3
+    """The loop is tried where the path driven is at least this number of laps long."""
+    correlation: float = 0.7
+    """The loop is tried where the curvature driven agrees with itself a lap later to this degree at least, 1
+    where it is the same."""
+    used: float = 0.6
+    """A closed result has at least this share of the first lap's coloured detections on its curves."""
+    used_again: float = 0.85
+    """The share of those after the first lap is at least this part of it."""
+    misfit: float = 1.5
+    """A closed result has detections after the first lap that are this number of sigmas from their curves at
+    most (root mean square)."""
+    gap: float = 25.0
+    """A closed result has no longer stretch of a boundary without detections on it than this (m)."""
+    overlap: float = 15.0
+    """A closed result has been driven again over this length at least (m)."""
+    sigma: float = 0.3
+    """The detections after the first lap hold their drive beside the curves by this standard deviation at
+    most (m), in every direction."""
+
+
+@dataclass(frozen=True)
 class OpenLapSettings(Positive, group="open_lap"):
     """Describes how the open lap is solved as a batch when the loop closes online."""
 
@@ -121,9 +150,14 @@ class OpenLapSettings(Positive, group="open_lap"):
     holds. The update waits for it, so that the same log always gives the same map."""
     rough_rounds: int = 8
     """The first optimization has at most this number of rounds."""
-    rounds: int = 8
+    rounds: int = 12
     """The second optimization, on knots that follow the result of the first, has at most this number of
     rounds."""
+    rounds_from_odometry: int = 24
+    """A batch that begins at odometry, since no registration has closed the loop, has at most this number of
+    rounds in each optimization."""
+    retry: float = 20.0
+    """Such a loop is tried again after this length of path (m) where the detections were against it."""
     tolerance: float = 10.0
     """The tolerances of the batch are multiplied by this."""
     max_cycles: float = 6000.0
@@ -180,7 +214,8 @@ class BatchSettings(Positive):
     gate_factor: float = 0.7
     """The gate is multiplied by this from each round to the next, down to `gate`."""
     damping: float = 1e-2
-    """This is the first damping of control points (1/m^2)."""
+    """This is the first damping of control points (1/m^2). It resists a motion as seen from the pose beside a
+    control point, so a map that swings with its poses isn't damped."""
     damping_up: float = 5.0
     """The damping is multiplied by this after a step that increased the cost."""
     damping_down: float = 0.1
@@ -195,12 +230,14 @@ class BatchSettings(Positive):
     share_most: float = 0.97
     """A step is not extended if its ratio to the step before is larger than this."""
     tolerance_cost: float = 1e-5
-    """The optimization has converged when |cost_before - cost_after| <= tolerance_cost * cost_before, and the
-    other two tolerances hold."""
+    """The optimization has converged when a round's step has made the cost smaller by this share at most, and
+    the other two tolerances hold."""
     tolerance_curve: float = 2e-3
-    """At convergence, no point of a curve moved farther than this across it in a round (m)."""
-    tolerance_pose: float = 2e-3
-    """At convergence, no pose moved farther than this in a round (m, and rad)."""
+    """At convergence, no point of a curve moved farther than this across it in a round, as seen from the
+    poses beside it (m)."""
+    tolerance_decrease: float = 5e-3
+    """At convergence, an undamped step would make the cost smaller by no more than this. A step of one sigma
+    in any direction makes it smaller by 1/2, also where it swings a whole map by metres."""
     min_size_share: float = 0.6
     """The map's curves are tried with at least this share of the largest number of control points."""
     curve_samples: int = 2
@@ -215,5 +252,7 @@ class BatchSettings(Positive):
     """These settings place poses and detections along the curves."""
     foot_points: FootPointSettings = field(default_factory=FootPointSettings)
     """These settings compute foot points."""
+    closure: ClosureSettings = field(default_factory=ClosureSettings)
+    """These settings decide on loops that no registration has closed."""
     scatter: ScatterSettings = field(default_factory=ScatterSettings)
     """These settings measure how far cones lie from the map's curves."""

@@ -122,6 +122,22 @@ class GateSettings(Positive):
 
 
 @dataclass(frozen=True)
+class PlaceSettings(Positive):
+    """Describes the places of the cones along a closed curve, which hold the vehicle along the track."""
+
+    use: Literal["none", "cones"] = "none"
+    """With `cones`, each cone has a place on the closed curve: an arc length, with which detections are
+    associated along the curve only. With `none`, detections say nothing along the curve."""
+    sigma: float = 0.1
+    """This is the standard deviation (m) of a cone's place along the curve. Its square is added to the
+    variance of each detection along the curve."""
+    room: float = 1.0
+    """A detection is of the place next to its foot point if that is nearer than this (m along the curve)."""
+    apart: float = 2.0
+    """The second nearest place must be farther away than the nearest one by this factor."""
+
+
+@dataclass(frozen=True)
 class PathSettings(Positive):
     """Describes the driven path, and the prediction of the path ahead."""
 
@@ -186,6 +202,48 @@ class GrowthSettings(Positive):
     """A carried end keeps at least this distance from the path (m)."""
     min_carry: float = 0.5
     """An end is carried on by at least this distance (m), or not at all."""
+
+
+@dataclass(frozen=True)
+class TentativeSettings(Positive):
+    """Describes the tentative stretch of an open curve, from its confirmed end on.
+
+    It is fitted anew whenever the map is asked for. No estimate depends on it.
+    """
+
+    reach: float = 12.5
+    """The stretch leads through tentative tracks up to this far from the vehicle (m)."""
+    memory: float = 0.35
+    """A tentative track that is not confirmed counts for this time after it was last detected (s), because a
+    detection of nothing is not repeated."""
+    gap: float = 11.0
+    """Neighbouring tracks of a row are at most this far apart (m); these are two regular gaps, since a cone
+    may never be detected."""
+    turn: float = 2.0
+    """A row turns by at most this from one track to the next (rad), less what `turn_rate` takes away."""
+    turn_rate: float = 0.1
+    """The turn that is allowed shrinks by this for each metre to the next track (rad/m)."""
+    turn_cost: float = 1.0
+    """The next track of a row has the least `distance (1 + turn_cost turn^2)` (rad^-2)."""
+    min_width: float = 1.5
+    """A row is at least this far from the other boundary (m)."""
+    width_ratio: float = 1.8
+    """The next track of a row is at most this many times as far from the other boundary as the one before,
+    plus `width_slack`."""
+    width_slack: float = 1.0
+    """The next track of a row may be this much farther from the other boundary (m), in addition to
+    `width_ratio`."""
+    tail: float = 20.0
+    """This length at the end of the confirmed curves (m) tells where the track leads and how wide it is."""
+    tail_step: float = 1.0
+    """The confirmed curves are sampled at this step (m)."""
+    begin_lateral: float = 1.5
+    """The row of a boundary that has not begun is searched from this far beside the vehicle on (m)."""
+    sigma_cone: float = 0.1
+    """This is the standard deviation of a cone's distance from a smooth curve (m), added to a track's own."""
+    sigma_bend: float = 1.0
+    """The second difference of the control points has this standard deviation (m) about that of a straight
+    line; it widens the band between tracks that are far apart, and beyond the last one."""
 
 
 @dataclass(frozen=True)
@@ -340,10 +398,14 @@ class MapperSettings(Positive):
     """These settings describe the weak priors on what detections leave free."""
     gate: GateSettings = field(default_factory=GateSettings)
     """These settings describe which detections are used, and how much they weigh."""
+    place: PlaceSettings = field(default_factory=PlaceSettings)
+    """These settings describe the places of the cones along a closed curve."""
     path: PathSettings = field(default_factory=PathSettings)
     """These settings describe the driven path and the predicted path ahead."""
     growth: GrowthSettings = field(default_factory=GrowthSettings)
     """These settings describe how the open end of a curve grows."""
+    tentative: TentativeSettings = field(default_factory=TentativeSettings)
+    """These settings describe the tentative stretch beyond the confirmed end of an open curve."""
     closing: ClosingSettings = field(default_factory=ClosingSettings)
     """These settings describe loop closing."""
     open_lap: OpenLapSettings = field(default_factory=OpenLapSettings)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_foot_points
 from pathspace_graph.factors.gauge import greville, smoothness_coefficients, smoothness_matrix
+from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.factors.spans import SpanPolynomials, Spans, lay_out
 from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 
@@ -37,6 +38,31 @@ class Gauge:
     """(t, 3) Each row holds three control points that follow one another."""
     bending: Array
     """(t, 3) These coefficients give the second difference of a triple in sigmas (1/m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Holds how an extension places control points: a linear map of what they are fitted to.
+
+    The control points from index `kept` on are `by_known @ known[first:] + by_target @ targets`, and the
+    second differences that the fit assumes to be zero would move them by `by_bend`.
+    """
+
+    first: int
+    """The fit depends on the known control points from this index on."""
+    kept: int
+    """The control points before this index stay where they are."""
+    by_known: Array
+    """(f, n - first) This is the derivative of the placed control points by the known ones."""
+    by_target: Array
+    """(f, k) This is their derivative by the targets."""
+    by_bend: Array
+    """(f, t) This is their derivative by the second differences."""
+
+    def place(self, known: Array, targets: Array) -> Array:
+        """Returns all control points (n', 2), from the known ones (n, 2) and the targets (k, 2)."""
+        placed = self.by_known @ known[self.first :] + self.by_target @ targets
+        return np.concatenate([known[: self.kept], placed])
 
 
 class Boundary:
@@ -178,53 +204,74 @@ class Boundary:
         """Extends the curve through targets (k, 2) at parameters (k,) and returns its control points (n', 2).
 
         Knots are appended until the domain holds the last parameter, which becomes `confirmed_end`. No basis
-        function of the old curve changes. The old control points that act only beyond `confirmed_end` are
-        placed again with the new ones.
+        function of the old curve changes. The old control points that act only beyond the last cone before
+        `confirmed_end` are placed again with the new ones: the direction at the end was a guess as long as
+        nothing was known beyond it, and over a long gap it would lead the curve astray.
         """
-        old, spacing = len(control_points), self.settings.spacing
+        placement = self.extend(len(control_points), targets_u, self._last_cone_before_end())
+        return placement.place(control_points, targets)
+
+    def _last_cone_before_end(self) -> float:
+        """Returns the parameter of the last cone before the confirmed end, or the end if there is none."""
+        before = int(np.searchsorted(self.cone_parameters, self.confirmed_end - ROUND_OFF))
+        return self.cone_parameters[before - 1] if before else self.confirmed_end
+
+    def extend(self, old: int, targets_u: Array, from_u: float | None = None) -> Placement:
+        """Extends a curve of `old` control points to targets at parameters (k,), as `grow` does.
+
+        The curve is placed anew from `from_u` on, by default from its confirmed end on; its end stays where
+        it is. Returns how the control points are to be placed.
+        """
+        spacing = self.settings.spacing
         missing = int(np.ceil((targets_u[-1] - self.tables.high) / spacing - ROUND_OFF))
         if missing > 0:
             last = self.knots[-1] + spacing * np.arange(1, missing + 1)
             self._set_tables(self.tables.extended(np.concatenate([self.knots, last])))
-        placed = self._place(control_points, self.settled(old), targets_u, targets)
+        from_u = self.confirmed_end if from_u is None else from_u
+        placement = self._placement(old, targets_u, from_u)
         self.confirmed_end = float(targets_u[-1])
-        return placed
+        return placement
 
-    def settled(self, size: int) -> int:
-        """Returns how many of the first `size` control points act before `confirmed_end`."""
-        return max(int(np.searchsorted(self.knots[:size], self.confirmed_end - ROUND_OFF)) - 1, 0)
+    def settled(self, size: int, u: float | None = None) -> int:
+        """Returns how many of the first `size` control points act before u, by default `confirmed_end`."""
+        u = self.confirmed_end if u is None else u
+        return max(int(np.searchsorted(self.knots[:size], u - ROUND_OFF)) - 1, 0)
+
+    def move(self, motion: Array) -> None:
+        """Moves the observed cones by a rigid motion (3,) of the map frame."""
+        if self.observed:
+            self.observed = [*move_points(motion, np.array(self.observed))]
 
     def take_back(self, kept: int) -> None:
         """Removes all observed cones but the first `kept`; the curve is confirmed up to the last of these."""
         self.confirmed_end = self.cone_parameters[kept - 1]
         del self.observed[kept:], self.cone_parameters[kept:]
 
-    def _place(self, control_points: Array, kept: int, targets_u: Array, targets: Array) -> Array:
-        """Fits the control points from index `kept` on to the targets and to the end of the old curve."""
-        held_u = np.zeros(0)
-        if len(control_points):
-            start = max(self.confirmed_end - self.nominal[0], 0.0)
-            held_u = np.linspace(start, self.confirmed_end, self.settings.fit_held)
-        held = self._held(control_points, held_u)
+    def _placement(self, old: int, targets_u: Array, from_u: float) -> Placement:
+        """Fits the control points that act beyond `from_u` to targets at parameters (k,) and to the curve."""
+        kept, held_u = self.settled(old, from_u), np.zeros(0)
+        if old:
+            held_u = np.linspace(max(from_u - self.nominal[0], 0.0), from_u, self.settings.fit_held)
+            if from_u < self.confirmed_end:
+                held_u = np.append(held_u, self.confirmed_end)
         values, span = self.tables.evaluate(np.concatenate([held_u, targets_u]))
         columns = self.columns(span)
         first = max(min(int(columns.min()), kept - 2), 0)  # rows before this have no free column
-        smooth = self.settings.fit_smoothness * smoothness_matrix(self.abscissae[first:], None)
-        design = np.zeros((len(span), self.size - first))
-        np.put_along_axis(design, columns - first, values[0], axis=1)
-        matrix = np.concatenate([design, smooth])
-        right = np.concatenate([held, targets, np.zeros((len(smooth), 2))])
-        right = right - matrix[:, : kept - first] @ control_points[first:kept]
-        free = np.linalg.lstsq(matrix[:, kept - first :], right, rcond=None)[0]
-        return np.concatenate([control_points[:kept], free])
+        weight, held, bent = self.settings.fit_smoothness, len(held_u), len(columns)
+        matrix = np.zeros((bent, self.size - first))
+        np.put_along_axis(matrix, columns - first, values[0], axis=1)
+        matrix = np.concatenate([matrix, weight * smoothness_matrix(self.abscissae[first:], None)])
+        fit = np.asarray(np.linalg.pinv(matrix[:, kept - first :]), float)
+        by_known = fit[:, :held] @ self._held_design(columns[:held], values[0][:held], first, old)
+        by_known[:, : kept - first] -= fit @ matrix[:, : kept - first]
+        return Placement(first, kept, by_known, fit[:, held:bent], weight * fit[:, bent:])
 
-    def _held(self, control_points: Array, u: Array) -> Array:
-        """Returns (k, 2) the old curve at u (k,), from the old control points (n, 2) alone."""
-        if len(u) == 0:
-            return np.zeros((0, 2))
-        values, span = self.tables.evaluate(u)
-        columns = np.minimum(self.columns(span), len(control_points) - 1)
-        return np.asarray(np.einsum("mj,mjd->md", values[0], control_points[columns]))
+    def _held_design(self, columns: IntArray, values: Array, first: int, old: int) -> Array:
+        """Returns (k, old - first) the basis of the old curve, whose control points end at index `old`."""
+        design = np.zeros((len(columns), old - first))
+        rows = np.broadcast_to(np.arange(len(columns))[:, None], columns.shape)
+        np.add.at(design, (rows, np.minimum(columns, old - 1) - first), values)
+        return design
 
 
 def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:

@@ -89,19 +89,26 @@ class Refit:
     """(m_old, m_new) The matrix E fits the old curve to samples of the new one: C_old ~ E C_new."""
 
 
-def refit(old: BSpline, new: BSpline, u_map: Callable[[Floats], Floats] | None = None) -> Refit:
+def refit(
+    old: BSpline,
+    new: BSpline,
+    u_map: Callable[[Floats], Floats] | None = None,
+    within: tuple[float, float] = (-np.inf, np.inf),
+) -> Refit:
     """Fits the bases of two splines to each other; only the knots of `new` are used, not its control points.
 
     `u_map` maps increasing parameters of the old spline to those of the new one (default: the same ones). A
     periodic new spline wraps them, so the beginning of an open curve and an end that overlaps it lie on the
-    same stretch. Where the new domain has no sample of the old one, F fills the gap smoothly.
+    same stretch. Where the new domain has no sample of the old one, F fills the gap smoothly. What lies
+    outside the parameters `within` of the old spline doesn't count for F, as a shorter new one ends there.
     """
     u = _refit_samples(old, new)
+    inside = (u >= within[0]) & (u <= within[1])
     w = u if u_map is None else u_map(u)
     B_old, B_new = old.basis_matrix(u), new.basis_matrix(w)
     bridge = _BRIDGE * _bending_rows(new)[np.repeat(_sparse_spans(new, w), _BENDING_PER_SPAN)]
-    stacked = np.concatenate([B_new, bridge])
-    target = np.concatenate([B_old, np.zeros((len(bridge), old.size))])
+    stacked = np.concatenate([B_new[inside], bridge])
+    target = np.concatenate([B_old[inside], np.zeros((len(bridge), old.size))])
     return Refit(new_from_old=_least_squares(stacked, target), old_from_new=_least_squares(B_old, B_new))
 
 

@@ -73,6 +73,17 @@ def test_in_a_hairpin_a_pose_is_beside_the_leg_of_its_own_direction(heading: flo
     np.testing.assert_allclose(beside[0], [20.0, y], atol=0.5)
 
 
+def test_an_open_curve_that_lies_over_itself_is_followed_in_the_order_of_the_drive() -> None:
+    """It turns by a whole turn and a quarter; the second time the poses are nearer to the first stretch."""
+    phi = np.linspace(0.0, 2.5 * np.pi, 120)
+    radius = 20.0 + 0.5 * phi / phi[-1]
+    spiral = radius[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])
+    poses = np.column_stack([17.0 * np.column_stack([np.cos(phi), np.sin(phi)]), phi + 0.5 * np.pi])
+    state = state_of({LEFT: spiral}, poses)
+    expected = np.append(0.0, np.cumsum(np.hypot(*np.diff(spiral, axis=0).T)))
+    np.testing.assert_allclose(state.pose_u[LEFT], expected, atol=1.5)
+
+
 def test_a_foot_point_is_found_anywhere_on_a_curve() -> None:
     state = corridor_state()
     points = np.array([[3.0, 5.0], [57.0, -1.0]])
@@ -111,11 +122,16 @@ def test_an_unknown_colour_goes_to_the_better_fit_but_only_in_the_end() -> None:
     np.testing.assert_array_equal(table.boundary, [LEFT, RIGHT])
 
 
-def test_what_lies_out_of_view_is_searched_for_only_in_the_end() -> None:
-    """The pose sees the curve from 4 m behind it to 25 m ahead, and some metres of room."""
-    points, labels = [[3.0, 2.1], [25.0, 2.1]], [LEFT, LEFT]
-    np.testing.assert_array_equal(associated(points, labels, strict=False).used, [False, True])
-    np.testing.assert_array_equal(associated(points, labels, strict=True).used, [True, True])
+@pytest.mark.parametrize("periodic", [False, True])
+def test_what_lies_out_of_view_is_searched_for_only_in_the_end_and_on_closed_curves(periodic: bool) -> None:
+    """The pose sees 4 m behind it and 25 m ahead along a circle, and some metres of room. Its detections of
+    the far side are on the curve, but an open curve may have drifted there by any distance."""
+    points = ring(30.0) if periodic else ring(30.0)[:-4]
+    state = state_of({LEFT: points}, np.array([[28.0, 0.0, 0.5 * np.pi]]), periodic)
+    table = detections_of(np.array([[5.0, -2.0], [0.0, 58.0]]), np.array([LEFT, LEFT]), 0.5)
+    for strict in (False, True):
+        associate(state, table, SETTINGS, GATE, strict)
+        np.testing.assert_array_equal(table.used, [True, strict and periodic])
 
 
 def test_a_detection_beyond_the_end_of_a_curve_is_not_used() -> None:

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.cones import Cones, cluster, cones_of_curve, in_order_of_drive, without_folds
+from pathspace_graph.batch.cones import (
+    Cones,
+    cluster,
+    cones_of_curve,
+    in_order_of_drive,
+    places,
+    without_folds,
+)
 from pathspace_graph.labels import LEFT
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -29,6 +36,13 @@ def test_every_cluster_is_a_cone() -> None:
     cones = cluster(points, u, np.ones(len(u)), 62.0, False, SETTINGS)
     np.testing.assert_allclose(cones.points, np.column_stack([true, np.zeros(len(true))]), atol=0.1)
     np.testing.assert_array_equal(cones.count, np.full(len(true), 30))
+
+
+def test_a_place_is_the_weighted_mean_of_the_parameters_of_a_cone() -> None:
+    """Those of the first cone lie on both sides of the beginning of a closed curve of 20 m."""
+    u, weight = np.array([0.2, 19.9, 19.9, 8.0, 8.4, 8.4]), np.array([2.0, 1.0, 1.0, 3.0, 0.5, 0.5])
+    found = places(u, weight, 20.0, True, SETTINGS)
+    np.testing.assert_allclose(np.mod(np.sort(found), 20.0), [0.05, 8.1])
 
 
 def test_a_cluster_of_few_detections_is_no_cone() -> None:

@@ -43,7 +43,7 @@ def drifting() -> tuple[Log, LogOdometry]:
 
 def by_hand() -> Recurrence:
     """Returns a pose each 3 m along 39 m of a course of 15 m, which turns once to the left in a lap."""
-    return Recurrence(np.arange(0.0, 40.0, 3.0), 15.0, 6.1)
+    return Recurrence(np.arange(0.0, 40.0, 3.0), 15.0, 6.1, 1.0)
 
 
 def test_each_lap_passes_every_reference_pose_once() -> None:

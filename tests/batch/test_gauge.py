@@ -52,18 +52,44 @@ def test_its_jacobians_are_its_derivatives() -> None:
         np.testing.assert_allclose(rows.jacobian[:, k], slope / (2.0 * h), atol=1e-6)
 
 
-def test_the_rows_of_smoothness_are_linear_in_the_control_points_that_they_name() -> None:
-    """Together with the other rows they make the cost."""
+def test_the_jacobians_of_smoothness_are_its_derivatives() -> None:
+    """The residuals are far from zero."""
     state, gauge = scene()
     rng = np.random.default_rng(1)
     points = state.control_points(0) + rng.normal(0.0, 0.5, state.control_points(0).shape)
-    rows, place = gauge.smooth(points), {key: k for k, key in enumerate(gauge.keys.tolist())}
-    neighbours = np.array([[place[key] for key in row] for row in rows.keys.tolist()])
-    linear = (rows.jacobian * points[neighbours].reshape(len(rows), -1)).sum(axis=1)
-    np.testing.assert_allclose(linear, rows.residual, atol=1e-9)
-    beside = gauge.beside(points, state.poses).residual
-    cost = 0.5 * (beside @ beside + rows.residual @ rows.residual)
+    poses = state.poses + rng.normal(0.0, 0.3, state.poses.shape)
+    rows, place = gauge.smooth(points, poses), {key: k for k, key in enumerate(gauge.keys.tolist())}
+    neighbours = np.array([[place[key] for key in row] for row in rows.keys[:, :3].tolist()])
+    change, h = rng.normal(size=points.shape), 1e-6
+    ends = [gauge.smooth(points + sign * h * change, poses).residual for sign in (1.0, -1.0)]
+    linear = (rows.jacobian[:, :6] * change[neighbours].reshape(len(rows), -1)).sum(axis=1)
+    np.testing.assert_allclose(linear, (ends[0] - ends[1]) / (2.0 * h), atol=1e-6)
+    turn = h * np.array([0.0, 0.0, 1.0])
+    ends = [gauge.smooth(points, poses + sign * turn).residual for sign in (1.0, -1.0)]
+    np.testing.assert_allclose(rows.jacobian[:, 8], (ends[0] - ends[1]) / (2.0 * h), atol=1e-6)
+    np.testing.assert_array_equal(rows.jacobian[:, 6:8], 0.0)
+
+
+def test_all_rows_together_make_the_cost() -> None:
+    state, gauge = scene()
+    rng = np.random.default_rng(1)
+    points = state.control_points(0) + rng.normal(0.0, 0.5, state.control_points(0).shape)
+    rows = gauge.beside(points, state.poses).residual, gauge.smooth(points, state.poses).residual
+    cost = 0.5 * sum(residual @ residual for residual in rows)
     np.testing.assert_allclose(gauge.cost(points, state.poses), cost)
+
+
+def test_no_row_is_changed_by_a_turn_of_the_map_with_its_poses() -> None:
+    """Linearized in the map frame, a bent curve would seem to hold its heading."""
+    state, gauge = scene()
+    rng = np.random.default_rng(2)
+    points = state.control_points(0) + rng.normal(0.0, 0.5, state.control_points(0).shape)
+    rows, place = gauge.smooth(points, state.poses), {key: k for k, key in enumerate(gauge.keys.tolist())}
+    neighbours = np.array([[place[key] for key in row] for row in rows.keys[:, :3].tolist()])
+    by_turn = np.column_stack([-points[:, 1], points[:, 0]])
+    change = (rows.jacobian[:, :6] * by_turn[neighbours].reshape(len(rows), -1)).sum(axis=1)
+    np.testing.assert_allclose(change + rows.jacobian[:, 8], 0.0, atol=1e-9)
+    assert np.abs(rows.jacobian[:, 8]).max() > 1e-3
 
 
 def test_a_map_that_moves_with_its_poses_costs_nothing() -> None:
@@ -91,10 +117,9 @@ def test_rows_on_control_points_alone_have_factors_of_their_own() -> None:
     """No factor of a pose has their number."""
     state, gauge = scene()
     points = state.control_points(0)
-    beside = gauge.beside(points, state.poses).owner
-    alone = np.concatenate([gauge.smooth(points).owner, gauge.anchor().owner])
-    assert beside.min() >= 0
-    assert alone.max() < 0
+    seen = [gauge.beside(points, state.poses).owner, gauge.smooth(points, state.poses).owner]
+    assert np.concatenate(seen).min() >= 0
+    assert gauge.anchor().owner.max() < 0
 
 
 def test_a_hairpin_holds_each_control_point_beside_the_leg_of_its_own_direction() -> None:
@@ -105,3 +130,14 @@ def test_a_hairpin_holds_each_control_point_beside_the_leg_of_its_own_direction(
     points = np.column_stack([x, np.full(len(x), 2.0)])
     gauge = curve_gauge(state_of({0: points}, np.concatenate([there, back])), 0, 0.2)
     assert gauge.cycle.max() < len(there)
+
+
+def test_an_open_curve_over_itself_is_held_by_the_poses_of_its_own_stretch() -> None:
+    """It turns by a whole turn and a quarter; the second time the poses are nearer to the first stretch."""
+    phi = np.linspace(0.0, 2.5 * np.pi, 120)
+    spiral = (20.0 + 0.5 * phi / phi[-1])[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])
+    driven = 22.0 - 0.5 * phi / phi[-1]
+    poses = np.column_stack([driven * np.cos(phi), driven * np.sin(phi), phi + 0.5 * np.pi])
+    gauge = curve_gauge(state_of({0: spiral}, poses), 0, 0.2)
+    assert (np.diff(gauge.cycle) >= 0).all()
+    assert np.abs(gauge.ahead).max() < 3.0

@@ -5,12 +5,21 @@ from __future__ import annotations
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
+from typing import Literal
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.lap import LapMarginal, OpenLap, lap_optimum, marginal_of, rows_before, solve_lap
+from pathspace_graph.batch.lap import (
+    ClosedMap,
+    LapMarginal,
+    OpenLap,
+    lap_optimum,
+    marginal_of,
+    rows_before,
+    solve_lap,
+)
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.system import BatchSystem, Evaluation
 from pathspace_graph.eval.metrics.table1 import lap_metrics
@@ -25,9 +34,10 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.log_odometry import integrate_log
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings, PlaceSettings
 from pathspace_graph.spline.knots import fit_spline
 
+from ..scenes.batch import COURSE, course_log
 from ..scenes.drives import bean_track, lap_log, noisy, true_poses
 
 Array = NDArray[np.float64]
@@ -52,21 +62,21 @@ def open_lap(settings: MapperSettings | None = None) -> OpenLap:
         settings=settings,
         chain=integrate_log(drive, drive.odometry_sigma, settings.odometry),
         detections=DetectionTable.of(drive.cycles),
-        splines=splines,
-        poses=true_poses(drive),
-        calibration=np.zeros(2),
         first_kept=len(drive.cycles) - WINDOW,
+        closed=ClosedMap(splines, true_poses(drive), np.zeros(2)),
     )
 
 
 @cache
 def solved() -> LapMarginal:
-    return solve_lap(open_lap())
+    marginal = solve_lap(open_lap())
+    assert marginal is not None
+    return marginal
 
 
 @cache
-def optimum() -> tuple[BatchSystem, Evaluation]:
-    system, at, _ = lap_optimum(open_lap())
+def optimum(use: Literal["none", "cones"] = "none") -> tuple[BatchSystem, Evaluation]:
+    system, at, _ = lap_optimum(open_lap(MapperSettings(place=PlaceSettings(use))))
     return system, at
 
 
@@ -77,8 +87,10 @@ def later(rows: Rows, cycle: int) -> Rows:
     return rows.where(np.asarray(poses.any(axis=1) & (first >= cycle)))
 
 
-def test_the_marginal_and_the_window_are_the_whole_problem() -> None:
-    system, at = optimum()
+@pytest.mark.parametrize("use", ["none", "cones"])
+def test_the_marginal_and_the_window_are_the_whole_problem(use: Literal["none", "cones"]) -> None:
+    system, at = optimum(use)
+    assert (at.placed is not None) == (use == "cones")
     state, first = at.state, len(log().cycles) - WINDOW
     unchanged = np.eye(state.map_points.size)
     information, mean = marginal_of(system, at, state, unchanged, first)
@@ -132,15 +144,44 @@ def test_the_mean_of_the_marginal_is_near_the_optimum_by_its_own_covariance() ->
     assert off @ marginal.information @ off < len(off)
 
 
+def test_the_cones_have_their_places_on_the_simplified_curves() -> None:
+    marginal, truth = solve_lap(open_lap(MapperSettings(place=PlaceSettings("cones")))), log().truth
+    assert truth is not None and solved().places == {}
+    for label, u in marginal.places.items():
+        cones = truth.cones[truth.cone_labels == label]
+        offset = marginal.splines[label].evaluate(u)[:, None] - cones
+        assert len(u) == pytest.approx(len(cones), abs=1)
+        assert np.median(np.hypot(offset[:, :, 0], offset[:, :, 1]).min(axis=1)) < 0.1
+
+
 def test_few_rounds_do_not_converge() -> None:
     settings = MapperSettings()
     hurried = replace(settings, open_lap=replace(settings.open_lap, rough_rounds=1, rounds=1))
-    assert not solve_lap(open_lap(hurried)).convergence.converged
+    marginal = solve_lap(open_lap(hurried))
+    assert marginal is not None
+    assert not marginal.convergence.converged
 
 
 def test_the_lap_itself_is_not_changed() -> None:
     lap = open_lap()
-    used, poses = deepcopy(lap.detections.used), lap.poses.copy()
+    assert lap.closed is not None
+    used, poses = deepcopy(lap.detections.used), lap.closed.poses.copy()
     solve_lap(lap)
     assert (lap.detections.used == used).all()
-    assert (lap.poses == poses).all()
+    assert (lap.closed.poses == poses).all()
+
+
+@pytest.mark.parametrize(("laps", "closes"), [(1.35, True), (0.9, False)])
+def test_a_search_from_odometry_has_a_result_where_the_loop_is_driven_again(
+    laps: float, closes: bool
+) -> None:
+    drive, settings = noisy(course_log(laps), seed=3), MapperSettings()
+    chain = integrate_log(drive, drive.odometry_sigma, settings.odometry)
+    lap = OpenLap(settings, chain, DetectionTable.of(drive.cycles), len(drive.cycles) - WINDOW)
+    marginal = solve_lap(lap)
+    assert (marginal is not None) == closes
+    if marginal is not None:
+        assert marginal.convergence.converged
+        assert all(spline.periodic for spline in marginal.splines.values())
+        for spline in marginal.splines.values():
+            np.testing.assert_allclose(spline.length(), COURSE, atol=13.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
+from pathspace_graph.batch.recurrence import Recurrence, find_recurrence, profile_of
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.batch import COURSE, course_curvature
@@ -70,5 +70,25 @@ def test_a_clockwise_lap_has_a_negative_turn() -> None:
     np.testing.assert_allclose(find_recurrence(poses, SETTINGS).whole_turn, -2.0 * np.pi)
 
 
+def test_the_search_climbs_to_the_peak_of_a_smooth_track() -> None:
+    """An oval with long straights agrees with itself well before a whole lap."""
+    s = np.arange(0.0, 1.6 * 400.0, 0.6)
+    curvature = 2.0 * np.pi / 400.0 * (1.0 - np.cos(4.0 * np.pi * s / 400.0))
+    recurrence = find_recurrence(path(curvature, 0.6), SETTINGS)
+    np.testing.assert_allclose(recurrence.lap, 400.0, atol=2.0 * STEP)
+    assert recurrence.correlation > 0.99
+
+
+def test_correlations_are_those_of_the_two_stretches() -> None:
+    poses = laps_of_course(1.5, 3e-4)
+    driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+    profile = profile_of(poses, driven, SETTINGS.batch.recurrence)
+    lag = round(COURSE / STEP)
+    first, second = profile.curvature[:-lag], profile.curvature[lag:]
+    expected = 1.0 - np.mean((first - second) ** 2) / (np.mean(first**2) + np.mean(second**2))
+    found = profile.correlations(np.array([lag // 2, lag]), SETTINGS.closing)
+    np.testing.assert_allclose(found, [-np.inf, expected], atol=1e-9)
+
+
 def test_a_figure_of_eight_has_no_whole_turn() -> None:
-    assert Recurrence(np.zeros(1), 100.0, 0.3).whole_turn == 0.0
+    assert Recurrence(np.zeros(1), 100.0, 0.3, 1.0).whole_turn == 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from functools import cache
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.association import associate, locate_poses
 from pathspace_graph.batch.dead_reckoning import start_odometry
 from pathspace_graph.batch.mapper import own_settings
-from pathspace_graph.batch.optimizer import gradient_norm
+from pathspace_graph.batch.optimizer import gradient
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved
 from pathspace_graph.graph.keys import pose_key
 from pathspace_graph.mapping.detections import DetectionTable
@@ -52,7 +53,7 @@ def test_dead_reckoning_of_an_exact_log_is_the_truth() -> None:
 def test_the_gradient_is_that_of_the_cost() -> None:
     system, state = small_system()
     at, layout = system.evaluate(state), state.variables.layout
-    information, negative_gradient = system.linear_graph(at).hessian(layout.ordering)
+    _, negative_gradient = system.linear_graph(at).hessian(layout.ordering)
     rng = np.random.default_rng(5)
     for _ in range(5):
         direction = rng.normal(size=layout.size)
@@ -60,8 +61,22 @@ def test_the_gradient_is_that_of_the_cost() -> None:
         costs = [system.evaluate(moved(state, s * h * direction)).cost for s in (1.0, -1.0)]
         slope = (costs[0] - costs[1]) / (2.0 * h)
         np.testing.assert_allclose(-negative_gradient @ direction, slope, rtol=1e-4)
-    norm = np.linalg.norm(negative_gradient / np.sqrt(np.diagonal(information)))
-    np.testing.assert_allclose(gradient_norm(system.rows(at), layout), norm)
+    np.testing.assert_allclose(gradient(system.rows(at), layout), -negative_gradient, atol=1e-7)
+
+
+def test_the_gradient_is_that_of_the_cost_with_the_places_of_the_cones() -> None:
+    system, state = copy.deepcopy(small_system())
+    system.place(state)
+    at, layout = system.evaluate(state, hold=True), state.variables.layout
+    assert at.placed is not None and len(at.placed.rows) > 0.8 * system.detections.used.sum()
+    assert at.cost > small_system()[0].evaluate(state).cost
+    _, negative_gradient = system.linear_graph(at).hessian(layout.ordering)
+    rng = np.random.default_rng(6)
+    for _ in range(5):
+        direction, h = rng.normal(size=layout.size), 1e-5
+        costs = [system.evaluate(moved(state, s * h * direction)).cost for s in (1.0, -1.0)]
+        slope = (costs[0] - costs[1]) / (2.0 * h)
+        np.testing.assert_allclose(-negative_gradient @ direction, slope, rtol=1e-4)
 
 
 def test_the_step_is_that_of_gtsam() -> None:
@@ -89,6 +104,48 @@ def test_pose_marginals_are_those_of_gtsam() -> None:
     for k in (0, len(state.poses) // 2, len(state.poses) - 1):
         information = graph.marginal([pose_key(k)]).hessian()[0]
         np.testing.assert_allclose(marginals[k], np.linalg.inv(information), rtol=1e-6, atol=1e-12)
+
+
+def test_a_step_in_relative_coordinates_is_the_step_to_first_order() -> None:
+    system, state = small_system()
+    direction = np.random.default_rng(6).normal(size=state.variables.layout.size)
+    for h in (1e-3, 1e-4):
+        linear, relative = (make(state, h * direction) for make in (moved, system.retract))
+        off = np.abs(relative.variables.values - linear.variables.values).max()
+        assert off < 1e4 * h**2
+
+
+def test_a_map_that_swings_in_one_step_keeps_its_shape() -> None:
+    """Everything turns about the first pose by 0.5 rad: the step is as long as the turn's derivative."""
+    system, state = small_system()
+    turn, variables = 0.5, state.variables
+    swing = state.copy()
+    swing.variables.values[:] = 0.0
+    places = (swing.poses[:, :2], state.poses[:, :2]), (swing.map_points, state.map_points)
+    for change, place in places:
+        arm = place - state.poses[0, :2]
+        change[:] = turn * np.column_stack([-arm[:, 1], arm[:, 0]])
+    swing.poses[:, 2] = turn
+    after = system.retract(state, swing.variables.values)
+    for points, before in ((after.poses[:, :2], state.poses[:, :2]), (after.map_points, state.map_points)):
+        arm = (before - state.poses[0, :2]) @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+        np.testing.assert_allclose(points - state.poses[0, :2], arm, atol=1e-9)
+    np.testing.assert_allclose(after.poses[:, 2], state.poses[:, 2] + turn)
+    np.testing.assert_array_equal(after.calibration, variables.calibration)
+
+
+def test_a_swing_of_the_map_with_its_poses_is_not_damped() -> None:
+    system, state = small_system()
+    after = system.retract(state, np.zeros(state.variables.layout.size))
+    np.testing.assert_allclose(after.variables.values, state.variables.values, atol=1e-9)
+    for label, gauge in system.gauges.items():
+        points, poses = state.control_points(label), state.poses
+        rows = gauge.damping(points, poses, 4.0)
+        arms = (points - state.poses[0, :2], poses[gauge.cycle, :2] - poses[0, :2])
+        by_turn = [np.column_stack([-arm[:, 1], arm[:, 0]]) for arm in arms]
+        swing = np.column_stack([*by_turn, np.ones(len(points))]).repeat(2, axis=0)
+        np.testing.assert_allclose((rows.jacobian * swing).sum(axis=1), 0.0, atol=1e-9)
+        np.testing.assert_allclose((rows.jacobian[:, :2] ** 2).sum(axis=1), 4.0)
 
 
 def test_a_step_of_the_poses_leaves_the_rest() -> None:

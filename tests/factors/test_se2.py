@@ -7,7 +7,17 @@ import numpy as np
 import pytest
 
 from pathspace_graph.factors.gtsam_factors import pose_array
-from pathspace_graph.factors.se2 import compose, rotation, se2_exp, to_map, to_vehicle, wrap_angle
+from pathspace_graph.factors.se2 import (
+    compose,
+    inverse,
+    move_points,
+    relative,
+    rotation,
+    se2_exp,
+    to_map,
+    to_vehicle,
+    wrap_angle,
+)
 
 
 @pytest.mark.parametrize("turn", [0.0, 1e-12, 1e-6, 0.1, 3.0, -3.0])
@@ -52,3 +62,13 @@ def test_poses_are_composed_row_by_row() -> None:
 
 def test_a_quarter_turn_leads_from_ahead_to_the_left() -> None:
     np.testing.assert_allclose(rotation(np.pi / 2.0) @ [2.0, 0.0], [0.0, 2.0], atol=1e-15)
+
+
+def test_an_inverse_undoes_a_motion_of_poses_and_of_points() -> None:
+    """The heading is not wrapped; a pose seen from another is composed with the other's inverse."""
+    pose, other = np.array([3.0, -2.0, 7.5]), np.array([-1.0, 4.0, 0.3])
+    np.testing.assert_allclose(compose(pose, inverse(pose)), 0.0, atol=1e-14)
+    np.testing.assert_allclose(compose(inverse(pose), other), relative(pose, other), atol=1e-14)
+    points = np.array([[1.0, 2.0], [-5.0, 0.5]])
+    np.testing.assert_allclose(move_points(inverse(pose), move_points(pose, points)), points, atol=1e-14)
+    np.testing.assert_allclose(move_points(pose, points)[0], compose(pose, np.append(points[0], 0.0))[:2])

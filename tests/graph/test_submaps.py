@@ -14,8 +14,9 @@ from pathspace_graph.factors.odometry import odometry_residuals
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, keys_of, normal_equations
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
+from pathspace_graph.graph.relative import RelativeFactor
 from pathspace_graph.graph.rows import Rows, jacobian_factors
-from pathspace_graph.graph.submaps import Submap, Submaps
+from pathspace_graph.graph.submaps import Submaps
 from pathspace_graph.graph.variables import Layout, Variables
 
 from ..scenes.graph import columns_of, dense_rows, schur
@@ -32,9 +33,9 @@ WHOLE = np.concatenate([[CALIBRATION_KEY], POINTS, [KEYFRAME, END]])
 """The same with the keyframe, ascending."""
 
 
-def random_submap(rng: np.random.Generator) -> Submap:
+def random_submap(rng: np.random.Generator) -> RelativeFactor:
     root, right = rng.normal(size=(SIZE + 2, SIZE)), rng.normal(size=SIZE + 2)
-    return Submap(KEYFRAME, Layout(KEYS), root, right, rng.normal(size=SIZE))
+    return RelativeFactor(KEYFRAME, Layout(KEYS), root, right, rng.normal(size=SIZE))
 
 
 def variables_at(x: Array, keys: IntArray, rng: np.random.Generator) -> Variables:
@@ -63,13 +64,13 @@ def parts(x: Array) -> tuple[Array, Array]:
     return np.delete(x, np.arange(SIZE - POSE, SIZE)), x[SIZE - POSE : SIZE]
 
 
-def energy(submap: Submap, x: Array) -> float:
+def energy(submap: RelativeFactor, x: Array) -> float:
     """`1/2 |A e - b|^2`."""
     left = submap.root @ (seen_from(*parts(x)) - submap.local) - submap.right
     return float(0.5 * left @ left)
 
 
-def linearized(submap: Submap, x: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+def linearized(submap: RelativeFactor, x: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Hessian and negative gradient of the factor by all values, in the order of their keys."""
     variables = variables_at(x, WHOLE, rng)
     hessian, vector = normal_equations(graph_of(submap.factor(variables)), variables.layout)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,26 @@ def spline_map() -> Map:
             LEFT: SplineBoundary(closed_spline(), covariance(9, 3)),
         },
     )
+
+
+def test_a_map_says_up_to_where_a_curve_is_confirmed() -> None:
+    """Older maps don't say it: all of their curves is confirmed."""
+    track = spline_map()
+    right = replace(track.boundaries[RIGHT], confirmed_until=31.5)
+    content = map_to_json(Map(False, {**track.boundaries, RIGHT: right}))
+    assert content["boundaries"]["right"]["confirmed_until"] == 31.5
+    again = map_from_json(content).boundaries
+    assert [again[label].confirmed_until for label in (LEFT, RIGHT)] == [closed_spline().domain[1], 31.5]
+    del content["boundaries"]["right"]["confirmed_until"]
+    assert map_from_json(content).boundaries[RIGHT].confirmed_until == 50.0
+
+
+@pytest.mark.parametrize("until", [-0.1, 50.1, float("nan"), "far", None, [1.0]])
+def test_a_curve_is_confirmed_up_to_a_parameter_of_its_domain(until: Any) -> None:
+    content = map_to_json(spline_map())
+    content["boundaries"]["right"]["confirmed_until"] = until
+    with pytest.raises(InputError, match=r"right\.confirmed_until"):
+        map_from_json(content)
 
 
 def test_scipy_evaluates_the_written_map_the_same() -> None:

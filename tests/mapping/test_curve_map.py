@@ -61,7 +61,7 @@ def test_an_offset_holds_the_vehicle_along_a_straight_curve_and_a_distance_does_
     assert np.linalg.norm(rows_of(mapper, POINT).jacobian[:, :POSE] @ along) > 5.0
 
 
-def test_a_reading_that_slides_to_where_an_open_map_is_inactive_brings_all_of_it_back() -> None:
+def test_a_reading_that_slides_to_where_an_open_map_is_inactive_brings_that_back() -> None:
     found, _ = map_log(exact_log(ahead(6.0, 9.0), *corridor(80.0)))
     smoother, state = found.smoother, found.smoother.map.state
     detections = smoother.map.detections
@@ -70,7 +70,8 @@ def test_a_reading_that_slides_to_where_an_open_map_is_inactive_brings_all_of_it
     newest = np.flatnonzero(detections.used)[-1:]
     detections.take(newest, detections.boundary[newest], np.ones(1))
     smoother.step(found.settings.sigma_step)
-    assert state.whole and len(smoother.inactive) == 0
+    assert {int(active[0]) for active in state.active_stretch.values()} == {0}
+    assert len(smoother.inactive) == 0
     assert smoother.layout.size > size
     cycles = np.arange(smoother.first_cycle, smoother.next_cycle)
     assert sum(map(len, smoother.map.rows(cycles))) == rows
@@ -150,3 +151,14 @@ def test_a_drive_without_noise_is_mapped_with_either() -> None:
             curve = boundary.spline.evaluate(np.linspace(*boundary.spline.domain, 50))
             np.testing.assert_allclose(np.abs(curve[:, 1]), 2.0, atol=0.02)
         assert set(found.map().boundaries) == set(BOUNDARIES)
+
+
+def test_the_cones_of_a_curve_move_with_the_map() -> None:
+    """A quarter turn and a shift."""
+    found, _ = map_log(exact_log(ahead(6.0, 4.0), *corridor(40.0)))
+    curves = found.smoother.map
+    before = {label: np.array(boundary.observed) for label, boundary in curves.state.boundaries.items()}
+    curves.move(np.array([2.0, -1.0, 0.5 * np.pi]))
+    for label, boundary in curves.state.boundaries.items():
+        x, y = before[label].T
+        np.testing.assert_allclose(boundary.observed, np.column_stack([2.0 - y, x - 1.0]), atol=1e-12)

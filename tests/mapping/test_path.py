@@ -140,3 +140,15 @@ def test_turning_on_the_spot_keeps_the_path() -> None:
     for theta in np.linspace(0.0, np.pi, 20):
         path.update(np.array([6.0 + 1e-3 * np.cos(7.0 * theta), 0.0, theta]))
     assert path.length == pytest.approx(6.0, abs=0.5)
+
+
+def test_a_rigid_motion_moves_the_way_behind_and_not_the_beginning() -> None:
+    """A quarter turn and a shift; the way goes on from the moved pose, and no station changes."""
+    path = driven([0.0, 1.0, 2.0])
+    beginning, stations = path.beginning.copy(), path.stations.copy()
+    path.move(np.array([5.0, 0.0, 0.5 * np.pi]))
+    np.testing.assert_allclose(path.points, [[5.0, 0.0], [5.0, 1.0], [5.0, 2.0]], atol=1e-12)
+    np.testing.assert_array_equal(path.beginning, beginning)
+    np.testing.assert_array_equal(path.stations, stations)
+    path.update(np.array([5.0, 3.0, 0.5 * np.pi]))
+    assert path.length == pytest.approx(3.0)

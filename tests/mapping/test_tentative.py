@@ -77,3 +77,11 @@ def test_remove_and_clear() -> None:
     found.clear()
     assert found.points.shape == (0, 2)
     assert found.confirmed().tolist() == []
+
+
+def test_a_rigid_motion_moves_every_track() -> None:
+    """A half turn and a shift; weights and counts stay."""
+    found = tentative((1.0, 0.0, 1.0, 0.0), (4.0, 2.0, 0.5, 0.0))
+    found.move(np.array([1.0, 1.0, np.pi]))
+    np.testing.assert_allclose(found.points, [[0.0, 1.0], [-3.0, -1.0]], atol=1e-12)
+    assert found.weights.tolist() == [1.0, 2.0] and found.counts.tolist() == [1, 1]

@@ -75,7 +75,7 @@ def variance_of_residual(mapper: FixedLagMapper) -> float:
     step = integrate_twists(np.full(CYCLE, DT), ahead(SPEED, CYCLE * DT), mapper.odometry_sigma)
     x = mapper.poses[-1, 0] + step.delta[0] + AHEAD
     keys = mapper.control_keys(LEFT)
-    spline = mapper.map().boundaries[LEFT].spline
+    spline = mapper.boundaries[LEFT].spline(mapper.control_points(LEFT))
     g = np.zeros(3 + 2 * len(keys))
     g[:3] = [0.0, 1.0, AHEAD + step.delta[0]]
     g[4::2] = -spline.basis_matrix(spline.foot_points(np.array([[x, 2.0]])).u)[0]

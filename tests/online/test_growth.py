@@ -262,10 +262,10 @@ def turn(speed: float, radius: float) -> Array:
 
 
 def backwards(mapper: FixedLagMapper, log: Log) -> float:
-    """How far (m) a curve goes back between two neighbours of a row, at most."""
+    """How far (m) a curve of the graph goes back between two neighbours of a row, at most."""
     assert log.truth is not None
     cones = log.truth.cones[log.truth.cone_labels == LEFT]
-    spline = mapper.map().boundaries[LEFT].spline
+    spline = mapper.boundaries[LEFT].spline(mapper.control_points(LEFT))
     u = np.linspace(*spline.domain, 4000)
     nearest = u[KDTree(spline.evaluate(u)).query(cones)[1]]
     return float(np.max(-np.diff(nearest), initial=0.0))

@@ -53,6 +53,36 @@ def test_it_has_as_many_spans_as_its_last_cone_needs(last: float, size: int) -> 
     assert boundary.confirmed_end == last
 
 
+def test_growing_is_linear_in_the_known_points_and_in_the_targets() -> None:
+    """Moving both by any offset moves the placed control points as the placement says."""
+    rng = np.random.default_rng(0)
+    boundary, known = line(20.0)
+    u, targets = boundary.confirmed_end + np.array([3.0, 8.0]), np.array([[23.0, 0.5], [28.0, 1.0]])
+    placement = boundary.extend(len(known), u)
+    points = placement.place(known, targets)
+    assert len(points) == boundary.size
+    by_known, by_target = rng.normal(size=known.shape), rng.normal(size=targets.shape)
+    moved = placement.place(known + by_known, targets + by_target)
+    kept, first = placement.kept, placement.first
+    np.testing.assert_allclose(moved[:kept], known[:kept] + by_known[:kept])
+    change = placement.by_known @ by_known[first:] + placement.by_target @ by_target
+    np.testing.assert_allclose(moved[kept:] - points[kept:], change, atol=1e-12)
+    # rigid motion: the curve moves as its points and targets do
+    np.testing.assert_allclose(placement.place(known + 1.0, targets + 1.0), points + 1.0, atol=1e-9)
+
+
+def test_a_curve_that_grows_is_placed_anew_from_its_last_cone_but_one() -> None:
+    """A straight row turns off behind a gap: the last stretch bends, the one before and the cones stay."""
+    boundary, known = line(20.0)
+    boundary.cone_parameters = [0.0, 4.0, 8.0, 12.0, 20.0]
+    before, last = boundary.evaluate(known, np.array([4.0, 8.0, 11.9])), np.array([15.0, 16.0, 17.0])
+    straight = boundary.evaluate(known, last)
+    points = boundary.grow(known.copy(), np.array([29.0]), np.array([[28.0, 4.0]]))
+    np.testing.assert_allclose(boundary.evaluate(points, np.array([4.0, 8.0, 11.9])), before, atol=0.03)
+    np.testing.assert_allclose(boundary.evaluate(points, np.array([20.0])), [[20.0, 0.0]], atol=0.1)
+    assert np.abs(boundary.evaluate(points, last) - straight).max() > 0.05
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.tuples(st.floats(2.0, 6.0), st.floats(-0.3, 0.3)), min_size=3, max_size=6))
 def test_growth_reaches_for_the_cones_and_keeps_what_was_confirmed(steps: list[tuple[float, float]]) -> None:

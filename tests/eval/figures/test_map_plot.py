@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -37,6 +39,18 @@ def test_the_legend_names_what_is_there_and_an_exaggerated_band() -> None:
     bare = legend(plot_map(ring_map(), band_scale=4.0))
     assert any("drawn 4× as wide" in text for text in bare)
     assert not {"true cones", "true path", "trajectory"} & set(bare)
+
+
+def test_a_tentative_stretch_is_dashed() -> None:
+    ring = shifted_ring(18.0)
+    ring = replace(ring, confirmed_until=0.5 * sum(ring.spline.domain))
+    figure = plot_map(Map(False, {LEFT: ring, RIGHT: shifted_ring(22.0)}))
+    assert "left tentative" in legend(figure)
+    assert "right tentative" not in legend(figure)
+    lines = {line.get_label(): line for line in figure.axes[0].get_lines()}
+    confirmed, tentative = lines["left boundary"], lines["left tentative"]
+    assert (confirmed.get_linestyle(), tentative.get_linestyle()) == ("-", "--")
+    np.testing.assert_allclose(confirmed.get_xydata()[-1], tentative.get_xydata()[0])
 
 
 def test_equal_scales_and_everything_in_sight() -> None:

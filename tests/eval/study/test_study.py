@@ -184,6 +184,7 @@ def test_the_studies_listed_are_the_files_on_disk_and_are_shipped() -> None:
         "online",
         "open",
         "paper",
+        "places",
         "reach",
         "relinearize",
         "residual",

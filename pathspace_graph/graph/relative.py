@@ -1,0 +1,139 @@
+"""Relative factors: Gaussian information on coordinates in the frame of a pose.
+
+All measurements of a drive are relative: detections relate poses to map points, and odometry relates poses to
+poses. So what is left of them after an elimination is a function of coordinates in the frame of any one of
+these poses. It stays valid when the whole neighbourhood of the pose turns, and it adds no information about
+that turn. A factor that is linear in map coordinates does neither: it is linearized at the heading that the
+vehicle had drifted to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from .gaussian import (
+    condition,
+    graph_of,
+    jacobian_factor,
+    keys_of,
+    normal_equations,
+    remove_information,
+    square_root_form,
+)
+from .keys import ORIGIN_KEY, POSE
+from .variables import Layout, Variables, rotation_blocks
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeFactor:
+    """A relative factor is `1/2 |A e - b|^2` with `e = y(x) - y0`, where y are in the frame of a pose.
+
+    In the frame of the pose `(p, theta)` a map point c is `R(theta)' (c - p)`, and another pose `(t, h)` is
+    `(R(theta)' (t - p), h - theta)`. The calibration does not depend on a frame.
+    """
+
+    frame: int
+    """This is the key of the pose in whose frame the factor is."""
+    keys: Layout
+    """The variables y are the calibration, map points and poses, by their keys."""
+    root: Array
+    """This is A (r, q), a square root of the information."""
+    right: Array
+    """This is b (r,)."""
+    local: Array
+    """This is the linearization point y0 (q,)."""
+
+    def factor(self, variables: Variables) -> gtsam.GaussianFactor:
+        """Returns the factor on its keys and the frame's, linearized at the variables' values.
+
+        The origin of the map frame does not move, so the factor does not hold it.
+        """
+        keys = np.append(self.keys.keys, self.frame)
+        values, frame = variables.of(self.keys.keys), variables.of(keys[-1:])
+        by_keys, by_frame = rotations(self.keys, frame[2]).T, by_frame_of(values, frame, self.keys)
+        jacobian = self.root @ np.concatenate([by_keys, by_frame], axis=1)
+        residual = self.root @ (to_frame(values, frame, self.keys) - self.local) - self.right
+        now = variables.change(variables.layout.entries(keys))
+        fixed = np.repeat(keys == ORIGIN_KEY, np.append(self.keys.widths, POSE))
+        return jacobian_factor(keys[keys != ORIGIN_KEY], jacobian[:, ~fixed], jacobian @ now - residual)
+
+    def without(self, keys: IntArray) -> RelativeFactor:
+        """Returns the factor without information about some keys."""
+        removed = Layout(np.intersect1d(self.keys.keys, keys))
+        if removed.size == 0:
+            return self
+        kept = Layout(np.setdiff1d(self.keys.keys, removed.keys))
+        graph = graph_of(jacobian_factor(self.keys.keys, self.root, self.right))
+        graph = remove_information(graph, removed, np.zeros(removed.size))
+        root, right = square_root_form(*normal_equations(graph, kept))
+        return RelativeFactor(self.frame, kept, root, right, self.local[self.keys.entries(kept.keys)])
+
+
+def relative_factor(
+    graph: gtsam.GaussianFactorGraph, frame: int, pose: Array, reference: Array, variables: Variables
+) -> RelativeFactor:
+    """Returns a graph of relative measurements as a factor in the frame of a pose.
+
+    The pose of the frame is at `pose` (3,), and its unknown is measured from `reference` (3,). In the frame
+    of a fixed pose the variables are linear functions of the unknowns, so the change of frame is exact.
+    """
+    held = keys_of(graph)
+    keys = Layout(held[held != frame])
+    if keys.size < Layout(held).size:
+        information, vector = condition(graph, keys, frame, pose - reference)
+    else:
+        information, vector = normal_equations(graph, keys)
+    known = keys.keys[np.diagonal(information)[keys.starts] > 0.0]
+    kept, own = Layout(known), keys.entries(known)
+    entries = variables.layout.entries(known)
+    vector = vector[own] - information[np.ix_(own, own)] @ variables.change(entries)
+    root, right = square_root_form(information[np.ix_(own, own)], vector)
+    local = to_frame(variables.values[entries], pose, kept)
+    return RelativeFactor(frame, kept, root @ rotations(kept, pose[2]), right, local)
+
+
+# --- coordinates in the frame of a pose ------------------------------------------------------------------
+
+
+def rotations(keys: Layout, heading: float) -> Array:
+    """Returns the rotation (q, q) of points and poses from a frame with a heading (rad) to the map frame."""
+    x = keys.turning
+    return rotation_blocks(keys.size, x, np.full(len(x), heading))
+
+
+def to_frame(values: Array, frame: Array, keys: Layout) -> Array:
+    """Returns values (q,) of keys, which are in the map frame, in the frame of a pose (3,)."""
+    c, s = np.cos(frame[2]), np.sin(frame[2])
+    local, x = values.copy(), keys.turning
+    dx, dy = values[x] - frame[0], values[x + 1] - frame[1]
+    local[x], local[x + 1] = c * dx + s * dy, -s * dx + c * dy
+    local[keys.headings] -= frame[2]
+    return local
+
+
+def from_frame(local: Array, frame: Array, keys: Layout) -> Array:
+    """Returns values (q,) of keys, which are in the frame of a pose (3,), in the map frame."""
+    c, s = np.cos(frame[2]), np.sin(frame[2])
+    values, x = local.copy(), keys.turning
+    values[x] = frame[0] + c * local[x] - s * local[x + 1]
+    values[x + 1] = frame[1] + s * local[x] + c * local[x + 1]
+    values[keys.headings] += frame[2]
+    return values
+
+
+def by_frame_of(values: Array, frame: Array, keys: Layout) -> Array:
+    """Returns the derivative (q, 3) of `to_frame` by the pose of the frame."""
+    c, s = np.cos(frame[2]), np.sin(frame[2])
+    matrix, x = np.zeros((keys.size, POSE)), keys.turning
+    dx, dy = values[x] - frame[0], values[x + 1] - frame[1]
+    matrix[x, 0], matrix[x, 1], matrix[x, 2] = -c, -s, -s * dx + c * dy
+    matrix[x + 1, 0], matrix[x + 1, 1], matrix[x + 1, 2] = s, -c, -c * dx - s * dy
+    matrix[keys.headings, 2] = -1.0
+    return matrix

@@ -1,0 +1,126 @@
+"""When a loop is tried, and which closed results are believed: courses that are driven again or aren't."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.batch import dead_reckoning
+from pathspace_graph.batch.closure import Evidence, evidence, is_true_closure, is_worth_trying
+from pathspace_graph.batch.dead_reckoning import start_odometry
+from pathspace_graph.batch.mapper import (
+    BatchMapper,
+    find_optimum,
+    find_optimum_from_odometry,
+    own_settings,
+)
+from pathspace_graph.batch.optimizer import Optimizer
+from pathspace_graph.batch.recurrence import Recurrence
+from pathspace_graph.batch.system import BatchSystem, Biweight
+from pathspace_graph.io.log import Log
+from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.log_odometry import integrate_log
+from pathspace_graph.settings.mapper import MapperSettings
+
+from ..scenes.batch import COURSE, course_log
+from ..scenes.drives import noisy
+
+Array = NDArray[np.float64]
+
+SETTINGS = own_settings(MapperSettings())
+CLOSURE = SETTINGS.batch.closure
+
+BELIEVED = Evidence(closed=True, used=0.95, used_again=0.95, misfit=1.0, gap=6.0, overlap=40.0, sigma=0.05)
+
+
+def path_of(laps: float, correlation: float = 0.95) -> Recurrence:
+    """Returns a path that recurs after 100 m, of this number of laps."""
+    return Recurrence(np.array([0.0, 100.0 * laps]), 100.0, 2.0 * np.pi, correlation)
+
+
+def test_a_loop_is_tried_after_a_good_part_of_the_second_lap() -> None:
+    assert is_worth_trying(path_of(1.35), SETTINGS)
+    assert not is_worth_trying(path_of(1.25), SETTINGS)
+    assert not is_worth_trying(path_of(1.35, correlation=0.5), SETTINGS)
+    assert not is_worth_trying(path_of(1.35).denied(), SETTINGS)
+
+
+@pytest.mark.parametrize(
+    "against",
+    [
+        {"closed": False},
+        {"used": 0.5, "used_again": 0.5},
+        {"used_again": 0.7},
+        {"misfit": 2.0},
+        {"gap": 40.0},
+        {"overlap": 10.0},
+        {"sigma": 0.5},
+    ],
+)
+def test_a_closed_result_needs_evidence_in_every_respect(against: dict[str, float]) -> None:
+    assert is_true_closure(BELIEVED, SETTINGS)
+    assert not is_true_closure(replace(BELIEVED, **against), SETTINGS)  # type: ignore[arg-type]
+
+
+# --- drives ----------------------------------------------------------------------------------------------
+
+
+def optimizer_of(log: Log) -> Optimizer:
+    """Returns the optimizer of a log's batch."""
+    chain = integrate_log(log, log.odometry_sigma, SETTINGS.odometry)
+    system = BatchSystem(DetectionTable.of(log.cycles), chain, SETTINGS, Biweight(SETTINGS.batch.loose_gate))
+    return Optimizer(system, SETTINGS.batch)
+
+
+@cache
+def driven(laps: float) -> Log:
+    """Returns a drive on the course whose measurements have noise."""
+    return noisy(course_log(laps), seed=3)
+
+
+def test_a_course_that_is_driven_again_is_closed() -> None:
+    """The longest gap is that of a few cones, and the overlap is what was driven of the second lap."""
+    optimizer = optimizer_of(driven(1.4))
+    at, convergence = find_optimum_from_odometry(optimizer, SETTINGS)
+    found = evidence(at, optimizer.system.detections, SETTINGS)
+    assert convergence.converged
+    assert is_true_closure(found, SETTINGS)
+    assert found.used > 0.95
+    assert found.used_again > 0.95
+    assert 0.7 < found.misfit < 1.3
+    np.testing.assert_allclose(found.overlap, 0.4 * COURSE, atol=5.0)
+
+
+def test_a_loop_that_is_closed_short_of_the_lap_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The path is said to recur after three quarters of the course."""
+
+    def too_short(poses: Array, settings: MapperSettings) -> Recurrence:
+        length = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+        return Recurrence(length, 0.75 * COURSE, 2.0 * np.pi, 1.0)
+
+    monkeypatch.setattr(dead_reckoning, "find_recurrence", too_short)
+    optimizer = optimizer_of(driven(1.4))
+    chain, detections = optimizer.system.chain, optimizer.system.detections
+    state = start_odometry(chain, detections, SETTINGS)
+    at, _ = find_optimum(optimizer, state, SETTINGS)
+    assert not is_true_closure(evidence(at, detections, SETTINGS), SETTINGS)
+
+
+def test_a_course_that_ends_before_the_line_stays_open() -> None:
+    log = driven(0.9)
+    result = BatchMapper(None, log.odometry_sigma).solve(log, "odometry")
+    assert not result.map.closed
+
+
+def test_a_denied_recurrence_gives_open_curves() -> None:
+    optimizer = optimizer_of(driven(1.4))
+    chain, detections = optimizer.system.chain, optimizer.system.detections
+    state = start_odometry(chain, detections, SETTINGS, closes=False)
+    at = optimizer.system
+    at.begin(state)
+    assert not any(boundary.periodic for boundary in state.boundaries.values())
+    assert not evidence(at.evaluate(state), detections, SETTINGS).closed
