@@ -31,11 +31,8 @@ def is_worth_trying(recurrence: Recurrence, settings: MapperSettings) -> bool:
 
     It costs about a millisecond with `find_recurrence`, so it can be asked every few metres.
     """
-    own = settings.batch.closure
-    if not recurrence.recurs:
-        return False
-    laps = float(recurrence.driven[-1]) / recurrence.lap
-    return laps >= own.laps and recurrence.correlation >= own.correlation
+    laps = settings.batch.closure.laps
+    return recurrence.recurs and float(recurrence.driven[-1]) >= laps * recurrence.lap
 
 
 @dataclass(frozen=True)

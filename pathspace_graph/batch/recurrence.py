@@ -106,7 +106,7 @@ def find_recurrence(poses: Array, settings: MapperSettings) -> Recurrence:
     first, last = int(closing.min_path / own.profile_step), int(own.min_overlap / own.profile_step)
     lags = np.arange(first, len(profile.heading) - last)
     scores = profile.correlations(lags, closing) if len(lags) else np.zeros(0)
-    if not scores.max(initial=-np.inf) > 0.0:
+    if not scores.max(initial=-np.inf) >= own.min_correlation:
         return Recurrence(driven, np.inf, 0.0, 0.0)
     begin = int(np.argmax(scores >= own.correlation_share * scores.max()))
     best = _climbed(scores, begin, int(closing.radius / own.profile_step))

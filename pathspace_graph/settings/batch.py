@@ -21,6 +21,9 @@ class RecurrenceSettings(Positive, group="batch.recurrence"):
     correlation_share: float = 0.8
     """The curvature is correlated with itself a lag later. A lap is about the shortest lag whose correlation
     is at least this share of the largest one."""
+    min_correlation: float = 0.7
+    """The curvature agrees with itself a lap later to this degree at least, 1 where it is the same. On a
+    track of two loops of which one is wider, it agrees to 0.56 at most after one of them."""
     min_overlap: float = 20.0
     """The path must go on for this length (m) after a lap, or else the lap isn't found. Over less, straights
     agree with straights."""
@@ -117,9 +120,6 @@ class ClosureSettings(Positive, group="batch.closure"):
 
     laps: float = 1.3
     """The loop is tried where the path driven is at least this number of laps long."""
-    correlation: float = 0.7
-    """The loop is tried where the curvature driven agrees with itself a lap later to this degree at least, 1
-    where it is the same."""
     used: float = 0.6
     """A closed result has at least this share of the first lap's coloured detections on its curves."""
     used_again: float = 0.85

@@ -37,15 +37,14 @@ CLOSURE = SETTINGS.batch.closure
 BELIEVED = Evidence(closed=True, used=0.95, used_again=0.95, misfit=1.0, gap=6.0, overlap=40.0, sigma=0.05)
 
 
-def path_of(laps: float, correlation: float = 0.95) -> Recurrence:
+def path_of(laps: float) -> Recurrence:
     """Returns a path that recurs after 100 m, of this number of laps."""
-    return Recurrence(np.array([0.0, 100.0 * laps]), 100.0, 2.0 * np.pi, correlation)
+    return Recurrence(np.array([0.0, 100.0 * laps]), 100.0, 2.0 * np.pi, 0.95)
 
 
 def test_a_loop_is_tried_after_a_good_part_of_the_second_lap() -> None:
     assert is_worth_trying(path_of(1.35), SETTINGS)
     assert not is_worth_trying(path_of(1.25), SETTINGS)
-    assert not is_worth_trying(path_of(1.35, correlation=0.5), SETTINGS)
     assert not is_worth_trying(path_of(1.35).denied(), SETTINGS)
 
 
