@@ -150,7 +150,7 @@ class OpenLapSettings(Positive, group="open_lap"):
     holds. The update waits for it, so that the same log always gives the same map."""
     rough_rounds: int = 8
     """The first optimization has at most this number of rounds."""
-    rounds: int = 12
+    rounds: int = 20
     """The second optimization, on knots that follow the result of the first, has at most this number of
     rounds."""
     rounds_from_odometry: int = 24
