@@ -31,8 +31,9 @@ def is_worth_trying(recurrence: Recurrence, settings: MapperSettings) -> bool:
 
     It costs about a millisecond with `find_recurrence`, so it can be asked every few metres.
     """
-    laps = settings.batch.closure.laps
-    return recurrence.recurs and float(recurrence.driven[-1]) >= laps * recurrence.lap
+    own = settings.batch.closure
+    long_enough = float(recurrence.driven[-1]) >= own.laps * recurrence.lap
+    return recurrence.recurs and long_enough and recurrence.correlation >= own.min_correlation
 
 
 @dataclass(frozen=True)
