@@ -39,7 +39,7 @@ def test_gnss_holds_the_vehicle_where_cones_let_it_drift() -> None:
 @pytest.mark.slow
 def test_a_boundary_passes_through_the_surveyed_point() -> None:
     without, with_survey = example("surveyed_point").main()
-    assert with_survey < 0.1
+    assert with_survey < 0.15
     assert with_survey < 0.1 * without
 
 

@@ -121,9 +121,9 @@ class ClosureSettings(Positive, group="batch.closure"):
     laps: float = 1.3
     """The loop is tried where the path driven is at least this number of laps long."""
     min_correlation: float = 0.9
-    """The loop is tried where the curvature agrees with itself a lap later to this degree at least, 1 where it
-    is the same. Of two loops side by side the second agrees with the first to 0.89 at most; a true lap agrees
-    to 0.92 and more."""
+    """The loop is tried where the curvature agrees with itself a lap later to this degree at least, 1 where
+    it is the same. Of two loops side by side the second agrees with the first to 0.89 at most; a true lap
+    agrees to 0.92 and more."""
     used: float = 0.6
     """A closed result has at least this share of the first lap's coloured detections on its curves."""
     used_again: float = 0.85

@@ -106,7 +106,7 @@ def refit(
     inside = (u >= within[0]) & (u <= within[1])
     w = u if u_map is None else u_map(u)
     B_old, B_new = old.basis_matrix(u), new.basis_matrix(w)
-    bridge = _BRIDGE * _bending_rows(new)[np.repeat(_sparse_spans(new, w), _BENDING_PER_SPAN)]
+    bridge = _BRIDGE * _bending_rows(new)[np.repeat(_sparse_spans(new, w[inside]), _BENDING_PER_SPAN)]
     stacked = np.concatenate([B_new[inside], bridge])
     target = np.concatenate([B_old[inside], np.zeros((len(bridge), old.size))])
     return Refit(new_from_old=_least_squares(stacked, target), old_from_new=_least_squares(B_old, B_new))
