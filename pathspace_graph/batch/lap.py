@@ -29,14 +29,13 @@ from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.batch import BatchSettings
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
 from .association import add_drive, associate, find_anywhere, locate_poses
 from .closure import evidence, is_true_closure
 from .dead_reckoning import start_odometry
 from .gauge import curve_gauge
-from .knots import exact_settings
+from .knots import boundary_of
 from .mapper import find_optimum, own_settings
 from .optimizer import Convergence, Optimizer
 from .simplification import scatter_of_cones, simplified
@@ -121,9 +120,7 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
         scatter = scatter_of_cones(few, detections, settings)
         return LapMarginal(
             convergence=convergence,
-            splines={
-                label: b.spline(few.control_points(label).copy()) for label, b in few.boundaries.items()
-            },
+            splines=few.splines,
             calibration=at.state.calibration.copy(),
             poses=at.state.poses.copy(),
             first_kept=lap.first_kept,
@@ -166,11 +163,9 @@ def _start(lap: OpenLap, settings: MapperSettings) -> State:
     """Returns the closed curves of the online map with all poses beside them, or the start from odometry."""
     if lap.closed is None:
         return start_odometry(lap.chain, lap.detections, settings)
-    state, exact = State(), exact_settings(settings.spline, settings.batch)
+    state = State()
     for label, spline in lap.closed.splines.items():
-        boundary = Boundary(spline.knots, True, exact, settings.gauge)
-        boundary.confirmed_end = boundary.tables.high
-        state.add_boundary(label, boundary, spline.distinct_control_points)
+        state.add_boundary(label, *boundary_of(spline, settings))
     add_drive(state, lap.closed.poses, lap.closed.calibration, settings.batch.association)
     return state
 
@@ -211,14 +206,9 @@ def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Ro
     The rows that hold each control point beside a pose are made anew with poses that leave, so that none of
     them is lost.
     """
-    state, groups = at.state, system.chain.rows(at.odometry, at.state.poses[0], at.state.calibration)
-    for label in state.boundaries:
-        gauge = curve_gauge(state, label, system.settings.batch.sigma_slide, first_kept)
-        points = state.control_points(label)
-        groups += [system.detection_rows(at, label), gauge.beside(points, state.poses)]
-        groups += [gauge.smooth(points, state.poses), gauge.anchor()]
-    if at.placed is not None:
-        groups.append(system.place_rows(at, at.placed))
+    state, sigma = at.state, system.settings.batch.sigma_slide
+    gauges = {label: curve_gauge(state, label, sigma, first_kept) for label in state.boundaries}
+    groups = system.rows(at, gauges)
     return [rows.where(_is_before(rows.keys, first_kept)) for rows in groups if len(rows)]
 
 

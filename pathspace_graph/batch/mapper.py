@@ -190,7 +190,7 @@ def find_optimum_from_odometry(
     chain, detections = optimizer.system.chain, optimizer.system.detections
     state = start_odometry(chain, detections, settings)
     at, convergence = find_optimum(optimizer, state, settings, on_round)
-    if not is_closed(state) or is_true_closure(evidence(at, detections, settings), settings):
+    if not state.closed or is_true_closure(evidence(at, detections, settings), settings):
         return at, convergence
     state = start_odometry(chain, detections, settings, closes=False)
     return find_optimum(optimizer, state, settings, on_round)
@@ -235,16 +235,10 @@ def _map(state: State, joint: Array, scatter: Scatter) -> Map:
     boundaries = {}
     for label, boundary in state.boundaries.items():
         block = map_block(state, label)
-        spline = boundary.spline(state.control_points(label).copy())
         sigma = np.repeat(scatter.sigma(label, boundary.abscissae), 2)
         covariance = joint[block, block] + np.diag(sigma**2)
-        boundaries[label] = SplineBoundary(spline, covariance)
-    return Map(is_closed(state), boundaries, joint_covariance(joint, boundaries))
-
-
-def is_closed(state: State) -> bool:
-    """Returns whether a boundary of the state is closed."""
-    return any(boundary.periodic for boundary in state.boundaries.values())
+        boundaries[label] = SplineBoundary(state.spline(label), covariance)
+    return Map(state.closed, boundaries, joint_covariance(joint, boundaries))
 
 
 def _records(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import gtsam
@@ -169,10 +170,7 @@ class BatchSystem:
         if self.places is None:
             own = {label: self._places_of(boundary, label) for label, boundary in state.boundaries.items()}
             self.places = lay_out_places(state.curves, own)
-        rows, settings = np.flatnonzero(self.detections.used), self.settings.place
-        curve = state.curves.number(self.detections.boundary[rows])
-        u = self.detections.u[rows]
-        self.detections.put(rows, self.places.nearest(curve, u, settings.room, settings.apart))
+        self.places.associate(self.detections, state.curves, self.settings.place)
 
     def places_by_label(self, state: State) -> dict[int, Array]:
         """Returns the parameters (k,) of the places on each curve, none where the settings ask for none."""
@@ -218,11 +216,14 @@ class BatchSystem:
 
     # --- linear factors ----------------------------------------------------------------------------------
 
-    def rows(self, at: Evaluation) -> list[Rows]:
-        """Returns every whitened row of Gauss-Newton at a state; those of detections have robust weights."""
+    def rows(self, at: Evaluation, gauges: Mapping[int, CurveGauge] | None = None) -> list[Rows]:
+        """Returns every whitened row of Gauss-Newton at a state; those of detections have robust weights.
+
+        Other gauges than the problem's own may take their place.
+        """
         state = at.state
         groups = self.chain.rows(at.odometry, state.poses[0], state.calibration)
-        for label, gauge in self.gauges.items():
+        for label, gauge in (gauges or self.gauges).items():
             points = state.control_points(label)
             groups += [self.detection_rows(at, label), gauge.beside(points, state.poses)]
             groups += [gauge.smooth(points, state.poses), gauge.anchor()]

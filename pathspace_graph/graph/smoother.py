@@ -378,6 +378,10 @@ class FixedLagSmoother(Generic[M_co]):
         if key not in self.inactive.anchors:
             self.prior = marginalize(self.prior, np.array([key]))
             self.variables.remove(np.array([key]))
+        self._drop_oldest(cycle)
+
+    def _drop_oldest(self, cycle: int) -> None:
+        """Removes the stamp, the odometry and the detections of the oldest pose, which leaves the window."""
         self.times.pop(0)
         self.window.odometry.drop_first()
         self.map.drop_cycle(cycle)
@@ -439,9 +443,7 @@ class FixedLagSmoother(Generic[M_co]):
         self.prior, keyframes = gtsam.GaussianFactorGraph(), self.variables.keyframes
         leaving = np.arange(self.first_cycle, first_cycle)
         for cycle in leaving.tolist():
-            self.times.pop(0)
-            self.window.odometry.drop_first()
-            self.map.drop_cycle(cycle)
+            self._drop_oldest(cycle)
         self.variables.first_cycle = first_cycle
         self.variables.remove(np.concatenate([keyframes, pose_keys(leaving), removed]))
         self.variables.insert(added, points.ravel())

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.cone_place import PlaceRows, along_from_place
+from pathspace_graph.settings.mapper import PlaceSettings
 
 from .curves import Curves
-from .detections import NOWHERE
+from .detections import NOWHERE, DetectionTable
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -55,6 +56,15 @@ class ConePlaces:
             chosen = (nearest < room) & (second > apart * nearest)
             found[rows] = np.where(chosen, begin + offset.argmin(axis=1), NOWHERE)
         return found
+
+    def associate(
+        self, detections: DetectionTable, curves: Curves, settings: PlaceSettings, since: int = 0
+    ) -> None:
+        """Associates the detections in use, from the row `since` on, with the places next to their feet."""
+        rows = since + np.flatnonzero(detections.used[since:])
+        curve = curves.number(detections.boundary[rows])
+        place = self.nearest(curve, detections.u[rows], settings.room, settings.apart)
+        detections.put(rows, place)
 
     def along(self, place: IntArray, map_points: Array, points: Array, poses: Array) -> PlaceRows:
         """Returns how far detections at points (m, 2), from poses (m, 3), lie past their places (m,)."""

@@ -109,13 +109,8 @@ class CurveMap:
 
     def place_detections(self, since: int) -> None:
         """Associates the detections in use, from the row `since` on, with the places along their curves."""
-        if self.places is None:
-            return
-        detections, settings = self.detections, self.settings.place
-        rows = since + np.flatnonzero(detections.used[since:])
-        curve = self.state.curves.number(detections.boundary[rows])
-        place = self.places.nearest(curve, detections.u[rows], settings.room, settings.apart)
-        detections.put(rows, place)
+        if self.places is not None:
+            self.places.associate(self.detections, self.state.curves, self.settings.place, since)
 
     def linearized(self, cycles: IntArray) -> None:
         """Accepts the latest `rows`, of these cycles: the graph holds them from now on."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pathspace_graph.graph.keys import CONTROL_LETTERS, control_keys
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.spline.boundary import Boundary
+from pathspace_graph.spline.bspline import BSpline
 
 from .curves import Curves, lay_out_curves
 
@@ -79,6 +80,20 @@ class State:
     def whole(self) -> bool:
         """Returns whether every control point is active."""
         return not self.active_stretch
+
+    @property
+    def closed(self) -> bool:
+        """Returns whether a curve is closed; both are closed together."""
+        return any(boundary.periodic for boundary in self.boundaries.values())
+
+    def spline(self, label: int) -> BSpline:
+        """Returns a boundary as a spline of its own, which later changes of the state leave alone."""
+        return self.boundaries[label].spline(self.control_points(label).copy())
+
+    @property
+    def splines(self) -> dict[int, BSpline]:
+        """Returns all boundaries as splines of their own, by label."""
+        return {label: self.spline(label) for label in self.boundaries}
 
     @property
     def curves(self) -> Curves:

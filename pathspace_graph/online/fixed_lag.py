@@ -287,7 +287,7 @@ class FixedLagMapper:
             block = slice(at, at := at + POINT * boundary.size)
             sigma = scatter.get(label, np.full(boundary.size, shape))
             covariance = joint[block, block] + np.diag(np.repeat(sigma, POINT) ** 2)
-            spline = boundary.spline(self.control_points(label).copy())
+            spline = self.smoother.map.state.spline(label)
             boundaries[label] = SplineBoundary(spline, covariance, spline.domain[1])
         return Map(True, boundaries, joint_covariance(joint, boundaries))
 

@@ -101,11 +101,7 @@ class OpenLapRecord:
     def closed_map(self, smoother: CurveSmoother) -> ClosedMap:
         """Returns the map that has just been closed, with the poses of all cycles beside it."""
         state = smoother.map.state
-        splines = {
-            label: boundary.spline(state.control_points(label).copy())
-            for label, boundary in state.boundaries.items()
-        }
-        return ClosedMap(splines, self.corrected(smoother), state.calibration.copy())
+        return ClosedMap(state.splines, self.corrected(smoother), state.calibration.copy())
 
     def lap(self, first_kept: int, closed: ClosedMap | None) -> OpenLap:
         """Returns the lap, whose search begins at a map that has just been closed, or at odometry."""

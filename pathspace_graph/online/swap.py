@@ -10,7 +10,6 @@ from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.factors.se2 import compose, relative
 from pathspace_graph.graph.keys import CALIBRATION_KEY, control_keys, pose_keys
 from pathspace_graph.mapping.curve_map import CurveSmoother
-from pathspace_graph.spline.boundary import Boundary
 
 from .association import reassociate
 
@@ -29,10 +28,7 @@ def go_on_from(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
     before = state.poses[-1].copy()
     removed, added, points = state.map_keys, [], []
     for label, spline in marginal.splines.items():
-        old = state.boundaries[label]
-        boundary = Boundary(spline.knots, True, old.settings, old.gauge, old.first + old.size)
-        boundary.confirmed_end = boundary.tables.high
-        state.boundaries[label] = boundary
+        boundary = state.boundaries[label] = state.boundaries[label].closed(spline.knots)
         added.append(control_keys(label, boundary.numbers))
         points.append(spline.distinct_control_points)
     smoother.restart(first, removed, np.concatenate(added), np.concatenate(points))
