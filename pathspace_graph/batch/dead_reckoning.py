@@ -33,18 +33,19 @@ BoolArray = NDArray[np.bool_]
 
 
 def start_odometry(
-    chain: LogOdometry, detections: DetectionTable, settings: MapperSettings, closes: bool = True
+    chain: LogOdometry,
+    detections: DetectionTable,
+    settings: MapperSettings,
+    recurrence: Recurrence | None = None,
 ) -> State:
     """Returns poses by dead reckoning, and curves through the cones that were seen in the first lap.
 
     Where the path recurs, the drift of the odometry is taken out first: every lap passes the same places. The
-    curves are closed then. They are open where the path doesn't recur, or where `closes` is false.
+    curves are closed then, and otherwise open. By default the path driven says whether it recurs.
     """
     calibration = np.zeros(CALIBRATION_SIZE)
     poses = chain.dead_reckoned(calibration)
-    recurrence = find_recurrence(poses, settings)
-    if not closes:
-        recurrence = recurrence.denied()
+    recurrence = recurrence or find_recurrence(poses, settings)
     if recurrence.recurs:
         poses, calibration = align_laps(chain, recurrence, settings.batch.laps)
     state = State()
@@ -190,7 +191,7 @@ def _beside_path(
     station, lateral = along_and_across(points, path, stations)
     length = recurrence.lap if recurrence.recurs else float(stations[-1]) + settings.growth.reach
     side, gate = SIDES[label] * lateral, settings.gate
-    kept = (side > settings.growth.min_lateral) & (side < settings.growth.max_lateral)
+    kept = (side > settings.growth.min_lateral) & (side < settings.batch.cones.max_lateral)
     ahead = station - recurrence.driven[cycles]
     kept &= (ahead > -gate.view_behind) & (ahead < gate.view_ahead)
     return station, np.asarray(kept & (station >= 0.0) & (station < length)), length

@@ -38,6 +38,7 @@ from .gauge import curve_gauge
 from .knots import boundary_of
 from .mapper import find_optimum, own_settings
 from .optimizer import Convergence, Optimizer
+from .recurrence import Recurrence
 from .simplification import scatter_of_cones, simplified
 from .system import BatchSystem, Biweight, Evaluation
 
@@ -69,8 +70,8 @@ class OpenLap:
     """These are the detections of all cycles; their associations are found anew."""
     first_kept: int
     """The poses from this cycle on stay variables of the window."""
-    closed: ClosedMap | None = None
-    """The search begins at this map, or at odometry alone, where the path driven recurs."""
+    start: ClosedMap | Recurrence
+    """The search begins at a map, or at odometry alone, where the path driven recurs after a lap."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +112,9 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
     with threadpool_limits(limits=1):
         system, at, convergence = lap_optimum(lap)
         settings, detections = system.settings, system.detections
-        if lap.closed is None and not is_true_closure(evidence(at, detections, settings), settings):
+        if isinstance(lap.start, Recurrence) and not is_true_closure(
+            evidence(at, detections, settings), settings
+        ):
             return None
         few, change = simplified(at.state, detections, settings)
         information, mean = marginal_of(system, at, few, change, lap.first_kept)
@@ -144,13 +147,14 @@ def lap_optimum(lap: OpenLap) -> tuple[BatchSystem, Evaluation, Convergence]:
 def _capped(lap: OpenLap) -> MapperSettings:
     """Returns the batch's settings with fewer rounds and looser tolerances, so that the result is in time."""
     settings, own = own_settings(lap.settings), lap.settings.open_lap
+    known = isinstance(lap.start, ClosedMap)
     batch: BatchSettings = settings.batch
     return replace(
         settings,
         batch=replace(
             batch,
-            rough_rounds=own.rough_rounds if lap.closed else batch.rough_rounds,
-            max_rounds=own.rounds if lap.closed else own.rounds_from_odometry,
+            rough_rounds=own.rough_rounds if known else batch.rough_rounds,
+            max_rounds=own.rounds if known else own.rounds_from_odometry,
             knot_passes=1,
             tolerance_cost=own.tolerance * batch.tolerance_cost,
             tolerance_curve=own.tolerance * batch.tolerance_curve,
@@ -161,12 +165,12 @@ def _capped(lap: OpenLap) -> MapperSettings:
 
 def _start(lap: OpenLap, settings: MapperSettings) -> State:
     """Returns the closed curves of the online map with all poses beside them, or the start from odometry."""
-    if lap.closed is None:
-        return start_odometry(lap.chain, lap.detections, settings)
+    if isinstance(lap.start, Recurrence):
+        return start_odometry(lap.chain, lap.detections, settings, lap.start)
     state = State()
-    for label, spline in lap.closed.splines.items():
+    for label, spline in lap.start.splines.items():
         state.add_boundary(label, *boundary_of(spline, settings))
-    add_drive(state, lap.closed.poses, lap.closed.calibration, settings.batch.association)
+    add_drive(state, lap.start.poses, lap.start.calibration, settings.batch.association)
     return state
 
 

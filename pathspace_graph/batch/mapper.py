@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
 from pathspace_graph.graph.keys import CALIBRATION_KEY, are_poses, pose_key
@@ -36,6 +37,7 @@ from .dead_reckoning import start_odometry
 from .knots import reknot
 from .nonlinear_graph import nonlinear_graph
 from .optimizer import Convergence, Optimizer, Schedule
+from .recurrence import find_recurrence
 from .simplification import Scatter, map_block, scatter_of_cones, simplify
 from .start import CurveMapper, start_online
 from .system import BatchSystem, Biweight, Evaluation
@@ -188,11 +190,12 @@ def find_optimum_from_odometry(
     Where the path recurs, the loop is closed, and it stays closed if the detections are for it.
     """
     chain, detections = optimizer.system.chain, optimizer.system.detections
-    state = start_odometry(chain, detections, settings)
+    recurrence = find_recurrence(chain.dead_reckoned(np.zeros(CALIBRATION_SIZE)), settings)
+    state = start_odometry(chain, detections, settings, recurrence)
     at, convergence = find_optimum(optimizer, state, settings, on_round)
     if not state.closed or is_true_closure(evidence(at, detections, settings), settings):
         return at, convergence
-    state = start_odometry(chain, detections, settings, closes=False)
+    state = start_odometry(chain, detections, settings, recurrence.denied())
     return find_optimum(optimizer, state, settings, on_round)
 
 

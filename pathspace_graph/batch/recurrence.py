@@ -10,7 +10,8 @@ from scipy.fft import fft, ifft, next_fast_len
 
 from pathspace_graph.graph.keys import POSE
 from pathspace_graph.settings.batch import RecurrenceSettings
-from pathspace_graph.settings.mapper import ClosingSettings, MapperSettings
+from pathspace_graph.settings.closing import ClosingSettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import to_map, wrap_angle
-from pathspace_graph.settings.mapper import ClosingSettings
+from pathspace_graph.settings.closing import ClosingSettings
 
 from .curve_map import CurveMap
 from .path import DrivenPath
@@ -91,7 +91,7 @@ def register(
     prior = np.linalg.inv(covariance * settings.prior_scale**2)
     centre = track.state.poses[-1, :2].copy()
     vector = np.zeros(3)
-    lost = bool(np.linalg.eigvalsh(prior[:2, :2])[0] < settings.icp_reach**-2)
+    lost = is_lost(covariance, settings)
     if lost:
         pose = track.state.poses[-1]
         starts = [v for v in _motions(pose, beginning, settings) if v @ prior @ v < settings.start_chi2]
@@ -109,6 +109,12 @@ def register(
     if not (agrees(matches, list(labels), settings) and is_certain(matches, posterior, settings, lost)):
         return None
     return Registration(Motion(centre, vector), {label: matches.inliers(label) for label in labels})
+
+
+def is_lost(covariance: Array, settings: ClosingSettings) -> bool:
+    """Returns whether a pose with this covariance (3, 3) is less certain than the registration can bridge."""
+    prior = np.linalg.inv(covariance * settings.prior_scale**2)
+    return bool(np.linalg.eigvalsh(prior[:2, :2])[0] < settings.icp_reach**-2)
 
 
 def _motions(pose: Array, beginning: Array, settings: ClosingSettings) -> list[Array]:

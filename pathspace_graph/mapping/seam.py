@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.settings.knots import BreakSettings, FitSettings, Knots
-from pathspace_graph.settings.mapper import ClosingSettings, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.cone_knots import thin

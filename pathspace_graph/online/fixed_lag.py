@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import ClosedMap
+from pathspace_graph.batch.recurrence import Recurrence
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
@@ -33,6 +34,7 @@ from .growth import Growth
 from .nonlinear_graph import window_graph
 from .open_lap import LapBatch, OpenLapRecord
 from .outlook import Outlook, confirmed, joint_covariance_of, look_ahead
+from .recognition import recognize
 from .swap import go_on_from
 
 Array = NDArray[np.float64]
@@ -87,7 +89,7 @@ class FixedLagMapper:
         self._lap_batch: LapBatch | None = None
         self._grown: frozenset[int] = frozenset()
         self._closing_tried = 0.0
-        self._loop_tried = 0.0
+        self._loop_tried, self._recognition_tried = 0.0, 0.0
 
     def update(
         self,
@@ -205,11 +207,12 @@ class FixedLagMapper:
         self._begin_batch(closed)
         return ""
 
-    def _begin_batch(self, closed: ClosedMap | None) -> None:
+    def _begin_batch(self, start: ClosedMap | Recurrence) -> None:
         """Sends the lap to its batch, which begins at a map that has just been closed, or at odometry."""
-        first, cycle = self.smoother.first_cycle, self.smoother.next_cycle - 1
-        wait = min(self.settings.open_lap.cycles, cycle - first)
-        self._lap_batch = LapBatch(self._open_lap.lap(first + wait, closed), cycle + wait)
+        own, first, cycle = self.settings.open_lap, self.smoother.first_cycle, self.smoother.next_cycle - 1
+        wait = max(min(own.cycles, cycle - first), int(own.cycles_share * cycle))
+        first_kept = min(first + wait, cycle)
+        self._lap_batch = LapBatch(self._open_lap.lap(first_kept, start), cycle + wait)
 
     def _try_loop(self) -> None:
         """Sends the lap to a batch from odometry where the drive says that it is over.
@@ -219,9 +222,22 @@ class FixedLagMapper:
         if self.path.length < self._loop_tried or set(self.boundaries) != set(BOUNDARIES):
             return
         self._loop_tried = self.path.length + self.settings.closing.check_interval
-        if self._open_lap.is_over():
+        recurrence = self._recurrence()
+        if recurrence is not None:
             self._loop_tried = self.path.length + self.settings.open_lap.retry
-            self._begin_batch(None)
+            self._begin_batch(recurrence)
+
+    def _recurrence(self) -> Recurrence | None:
+        """Returns after which length the drive recurs, by its odometry or by the shape of the curves."""
+        record, settings = self._open_lap, self.settings.closing.recognition
+        if record.unsolvable is not None:
+            return None
+        found = record.recurrence()
+        if found is not None or self.path.length < self._recognition_tried + settings.interval:
+            return found
+        self._recognition_tried = self.path.length
+        place = recognize(self.smoother)
+        return None if place is None else record.recurrence_since(place)
 
     def _go_on(self, closes: bool) -> tuple[Array | None, str]:
         """Records the open lap, has it solved when it closes, and goes on from the result when it is due.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.closure import is_worth_trying
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
-from pathspace_graph.batch.recurrence import find_recurrence
+from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
 from pathspace_graph.batch.start import unwrap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.odometry import IntegratedOdometry
@@ -27,6 +27,7 @@ from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .places import Place, curve_poses, in_final_map
+from .recognition import RecognizedPlace
 
 Array = NDArray[np.float64]
 
@@ -77,11 +78,19 @@ class OpenLapRecord:
             (pose,) = curve_poses(boundary, state.control_points(label), u)
             self._places.setdefault(label, []).append(Place(cycle, float(u[0]), pose))
 
-    def is_over(self) -> bool:
-        """Returns whether the path driven says, by odometry alone, that the lap is over."""
-        if self.unsolvable is not None or not self._reckoned:
-            return False
-        return is_worth_trying(find_recurrence(np.array(self._reckoned), self.settings), self.settings)
+    def recurrence(self) -> Recurrence | None:
+        """Returns the recurrence of the path driven, if odometry alone says that the lap is over."""
+        found = find_recurrence(np.array(self._reckoned), self.settings)
+        return found if is_worth_trying(found, self.settings) else None
+
+    def recurrence_since(self, place: RecognizedPlace) -> Recurrence:
+        """Returns the recurrence of the path driven since the vehicle was at a place before."""
+        poses, (label, u) = np.array(self._reckoned), next(iter(place.beside.items()))
+        places = self._places[label]
+        before = places[int(np.argmin([abs(at.u - u) for at in places]))].cycle
+        driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+        turn = float(poses[-1, 2] - poses[before, 2])
+        return Recurrence(driven, float(driven[-1] - driven[before]), turn, 1.0)
 
     def prepare(self) -> None:
         """Starts the process that solves laps, once, so that it is ready when the loop closes.
@@ -103,14 +112,14 @@ class OpenLapRecord:
         state = smoother.map.state
         return ClosedMap(state.splines, self.corrected(smoother), state.calibration.copy())
 
-    def lap(self, first_kept: int, closed: ClosedMap | None) -> OpenLap:
+    def lap(self, first_kept: int, start: ClosedMap | Recurrence) -> OpenLap:
         """Returns the lap, whose search begins at a map that has just been closed, or at odometry."""
         return OpenLap(
             settings=self.settings,
             chain=chained(self._stamps, self._odometry, self.settings.odometry),
             detections=DetectionTable.of(self._detections),
             first_kept=first_kept,
-            closed=closed,
+            start=start,
         )
 
 

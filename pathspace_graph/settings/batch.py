@@ -67,6 +67,8 @@ class ConeSettings(Positive, group="batch.cones"):
     min_share_beside: float = 0.3
     """A cluster beside a curve, whose detections aren't used, is no cone if it has fewer detections than this
     share of the median cluster's."""
+    max_lateral: float = 15.0
+    """In a start from odometry, a boundary has detections nearer to the driven path than this (m)."""
     min_count: int = 4
     """A curve is fitted to no fewer cones than this, and no cone is removed where there are fewer."""
     fold_cosine: float = 0.5
@@ -152,6 +154,9 @@ class OpenLapSettings(Positive, group="open_lap"):
     cycles: int = 20
     """The batch replaces the prior this number of cycles after the loop has closed, or as many as the window
     holds. The update waits for it, so that the same log always gives the same map."""
+    cycles_share: float = 0.03
+    """A long lap gives its batch more time: this share of its cycles, if that is more than `cycles`. The
+    window holds more poses until then."""
     rough_rounds: int = 8
     """The first optimization has at most this number of rounds."""
     rounds: int = 20
@@ -167,7 +172,7 @@ class OpenLapSettings(Positive, group="open_lap"):
     max_cycles: float = 6000.0
     """Measurements of the open lap are kept up to this number of cycles. After a longer lap the map goes on
     from what the window has marginalized."""
-    max_cones: float = 700.0
+    max_cones: float = 1500.0
     """A lap with more cones than this goes on from what the window has marginalized, since its batch would
     not be in time."""
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch import dead_reckoning
 from pathspace_graph.batch.closure import Evidence, evidence, is_true_closure, is_worth_trying
 from pathspace_graph.batch.dead_reckoning import start_odometry
 from pathspace_graph.batch.mapper import (
@@ -19,7 +18,7 @@ from pathspace_graph.batch.mapper import (
     own_settings,
 )
 from pathspace_graph.batch.optimizer import Optimizer
-from pathspace_graph.batch.recurrence import Recurrence
+from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
 from pathspace_graph.batch.system import BatchSystem, Biweight
 from pathspace_graph.io.log import Log
 from pathspace_graph.mapping.detections import DetectionTable
@@ -94,17 +93,13 @@ def test_a_course_that_is_driven_again_is_closed() -> None:
     np.testing.assert_allclose(found.overlap, 0.4 * COURSE, atol=5.0)
 
 
-def test_a_loop_that_is_closed_short_of_the_lap_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_that_is_closed_short_of_the_lap_is_not_believed() -> None:
     """The path is said to recur after three quarters of the course."""
-
-    def too_short(poses: Array, settings: MapperSettings) -> Recurrence:
-        length = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-        return Recurrence(length, 0.75 * COURSE, 2.0 * np.pi, 1.0)
-
-    monkeypatch.setattr(dead_reckoning, "find_recurrence", too_short)
     optimizer = optimizer_of(driven(1.4))
     chain, detections = optimizer.system.chain, optimizer.system.detections
-    state = start_odometry(chain, detections, SETTINGS)
+    driven_to = find_recurrence(chain.dead_reckoned(np.zeros(2)), SETTINGS).driven
+    too_short = Recurrence(driven_to, 0.75 * COURSE, 2.0 * np.pi, 1.0)
+    state = start_odometry(chain, detections, SETTINGS, too_short)
     at, _ = find_optimum(optimizer, state, SETTINGS)
     assert not is_true_closure(evidence(at, detections, SETTINGS), SETTINGS)
 
@@ -118,7 +113,9 @@ def test_a_course_that_ends_before_the_line_stays_open() -> None:
 def test_a_denied_recurrence_gives_open_curves() -> None:
     optimizer = optimizer_of(driven(1.4))
     chain, detections = optimizer.system.chain, optimizer.system.detections
-    state = start_odometry(chain, detections, SETTINGS, closes=False)
+    recurrence = find_recurrence(chain.dead_reckoned(np.zeros(2)), SETTINGS)
+    assert recurrence.recurs
+    state = start_odometry(chain, detections, SETTINGS, recurrence.denied())
     at = optimizer.system
     at.begin(state)
     assert not any(boundary.periodic for boundary in state.boundaries.values())

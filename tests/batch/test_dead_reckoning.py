@@ -135,3 +135,11 @@ def test_a_path_that_does_not_recur_is_dead_reckoned() -> None:
     for label, y in ((LEFT, 2.0), (RIGHT, -2.0)):
         assert not state.boundaries[label].periodic
         np.testing.assert_allclose(state.control_points(label)[:, 1], y, atol=1e-6)
+
+
+def test_a_circuit_of_21_metres_has_both_boundaries() -> None:
+    log = exact_log(ahead(6.0, 5.0), *corridor(60.0, half_width=10.5))
+    chain = integrate_log(log, log.odometry_sigma, SETTINGS.odometry)
+    state = start_odometry(chain, DetectionTable.of(log.cycles), SETTINGS)
+    for label, y in ((LEFT, 10.5), (RIGHT, -10.5)):
+        np.testing.assert_allclose(state.control_points(label)[:, 1], y, atol=1e-6)

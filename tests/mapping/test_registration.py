@@ -23,8 +23,9 @@ from pathspace_graph.mapping.registration import (
     register,
 )
 from pathspace_graph.mapping.state import State
+from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.settings.growth import PathSettings
-from pathspace_graph.settings.mapper import ClosingSettings, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.curves import boundary_through
 from ..scenes.drives import detections

@@ -1,0 +1,247 @@
+"""Place recognition: the newest stretch of the curves is registered with an earlier one.
+
+After a long lap the vehicle may be anywhere along the first few hundred metres. The detections of the last
+seconds agree with any place along a straight there. The open curves hold more: their newest stretch has the
+bends of the track in it, and these are where they were a lap before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.se2 import wrap_angle
+from pathspace_graph.graph.keys import pose_keys
+from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
+from pathspace_graph.mapping.registration import Motion, is_lost
+from pathspace_graph.mapping.state import State
+from pathspace_graph.settings.closing import ClosingSettings
+from pathspace_graph.spline.boundary import Boundary
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class RecognizedPlace:
+    """A place is where the newest stretch of the curves lies on an earlier stretch."""
+
+    motion: Motion
+    """The motion moves the newest stretch onto the earlier one."""
+    beside: dict[int, float]
+    """The newest pose was there beside each boundary at this parameter (m), a lap or more before."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Holds the cones of the newest stretch of both curves."""
+
+    length: float
+    """This is the length of the stretch (m)."""
+    cones: dict[int, Array]
+    """Each boundary has cones (k, 2) at these points in m, map frame."""
+    normals: dict[int, Array]
+    """Each of these cones has the unit normal (k, 2) of its curve."""
+
+    def tells_place(self, centre: Array, settings: ClosingSettings) -> bool:
+        """Returns whether the stretch, laid on itself, holds the vehicle at `centre` (2,) in every direction.
+
+        A straight does not: it could as well lie farther along.
+        """
+        arms = {label: cones - centre for label, cones in self.cones.items()}
+        rows = np.concatenate([_by_motion(self.normals[b], arms[b], settings) for b in arms])
+        return _sigma(rows.T @ rows) <= settings.sigma_max
+
+
+def recognize(smoother: CurveSmoother) -> RecognizedPlace | None:
+    """Returns the place at which the newest stretch of the curves has been before.
+
+    The result is None where the vehicle is not lost, or its place is not found.
+    """
+    settings, track = smoother.map.settings.closing, smoother.map
+    if not may_tell_place(track.state, settings):
+        return None
+    smoother.carry()
+    smoother.refresh()
+    covariance = smoother.covariance(pose_keys(np.array([smoother.next_cycle - 1])))
+    return find_place(track, covariance, settings) if is_lost(covariance, settings) else None
+
+
+def may_tell_place(state: State, settings: ClosingSettings) -> bool:
+    """Returns whether it is worth asking for the place: the curves are long enough, and not straight."""
+    if not is_long_enough(state, settings):
+        return False
+    return newest_stretch(state, settings.recognition.stretch).tells_place(state.poses[-1, :2], settings)
+
+
+def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) -> RecognizedPlace | None:
+    """Returns the only place at which the newest stretch of the curves agrees with an earlier stretch.
+
+    The `covariance` (3, 3) of the newest pose says how far the place may be from where the vehicle believes
+    to be. The result is None if no place agrees, if several do, or if the place along the track is uncertain.
+    """
+    state = track.state
+    if not is_long_enough(state, settings):
+        return None
+    newest = newest_stretch(state, settings.recognition.stretch)
+    centre = state.poses[-1, :2].copy()
+    prior = np.asarray(np.linalg.inv(_wide(covariance) * settings.prior_scale**2), np.float64)
+    found: list[RecognizedPlace] = []
+    for vector, low in _starts(state, prior, settings):
+        place = _register(state, newest, Motion(centre, vector), low, prior, settings)
+        if place is not None and not any(_same(place, other, settings) for other in found):
+            found.append(place)
+    return found[0] if len(found) == 1 else None
+
+
+def _wide(covariance: Array) -> Array:
+    """Returns the covariance (3, 3) of a pose without correlations, as wide as its worst direction.
+
+    A lap away the heading turns the position on an arc, which the correlations follow only for small angles.
+    """
+    variance = np.linalg.eigvalsh(covariance[:2, :2])[-1]
+    return np.diag([variance, variance, covariance[2, 2]])
+
+
+def is_long_enough(state: State, settings: ClosingSettings) -> bool:
+    """Returns whether the curves hold a whole lap between an earlier stretch and the newest one."""
+    end = min(boundary.confirmed_end for boundary in state.boundaries.values())
+    early = settings.beginning_share * end
+    return bool(settings.recognition.stretch < early < end - settings.recognition.stretch - settings.min_path)
+
+
+def newest_stretch(state: State, length: float) -> Stretch:
+    """Returns the confirmed cones on the last `length` metres of each curve."""
+    cones, normals = {}, {}
+    for label, boundary in state.boundaries.items():
+        u, points = np.array(boundary.cone_parameters), state.control_points(label)
+        chosen = u[(u > boundary.confirmed_end - length) & (u <= boundary.confirmed_end)]
+        cones[label], tangents = boundary.evaluate(points, chosen), boundary.evaluate(points, chosen, 1)
+        tangents /= np.hypot(tangents[:, :1], tangents[:, 1:])
+        normals[label] = np.column_stack([-tangents[:, 1], tangents[:, 0]])
+    return Stretch(length, cones, normals)
+
+
+def _by_motion(normals: Array, arms: Array, settings: ClosingSettings) -> Array:
+    """Returns the derivative (k, 3) of cones' distances across a curve by a motion about the arms' origin."""
+    turning = normals[:, 1] * arms[:, 0] - normals[:, 0] * arms[:, 1]
+    return np.column_stack([normals, turning]) / settings.sigma_reading
+
+
+def _sigma(information: Array) -> float:
+    """Returns the standard deviation (m) of the position in its worst direction, by information (3, 3)."""
+    if np.linalg.matrix_rank(information) < len(information):
+        return np.inf
+    return float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(information)[:2, :2])[-1]))
+
+
+def _same(a: RecognizedPlace, b: RecognizedPlace, settings: ClosingSettings) -> bool:
+    """Returns whether two places are one."""
+    return bool(np.hypot(*(a.motion.vector - b.motion.vector)[:2]) < settings.overlap)
+
+
+def _starts(state: State, prior: Array, settings: ClosingSettings) -> list[tuple[Array, float]]:
+    """Returns motions (3,) onto earlier stretches that turn as the newest one does, the likest first.
+
+    Each goes with the parameter at which the earlier stretch of the first boundary begins. The headings along
+    both stretches are compared, after a common turn.
+    """
+    label = next(iter(state.boundaries))
+    boundary, step = state.boundaries[label], settings.start_step
+    points, headings = _samples(boundary, state.control_points(label), step)
+    count = int(settings.recognition.stretch / step)
+    last = int(settings.beginning_share * len(points))
+    turns = np.lib.stride_tricks.sliding_window_view(headings[:last], count) - headings[-count:]
+    places = np.lib.stride_tricks.sliding_window_view(points[:last], count, axis=0).mean(axis=2)
+    turn, unlike = turns.mean(axis=1), turns.std(axis=1)
+    centre, middle = state.poses[-1, :2], points[-count:].mean(axis=0)
+    arm, c, s = middle - centre, np.cos(turn), np.sin(turn)
+    turned = np.column_stack([c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]]) + centre
+    motions = np.column_stack([places - turned, wrap_angle(turn)])
+    possible = np.einsum("ij,jk,ik->i", motions, prior, motions) < settings.start_chi2
+    unlike = np.where(possible, unlike, np.inf)
+    best = _minima(unlike, int(settings.overlap / step))[: settings.recognition.starts]
+    return [(motions[i], float(step * i)) for i in best]
+
+
+def _samples(boundary: Boundary, control_points: Array, step: float) -> tuple[Array, Array]:
+    """Returns points (n, 2) a step apart up to the end of a curve, and the headings (n,), not wrapped."""
+    u = np.arange(boundary.confirmed_end % step, boundary.confirmed_end, step)
+    tangents = boundary.evaluate(control_points, u, 1)
+    return boundary.evaluate(control_points, u), np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
+
+
+def _minima(values: Array, apart: int) -> list[int]:
+    """Returns the indices of finite values that are the least of all that are as near as `apart`."""
+    padded = np.pad(values, apart, constant_values=np.inf)
+    least = np.lib.stride_tricks.sliding_window_view(padded, 2 * apart + 1).min(axis=1)
+    found = np.flatnonzero(np.isfinite(values) & (values == least))
+    return list(found[np.argsort(values[found])])
+
+
+def _register(
+    state: State, newest: Stretch, start: Motion, low: float, prior: Array, settings: ClosingSettings
+) -> RecognizedPlace | None:
+    """Registers the newest stretch with the earlier one; returns None if they disagree."""
+    first = next(iter(state.boundaries))
+    ends = np.array([low, low + newest.length])
+    corners = state.boundaries[first].evaluate(state.control_points(first), ends)
+    stretches = {label: _beside(state, label, corners, settings) for label in state.boundaries}
+    vector = start.vector
+    for iteration in range(settings.icp_iterations):
+        reach = max(settings.inlier_distance, settings.icp_reach * settings.icp_shrink**iteration)
+        motion = Motion(start.centre, vector)
+        hessian, gradient, shares = _linearize(state, newest, motion, stretches, reach, settings)
+        vector = vector + np.linalg.solve(hessian + prior, gradient - prior @ vector)
+    if min(shares) < settings.inlier_share or _sigma(hessian) > settings.sigma_max:
+        return None
+    motion = Motion(start.centre, vector)
+    return RecognizedPlace(motion, _beside_newest(state, motion, stretches))
+
+
+def _beside_newest(
+    state: State, motion: Motion, stretches: dict[int, tuple[float, float]]
+) -> dict[int, float]:
+    """Returns the parameter of each boundary's earlier stretch that the moved newest pose is beside (m)."""
+    place, beside = motion.apply(state.poses[-1:, :2]), {}
+    for label, (low, high) in stretches.items():
+        foot = state.boundaries[label].find(
+            state.control_points(label), place, np.array([low]), np.array([high])
+        )
+        beside[label] = float(foot.u[0])
+    return beside
+
+
+def _beside(state: State, label: int, corners: Array, settings: ClosingSettings) -> tuple[float, float]:
+    """Returns the parameters of the stretch of a boundary between two points (2, 2), and some room."""
+    boundary, room = state.boundaries[label], settings.recognition.stretch_room
+    zero = np.zeros(len(corners))
+    high = zero + settings.beginning_share * boundary.confirmed_end
+    u = boundary.find(state.control_points(label), corners, zero, high).u
+    return max(float(u[0]) - room, 0.0), float(u[1]) + room
+
+
+def _linearize(
+    state: State,
+    newest: Stretch,
+    motion: Motion,
+    stretches: dict[int, tuple[float, float]],
+    reach: float,
+    settings: ClosingSettings,
+) -> tuple[Array, Array, list[float]]:
+    """Returns the information (3, 3) about the motion, the negative gradient (3,), and shares of inliers."""
+    hessian, gradient, shares = np.zeros((3, 3)), np.zeros(3), []
+    for label, cones in newest.cones.items():
+        moved, (low, high) = motion.apply(cones), stretches[label]
+        at = np.zeros(len(cones))
+        foot = state.boundaries[label].find(state.control_points(label), moved, at + low, at + high)
+        used = foot.interior & (np.abs(foot.distance) < reach)
+        arms = moved[used] - motion.centre - motion.vector[:2]
+        by_motion = _by_motion(foot.normal_unit[used], arms, settings)
+        hessian += by_motion.T @ by_motion
+        gradient -= by_motion.T @ foot.distance[used] / settings.sigma_reading
+        inliers = np.abs(foot.distance) < settings.inlier_distance
+        shares.append(float(np.mean(foot.interior & inliers)) if len(cones) else 0.0)
+    return hessian, gradient, shares
