@@ -21,7 +21,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
-POSE, CALIBRATION = ord("x"), ord("b")
+POSE, CALIBRATION, SENSOR = ord("x"), ord("b"), ord("c")
 
 
 def build_mapper(cycles: int = 150, seed: int = 0) -> FixedLagMapper:
@@ -43,7 +43,7 @@ def kind(factor: gtsam.NonlinearFactor) -> str:
     if isinstance(factor, gtsam.RangeFactor2):
         return "spacing"
     if isinstance(factor, gtsam.LinearContainerFactor):
-        return "prior of the window" if letters & {POSE, CALIBRATION} else "smoothness"
+        return "prior of the window" if letters & {POSE, CALIBRATION, SENSOR} else "smoothness"
     return "anchor"
 
 
@@ -60,12 +60,14 @@ def errors_by_kind(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> d
 def draw(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, axes: Axes) -> None:
     """Draws poses and control points, and a line from the pose of each projection factor to its points."""
     positions = {
-        key: _position(values, key) for key in list(values.keys()) if gtsam.symbolChr(key) != CALIBRATION
+        key: _position(values, key)
+        for key in list(values.keys())
+        if gtsam.symbolChr(key) not in (CALIBRATION, SENSOR)
     }
     for index in range(graph.size()):
         factor = graph.at(index)
         if kind(factor) == "spline projection":
-            pose, *controls = factor.keys()
+            pose, _, *controls = factor.keys()  # the second key is the calibration of the sensor
             for point in controls:
                 axes.plot(
                     *np.array([positions[pose], positions[point]]).T, color="0.85", linewidth=0.5, zorder=0

@@ -24,10 +24,9 @@ class PlaceRows:
     """These are the derivatives (m, degree + 1, 2) by the control points of the place's span."""
 
     @property
-    def jacobian(self) -> Array:
-        """Returns the derivatives (m, 3 + 2 (degree + 1)) by the pose, and by the control points."""
-        by_control = self.by_control.reshape(-1, 2 * self.by_control.shape[1])
-        return np.concatenate([self.by_pose, by_control], axis=1)
+    def flat_by_control(self) -> Array:
+        """Returns the derivatives (m, 2 (degree + 1)) by the coordinates of the control points."""
+        return self.by_control.reshape(-1, 2 * self.by_control.shape[1])
 
 
 def along_from_place(

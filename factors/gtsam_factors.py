@@ -17,6 +17,7 @@ from .noise import huber_roots, huber_weights
 from .odometry import IntegratedOdometry, odometry_residuals
 from .projection import project
 from .se2 import rotation, to_map
+from .sensor import by_sensor, range_rates, sensor_rows
 from .spans import SpanPolynomials
 
 Array = NDArray[np.float64]
@@ -38,6 +39,8 @@ def spline_projection_factor(
     high: Array,
     sigma_model: float,
     huber: float,
+    sensor_key: int | None = None,
+    twists: Array | None = None,
 ) -> gtsam.CustomFactor:
     """Returns the factor `e_i = n_i . (R z_i + t - S(u_i)) / sigma_i` of one cycle on one boundary.
 
@@ -46,6 +49,9 @@ def spline_projection_factor(
     is a few metres about the expected foot point. points_vehicle z (m, 2) and covariances (m, 2, 2) are in
     the vehicle frame, and sigma_model is in m. A row's weight falls beyond the whitened residual `huber`,
     which may be infinite.
+
+    With a `sensor_key`, the detections are corrected by the sensor's calibration (5,) of that key (see
+    `sensor.by_sensor`), with twists (m, 3) of the vehicle in m/s, m/s and rad/s.
 
     Foot points, standard deviations and weights are recomputed at every evaluation. With Jacobians, rows are
     scaled by the square root of their Huber weight. Without, half their squares are the Huber loss, so that
@@ -60,8 +66,11 @@ def spline_projection_factor(
             f"{len(points_vehicle)}, {len(covariances)} and {len(low)}, {len(high)}"
         )
     curve = _Curve.of(control_keys, tables, low, high)
-    function = _Projection(int(pose_key), curve, points_vehicle, covariances, sigma_model, huber)
-    keys = [int(pose_key), *curve.keys]
+    moving = np.zeros((len(low), 3)) if twists is None else twists
+    function = _Projection(
+        int(pose_key), curve, points_vehicle, covariances, sigma_model, huber, sensor_key, moving
+    )
+    keys = [int(pose_key), *([] if sensor_key is None else [int(sensor_key)]), *curve.keys]
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(low)), keys, function)
 
 
@@ -76,6 +85,8 @@ def spline_projection_factors(
     high: Array,
     sigma_model: float,
     huber: float,
+    sensor_key: int | None = None,
+    twists: Array | None = None,
 ) -> list[gtsam.CustomFactor]:
     """Returns a `spline_projection_factor` for each pose in pose_keys (m,), the key of each row's own pose.
 
@@ -93,6 +104,8 @@ def spline_projection_factors(
             high=high[own],
             sigma_model=sigma_model,
             huber=huber,
+            sensor_key=sensor_key,
+            twists=None if twists is None else twists[own],
         )
         for own in np.split(np.arange(len(pose_keys)), changes)
         if len(own)
@@ -187,23 +200,35 @@ class _Projection:
     """Cones lie about a smooth curve with this standard deviation (m)."""
     huber: float
     """The weight of a row falls beyond this whitened residual."""
+    sensor_key: int | None
+    """This is the key of the sensor's calibration, if the detections are corrected by it."""
+    twists: Array
+    """The vehicle moved with these twists (m, 3), in m/s, m/s and rad/s."""
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
         """Returns robust whitened rows (m,), and writes their Jacobians to H where it is given."""
-        pose = values.atPose2(self.pose_key)
-        poses = np.tile(pose_array(pose), (len(self.points_vehicle), 1))
-        points = to_map(self.points_vehicle, poses)
+        pose, measured = values.atPose2(self.pose_key), self.points_vehicle
+        poses = np.tile(pose_array(pose), (len(measured), 1))
+        sensor = np.zeros(0) if self.sensor_key is None else np.array(values.atVector(self.sensor_key))
+        corrected = measured + by_sensor(measured, self.twists) @ sensor if len(sensor) else measured
+        points = to_map(corrected, poses)
         foot = self.curve.find(values, points)
         rows = project(points, self.covariances, poses, foot, self.sigma_model)
         usable, slots = self.curve.usable(foot)
-        whitened = rows.residual / rows.sigma
+        normals = foot.normal_unit
+        rates = range_rates(normals, poses, measured)
+        by = sensor_rows(normals, rows.residual, poses, measured, self.twists, sensor, rates)
+        whitened = by.factor * rows.residual / rows.sigma
         if H is None:
             return np.asarray(huber_roots(whitened, self.huber) * usable)
         root = np.sqrt(huber_weights(whitened, self.huber)) * usable
-        scale = root / rows.sigma
+        own = root / rows.sigma
+        scale = by.factor * own
         by_pose = rows.by_pose * scale[:, None]
         by_pose[:, :2] = by_pose[:, :2] @ rotation(pose.theta())
-        _fill(H, [by_pose, *self.curve.by_key(rows.by_control * scale[:, None, None], slots)])
+        by_calibration = [by.by_sensor * own[:, None]] if len(sensor) else []
+        by_control = self.curve.by_key(rows.by_control * scale[:, None, None], slots)
+        _fill(H, [by_pose, *by_calibration, *by_control])
         return np.asarray(whitened * root)
 
 

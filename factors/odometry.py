@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,8 @@ class IntegratedOdometry:
     """This is the derivative (3, 2) of the end pose, in its own frame, by (scale error, yaw-rate bias)."""
     whitener: Array
     """This matrix W (3, 3) with `W' W = covariance^-1` whitens a residual."""
+    twist: Array = field(default_factory=lambda: np.zeros(3))
+    """This twist (3,), in m/s, m/s and rad/s, was in force at the end."""
 
 
 def integrate_poses(durations: Array, twists: Array) -> Array:
@@ -68,7 +70,7 @@ def integrate_twists(durations: Array, twists: Array, sigma: Array) -> Integrate
     scaled = (adjoints * (durations[:, None] * sigma)[:, None, :]).transpose(1, 0, 2).reshape(3, -1)
     by_speed, by_rate = adjoints[:, :, :2] @ twists[:, :2, None], adjoints[:, :, 2:]
     by_calibration = np.concatenate([by_speed, by_rate], axis=2).transpose(1, 2, 0) @ durations
-    return _integrated(end, scaled @ scaled.T, by_calibration)
+    return replace(_integrated(end, scaled @ scaled.T, by_calibration), twist=twists[-1])
 
 
 def _integrated(delta: Array, covariance: Array, calibration_jacobian: Array) -> IntegratedOdometry:

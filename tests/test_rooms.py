@@ -20,7 +20,7 @@ LEAVES = {"errors", "labels", "progress"}
 ESTIMATORS = {"online", "batch", "ckf", "landmark"}
 BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "run"}
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping"}
-BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"sim", "estimators"}
+BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"sim", "estimators", "diagnosis"}
 
 ARROWS: dict[str, set[str]] = {
     **{leaf: set() for leaf in LEAVES},
@@ -28,10 +28,11 @@ ARROWS: dict[str, set[str]] = {
     "settings": set(),
     "laps": set(),
     "spline": {"factors", "settings"},
-    "io": {"spline"},
+    "io": {"spline", "factors"},
     "sim": {"io"},
     "graph": {"factors"},
     "run": {"io", "laps"},
+    "diagnosis": {"factors", "io"},
     "mapping": BELOW_MAPPING,
     **dict.fromkeys(ESTIMATORS, BELOW_ESTIMATORS),
     "online": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes

@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchResult
-from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.diagnosis import diagnose
+from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.io.log import CALIBRATION, Log, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES, NAMES
@@ -45,6 +47,8 @@ def summarize(result: RunResult, log: Log) -> dict[str, Any]:
     state = vehicle_of(result)
     if state is not None:
         summary |= _vehicle(state)
+        found = diagnose(state, result.settings)
+        summary |= {"diagnosis": found} if found else {}
     if log.truth is not None:
         summary |= _map_errors(result, log, log.truth) | _trajectory_errors(result, log.truth)
     return summary
@@ -56,11 +60,18 @@ def vehicle_of(result: RunResult) -> VehicleState | None:
 
 
 def _vehicle(state: VehicleState) -> dict[str, Any]:
-    """Returns the calibration with its standard deviations (-, rad/s), and that of the last heading (rad)."""
-    (scale, bias), sigmas = state.calibration.tolist(), state.sigmas.tolist()
-    *_, heading_sigma, scale_sigma, bias_sigma = sigmas
-    calibration = {"scale": scale, "bias": bias, "scale_sigma": scale_sigma, "bias_sigma": bias_sigma}
-    return {"calibration": calibration, "heading_sigma": heading_sigma}
+    """Returns the calibrations with their standard deviations, and that of the last heading (rad).
+
+    Those of the odometry are in (-, rad/s), those of the sensor in the units of `factors.sensor:SENSOR`.
+    """
+    vehicle: list[float] = state.sigmas.tolist()
+    sigmas = [*vehicle[3:], *state.sensor_sigmas.tolist()]
+    names = [*CALIBRATION, *SENSOR]
+    values = [*state.calibration.tolist(), *state.sensor.tolist()]
+    known = list(zip(names, values, sigmas, strict=False))
+    calibration = {name: value for name, value, _ in known}
+    calibration |= {f"{name}_sigma": sigma for name, _, sigma in known}
+    return {"calibration": calibration, "heading_sigma": vehicle[2]}
 
 
 def _events(result: RunResult) -> list[dict[str, Any]]:

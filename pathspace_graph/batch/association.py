@@ -9,7 +9,7 @@ from scipy.ndimage import minimum_filter1d
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.projection import project
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_keys
+from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
@@ -22,8 +22,11 @@ IntArray = NDArray[np.intp]
 
 
 def add_drive(state: State, poses: Array, calibration: Array, settings: AssociationSettings) -> None:
-    """Adds the poses (P, 3) of all cycles and the calibration (2,) to a state that has its curves already."""
-    state.variables.insert(np.array([CALIBRATION_KEY]), calibration)
+    """Adds the poses (P, 3) of all cycles to a state that has its curves already.
+
+    The calibration is that of the odometry (2,), or of odometry and sensor (7,).
+    """
+    state.variables.insert_calibrations(calibration)
     state.variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
     locate_poses(state, settings)
 

@@ -16,7 +16,7 @@ from pathspace_graph.graph.variables import Variables
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.candidates import SIDES
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.log_odometry import LogOdometry
+from pathspace_graph.mapping.log_odometry import LogOdometry, no_errors
 from pathspace_graph.mapping.path import along_and_across
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.batch import LapCorrespondenceSettings
@@ -43,11 +43,11 @@ def start_odometry(
     Where the path recurs, the drift of the odometry is taken out first: every lap passes the same places. The
     curves are closed then, and otherwise open. By default the path driven says whether it recurs.
     """
-    calibration = np.zeros(CALIBRATION_SIZE)
-    poses = chain.dead_reckoned(calibration)
+    calibration = no_errors(settings.calibration)
+    poses = chain.dead_reckoned(calibration[:CALIBRATION_SIZE])
     recurrence = recurrence or find_recurrence(poses, settings)
     if recurrence.recurs:
-        poses, calibration = align_laps(chain, recurrence, settings.batch.laps)
+        poses, calibration[:CALIBRATION_SIZE] = align_laps(chain, recurrence, settings.batch.laps)
     state = State()
     for label in BOUNDARIES:
         _begin_boundary(state, label, poses, recurrence, detections, settings)

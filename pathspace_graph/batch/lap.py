@@ -21,7 +21,7 @@ from scipy.linalg import block_diag
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.graph.elimination import eliminated_system, linear_graph
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POINT, POSE, are_poses, indices, pose_keys
+from pathspace_graph.graph.keys import POSE, are_poses, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.mapping.detections import DetectionTable
@@ -55,7 +55,7 @@ class ClosedMap:
     poses: Array
     """(P, 3) These are the poses of all cycles, map frame."""
     calibration: Array
-    """(2,) This is the calibration: scale error (-) and yaw-rate bias (rad/s)."""
+    """(2,) or (7,) This is the calibration of the odometry, and of the sensor where it is estimated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class LapMarginal:
     splines: dict[int, BSpline]
     """These are the simplified closed curves by label, map frame."""
     calibration: Array
-    """(2,) This is the calibration at the optimum."""
+    """(2,) or (7,) This is the calibration of odometry and sensor at the optimum."""
     poses: Array
     """(P, 3) These are the poses of all cycles of the lap, map frame."""
     first_kept: int
@@ -124,7 +124,7 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
         return LapMarginal(
             convergence=convergence,
             splines=few.splines,
-            calibration=at.state.calibration.copy(),
+            calibration=at.state.variables.calibrations.copy(),
             poses=at.state.poses.copy(),
             first_kept=lap.first_kept,
             mean=mean,
@@ -184,14 +184,17 @@ def marginal_of(
     `T = diag(I, F, I)`, where Sigma is the inverse of the dense marginal's information.
     """
     state = at.state
-    kept = np.concatenate([[CALIBRATION_KEY], state.map_keys, pose_keys(np.array([first_kept]))])
+    calibrations = state.variables.calibrations
+    kept = np.concatenate(
+        [state.variables.calibration_keys, state.map_keys, pose_keys(np.array([first_kept]))]
+    )
     graph = linear_graph(rows_before(system, at, first_kept), state.variables)
     information, vector = eliminated_system(graph, Layout(kept))
     covariance = np.linalg.inv(information)
     shift = covariance @ vector
-    T = block_diag(np.eye(POINT), change, np.eye(POSE))
+    T = block_diag(np.eye(len(calibrations)), change, np.eye(POSE))
     covariance = T @ covariance @ T.T
-    here = np.concatenate([state.calibration, few.map_points.ravel(), state.poses[first_kept]])
+    here = np.concatenate([calibrations, few.map_points.ravel(), state.poses[first_kept]])
     return np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), np.float64), here + T @ shift
 
 

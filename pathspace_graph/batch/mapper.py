@@ -16,7 +16,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
-from pathspace_graph.graph.keys import CALIBRATION_KEY, are_poses, pose_key
+from pathspace_graph.graph.keys import are_poses, pose_key
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, SplineBoundary, joint_covariance
@@ -91,8 +91,8 @@ class BatchResult(BatchRun):
             kept = Layout(keys[~are_poses(keys) | (keys == last)])
             information, _ = eliminated_system(self.system.linear_graph(self.optimum), kept)
             system = FactoredSystem(kept, cholesky(information))
-            covariance = system.covariance(np.array([last, CALIBRATION_KEY], np.intp))
-        return VehicleState(self.trajectory[-1].copy(), self.calibration.copy(), covariance)
+            covariance = system.covariance(np.append(last, variables.calibration_keys))
+        return VehicleState.split(self.trajectory[-1], variables.calibrations, covariance)
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Returns the whole problem at the optimum as GTSAM's nonlinear factors (see `nonlinear_graph`)."""
@@ -136,7 +136,7 @@ class BatchMapper:
     def _solve(self, log: Log, start: Start, on_round: Callable[[], None] | None) -> BatchResult:
         settings, batch, watch = own_settings(self.settings), self.settings.batch, Stopwatch()
         chain = integrate_log(log, self.odometry_sigma, settings.odometry)
-        detections = DetectionTable.of(log.cycles)
+        detections = DetectionTable.of(log.cycles, twists=chain.twists)
         system = BatchSystem(detections, chain, settings, Biweight(batch.loose_gate))
         optimizer = Optimizer(system, batch)
         watch.lap("integrate")

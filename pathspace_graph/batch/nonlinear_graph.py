@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.se2 import rotation, to_map
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POINT, POSE, pose_key, pose_keys
+from pathspace_graph.factors.sensor import SENSOR_SIZE
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POINT, POSE, SENSOR_KEY, pose_key, pose_keys
 from pathspace_graph.graph.odometry import odometry_factor
 from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.spline.boundary import Boundary
@@ -47,6 +48,9 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
         graph.add(factor)
     for factor in _priors(system.chain, at.state.poses[0, 2]):
         graph.add(factor)
+    if len(at.state.variables.sensor):
+        sigmas = gtsam.noiseModel.Diagonal.Sigmas(np.array(system.settings.calibration.sigmas))
+        graph.add(gtsam.PriorFactorVector(SENSOR_KEY, np.zeros(SENSOR_SIZE), sigmas))
     for label, gauge in system.gauges.items():
         for factor in (*_gauge(gauge, at.state.control_points(label)), *_projections(system, at, label)):
             graph.add(factor)
@@ -133,19 +137,21 @@ def _projections(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.
     scale, detections = system.scale(projected), system.detections
     weighted = scale > 0.0
     scale, u, rows = scale[weighted], projected.foot.u[weighted], projected.rows[weighted]
-    cycles, points_vehicle = detections.cycle[rows], detections.point[rows]
-    points = to_map(points_vehicle, at.state.variables.poses_at(cycles))
+    cycles, variables = detections.cycle[rows], at.state.variables
+    points = to_map(detections.corrected(rows, variables.sensor), variables.poses_at(cycles))
     room = _room(boundary, at.state.control_points(label), points, u)
     return spline_projection_factors(
         pose_keys(cycles),
         at.state.keys(label).tolist(),
         boundary.tables,
-        points_vehicle=points_vehicle,
+        points_vehicle=detections.measured[rows],
         covariances=scale[:, None, None] ** -2.0 * np.eye(2),
         low=u - room,
         high=u + room,
         sigma_model=0.0,
         huber=np.inf,
+        sensor_key=SENSOR_KEY if len(variables.sensor) else None,
+        twists=detections.twist[rows],
     )
 
 

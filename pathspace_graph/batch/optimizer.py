@@ -113,6 +113,7 @@ class Optimizer:
         system = self.system
         if not strict:
             locate_poses(state, self.settings.association)
+        system.detections.correct(state.variables.sensor)
         associate(state, system.detections, system.settings, gate, strict)
         if strict and system.settings.place.use == "cones":
             system.place(state)

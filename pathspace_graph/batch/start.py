@@ -28,8 +28,8 @@ class CurveMapper(OnlineEstimator, Protocol):
         """Returns the curves by label, without their control points."""
 
     @property
-    def calibration(self) -> Array:
-        """Returns the calibration (2,) of the odometry: scale error [-] and yaw-rate bias [rad/s]."""
+    def calibrations(self) -> Array:
+        """Returns the calibration of the odometry (2,), or of odometry and sensor (7,)."""
 
     @property
     def closed(self) -> bool:
@@ -55,7 +55,7 @@ def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
         state.add_boundary(label, own, mapper.control_points(label))
     corrected = mapper.corrected_poses
     poses = unwrap(np.concatenate([corrected, run.trajectory[len(corrected) :]]))
-    add_drive(state, poses, mapper.calibration, batch.association)
+    add_drive(state, poses, mapper.calibrations, batch.association)
     return state, run
 
 

@@ -13,13 +13,14 @@ from pathspace_graph.factors.cone_place import PlaceRows
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.projection import ProjectionRows, project, sigma_across
 from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.sensor import SensorRows, range_rates, sensor_rows
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
-from pathspace_graph.graph.keys import are_poses, pose_keys
+from pathspace_graph.graph.keys import SENSOR_KEY, are_poses, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.mapping.cone_places import ConePlaces, lay_out_places
 from pathspace_graph.mapping.detections import NOWHERE, DetectionTable
-from pathspace_graph.mapping.log_odometry import LogOdometry
+from pathspace_graph.mapping.log_odometry import LogOdometry, sensor_prior, sensor_prior_cost
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
@@ -75,11 +76,13 @@ class Projected:
     inside: BoolArray
     """Each flag (m,) is set where the foot point was inside the curve when the round began. A round holds it,
     so that the cost does not jump where an end of an open curve slides past a detection."""
+    by: SensorRows
+    """This is how their residuals depend on the calibration of the sensor."""
 
     @property
     def whitened(self) -> Array:
         """Returns the residuals (m,) in sigmas."""
-        return np.asarray(self.projection.residual / self.sigma)
+        return np.asarray(self.by.factor * self.projection.residual / self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +95,13 @@ class Placed:
     """These are their residuals and derivatives."""
     sigma: Array
     """These are their standard deviations (m,) along the curve in m."""
+    by: SensorRows
+    """This is how their residuals depend on the calibration of the sensor."""
 
     @property
     def whitened(self) -> Array:
         """Returns the residuals (m,) in sigmas."""
-        return np.asarray(self.along.residual / self.sigma)
+        return np.asarray(self.by.factor * self.along.residual / self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +136,7 @@ class BatchSystem:
         """These are the cones' places along the curves, where the settings ask for them."""
         self._sigma, self._sigma_along = np.ones(len(detections)), np.ones(len(detections))
         self._inside = np.ones(len(detections), bool)
+        self._rates, self._rates_along = np.zeros((2, len(detections), 2))
 
     def begin(self, state: State) -> None:
         """Makes the gauges anew, which hold the control points where they are now.
@@ -157,6 +163,7 @@ class BatchSystem:
             self.gauges[label].cost(state.control_points(label), state.poses) for label in state.boundaries
         )
         cost += self.chain.prior_cost(state.poses[0], state.calibration)
+        cost += sensor_prior_cost(state.variables, self.settings.calibration)
         if placed is not None:
             cost += float(self.kernel.loss(placed.whitened).sum())
         return Evaluation(state, projected, placed, odometry, cost)
@@ -190,24 +197,40 @@ class BatchSystem:
         detections = self.detections
         rows = np.flatnonzero(detections.used & (detections.place != NOWHERE))
         poses = state.variables.poses_at(detections.cycle[rows])
-        points = to_map(detections.point[rows], poses)
+        points = to_map(detections.corrected(rows, state.variables.sensor), poses)
         along = places.along(detections.place[rows], state.map_points, points, poses)
         if hold:
             covariances, sigma = detections.covariance[rows], self.settings.place.sigma
             self._sigma_along[rows] = sigma_across(along.tangent_unit, covariances, poses, sigma)
-        return Placed(rows, along, self._sigma_along[rows])
+            self._rates_along[rows] = range_rates(along.tangent_unit, poses, detections.measured[rows])
+        by = self._by_sensor(state, rows, along.tangent_unit, along.residual, self._rates_along[rows])
+        return Placed(rows, along, self._sigma_along[rows], by)
 
     def _project(self, state: State, label: int, hold: bool) -> Projected:
         detections = self.detections
         rows = detections.used_on(label)
         poses = state.variables.poses_at(detections.cycle[rows])
-        points = to_map(detections.point[rows], poses)
+        points = to_map(detections.corrected(rows, state.variables.sensor), poses)
         foot = state.boundaries[label].refine(state.control_points(label), points, detections.u[rows])
         sigma_model = self.settings.spline.sigma_model
         projection = project(points, detections.covariance[rows], poses, foot, sigma_model)
         if hold:
             self._sigma[rows], self._inside[rows] = projection.sigma, foot.interior
-        return Projected(rows, foot, projection, self._sigma[rows], self._inside[rows])
+            self._rates[rows] = range_rates(foot.normal_unit, poses, detections.measured[rows])
+        by = self._by_sensor(state, rows, foot.normal_unit, foot.distance, self._rates[rows])
+        return Projected(rows, foot, projection, self._sigma[rows], self._inside[rows], by)
+
+    def _by_sensor(
+        self, state: State, rows: IntArray, directions: Array, residual: Array, rates: Array
+    ) -> SensorRows:
+        """Returns how residuals (m,) along unit vectors (m, 2), map frame, depend on the sensor.
+
+        A round holds the `rates` (m, 2), as it holds the sigmas.
+        """
+        detections, variables = self.detections, state.variables
+        poses = variables.poses_at(detections.cycle[rows])
+        measured, twists = detections.measured[rows], detections.twist[rows]
+        return sensor_rows(directions, residual, poses, measured, twists, variables.sensor, rates)
 
     def _detections_cost(self, projected: dict[int, Projected]) -> float:
         used = sum(int(p.inside.sum()) for p in projected.values())
@@ -223,6 +246,7 @@ class BatchSystem:
         """
         state = at.state
         groups = self.chain.rows(at.odometry, state.poses[0], state.calibration)
+        groups += sensor_prior(state.variables, self.settings.calibration)
         for label, gauge in (gauges or self.gauges).items():
             points = state.control_points(label)
             groups += [self.detection_rows(at, label), gauge.beside(points, state.poses)]
@@ -238,9 +262,9 @@ class BatchSystem:
         control = state.keys(label)[state.boundaries[label].columns(p.foot.span)]
         by_control = p.projection.by_control.reshape(len(cycle), 2 * control.shape[1])
         return Rows(
-            keys=np.column_stack([control, pose_keys(cycle)]),
-            jacobian=np.column_stack([by_control, p.projection.by_pose]) * scale[:, None],
-            residual=p.projection.residual * scale,
+            keys=np.column_stack([*self._sensor_keys(state, cycle), control, pose_keys(cycle)]),
+            jacobian=_jacobian(p.by, by_control, p.projection.by_pose) * scale[:, None],
+            residual=p.by.factor * p.projection.residual * scale,
             owner=owners(cycle, label),
         )
 
@@ -252,11 +276,15 @@ class BatchSystem:
         by_control = placed.along.by_control.reshape(len(cycle), -1)
         keys = self.places.keys[place]
         return Rows(
-            keys=np.column_stack([keys, pose_keys(cycle)]),
-            jacobian=np.column_stack([by_control, placed.along.by_pose]) * scale[:, None],
-            residual=placed.along.residual * scale,
+            keys=np.column_stack([*self._sensor_keys(at.state, cycle), keys, pose_keys(cycle)]),
+            jacobian=_jacobian(placed.by, by_control, placed.along.by_pose) * scale[:, None],
+            residual=placed.by.factor * placed.along.residual * scale,
             owner=owners(cycle, self.detections.boundary[placed.rows]),
         )
+
+    def _sensor_keys(self, state: State, cycles: IntArray) -> list[IntArray]:
+        """Returns the key of the sensor's calibration for each row (m,), if it is estimated."""
+        return [np.full_like(cycles, SENSOR_KEY)] if len(state.variables.sensor) else []
 
     def scale(self, projected: Projected) -> Array:
         """Returns the factor (m,) that whitens and weights each row (1/m), zero for those not inside."""
@@ -302,6 +330,12 @@ class BatchSystem:
         keys = at.state.variables.keys
         graph = linear_graph(fix_map(self.rows(at)), at.state.variables)
         return Elimination(graph, Layout(keys[are_poses(keys)])).poses_given(np.zeros(0))
+
+
+def _jacobian(by: SensorRows, by_control: Array, by_pose: Array) -> Array:
+    """Returns derivatives (m, n) by [calibration of the sensor | control points | pose]."""
+    factor = by.factor[:, None]
+    return np.concatenate([by.by_sensor, factor * by_control, factor * by_pose], axis=1)
 
 
 def seen_from(points: Array, poses: Array, points_after: Array, poses_after: Array) -> Array:

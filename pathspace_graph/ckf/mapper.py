@@ -34,7 +34,9 @@ class CkfMapper:
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
         self.odometry_sigma = odometry_noise(odometry_sigma)
-        self.state = CurveState(Belief.at_start(self.settings.odometry), self.settings)
+        self.state = CurveState(
+            Belief.at_start(self.settings.odometry, self.settings.calibration), self.settings
+        )
         """This holds the pose, the curves and their joint covariance."""
         self.path = DrivenPath(self.settings.path)
         """This is the path driven."""
@@ -49,6 +51,7 @@ class CkfMapper:
         """Processes one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
         self._predict(odometry, detections.t)
+        detections = self.state.belief.corrected(detections)
         watch.lap("predict")
         found = classify(self.state, detections)
         watch.lap("classify")

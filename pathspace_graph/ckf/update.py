@@ -10,11 +10,12 @@ from scipy.linalg import block_diag
 
 from pathspace_graph.factors.bspline import scatter
 from pathspace_graph.factors.projection import project
-from pathspace_graph.factors.se2 import rotation, to_map
+from pathspace_graph.factors.se2 import rotation, to_map, to_vehicle
+from pathspace_graph.factors.sensor import SENSOR_SIZE, in_vehicle
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
-from pathspace_graph.mapping.belief import point_columns, to_vehicle_rows
+from pathspace_graph.mapping.belief import SENSOR_COLUMNS, point_columns, to_vehicle_rows
 
 from .fit import SplineMeasurement, fit_detections
 from .state import CurveState
@@ -51,6 +52,8 @@ class CurveBlock:
     """This is S_z in the vehicle frame."""
     combinations: Array
     """(2 r, q) Each column is a linear combination of the coordinates of S_z that is measured."""
+    by_sensor: Array
+    """(2 r, 5) This is the derivative of S_z by the calibration of the sensor, as it corrects detections."""
 
 
 # --- classification --------------------------------------------------------------------------------------
@@ -80,9 +83,11 @@ def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
     projected = project(points, detections.covariances[rows], poses, foot, state.settings.ckf.sigma_model)
     control = foot.span[:, None] + np.arange(-curve.degree, 1)
     control = control % curve.size if curve.periodic else control
-    gradient = np.concatenate(
-        [projected.by_pose, projected.by_control.reshape(len(rows), control.shape[1] * POINT)], axis=1
-    )
+    by_control = projected.by_control.reshape(len(rows), control.shape[1] * POINT)
+    expected = to_vehicle(foot.position, poses)
+    normals = in_vehicle(foot.normal_unit, poses)
+    by_calibration = np.einsum("mi,mik->mk", normals, state.belief.by_sensor(expected))
+    gradient = np.concatenate([projected.by_pose, by_calibration, by_control], axis=1)
     variance = projected.sigma**2 + gate.sigma_floor**2 + _joint_variance(state, label, control, gradient)
     squared = foot.distance**2 / variance
     passes = foot.interior & (np.abs(foot.distance) < gate.rough) & (squared < gate.chi**2)
@@ -91,9 +96,13 @@ def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
 
 
 def _joint_variance(state: CurveState, label: int, control: IntArray, gradient: Array) -> Array:
-    """Returns `g' Sigma g` (m,) of gradients (m, 3 + 2 (p + 1)) by pose and control points (m, p + 1)."""
+    """Returns `g' Sigma g` (m,) of gradients (m, 8 + 2 (p + 1)) by pose, sensor and control points.
+
+    The control points (m, p + 1) are given by their indices.
+    """
     own = point_columns(state.offset(label) + control.ravel()).reshape(len(control), POINT * control.shape[1])
-    columns = np.concatenate([np.tile(np.arange(POSE), (len(control), 1)), own], axis=1)
+    head = np.append(np.arange(POSE), SENSOR_COLUMNS)
+    columns = np.concatenate([np.tile(head, (len(control), 1)), own], axis=1)
     block = state.belief.covariance[columns[:, :, None], columns[:, None, :]]
     return np.asarray(np.einsum("mi,mij,mj->m", gradient, block, gradient))
 
@@ -109,16 +118,19 @@ def update(state: CurveState, detections: Detections, found: dict[int, OnCurve])
     direct = state.settings.ckf.prediction == "direct"
     bounds = np.cumsum([0] + [len(block.columns) for block in blocks])
 
+    head, now = POSE + SENSOR_SIZE, state.belief.sensor.copy()
+
     def predict(x: Array) -> Array:
-        control_vehicle, predicted = to_vehicle_rows(x[:, :POSE], x[:, POSE:]), []
+        control_vehicle, predicted = to_vehicle_rows(x[:, :POSE], x[:, head:]), []
         for block, start, stop in zip(blocks, bounds[:-1], bounds[1:], strict=True):
             own = control_vehicle[:, start:stop]
             if not direct:
                 own = block.fitted.refitted(own.reshape(len(x), -1, POINT)).reshape(len(x), -1)
+            own = own - (x[:, POSE:head] - now) @ block.by_sensor.T
             predicted.append(own @ block.combinations)
         return np.concatenate(predicted, axis=1)
 
-    columns = np.concatenate([np.arange(POSE), *(block.columns for block in blocks)])
+    columns = state.belief.measuring_columns(np.concatenate([block.columns for block in blocks]))
     measured = np.concatenate([block.fitted.points.ravel() @ block.combinations for block in blocks])
     noise = block_diag(*(b.combinations.T @ b.fitted.covariance @ b.combinations for b in blocks))
     if direct:
@@ -140,7 +152,9 @@ def _fit(state: CurveState, label: int, detections: Detections, on: OnCurve) -> 
     )
     measured = np.eye(len(control)) if settings.prediction == "direct" else fitted.range_basis()
     combinations: Array = np.asarray(np.kron(measured, np.eye(POINT)), float)
-    return CurveBlock(state.columns(label, control), fitted, combinations)
+    expected = state.belief.by_sensor(on.basis[:, control] @ fitted.known)
+    by_calibration = np.einsum("rm,mik->rik", fitted.gain, expected).reshape(-1, SENSOR_SIZE)
+    return CurveBlock(state.columns(label, control), fitted, combinations, by_calibration)
 
 
 def _widened(state: CurveState, covariances: Array, tangents: Array) -> Array:

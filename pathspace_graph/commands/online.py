@@ -10,8 +10,9 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
+from pathspace_graph.diagnosis import diagnose
 from pathspace_graph.estimators import DEFAULT, check_online, make_online
-from pathspace_graph.eval.metrics.summary import lap_times, laps_of, not_mapped, summarize
+from pathspace_graph.eval.metrics.summary import lap_times, laps_of, not_mapped, summarize, vehicle_of
 from pathspace_graph.eval.metrics.table1 import LapMetrics
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import Log, read_log
@@ -72,6 +73,9 @@ def report(result: RunResult, log: Log) -> None:
             console.print(
                 f"at {record.t:.1f} s: {record.notice}", highlight=False, soft_wrap=True, markup=False
             )
+    state = vehicle_of(result)
+    for line in [] if state is None else diagnose(state, result.settings):
+        console.print(line, highlight=False, soft_wrap=True, markup=False)
     missing = not_mapped(result.map, log)
     if missing:
         Console(stderr=True).print("; ".join(missing), highlight=False, soft_wrap=True, markup=False)

@@ -21,7 +21,7 @@ from scipy.linalg import lapack
 from pathspace_graph.errors import SingularSystemError
 
 from .gaussian import cholesky, factors_of, graph_of, keys_of, normal_equations, require_keys, solve
-from .keys import POINT, POSE, are_poses, sizes
+from .keys import POSE, are_poses, sizes
 from .rows import Rows, jacobian_factors
 from .variables import Layout, Variables
 
@@ -96,8 +96,9 @@ class Elimination:
     def poses_given(self, change: Array) -> Array:
         """Returns the solution of the poses (3 P,), given a change of the map (n,)."""
         given = gtsam.VectorValues()
-        for key, point in zip(self.map.keys.tolist(), change.reshape(-1, POINT), strict=True):
-            given.insert(key, point)
+        own = np.split(change, self.map.starts[1:])
+        for key, values in zip(self.map.keys.tolist(), own if self.map.size else [], strict=True):
+            given.insert(key, values)
         return np.asarray(self._net.optimize(given).vector(self.poses.keys.tolist()))
 
     # --- covariances -------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Keys: what a GTSAM key means, and the order of the keys.
 
     b_0   calibration of the odometry (scale error [-], yaw-rate bias [rad/s])
+    c_0   calibration of the sensor (`factors.sensor:SENSOR`), where it is estimated
     l_j   control point j of the left boundary (m, m), map frame
     m_i   landmark i of the landmark graphs (m, m), map frame
     r_j   control point j of the right boundary (m, m), map frame
@@ -21,6 +22,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.sensor import SENSOR_SIZE
+
 IntArray = NDArray[np.intp]
 
 CONTROL_LETTERS: Final = ("l", "r")
@@ -29,14 +32,18 @@ LANDMARK_LETTER: Final = "m"
 """The keys of landmarks have this letter."""
 CALIBRATION_LETTER: Final = "b"
 """The key of the odometry's calibration has this letter."""
+SENSOR_LETTER: Final = "c"
+"""The key of the sensor's calibration has this letter."""
 POSE_LETTER: Final = "x"
 """The keys of poses have this letter."""
 POSE: Final = 3
 """A pose has this number of entries: x, y, theta."""
 POINT: Final = 2
-"""Every other variable has this number of entries: a control point, a landmark, the calibration."""
+"""Every other variable but the sensor's calibration has this number of entries."""
 CALIBRATION_KEY: Final = int(gtsam.symbol(CALIBRATION_LETTER, 0))
 """This is the key of the odometry's calibration."""
+SENSOR_KEY: Final = int(gtsam.symbol(SENSOR_LETTER, 0))
+"""This is the key of the sensor's calibration. The keys of all points and poses are greater."""
 
 _INDEX_BITS: Final = 56
 """GTSAM keeps the index of a symbol in this number of low bits, and its letter in the highest byte."""
@@ -91,7 +98,7 @@ def are_poses(keys: IntArray) -> NDArray[np.bool_]:
 
 def sizes(keys: IntArray) -> IntArray:
     """Returns the number of entries of each key's variable, which its letter determines."""
-    return np.where(are_poses(keys), POSE, POINT)
+    return np.where(are_poses(keys), POSE, np.where(keys == SENSOR_KEY, SENSOR_SIZE, POINT))
 
 
 def name(key: int) -> str:

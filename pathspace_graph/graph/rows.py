@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .keys import FIRST_POSE, POINT, POSE, names
+from .keys import names, sizes
 from .variables import UNKNOWN, Layout, Variables
 
 Array = NDArray[np.float64]
@@ -50,7 +50,7 @@ class Rows:
     @property
     def pattern(self) -> tuple[IntArray, IntArray]:
         """Returns which of a row's keys each derivative (n,) is by, and which entry of its variable."""
-        return _pattern(tuple((self.keys[0] >= FIRST_POSE).tolist()))
+        return _pattern(tuple(sizes(self.keys[0]).tolist()))
 
     def columns(self, layout: Layout) -> IntArray:
         """Returns the column (m, n) of each derivative, which is UNKNOWN where a key is not in the layout."""
@@ -60,8 +60,7 @@ class Rows:
 
 
 @cache
-def _pattern(poses: tuple[bool, ...]) -> tuple[IntArray, IntArray]:
-    widths = [POSE if is_pose else POINT for is_pose in poses]
+def _pattern(widths: tuple[int, ...]) -> tuple[IntArray, IntArray]:
     return np.repeat(np.arange(len(widths)), widths), np.concatenate([np.arange(width) for width in widths])
 
 

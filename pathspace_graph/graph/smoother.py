@@ -39,10 +39,11 @@ from .gaussian import (
 from .inactive import InactiveMap
 from .keys import (
     CALIBRATION_KEY,
-    CALIBRATION_LETTER,
     POINT,
     POSE,
     POSE_LETTER,
+    SENSOR_KEY,
+    SENSOR_LETTER,
     are_poses,
     indices,
     name,
@@ -77,6 +78,8 @@ class SmootherSettings:
     """The keyframes of the submaps are this length of path (m) apart."""
     sigma_calibration: tuple[float, float]
     """These are the prior sigmas of the calibration: scale error (-) and bias of the yaw rate (rad/s)."""
+    sigma_sensor: tuple[float, ...] = ()
+    """These are the prior sigmas of the sensor's calibration, none where it is not estimated."""
     relative: bool = False
     """While the loop is open, each part of the map is known in the frame of a pose beside it. The rows of the
     map must not change under a rigid motion of all variables."""
@@ -125,9 +128,12 @@ class FixedLagSmoother(Generic[M_co]):
         return self.first_cycle + len(self.times)
 
     def _begin_calibration(self) -> None:
-        key, sigma = np.array([CALIBRATION_KEY]), np.array(self.settings.sigma_calibration)
-        self.variables.insert(key, np.zeros(POINT))
-        self.prior.push_back(jacobian_factor(key, np.diag(1.0 / sigma), np.zeros(POINT)))
+        own = (CALIBRATION_KEY, self.settings.sigma_calibration), (SENSOR_KEY, self.settings.sigma_sensor)
+        for key, sigma in own:
+            if len(sigma):
+                keys, zero = np.array([key]), np.zeros(len(sigma))
+                self.variables.insert(keys, zero)
+                self.prior.push_back(jacobian_factor(keys, np.diag(1.0 / np.array(sigma)), zero))
 
     def predict(
         self, t: float, odometry: IntegratedOdometry, sigmas_start: tuple[float, float, float]
@@ -237,6 +243,7 @@ class FixedLagSmoother(Generic[M_co]):
         assert self.last_step is not None
         entries = self.variables.layout.entries(self.last_step.layout.keys)
         self.variables.values[entries] += solve(self.last_step.factor, negative_gradient)
+        self.map.correct()
 
     def factorize(self, sigma_step: float | None = None) -> Array:
         """Factors the system of a step into `last_step`, and returns the negative gradient (n,).
@@ -252,7 +259,7 @@ class FixedLagSmoother(Generic[M_co]):
         now = self.variables.change(self.variables.layout.entries(layout.keys))
         negative_gradient = vector - hessian @ now
         if sigma_step is not None:
-            first, last = layout.block(CALIBRATION_LETTER).stop, layout.block(POSE_LETTER).start
+            first, last = layout.block(SENSOR_LETTER).stop, layout.block(POSE_LETTER).start
             points = np.arange(first, last)
             hessian[points, points] += sigma_step**-2
         self.last_step = FactoredSystem(layout, cholesky(hessian))

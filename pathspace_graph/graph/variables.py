@@ -15,6 +15,8 @@ from .keys import (
     FIRST_POSE,
     POINT,
     POSE,
+    SENSOR_KEY,
+    SENSOR_LETTER,
     are_poses,
     letter_keys,
     name,
@@ -53,7 +55,7 @@ class Layout:
     @cached_property
     def turning(self) -> IntArray:
         """Returns the columns of the x of all points and poses, which a rigid motion turns with y."""
-        return np.asarray(self.starts[self.keys != CALIBRATION_KEY])
+        return np.asarray(self.starts[self.keys > SENSOR_KEY])
 
     @cached_property
     def headings(self) -> IntArray:
@@ -197,6 +199,26 @@ class Variables:
         return self.block(CALIBRATION_LETTER)
 
     @property
+    def calibrations(self) -> Array:
+        """Returns a view of the calibrations of the odometry and, where it is estimated, of the sensor."""
+        first, last = self.layout.block(CALIBRATION_LETTER), self.layout.block(SENSOR_LETTER)
+        return self.values[first.start : last.stop]
+
+    @property
+    def calibration_keys(self) -> IntArray:
+        """Returns the keys of the calibrations: the odometry's, and the sensor's if it is estimated."""
+        return np.asarray(self.keys[self.keys <= SENSOR_KEY])
+
+    def insert_calibrations(self, values: Array) -> None:
+        """Inserts the calibration of the odometry (2,), or of odometry and sensor (7,)."""
+        self.insert(np.array([CALIBRATION_KEY, SENSOR_KEY])[: 1 if len(values) == POINT else 2], values)
+
+    @property
+    def sensor(self) -> Array:
+        """Returns a view of the sensor's calibration (5,), which is empty where it is not estimated."""
+        return self.block(SENSOR_LETTER)
+
+    @property
     def keyframes(self) -> IntArray:
         """Returns the keys of the poses that are older than the window, oldest first."""
         first, last = self.keys.searchsorted([FIRST_POSE, pose_key(self.first_cycle)])
@@ -216,12 +238,12 @@ class Variables:
         return self.poses[cycles - self.first_cycle]
 
     def gtsam_values(self, keys: IntArray) -> gtsam.Values:
-        """Returns the values of keys (k,) for GTSAM: a pose is a `Pose2`, any other variable a `Point2`."""
+        """Returns the values of keys (k,) for GTSAM: a pose is a `Pose2`, any other variable a vector."""
         values = gtsam.Values()
         starts, poses = self.layout.columns(keys).tolist(), are_poses(keys).tolist()
-        for key, start, is_pose in zip(keys.tolist(), starts, poses, strict=True):
-            if is_pose:
-                values.insert(key, gtsam.Pose2(*self.values[start : start + POSE]))
-            else:
-                values.insert(key, self.values[start : start + POINT])
+        for key, start, width, is_pose in zip(
+            keys.tolist(), starts, sizes(keys).tolist(), poses, strict=True
+        ):
+            own = self.values[start : start + width]
+            values.insert(key, gtsam.Pose2(*own) if is_pose else own)
         return values

@@ -14,13 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .gaussian import as_hessian_factor, graph_of
-from .keys import CALIBRATION_LETTER, POSE, POSE_LETTER
+from .keys import CALIBRATION_LETTER, POSE, POSE_LETTER, SENSOR_LETTER
 from .odometry import OdometryChain
 from .rows import LinearFactor, Rows, jacobian_factors, stacked_factor
 from .variables import Variables
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+
+
+SENSOR_LEVER = 10.0
+"""A change of the sensor's calibration moves detections by about this much (m by its unit): they are ten
+metres away, and the vehicle drives at ten metres a second."""
 
 
 class MapRows(Protocol):
@@ -43,6 +48,9 @@ class MapRows(Protocol):
 
         The pose is the first key of a row, and the cycle is its owner.
         """
+
+    def correct(self) -> None:
+        """Corrects the detections by the present calibration of the sensor."""
 
     def linearized(self, cycles: IntArray) -> None:
         """Notes that the graph now holds the rows that were returned last, which are of these cycles."""
@@ -142,13 +150,15 @@ class WindowFactors(Generic[M_co]):
     def _moved(self) -> IntArray:
         """Returns the keys of variables that moved by more than the tolerance since their linearization.
 
-        The calibration is never among them, since every row is linear in it.
+        The odometry's calibration is never among them, since every row is linear in it. That of the sensor
+        moves the foot points of detections.
         """
         layout = self.variables.layout
         tolerance, poses = np.zeros(layout.size), layout.block(POSE_LETTER)
         if not self.exact:
             tolerance += self._tolerances[0]
             tolerance[poses.start + POSE - 1 : poses.stop : POSE] = self._tolerances[1]
+            tolerance[layout.block(SENSOR_LETTER)] = self._tolerances[0] / SENSOR_LEVER
         tolerance[layout.block(CALIBRATION_LETTER)] = np.inf
         moved = np.abs(self.variables.values - self.variables.linearized) > tolerance
         return layout.keys[np.logical_or.reduceat(moved, layout.starts)]

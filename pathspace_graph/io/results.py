@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE
+
 from .files import atomic_folder
 from .json_file import write_json
 from .map import MAP_FILE, Map, map_to_json
@@ -60,6 +62,25 @@ class VehicleState:
     """This is the calibration (2,): scale error of the speeds (-), bias of the yaw rate (rad/s)."""
     covariance: Array
     """This is the joint covariance (5, 5) of [pose | calibration]."""
+    sensor: Array = field(default_factory=lambda: np.zeros(0))
+    """This is the calibration of the sensor (5,), `factors.sensor:SENSOR`, or (0,) where there is none."""
+    sensor_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    """This is its covariance (5, 5), or (0, 0)."""
+
+    @property
+    def sensor_sigmas(self) -> Array:
+        """Returns the standard deviations (5,) of the sensor's calibration, or (0,)."""
+        return np.sqrt(np.diag(self.sensor_covariance))
+
+    @classmethod
+    def split(cls, pose: Array, calibrations: Array, joint: Array) -> VehicleState:
+        """Returns the state of a joint covariance of [pose | calibration of odometry | of sensor].
+
+        The calibrations (2,) or (7,) are copied.
+        """
+        known = len(pose) + CALIBRATION_SIZE
+        odometry, sensor = np.split(calibrations.copy(), [CALIBRATION_SIZE])
+        return cls(pose.copy(), odometry, joint[:known, :known], sensor, joint[known:, known:])
 
     @property
     def sigmas(self) -> Array:

@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 from pathspace_graph.factors.landmark import landmark_residuals
 from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.graph.keys import POINT
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.settings.comparison import LandmarkSettings
@@ -164,7 +165,9 @@ def predict(smoother: LandmarkSmoother, landmarks: IntArray) -> Prediction:
     expected = landmark_residuals(poses, state.landmarks[landmarks], zero)
     if smoother.last_step is None or k == 0:
         return Prediction(landmarks, expected.residual, np.zeros((k, POINT, POINT)))
-    jacobian = np.concatenate([expected.by_pose, expected.by_landmark], axis=2)
+    columns = len(smoother.variables.sensor)
+    sensor = by_sensor(expected.residual, np.tile(smoother.map.twist, (k, 1)))[:, :, :columns]
+    jacobian = np.concatenate([expected.by_pose, -sensor, expected.by_landmark], axis=2)
     rows = two_rows(np.full(k, smoother.next_cycle - 1), state.numbers[landmarks], jacobian, zero)
     return Prediction(landmarks, expected.residual, smoother.predicted_covariance(rows, together=POINT))
 

@@ -101,5 +101,5 @@ def start_online(log: Log, system: LandmarkSystem, odometry_sigma: Array) -> Lan
     state = LandmarkState()
     state.add(track.state.landmarks, track.state.labels, track.state.numbers)
     state.votes, state.next_number = track.state.votes, track.state.next_number
-    insert_drive(state, smoother.variables.calibration, poses)
+    insert_drive(state, smoother.variables.calibrations, poses)
     return state

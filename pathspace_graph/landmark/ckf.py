@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.graph.keys import POINT, POSE
+from pathspace_graph.graph.keys import POINT
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.belief import HEAD, Belief, point_columns, to_vehicle_rows
+from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
 from pathspace_graph.mapping.prediction import integrate_odometry, odometry_noise
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult, Stopwatch
@@ -48,7 +48,7 @@ class LandmarkCkf:
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
         self.odometry_sigma = odometry_noise(odometry_sigma)
-        self.belief = Belief.at_start(self.settings.odometry)
+        self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
         """This is the state `x = [pose | calibration | landmarks]`."""
         self.labels: IntArray = np.zeros(0, np.intp)
         """(n,) These are the labels of the landmarks."""
@@ -59,6 +59,7 @@ class LandmarkCkf:
         """Processes one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
         self.belief.predict(integrate_odometry(odometry, detections.t, self.odometry_sigma))
+        detections = self.belief.corrected(detections)
         watch.lap("predict")
         found = self._associate(detections)
         watch.lap("associate")
@@ -102,10 +103,10 @@ class LandmarkCkf:
         rows = np.flatnonzero(landmark != UNASSOCIATED)
         if len(rows) == 0:
             return
-        columns = np.concatenate([np.arange(POSE), point_columns(landmark[rows])])
+        columns = self.belief.measuring_columns(point_columns(landmark[rows]))
         noise = block_diag(*detections.covariances[rows])
         measured = detections.points_vehicle[rows].ravel()
-        self.belief.update(columns, lambda x: to_vehicle_rows(x[:, :POSE], x[:, POSE:]), measured, noise)
+        self.belief.update(columns, self.belief.measuring(landmark[rows]), measured, noise)
 
     def _create(self, detections: Detections, new: NDArray[np.bool_]) -> None:
         """Adds a landmark for each track that has enough detections beyond the gate of every landmark.

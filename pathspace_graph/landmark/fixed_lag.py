@@ -55,9 +55,10 @@ class LandmarkFixedLag:
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """Processes one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
-        predict(self.smoother, self.path, odometry, detections.t, self.odometry_sigma, self.settings)
+        sigma = self.odometry_sigma
+        integrated = predict(self.smoother, self.path, odometry, detections.t, sigma, self.settings)
         watch.lap("predict")
-        new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
+        new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, integrated.twist)
         associate_newest(self.smoother, new, self._eligible())
         watch.lap("associate")
         created = self._create(new, detections.t)

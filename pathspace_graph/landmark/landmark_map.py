@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.landmark import landmark_residuals
 from pathspace_graph.factors.noise import huber_weights, whiteners
-from pathspace_graph.graph.keys import POINT, POSE, landmark_keys, pose_keys
+from pathspace_graph.factors.sensor import RANGE, by_range, by_sensor
+from pathspace_graph.graph.keys import POINT, POSE, SENSOR_KEY, landmark_keys, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.io.log import Detections
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .state import LandmarkDetections, LandmarkState
@@ -35,10 +37,22 @@ class LandmarkMap:
         self.variables = self.state.variables
         self.detections = LandmarkDetections()
         """These are the detections from the poses in the window."""
+        self.twist: Array = np.zeros(POSE)
+        """(3,) The vehicle moved with this twist at the newest detections, in m/s, m/s and rad/s."""
         self.loop_pairs: IntArray = NO_PAIRS
         """(k, 2) Each row holds the numbers of two landmarks that are held together while the loop closes."""
         self.merged_into: dict[int, int] = {}
         """This maps the number of each landmark that was merged to the number of the one that was kept."""
+
+    def add(self, detections: Detections, cycle: int, twist: Array) -> slice:
+        """Adds the detections of the newest cycle, corrected by the sensor's calibration; returns their rows.
+
+        The vehicle moved with this twist (3,), in m/s, m/s and rad/s.
+        """
+        self.twist = twist
+        rows = self.detections.append(detections, cycle, twist)
+        self.correct()
+        return rows
 
     def changed(self) -> IntArray:
         """Returns the cycles (k,) whose detections in use have changed since they were linearized last."""
@@ -48,6 +62,10 @@ class LandmarkMap:
         """Returns two rows for each detection in use of some cycles."""
         chosen = self.detections.used & self.detections.in_cycles(cycles)
         return [landmark_rows(self.state, self.detections, np.flatnonzero(chosen), self.settings.gate.huber)]
+
+    def correct(self) -> None:
+        """Corrects the detections by the present calibration of the sensor."""
+        self.detections.correct(self.variables.sensor)
 
     def linearized(self, cycles: IntArray) -> None:
         """Notes that the graph holds the present rows of these cycles."""
@@ -109,16 +127,33 @@ def landmark_rows(
     """
     cycles, numbers = detections.cycle[chosen], detections.landmark[chosen]
     points = state.landmarks[state.positions(numbers)]
-    predicted = landmark_residuals(state.variables.poses_at(cycles), points, detections.point[chosen])
+    sensor = state.variables.sensor
+    seen = detections.corrected(chosen, sensor)
+    predicted = landmark_residuals(state.variables.poses_at(cycles), points, seen)
     white = whiteners(detections.covariance[chosen])
+    by_calibration = np.zeros((len(chosen), POINT, 0))
+    if len(sensor):
+        measured, twists = detections.measured[chosen], detections.twist[chosen]
+        rates = by_range(measured)
+        restored = np.eye(POINT) + np.einsum("mkij,k->mij", rates, sensor[RANGE])
+        by_calibration = -by_sensor(measured, twists)
+        by_range_errors = np.linalg.solve(restored[:, None], rates @ predicted.residual[:, None, :, None])
+        by_calibration[:, :, RANGE] += by_range_errors[..., 0].transpose(0, 2, 1)
+        white = white @ restored
     residual = np.einsum("mij,mj->mi", white, predicted.residual)
     weight = np.sqrt(huber_weights(residual, huber))
-    jacobian = white @ np.concatenate([predicted.by_pose, predicted.by_landmark], axis=2)
+    jacobian = white @ np.concatenate([predicted.by_pose, by_calibration, predicted.by_landmark], axis=2)
     return two_rows(cycles, numbers, jacobian * weight[:, :, None], residual * weight)
 
 
 def two_rows(cycles: IntArray, numbers: IntArray, jacobian: Array, residual: Array) -> Rows:
-    """Returns Jacobians (m, 2, 5) and residuals (m, 2) as rows on [pose | landmark], owned by the cycles."""
-    keys = np.stack([pose_keys(cycles), landmark_keys(numbers)], axis=1)
-    flat = jacobian.reshape(-1, POSE + POINT)
-    return Rows(np.repeat(keys, POINT, axis=0), flat, residual.ravel(), np.repeat(cycles, POINT))
+    """Returns Jacobians (m, 2, n) and residuals (m, 2) as rows on [pose | landmark], owned by the cycles.
+
+    The sensor's calibration is between both where the Jacobian has columns for it.
+    """
+    keys = [pose_keys(cycles), landmark_keys(numbers)]
+    if jacobian.shape[2] > POSE + POINT:
+        keys.insert(1, np.full(len(cycles), SENSOR_KEY))
+    flat = jacobian.reshape(-1, jacobian.shape[2])
+    both = np.repeat(np.stack(keys, axis=1), POINT, axis=0)
+    return Rows(both, flat, residual.ravel(), np.repeat(cycles, POINT))

@@ -15,6 +15,7 @@ from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
+from pathspace_graph.mapping.log_odometry import no_errors
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .state import LandmarkState
@@ -78,8 +79,8 @@ def start_oracle(system: LandmarkSystem, associations: Ints) -> LandmarkState:
     detections, rows = system.detections, np.flatnonzero(associations >= 0)
     numbers, first, landmark = np.unique(associations[rows], return_index=True, return_inverse=True)
     detections.take(rows, numbers[landmark])
-    calibration = np.zeros(CALIBRATION_SIZE)
-    poses = system.chain.dead_reckoned(calibration)
+    calibration = no_errors(system.settings.calibration)
+    poses = system.chain.dead_reckoned(calibration[:CALIBRATION_SIZE])
     points = to_map(detections.point[rows[first]], poses[detections.cycle[rows[first]]])
     labels = detections.label[rows]
     votes = np.stack(

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.noise import huber_loss
 from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
-from pathspace_graph.graph.keys import CALIBRATION_KEY, indices, pose_keys
+from pathspace_graph.graph.keys import indices, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import RIGHT
-from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
+from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log, sensor_prior, sensor_prior_cost
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .landmark_map import landmark_rows
@@ -39,7 +39,7 @@ class LandmarkSystem:
     def of_log(cls, log: Log, settings: MapperSettings, odometry_sigma: Array) -> LandmarkSystem:
         """Returns the problem of a log without any association; `odometry_sigma` (3,) is that of a twist."""
         chain = integrate_log(log, odometry_sigma, settings.odometry)
-        return cls(LandmarkDetections.of(log.cycles), chain, settings)
+        return cls(LandmarkDetections.of(log.cycles, twists=chain.twists), chain, settings)
 
     def cost(self, state: LandmarkState) -> float:
         """Returns half the sum of squares at a state, with Huber's loss of the detections."""
@@ -47,12 +47,13 @@ class LandmarkSystem:
         residual, _ = self.chain.terms(poses, calibration)
         losses = huber_loss(self._detection_rows(state, np.inf).residual, self.settings.gate.huber)
         cost = 0.5 * (residual**2).sum() + losses.sum() + self.chain.prior_cost(poses[0], calibration)
-        return float(cost)
+        return float(cost) + sensor_prior_cost(state.variables, self.settings.calibration)
 
     def rows(self, state: LandmarkState) -> list[Rows]:
         """Returns the Gauss-Newton rows at a state, where each row of a detection has its Huber weight."""
         poses, calibration = state.variables.poses, state.variables.calibration
         rows = self.chain.rows(self.chain.terms(poses, calibration), poses[0], calibration)
+        rows += sensor_prior(state.variables, self.settings.calibration)
         return [*rows, self._detection_rows(state, self.settings.gate.huber)]
 
     def eliminated(self, state: LandmarkState) -> Elimination:
@@ -62,7 +63,7 @@ class LandmarkSystem:
     def _detection_rows(self, state: LandmarkState, huber: float) -> Rows:
         """Returns the whitened rows; a factor owns those of a few poses on one side of the track."""
         rows = landmark_rows(state, self.detections, np.flatnonzero(self.detections.used), huber)
-        labels = state.labels[state.positions(indices(rows.keys[:, 1]))]
+        labels = state.labels[state.positions(indices(rows.keys[:, -1]))]
         return replace(rows, owner=owners(rows.owner, labels == RIGHT))
 
     def optimize(self, state: LandmarkState) -> None:
@@ -81,9 +82,10 @@ class LandmarkSystem:
             cost, damping = cost - gain, max(settings.damping_down * damping, settings.damping_least)
             if gain <= self.settings.landmark.tolerance * cost:
                 break
+        self.detections.correct(variables.sensor)
 
 
 def insert_drive(state: LandmarkState, calibration: Array, poses: Array) -> None:
-    """Makes the calibration (2,) and the poses (P, 3) of the whole log variables of a state."""
-    state.variables.insert(np.array([CALIBRATION_KEY]), calibration)
+    """Makes the calibration, (2,) or (7,), and the poses (P, 3) of the whole log variables of a state."""
+    state.variables.insert_calibrations(calibration)
     state.variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())

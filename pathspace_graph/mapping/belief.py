@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -11,8 +12,11 @@ from scipy.linalg import block_diag, lapack
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
+from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor
 from pathspace_graph.graph.keys import POINT, POSE
+from pathspace_graph.io.log import Detections
 from pathspace_graph.io.results import VehicleState
+from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import OdometrySettings
 
 from .cubature import Transformed, square_root, transform
@@ -20,32 +24,39 @@ from .cubature import Transformed, square_root, transform
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-HEAD: Final = POSE + CALIBRATION_SIZE
+_ODOMETRY: Final = slice(POSE, POSE + CALIBRATION_SIZE)
+HEAD: Final = POSE + CALIBRATION_SIZE + SENSOR_SIZE
 """The state has this many entries before its points."""
+SENSOR_COLUMNS: Final = np.arange(POSE + CALIBRATION_SIZE, HEAD)
+"""These entries of the state are the calibration of the sensor."""
 
 
 class Belief:
-    """A belief is a Gaussian over `x = [pose | calibration | points]`.
+    """A belief is a Gaussian over `x = [pose | calibration of odometry and sensor | points]`.
 
     The pose (x, y, theta) and the points (x, y) are in the map frame, in m and rad. The calibration of the
-    odometry is the scale error of the speeds and the bias of the yaw rate (rad/s).
+    odometry is the scale error of the speeds and the bias of the yaw rate (rad/s), that of the sensor is
+    `factors.sensor:SENSOR`.
 
     A model depends on few entries of x, so only those get cubature points. All others follow by the joint
     covariance, which is what the full rule would give for them, without its cubic cost.
     """
 
     def __init__(self, pose: Array, covariance: Array, calibration_sigma: Array | None = None) -> None:
-        sigma = np.zeros(CALIBRATION_SIZE) if calibration_sigma is None else calibration_sigma
-        self.mean: Array = np.concatenate([pose, np.zeros(CALIBRATION_SIZE)])
+        sigma, known = np.zeros(HEAD - POSE), () if calibration_sigma is None else calibration_sigma
+        sigma[: len(known)] = known
+        self.mean: Array = np.concatenate([pose, np.zeros(HEAD - POSE)])
         """(n,) This is the mean of x."""
         self.covariance: Array = block_diag(covariance, np.diag(sigma**2))
         """(n, n) This is the covariance of x."""
+        self.twist: Array = np.zeros(POSE)
+        """(3,) The vehicle moves with this twist, in m/s, m/s and rad/s."""
 
     @classmethod
-    def at_start(cls, settings: OdometrySettings) -> Belief:
+    def at_start(cls, settings: OdometrySettings, sensor: CalibrationSettings) -> Belief:
         """Returns the belief at the first odometry stamp, with an empty map."""
         sigmas = np.array([settings.sigma_start, settings.sigma_start, settings.sigma_start_heading])
-        calibration = np.array([settings.sigma_scale, settings.sigma_bias])
+        calibration = np.array([settings.sigma_scale, settings.sigma_bias, *sensor.sigmas])
         return cls(np.zeros(POSE), np.diag(sigmas**2), calibration)
 
     @property
@@ -58,20 +69,35 @@ class Belief:
         """Returns a view of the mean points (m, 2)."""
         return self.mean[HEAD:].reshape(-1, POINT)
 
+    @property
+    def sensor(self) -> Array:
+        """Returns a view of the mean calibration of the sensor (5,)."""
+        return self.mean[POSE + CALIBRATION_SIZE : HEAD]
+
+    def corrected(self, detections: Detections) -> Detections:
+        """Returns the newest detections, corrected by the mean calibration of the sensor."""
+        points = detections.points_vehicle
+        shift = self.by_sensor(points) @ self.sensor
+        return replace(detections, points_vehicle=points + shift)
+
+    def by_sensor(self, points_vehicle: Array) -> Array:
+        """Returns the derivatives (m, 2, 5) of the newest detections (m, 2) by the sensor's calibration."""
+        return by_sensor(points_vehicle, np.tile(self.twist, (len(points_vehicle), 1)))
+
     def vehicle_state(self) -> VehicleState:
         """Returns a copy of the pose and the calibration, with their joint covariance."""
-        mean, covariance = self.mean[:HEAD].copy(), self.covariance[:HEAD, :HEAD].copy()
-        return VehicleState(mean[:POSE], mean[POSE:], covariance)
+        covariance = self.covariance[:HEAD, :HEAD].copy()
+        return VehicleState.split(self.pose, self.mean[POSE:HEAD], covariance)
 
     def predict(self, odometry: IntegratedOdometry) -> None:
         """Predicts `pose <- pose * delta * (error - J calibration)`; the error is that of the odometry."""
-        drift, size = odometry.calibration_jacobian, HEAD + POSE
+        drift, size, self.twist = odometry.calibration_jacobian, HEAD + POSE, odometry.twist
         augmented = np.zeros((size, size))
         augmented[:HEAD, :HEAD] = self.covariance[:HEAD, :HEAD]
         augmented[HEAD:, HEAD:] = odometry.covariance
 
         def drive(x: Array) -> Array:
-            error = x[:, HEAD:] - x[:, POSE:HEAD] @ drift.T
+            error = x[:, HEAD:] - x[:, _ODOMETRY] @ drift.T
             return compose(compose(x[:, :POSE], odometry.delta), error)
 
         moved = transform(drive, np.append(self.mean[:HEAD], np.zeros(POSE)), augmented)
@@ -97,10 +123,31 @@ class Belief:
         self.covariance = 0.5 * (self.covariance + self.covariance.T)
 
     def predict_detections(self, points: IntArray) -> Transformed:
-        """Predicts the detections of points (k,): mean (2 k,), covariance (2 k, 2 k), vehicle frame."""
-        columns = np.concatenate([np.arange(POSE), point_columns(points)])
+        """Predicts the corrected detections of points (k,): mean (2 k,) and covariance (2 k, 2 k).
+
+        They are in the vehicle frame. An error of the sensor's calibration moves them, too.
+        """
+        columns = self.measuring_columns(point_columns(points))
         covariance = self.covariance[np.ix_(columns, columns)]
-        return transform(lambda x: to_vehicle_rows(x[:, :POSE], x[:, POSE:]), self.mean[columns], covariance)
+        return transform(self.measuring(points), self.mean[columns], covariance)
+
+    def measuring_columns(self, others: IntArray) -> IntArray:
+        """Returns the entries of x that detections depend on: the pose, the sensor, and others (k,)."""
+        return np.concatenate([np.arange(POSE), SENSOR_COLUMNS, others])
+
+    def measuring(self, points: IntArray) -> Callable[[Array], Array]:
+        """Returns the function from [pose | sensor | points] (k, d) to corrected detections of points (k,).
+
+        It is `R' (p - t) - C (b - b0)`, where b0 is the mean calibration by which they are corrected.
+        """
+        expected = to_vehicle_rows(self.pose[None], self.points[points].reshape(1, -1)).reshape(-1, POINT)
+        shift, now = self.by_sensor(expected).reshape(-1, SENSOR_SIZE), self.sensor.copy()
+
+        def detect(x: Array) -> Array:
+            seen = to_vehicle_rows(x[:, :POSE], x[:, POSE + SENSOR_SIZE :])
+            return seen - (x[:, POSE : POSE + SENSOR_SIZE] - now) @ shift.T
+
+        return detect
 
     def add_points(self, detections: Array, covariances: Array) -> None:
         """Adds points at the end of x, at detections (k, 2) with covariances (k, 2, 2), vehicle frame."""

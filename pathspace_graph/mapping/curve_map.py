@@ -13,7 +13,7 @@ from pathspace_graph.factors.gauge import pair_residuals
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.projection import offset_from_foot_point, project, sigma_across
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.graph.keys import CONTROL_LETTERS, POSE, control_keys, pose_keys
+from pathspace_graph.graph.keys import CONTROL_LETTERS, POSE, SENSOR_KEY, control_keys, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.settings.mapper import MapperSettings
@@ -72,19 +72,69 @@ class CurveMap:
         curves, cycle = state.curves, detections.cycle[rows]
         curve = curves.number(detections.boundary[rows])
         poses = self.variables.poses_at(cycle)
-        points = to_map(detections.point[rows], poses)
+        points = to_map(detections.corrected(rows, self.variables.sensor), poses)
         foot = curves.refine(state.map_points, points, curve, detections.u[rows])
         self._found, self.reached_inactive = (rows, foot.u), curves.reaches_inactive(curve, foot)
-        measured = points, detections.covariance[rows], poses, foot, settings
-        jacobian, residual = (
-            _to_point(*measured) if settings.spline.residual == "point" else _across(*measured)
-        )
-        keys = np.concatenate([pose_keys(cycle)[:, None], curves.keys[foot.columns]], axis=1)
+        kind = self._to_point if settings.spline.residual == "point" else self._across
+        jacobian, residual = kind(rows, points, poses, foot)
+        keys = np.concatenate([self.measuring_keys(cycle), curves.keys[foot.columns]], axis=1)
         doubled = len(residual) // max(len(rows), 1)
         groups = [Rows(np.repeat(keys, doubled, axis=0), jacobian, residual, np.repeat(cycle, doubled))]
         if self.places is not None:
             groups.append(self._place_rows(self.places, rows, points, poses))
         return groups
+
+    def measuring_keys(self, cycles: IntArray) -> IntArray:
+        """Returns the keys (m, k) that the detections of cycles (m,) depend on beside the curves.
+
+        These are the pose, and the calibration of the sensor where it is estimated.
+        """
+        poses = pose_keys(cycles)[:, None]
+        if not len(self.variables.sensor):
+            return poses
+        return np.concatenate([poses, np.full_like(poses, SENSOR_KEY)], axis=1)
+
+    def correct(self) -> None:
+        """Corrects the detections by the present calibration of the sensor."""
+        self.detections.correct(self.variables.sensor)
+
+    def _across(self, rows: IntArray, points: Array, poses: Array, foot: FootPoints) -> tuple[Array, Array]:
+        """Returns the weighted Jacobian (m, 3 + q + 2 (degree + 1)) and residual (m,) of signed distances.
+
+        The detections (m,) are at points (m, 2), map frame, from poses (m, 3). Their q derivatives by the
+        sensor's calibration are 5 or none.
+        """
+        settings, detections = self.settings, self.detections
+        projected = project(points, detections.covariance[rows], poses, foot, settings.spline.sigma_model)
+        by = detections.sensor_rows(rows, foot.normal_unit, projected.residual, poses, self.variables.sensor)
+        residual = by.factor * projected.residual
+        weight = np.sqrt(huber_weights(residual / projected.sigma, settings.gate.huber))
+        weight *= foot.interior / projected.sigma
+        by_control = projected.by_control.reshape(len(rows), 2 * foot.basis.shape[1])
+        factor = by.factor[:, None]
+        jacobian = np.concatenate([factor * projected.by_pose, by.by_sensor, factor * by_control], axis=1)
+        return jacobian * weight[:, None], residual * weight
+
+    def _to_point(self, rows: IntArray, points: Array, poses: Array, foot: FootPoints) -> tuple[Array, Array]:
+        """Returns the weighted Jacobian (2 m, 3 + q + 2 (degree + 1)) and residual (2 m,) of offsets.
+
+        The whitened offsets lead from the foot points to the detections; both rows of a detection are
+        adjacent. The arguments are those of `_across`.
+        """
+        settings, detections = self.settings, self.detections
+        covariances, sigma_model = detections.covariance[rows], settings.spline.sigma_model
+        projected = offset_from_foot_point(points, covariances, poses, foot, sigma_model)
+        size = np.hypot(projected.residual[:, 0], projected.residual[:, 1])
+        weight = np.repeat(np.sqrt(huber_weights(size, settings.gate.huber)) * foot.interior, 2)
+        twice, length = np.repeat(rows, 2), len(weight)
+        vectors, residual = projected.by_pose[:, :, :2].reshape(-1, 2), projected.residual.ravel()
+        norm = np.hypot(vectors[:, 0], vectors[:, 1])
+        unit, both = vectors / norm[:, None], np.repeat(poses, 2, axis=0)
+        by = detections.sensor_rows(twice, unit, residual / norm, both, self.variables.sensor)
+        factor, by_control = by.factor[:, None], projected.by_control.reshape(length, 2 * foot.basis.shape[1])
+        by_sensor = by.by_sensor * norm[:, None]
+        blocks = factor * projected.by_pose.reshape(length, POSE), by_sensor, factor * by_control
+        return np.concatenate(blocks, axis=1) * weight[:, None], by.factor * residual * weight
 
     def _place_rows(self, places: ConePlaces, rows: IntArray, points: Array, poses: Array) -> Rows:
         """Returns `w_i t . (R z_i + t - S(u_k)) / sigma_i` for the detections (m,) that are of a place u_k.
@@ -98,9 +148,15 @@ class CurveMap:
         place, cycle = detections.place[rows], detections.cycle[rows]
         along = places.along(place, self.state.map_points, points, poses)
         sigma = sigma_across(along.tangent_unit, detections.covariance[rows], poses, settings.place.sigma)
-        weight = np.sqrt(huber_weights(along.residual / sigma, settings.gate.huber)) / sigma
-        keys = np.concatenate([pose_keys(cycle)[:, None], places.keys[place]], axis=1)
-        return Rows(keys, along.jacobian * weight[:, None], along.residual * weight, cycle)
+        sensor = self.variables.sensor
+        by = detections.sensor_rows(rows, along.tangent_unit, along.residual, poses, sensor)
+        whitened = by.factor * along.residual / sigma
+        weight = np.sqrt(huber_weights(whitened, settings.gate.huber)) / sigma
+        keys = np.concatenate([self.measuring_keys(cycle), places.keys[place]], axis=1)
+        factor = by.factor[:, None]
+        blocks = factor * along.by_pose, by.by_sensor, factor * along.flat_by_control
+        jacobian = np.concatenate(blocks, axis=1)
+        return Rows(keys, jacobian * weight[:, None], by.factor * along.residual * weight, cycle)
 
     def set_places(self, u: Mapping[int, Array]) -> None:
         """Sets the cones' places on each closed curve, by label, and associates the window's detections."""
@@ -210,33 +266,6 @@ def _by_axis(coefficients: Array) -> Array:
     both = np.zeros((len(coefficients), 2, coefficients.shape[1], 2))
     both[:, 0, :, 0] = both[:, 1, :, 1] = coefficients
     return both.reshape(2 * len(coefficients), 2 * coefficients.shape[1])
-
-
-def _across(
-    points: Array, covariances: Array, poses: Array, foot: FootPoints, settings: MapperSettings
-) -> tuple[Array, Array]:
-    """Returns the weighted Jacobian (m, 3 + 2 (degree + 1)) and residual (m,) of the signed distances."""
-    projected = project(points, covariances, poses, foot, settings.spline.sigma_model)
-    whitened = projected.residual / projected.sigma
-    weight = np.sqrt(huber_weights(whitened, settings.gate.huber)) * foot.interior / projected.sigma
-    by_control = projected.by_control.reshape(len(points), 2 * foot.basis.shape[1])
-    jacobian = np.concatenate([projected.by_pose, by_control], axis=1)
-    return jacobian * weight[:, None], projected.residual * weight
-
-
-def _to_point(
-    points: Array, covariances: Array, poses: Array, foot: FootPoints, settings: MapperSettings
-) -> tuple[Array, Array]:
-    """Returns the weighted Jacobian (2 m, 3 + 2 (degree + 1)) and residual (2 m,) of whitened offsets.
-
-    The offsets lead from the foot points to the detections; both rows of a detection are adjacent.
-    """
-    projected = offset_from_foot_point(points, covariances, poses, foot, settings.spline.sigma_model)
-    size = np.hypot(projected.residual[:, 0], projected.residual[:, 1])
-    weight = np.repeat(np.sqrt(huber_weights(size, settings.gate.huber)) * foot.interior, 2)
-    by_control = projected.by_control.reshape(len(weight), 2 * foot.basis.shape[1])
-    jacobian = np.concatenate([projected.by_pose.reshape(len(weight), POSE), by_control], axis=1)
-    return jacobian * weight[:, None], projected.residual.ravel() * weight
 
 
 CurveSmoother: TypeAlias = FixedLagSmoother[CurveMap]

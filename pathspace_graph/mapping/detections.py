@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.sensor import SensorRows, by_sensor, range_rates, sensor_rows
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
 
@@ -29,8 +30,12 @@ class DetectionColumns:
 
     cycle: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
     """Each detection was made in this perception cycle; the column never decreases."""
+    measured: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    """Each row holds a detected position (x, y) in m, vehicle frame, as the sensor says."""
+    twist: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    """The vehicle moved with this twist (m, 3) then, in m/s, m/s and rad/s."""
     point: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    """Each row holds a detected position (x, y) in m, vehicle frame."""
+    """Each row holds the position after the latest correction."""
     covariance: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
     """Each entry is the (2, 2) covariance of the position in m^2, vehicle frame."""
     label: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
@@ -42,12 +47,19 @@ class DetectionColumns:
         return len(self.cycle)
 
     @classmethod
-    def of(cls, cycles: Sequence[Detections], first: int = 0) -> Self:
-        """Builds the table of consecutive perception cycles, numbered from `first`; nothing is in use."""
+    def of(cls, cycles: Sequence[Detections], first: int = 0, twists: Array | None = None) -> Self:
+        """Builds the table of consecutive perception cycles, numbered from `first`; nothing is in use.
+
+        The vehicle moved with twists (k, 3) at the cycles, in m/s, m/s and rad/s; by default it stood still.
+        """
         counts = [len(one.labels) for one in cycles]
+        points = np.concatenate([np.zeros((0, 2)), *(one.points_vehicle for one in cycles)])
+        moving = np.zeros((len(cycles), 3)) if twists is None else twists
         table = cls(
             cycle=first + np.repeat(np.arange(len(cycles)), counts),
-            point=np.concatenate([np.zeros((0, 2)), *(one.points_vehicle for one in cycles)]),
+            measured=points,
+            twist=np.repeat(moving, counts, axis=0),
+            point=points.copy(),
             covariance=np.concatenate([np.zeros((0, 2, 2)), *(one.covariances for one in cycles)]),
             label=np.concatenate([np.zeros(0, np.intp), *(one.labels for one in cycles)]).astype(np.intp),
             changed=np.zeros(sum(counts), bool),
@@ -58,13 +70,40 @@ class DetectionColumns:
     def _clear_associations(self) -> None:
         """Fills the subclass's columns as they are before any association."""
 
-    def append(self, detections: Detections, cycle: int) -> slice:
-        """Adds the detections of one cycle, none of them in use; returns their rows."""
-        start, new = len(self), type(self).of([detections], cycle)
+    def append(self, detections: Detections, cycle: int, twist: Array | None = None) -> slice:
+        """Adds the detections of one cycle, none of them in use; returns their rows.
+
+        The vehicle moved with this twist (3,), in m/s, m/s and rad/s; by default it stood still.
+        """
+        twists = None if twist is None else twist[None]
+        start, new = len(self), type(self).of([detections], cycle, twists)
         for column in fields(self):
             both = [getattr(self, column.name), getattr(new, column.name)]
             setattr(self, column.name, np.concatenate(both))
         return slice(start, len(self))
+
+    def corrected(self, rows: IntArray | slice, sensor: Array) -> Array:
+        """Returns positions (m, 2) corrected by the sensor's calibration (5,), which may be empty."""
+        if len(sensor) == 0:
+            return self.measured[rows]
+        measured = self.measured[rows]
+        return np.asarray(measured + by_sensor(measured, self.twist[rows]) @ sensor)
+
+    def sensor_rows(
+        self, rows: IntArray, directions: Array, residual: Array, poses: Array, sensor: Array
+    ) -> SensorRows:
+        """Returns `factors.sensor:sensor_rows` of residuals (m,) along unit vectors (m, 2), map frame.
+
+        The detections were made from poses (m, 3), and the sensor's calibration (5,) may be empty.
+        """
+        measured = self.measured[rows]
+        rates = range_rates(directions, poses, measured) if len(sensor) else np.zeros((len(rows), 2))
+        return sensor_rows(directions, residual, poses, measured, self.twist[rows], sensor, rates)
+
+    def correct(self, sensor: Array) -> None:
+        """Corrects all positions by the sensor's calibration (5,), which is empty where there is none."""
+        if len(sensor):
+            self.point = self.corrected(slice(None), sensor)
 
     def keep_from(self, cycle: int) -> None:
         """Removes the detections of all cycles before `cycle`."""

@@ -1,4 +1,4 @@
-"""The odometry of a whole log: the batch optimizations hold their poses against it."""
+"""The odometry of a whole log, and the priors of the calibrations, which hold the variables of a batch."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import IntegratedOdometry
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.elimination import owners
-from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_key
+from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, pose_key
 from pathspace_graph.graph.odometry import OdometryChain, calibrated_delta, odometry_rows
 from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.variables import Variables
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry
+from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import OdometrySettings
 
 from .prediction import integrate_odometry
@@ -35,6 +37,8 @@ class LogOdometry:
     """(3, 3) This is the inverse of the first pose's covariance, map frame."""
     odometry: OdometryChain
     """The chain has P - 1 intervals, one from each cycle's pose to the next."""
+    twists: Array
+    """(P, 3) These twists were in force at the cycles, in m/s, m/s and rad/s."""
     calibration_sigma: Array
     """(2,) The calibration (scale error [-], yaw-rate bias [rad/s]) has this prior standard deviation."""
 
@@ -94,5 +98,27 @@ def chained(
         first=compose(np.zeros(3), steps[0].delta),
         first_information=np.linalg.inv(steps[0].covariance + np.diag(settings.sigmas_start) ** 2),
         odometry=OdometryChain(steps[1:]),
+        twists=np.array([step.twist for step in steps]),
         calibration_sigma=np.array([settings.sigma_scale, settings.sigma_bias]),
     )
+
+
+# --- calibrations ----------------------------------------------------------------------------------------
+
+
+def no_errors(settings: CalibrationSettings) -> Array:
+    """Returns the calibration of odometry and sensor, (2,) or (7,), that corrects nothing."""
+    return np.zeros(CALIBRATION_SIZE + len(settings.sigmas))
+
+
+def sensor_prior(variables: Variables, settings: CalibrationSettings) -> list[Rows]:
+    """Returns the rows `b / sigma` of the sensor's calibration b, or none where it is not estimated."""
+    if len(variables.sensor) == 0:
+        return []
+    root = np.diag(1.0 / np.array(settings.sigmas))
+    return [_prior(SENSOR_KEY, root, variables.sensor)]
+
+
+def sensor_prior_cost(variables: Variables, settings: CalibrationSettings) -> float:
+    """Returns half the sum of squares of `sensor_prior`."""
+    return sum(0.5 * float((rows.residual**2).sum()) for rows in sensor_prior(variables, settings))

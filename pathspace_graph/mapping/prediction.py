@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
-from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_key
+from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, pose_key
 from pathspace_graph.graph.smoother import FixedLagSmoother, SmootherSettings
 from pathspace_graph.graph.window import MapRows
 from pathspace_graph.io.log import Odometry
@@ -55,9 +55,11 @@ def predict(
 
 def vehicle_state(smoother: FixedLagSmoother[MapRows]) -> VehicleState:
     """Returns the newest pose and the calibration of a smoother, with their joint covariance."""
-    keys = np.array([pose_key(smoother.next_cycle - 1), CALIBRATION_KEY], np.intp)
-    variables = smoother.variables
-    return VehicleState(variables.poses[-1].copy(), variables.calibration.copy(), smoother.covariance(keys))
+    variables, keys = smoother.variables, [pose_key(smoother.next_cycle - 1), CALIBRATION_KEY]
+    if len(variables.sensor):
+        keys.append(SENSOR_KEY)
+    covariance = smoother.covariance(np.array(keys, np.intp))
+    return VehicleState.split(variables.poses[-1], variables.calibrations, covariance)
 
 
 def smoother_settings(settings: MapperSettings) -> SmootherSettings:
@@ -67,5 +69,6 @@ def smoother_settings(settings: MapperSettings) -> SmootherSettings:
         tolerances=(settings.relinearize.point, settings.relinearize.heading),
         keyframe_interval=settings.closing.keyframe_interval,
         sigma_calibration=(settings.odometry.sigma_scale, settings.odometry.sigma_bias),
+        sigma_sensor=settings.calibration.sigmas,
         relative=True,
     )

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.projection import ProjectionRows, project, sigma_across
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.curve_map import CurveSmoother
@@ -78,7 +77,7 @@ def _accept(
     if len(doubtful):  # the joint uncertainty is costly, and only these need it
         feet = foot.where(doubtful)
         projected = project(points[doubtful], covariances[doubtful], poses[doubtful], feet, sigma_model)
-        variance[doubtful] += joint_variance(smoother, detections.cycle[rows[doubtful]], feet, projected)
+        variance[doubtful] += joint_variance(smoother, rows[doubtful], feet, projected)
         accepted[doubtful] = square[doubtful] < gate.chi**2 * variance[doubtful]
     _decide(detections, rows[accepted], state.curves.labels[curve[accepted]], foot.u[accepted])
 
@@ -152,13 +151,16 @@ def _append_pose_u(state: State, label: int, u: float) -> None:
 
 
 def joint_variance(
-    smoother: CurveSmoother, cycles: IntArray, foot: FootPoints, projected: ProjectionRows
+    smoother: CurveSmoother, rows: IntArray, foot: FootPoints, projected: ProjectionRows
 ) -> Array:
-    """Returns `g_i' Sigma g_i` (m,) in m^2: the variance of each residual by pose and control points.
+    """Returns `g_i' Sigma g_i` (m,) in m^2: the variance of each residual of detections (m,).
 
-    `cycles` (m,) are the detections' perception cycles.
+    It comes from the uncertainty of the pose, of the control points and of the sensor's calibration.
     """
-    keys = np.concatenate([pose_keys(cycles)[:, None], smoother.map.state.curves.keys[foot.columns]], axis=1)
+    track, cycles = smoother.map, smoother.map.detections.cycle[rows]
+    poses, sensor = smoother.variables.poses_at(cycles), smoother.variables.sensor
+    keys = np.concatenate([track.measuring_keys(cycles), track.state.curves.keys[foot.columns]], axis=1)
+    by = track.detections.sensor_rows(rows, foot.normal_unit, projected.residual, poses, sensor)
     by_control = projected.by_control.reshape(len(cycles), -1)
-    jacobian = np.concatenate([projected.by_pose, by_control], axis=1)
+    jacobian = np.concatenate([projected.by_pose, by.by_sensor, by_control], axis=1)
     return smoother.predicted_covariance(Rows(keys, jacobian, projected.residual, cycles))[:, 0, 0]

@@ -88,6 +88,7 @@ class FixedLagMapper:
             self._open_lap.give_up("no batch of the lap was asked for")
         self._lap_batch: LapBatch | None = None
         self._grown: frozenset[int] = frozenset()
+        self._twist = np.zeros(POSE)
         self._closing_tried = 0.0
         self._loop_tried, self._recognition_tried = 0.0, 0.0
 
@@ -144,6 +145,7 @@ class FixedLagMapper:
         """Adds the pose of the cycle by the calibrated odometry, and extends the driven path."""
         sigma, t = self.odometry_sigma, detections.t
         integrated = predict(self.smoother, self.path, odometry, t, sigma, self.settings)
+        self._twist = integrated.twist
         if not self.closed:
             self._open_lap.measured(t, integrated, detections)
         if self.solver is not None:
@@ -151,7 +153,8 @@ class FixedLagMapper:
 
     def _classify(self, detections: Detections) -> None:
         """Associates detections with the curves; those that no curve uses become tentative tracks."""
-        new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
+        new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1, self._twist)
+        self.smoother.map.correct()
         if self.boundaries:
             associate(self.smoother, self._grown)
             self.smoother.map.place_detections(new.start)
@@ -411,3 +414,8 @@ class FixedLagMapper:
     def calibration(self) -> Array:
         """Returns a view of the odometry's calibration: (scale error [-], yaw-rate bias [rad/s])."""
         return self.smoother.variables.calibration
+
+    @property
+    def calibrations(self) -> Array:
+        """Returns a view of the calibrations of the odometry and, where it is estimated, of the sensor."""
+        return self.smoother.variables.calibrations

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.gtsam_factors import pose_array
 from pathspace_graph.graph.gaussian import factors_of, keys_of
-from pathspace_graph.graph.keys import POSE, are_poses, control_keys, indices, pose_key
+from pathspace_graph.graph.keys import POSE, SENSOR_KEY, are_poses, control_keys, indices, pose_key
 from pathspace_graph.graph.odometry import odometry_factor
 from pathspace_graph.graph.user_factors import as_nonlinear
 from pathspace_graph.mapping.curve_map import CurveSmoother
@@ -127,7 +127,10 @@ class IncrementalSolver:
         self._held.update(identities)
         rows = rows[fresh & ~np.isin(detections.cycle[rows], marginalized)]
         room = np.full(len(rows), self.settings.spline.refine_room)
-        for factor in detection_factors(label, boundary, detections, rows, self.settings, (room, room)):
+        sensor_key = SENSOR_KEY if len(smoother.variables.sensor) else None
+        for factor in detection_factors(
+            label, boundary, detections, rows, self.settings, (room, room), sensor_key
+        ):
             self._graph.add(factor)
 
     # --- the estimate ------------------------------------------------------------------------------------
@@ -156,7 +159,9 @@ class IncrementalSolver:
                 turns = np.round((variables.values[start + POSE - 1] - pose[2]) / (2.0 * np.pi))
                 variables.values[start : start + POSE] = pose + np.array([0.0, 0.0, 2.0 * np.pi * turns])
             else:
-                variables.values[start : start + 2] = estimate.atPoint2(key)
+                own = estimate.atVector(key) if key == SENSOR_KEY else estimate.atPoint2(key)
+                variables.values[start : start + len(own)] = own
+        smoother.map.correct()
 
 
 def _parameters() -> gtsam.ISAM2Params:

@@ -14,7 +14,7 @@ from pathspace_graph.factors.gtsam_factors import (
     spline_projection_factors,
 )
 from pathspace_graph.graph.gaussian import factors_of
-from pathspace_graph.graph.keys import control_keys, pose_keys
+from pathspace_graph.graph.keys import SENSOR_KEY, control_keys, pose_keys
 from pathspace_graph.graph.odometry import odometry_factor
 from pathspace_graph.graph.user_factors import as_nonlinear
 from pathspace_graph.mapping.curve_map import CurveSmoother
@@ -37,7 +37,8 @@ def window_graph(smoother: CurveSmoother) -> gtsam.NonlinearFactorGraph:
         active = state.active(label)
         rows = detections.used_on(label)
         room = _room(boundary, active, detections.u[rows], settings.spline.refine_room)
-        _add(graph, detection_factors(label, boundary, detections, rows, settings, room))
+        sensor_key = SENSOR_KEY if len(smoother.variables.sensor) else None
+        _add(graph, detection_factors(label, boundary, detections, rows, settings, room, sensor_key))
         if not smoother.map.held_by_prior:
             _add(graph, gauge_factors(label, boundary, active, settings.gauge))
         anchor = gtsam.noiseModel.Isotropic.Sigma(2, settings.gauge.sigma_anchor)
@@ -66,22 +67,26 @@ def detection_factors(
     rows: IntArray,
     settings: MapperSettings,
     room: tuple[Array, Array],
+    sensor_key: int | None = None,
 ) -> list[gtsam.CustomFactor]:
     """Returns a spline-projection factor for each cycle of some detections (m,) on a boundary.
 
-    `room` (m,), (m,) limits how far before and past its present parameter each foot point may move.
+    `room` (m,), (m,) limits how far before and past its present parameter each foot point may move. The
+    detections are corrected by the sensor's calibration where it has a key.
     """
     u = detections.u[rows]
     return spline_projection_factors(
         pose_keys(detections.cycle[rows]),
         control_keys(label, boundary.numbers).tolist(),
         boundary.tables,
-        points_vehicle=detections.point[rows],
+        points_vehicle=detections.measured[rows],
         covariances=detections.covariance[rows],
         low=u - room[0],
         high=boundary.believed(u + room[1]),
         sigma_model=settings.spline.sigma_model,
         huber=settings.gate.huber,
+        sensor_key=sensor_key,
+        twists=detections.twist[rows],
     )
 
 

@@ -110,14 +110,15 @@ class OpenLapRecord:
     def closed_map(self, smoother: CurveSmoother) -> ClosedMap:
         """Returns the map that has just been closed, with the poses of all cycles beside it."""
         state = smoother.map.state
-        return ClosedMap(state.splines, self.corrected(smoother), state.calibration.copy())
+        return ClosedMap(state.splines, self.corrected(smoother), state.variables.calibrations.copy())
 
     def lap(self, first_kept: int, start: ClosedMap | Recurrence) -> OpenLap:
         """Returns the lap, whose search begins at a map that has just been closed, or at odometry."""
+        chain = chained(self._stamps, self._odometry, self.settings.odometry)
         return OpenLap(
             settings=self.settings,
-            chain=chained(self._stamps, self._odometry, self.settings.odometry),
-            detections=DetectionTable.of(self._detections),
+            chain=chain,
+            detections=DetectionTable.of(self._detections, twists=chain.twists),
             first_kept=first_kept,
             start=start,
         )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.factors.se2 import compose, relative
-from pathspace_graph.graph.keys import CALIBRATION_KEY, control_keys, pose_keys
+from pathspace_graph.graph.keys import control_keys, pose_keys
 from pathspace_graph.mapping.curve_map import CurveSmoother
 
 from .association import reassociate
@@ -35,9 +35,10 @@ def go_on_from(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
     smoother.map.held_by_prior = True
     smoother.map.scatter = marginal.scatter
     _move_poses(state.poses, marginal.poses[first:])
-    state.calibration[:] = marginal.calibration
+    state.variables.calibrations[:] = marginal.calibration
+    smoother.map.correct()
     locate_poses(state, settings.batch.association)
-    keys = np.concatenate([[CALIBRATION_KEY], *added, pose_keys(np.array([first]))])
+    keys = np.concatenate([state.variables.calibration_keys, *added, pose_keys(np.array([first]))])
     smoother.set_prior(keys, marginal.mean, marginal.information)
     reassociate(smoother)
     if marginal.places:

@@ -27,7 +27,7 @@ class Positive:
         """Raises a SettingsError that names the first wrong setting, as the command line knows it."""
         for entry in fields(self):  # type: ignore[arg-type]  # every heir is a dataclass
             value = getattr(self, entry.name)
-            if not isinstance(value, int | float):
+            if isinstance(value, bool) or not isinstance(value, int | float):
                 continue
             if not value > 0:
                 raise SettingsError(f"{self.prefix}{entry.name}: expected a positive number, found {value}")

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from .batch import BatchSettings, OpenLapSettings
+from .calibration import CalibrationSettings
 from .checked import Positive
 from .closing import ClosingSettings
 from .comparison import CkfSettings, LandmarkSettings
@@ -227,6 +228,8 @@ class MapperSettings(Positive):
     """These settings say which factors are linearized anew in a step."""
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     """These settings describe the constant errors of the odometry."""
+    calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
+    """These settings describe the constant errors of the sensor."""
     batch: BatchSettings = field(default_factory=BatchSettings)
     """These settings describe the batch optimization over a whole log."""
     landmark: LandmarkSettings = field(default_factory=LandmarkSettings)

@@ -52,7 +52,7 @@ def vector_of(values: gtsam.Values, state: State) -> Array:
     keys = state.variables.keys
     return np.concatenate(
         [
-            pose_array(values.atPose2(key)) if is_pose else values.atPoint2(key)
+            pose_array(values.atPose2(key)) if is_pose else values.atVector(key)
             for key, is_pose in zip(keys.tolist(), are_poses(keys).tolist(), strict=True)
         ]
     )

@@ -21,8 +21,11 @@ BATCH = MapperSettings().batch
 
 
 def noisy() -> tuple[BatchSystem, State]:
-    """Returns a straight drive that was measured with noise, and the truth of it."""
-    exact, truth = straight(4.0, BATCH.sigma_smoothness)
+    """Returns a straight drive that was measured with noise, and the truth of it.
+
+    The sensor's errors are known: they would move detections about the ends of the open curves.
+    """
+    exact, truth = straight(4.0, BATCH.sigma_smoothness, sensor=False)
     return drawn(exact, np.random.default_rng(3))[0], truth
 
 

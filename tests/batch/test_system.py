@@ -33,7 +33,8 @@ def small_system() -> tuple[BatchSystem, State]:
     settings = own_settings(MapperSettings())
     chain = integrate_log(log, log.odometry_sigma, settings.odometry)
     detections = DetectionTable.of(log.cycles)
-    detections.point = detections.point + np.random.default_rng(1).normal(0.0, 0.1, detections.point.shape)
+    noise = np.random.default_rng(1).normal(0.0, 0.1, detections.measured.shape)
+    detections.measured = detections.point = detections.measured + noise
     state = start_odometry(chain, detections, settings)
     system = BatchSystem(detections, chain, settings, Biweight(settings.batch.gate))
     system.begin(state)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pathspace_graph.ckf.state import CurveState
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.mapping.belief import Belief
+from pathspace_graph.mapping.belief import HEAD, Belief
 from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.knots import fit_spline
@@ -70,6 +70,6 @@ def circles(pose: Array, shift: Array, covariance: Array) -> CurveState:
         state.pose_u[label] = curve.domain[1] - 0.6 * radius
     n = len(state.belief.mean)
     joint = 0.04 * np.eye(n)
-    joint[:5, :5] = state.belief.covariance
+    joint[:HEAD, :HEAD] = state.belief.covariance
     state.belief.covariance = joint
     return state

@@ -52,4 +52,4 @@ def test_it_is_the_distance_past_the_place_along_a_straight_curve() -> None:
     np.testing.assert_allclose(rows.tangent_unit, [[0.0, 1.0]])
     np.testing.assert_allclose(rows.by_pose, [[0.0, 1.0, 0.4]])
     np.testing.assert_allclose(rows.by_control, [[[0.3, -0.5], [-0.3, -0.5]]])
-    np.testing.assert_allclose(rows.jacobian, [[0.0, 1.0, 0.4, 0.3, -0.5, -0.3, -0.5]])
+    np.testing.assert_allclose(rows.flat_by_control, [[0.3, -0.5, -0.3, -0.5]])

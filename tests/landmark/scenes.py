@@ -18,6 +18,7 @@ from pathspace_graph.landmark.oracle import start_oracle
 from pathspace_graph.landmark.state import LandmarkState
 from pathspace_graph.landmark.system import LandmarkSystem
 from pathspace_graph.mapping.prediction import smoother_settings
+from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 
 from ..scenes.drives import ODOMETRY_SIGMA, see
@@ -29,7 +30,9 @@ CONES = np.array([[6.0, 2.0], [6.0, -2.0], [10.0, 2.5], [10.0, -1.5], [6.1, 2.05
 LABELS = np.array([LEFT, RIGHT, LEFT, RIGHT, LEFT], dtype=np.intp)
 PERIOD = 0.1
 SPEED = 1.0
-QUADRATIC = replace(MapperSettings(), lag=100.0, gate=GateSettings(huber=np.inf))
+KNOWN = CalibrationSettings(sensor=False)
+"""The sensor has no errors, and none are estimated."""
+QUADRATIC = replace(MapperSettings(), lag=100.0, gate=GateSettings(huber=np.inf), calibration=KNOWN)
 
 
 def drive_on(smoother: LandmarkSmoother, cycle: int, twist: tuple[float, float, float]) -> None:
@@ -65,7 +68,7 @@ def with_covariance(
     points: Array, labels: IntArray, covariance: Array, settings: MapperSettings | None = None
 ) -> LandmarkSmoother:
     """Returns a smoother at the start, after a step on landmarks (n, 2) with joint covariance (2 n, 2 n)."""
-    settings = settings or MapperSettings()
+    settings = settings or MapperSettings(calibration=KNOWN)
     smoother = FixedLagSmoother(smoother_settings(settings), LandmarkMap(settings))
     drive_on(smoother, 0, (0.0, 0.0, 0.0))
     smoother.map.state.add(points, labels)

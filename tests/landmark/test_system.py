@@ -19,7 +19,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import ahead, exact_log
-from .scenes import beginning_of, normal_equations_of, oracle_system
+from .scenes import KNOWN, beginning_of, normal_equations_of, oracle_system
 
 
 def test_the_cost_falls_along_the_gradient_of_the_rows(bean: Log) -> None:
@@ -99,7 +99,9 @@ def gtsam_optimum(log: Log, associations: NDArray[np.int_]) -> gtsam.Values:
 def test_with_oracle_associations_it_is_gtsams_optimum(bean: Log) -> None:
     """GTSAM's detections are polar, so the two differ by how Gaussian a detection is in each."""
     beginning, associations = beginning_of(bean, 60)
-    ours, theirs = solve_landmarks(beginning, associations), gtsam_optimum(beginning, associations)
+    settings = MapperSettings(calibration=KNOWN)
+    ours = solve_landmarks(beginning, associations, settings=settings)
+    theirs = gtsam_optimum(beginning, associations)
     expected = np.array([theirs.atPoint2(L(int(j))) for j in ours.landmark_ids])
     np.testing.assert_allclose(ours.landmarks, expected, atol=0.03)
     last = theirs.atPose2(X(len(beginning.cycles)))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
 from pathspace_graph.factors.se2 import compose
-from pathspace_graph.mapping.belief import Belief, point_columns, to_map_rows, to_vehicle_rows
+from pathspace_graph.mapping.belief import HEAD, Belief, point_columns, to_map_rows, to_vehicle_rows
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,8 @@ def test_new_points_have_the_uncertainty_of_pose_and_detection() -> None:
     rng = np.random.default_rng(2)
     poses = rng.multivariate_normal(pose, covariance, 200_000)
     placed = to_map_rows(poses, rng.multivariate_normal(reading[0], 0.04 * np.eye(2), 200_000))
-    uncalibrated = np.delete(np.delete(belief.covariance, [3, 4], 0), [3, 4], 1)
+    calibrations = np.arange(3, HEAD)
+    uncalibrated = np.delete(np.delete(belief.covariance, calibrations, 0), calibrations, 1)
     np.testing.assert_allclose(uncalibrated, np.cov(np.hstack([poses, placed]).T), atol=2e-3)
 
 
@@ -73,26 +74,27 @@ def test_transformed_points_are_exact_and_the_others_stay() -> None:
     before, covariance = belief.mean.copy(), belief.covariance.copy()
     matrix = np.array([[0.5, 0.5], [0.0, 1.0], [1.5, -0.5]])
     belief.transform_points(0, 2, matrix, np.zeros(3))
-    full = np.zeros((13, 11))
-    full[:5, :5], full[11:, 9:], full[5:11, 5:9] = np.eye(5), np.eye(2), np.kron(matrix, np.eye(2))
+    full = np.zeros((HEAD + 8, HEAD + 6))
+    full[:HEAD, :HEAD], full[HEAD + 6 :, HEAD + 4 :] = np.eye(HEAD), np.eye(2)
+    full[HEAD : HEAD + 6, HEAD : HEAD + 4] = np.kron(matrix, np.eye(2))
     np.testing.assert_allclose(belief.mean, full @ before, atol=1e-12)
     np.testing.assert_allclose(belief.covariance, full @ covariance @ full.T, atol=1e-12)
 
 
 def test_reordering_keeps_each_point_with_its_covariance() -> None:
     belief = belief_with_points()
-    point, block = belief.points[2].copy(), belief.covariance[9:11, :3].copy()
+    point, block = belief.points[2].copy(), belief.covariance[HEAD + 4 : HEAD + 6, :3].copy()
     belief.reorder(np.array([2, 0]))
     assert belief.points.shape == (2, 2)
     np.testing.assert_array_equal(belief.points[0], point)
-    np.testing.assert_array_equal(belief.covariance[5:7, :3], block)
+    np.testing.assert_array_equal(belief.covariance[HEAD : HEAD + 2, :3], block)
 
 
 def test_detections_of_known_points_fix_the_pose() -> None:
     belief = Belief(np.array([0.3, -0.2, 0.01]), np.diag([0.5, 0.5, 0.02]) ** 2)
     known = np.array([[10.0, 2.0], [9.0, -2.0]])
     belief.mean = np.concatenate([belief.mean, known.ravel()])
-    belief.covariance = np.pad(belief.covariance, (0, 4)) + 1e-8 * np.eye(9)
+    belief.covariance = np.pad(belief.covariance, (0, 4)) + 1e-8 * np.eye(HEAD + 4)
     columns = np.concatenate([np.arange(3), point_columns(np.arange(2))])
     for _ in range(3):
         belief.update(columns, lambda x: to_vehicle_rows(x[:, :3], x[:, 3:]), known.ravel(), 1e-6 * np.eye(4))

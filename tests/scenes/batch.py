@@ -14,11 +14,13 @@ from pathspace_graph.batch.knots import boundary_of
 from pathspace_graph.batch.mapper import own_settings
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved
 from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.mapping.state import State
+from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.vehicle import integrate
 from pathspace_graph.spline.knots import fit_spline
@@ -36,9 +38,14 @@ COURSE = 120.0
 """This is the length of the closed course (m)."""
 
 
-def straight(seconds: float = 6.0, smoothness: float = SMOOTHNESS) -> tuple[BatchSystem, State]:
-    """Returns an exact drive at 6 m/s between two rows of cones at its optimum, every detection used."""
-    whole = MapperSettings()
+def straight(
+    seconds: float = 6.0, smoothness: float = SMOOTHNESS, sensor: bool = True
+) -> tuple[BatchSystem, State]:
+    """Returns an exact drive at 6 m/s between two rows of cones at its optimum, every detection used.
+
+    The calibration of the sensor is estimated, or is not.
+    """
+    whole = MapperSettings(calibration=CalibrationSettings(sensor=sensor))
     whole = replace(whole, batch=replace(whole.batch, sigma_smoothness=smoothness))
     cones, labels = corridor(60.0)
     log = exact_log(ahead(6.0, seconds), cones, labels)
@@ -47,6 +54,7 @@ def straight(seconds: float = 6.0, smoothness: float = SMOOTHNESS) -> tuple[Batc
         integrate_log(log, log.odometry_sigma, settings.odometry),
         DetectionTable.of(log.cycles),
     )
+    detections.twist[:] = ahead(6.0, 1.0)[0]
     state = start_odometry(chain, detections, settings)
     system = BatchSystem(detections, chain, settings, Biweight(LEAST_SQUARES))
     system.begin(state)
@@ -68,18 +76,21 @@ def settled(system: BatchSystem, state: State, steps: int = 4) -> State:
 
 
 def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, Array]:
-    """Returns the same drive measured with the problem's own noise, and the calibration (2,) in it."""
+    """Returns the same drive measured with the problem's own noise, and the calibration (7,) in it."""
     detections, chain = system.detections, system.chain
     odometry = system.settings.odometry
-    calibration = rng.normal(0.0, [odometry.sigma_scale, odometry.sigma_bias])
+    sigmas = [odometry.sigma_scale, odometry.sigma_bias, *system.settings.calibration.sigmas]
+    calibration = rng.normal(0.0, sigmas)
     sigma = np.sqrt(detections.covariance[:, 0, 0] + system.settings.spline.sigma_model**2)
-    points = detections.point + sigma[:, None] * rng.normal(size=detections.point.shape)
+    derivatives = by_sensor(detections.measured, detections.twist)[:, :, : len(calibration) - 2]
+    points = detections.measured - derivatives @ calibration[2:]
+    points += sigma[:, None] * rng.normal(size=points.shape)
     driven = chain.odometry
     noise = np.linalg.solve(driven.whiteners, rng.normal(size=(*driven.deltas.shape, 1)))[..., 0]
-    local = noise + driven.by_calibration @ calibration
+    local = noise + driven.by_calibration @ calibration[:2]
     first = rng.multivariate_normal(chain.first, np.linalg.inv(chain.first_information))
     noisy = BatchSystem(
-        replace(detections, point=points, u=detections.u.copy()),
+        replace(detections, measured=points, point=points, u=detections.u.copy()),
         _with_errors(replace(chain, first=first), local),
         system.settings,
         system.kernel,

@@ -26,7 +26,7 @@ KEYS = np.concatenate([[CALIBRATION_KEY], MAP_KEYS, POSE_KEYS])
 
 def width(key: int) -> int:
     """Returns the number of entries of a key's variable, independently of the engine."""
-    return 3 if chr(key >> 56) == "x" else 2
+    return {"x": 3, "c": 5}.get(chr(key >> 56), 2)
 
 
 def columns_of(keys: IntArray, among: IntArray) -> IntArray:

@@ -55,6 +55,9 @@ class LinearTrack:
         values = np.array([self.variables.of(one) for one in keys])
         return Rows(keys, J, (J * values).sum(axis=1) - z, np.full(len(keys), owner, np.intp))
 
+    def correct(self) -> None:
+        """Does nothing: these measurements have no sensor."""
+
     def linearized(self, cycles: IntArray) -> None:
         pass
 

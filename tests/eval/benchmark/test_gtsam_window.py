@@ -43,7 +43,7 @@ def test_gtsam_solves_the_system_that_the_mapper_solves(mapper: FixedLagMapper, 
 def test_the_marginal_is_on_the_map_and_the_next_pose(mapper: FixedLagMapper) -> None:
     window = linear_window(mapper)
     keys, everything = marginal_keys(window), window.layout
-    assert len(keys) == len(mapper.smoother.map.state.map_keys) + 2
+    assert len(keys) == len(mapper.smoother.map.state.map_keys) + 3  # calibrations of odometry and sensor
     assert keys[-1] == gtsam.symbol("x", mapper.smoother.first_cycle + 1)
     hessian, _ = window.graph.hessian(everything.ordering)
     covariance = np.linalg.inv(hessian)
