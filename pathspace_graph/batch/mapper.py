@@ -16,7 +16,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
-from pathspace_graph.graph.keys import are_poses, pose_key
+from pathspace_graph.graph.keys import CALIBRATION_KEY, are_poses, pose_key
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, SplineBoundary, joint_covariance
@@ -25,7 +25,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
-from pathspace_graph.mapping.prediction import odometry_noise
+from pathspace_graph.mapping.prediction import doubted_prior, odometry_noise
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import Stopwatch, settings_dict
 from pathspace_graph.settings.batch import Start
@@ -147,6 +147,7 @@ class BatchMapper:
             state, online = self._start_online(log)
             watch.lap("start")
             at, convergence = find_optimum(optimizer, state, settings, on_round)
+        at, convergence = _with_doubt(optimizer, at, convergence, settings, on_round)
         watch.lap("optimum")
         joint = system.eliminated(at).joint(at.state.map_keys)
         watch.lap("covariance")
@@ -180,6 +181,24 @@ class BatchMapper:
         if self.online is None:
             raise SettingsError("start online: expected an online mapper to begin with, found none")
         return start_online(log, self.online(self.settings, self.odometry_sigma))
+
+
+def _with_doubt(
+    optimizer: Optimizer,
+    at: Evaluation,
+    convergence: Convergence,
+    settings: MapperSettings,
+    on_round: Callable[[], None] | None,
+) -> tuple[Evaluation, Convergence]:
+    """Returns the optimum, searched again if it contradicts the prior of the odometry's calibration."""
+    system, key = optimizer.system, np.array([CALIBRATION_KEY])
+    variance = np.diag(system.eliminated(at).joint(key))
+    before = system.chain.calibration_sigma
+    sigma = doubted_prior(at.state.calibration, variance, before, settings.odometry)
+    if (sigma == before).all():
+        return at, convergence
+    system.chain = replace(system.chain, calibration_sigma=sigma)
+    return find_optimum(optimizer, at.state, settings, on_round)
 
 
 def find_optimum_from_odometry(

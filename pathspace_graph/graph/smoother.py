@@ -111,6 +111,8 @@ class FixedLagSmoother(Generic[M_co]):
         """These hold the prior in submaps, while the loop is open and the user gave no factors on poses."""
         self.last_step: FactoredSystem | None = None
         """The last Gauss-Newton step solved this damped system; it is None before the first step."""
+        self.calibration_sigma: Array = np.array(settings.sigma_calibration)
+        """The prior of the odometry's calibration has these standard deviations (2,)."""
         self.epoch = 0
         """This counts the changes of the prior other than the marginalization of a pose."""
         self._begin_calibration()
@@ -134,6 +136,22 @@ class FixedLagSmoother(Generic[M_co]):
                 keys, zero = np.array([key]), np.zeros(len(sigma))
                 self.variables.insert(keys, zero)
                 self.prior.push_back(jacobian_factor(keys, np.diag(1.0 / np.array(sigma)), zero))
+
+    def widen_calibration(self, sigma: Array) -> None:
+        """Gives the prior of the odometry's calibration other standard deviations (2,).
+
+        The calibration is never eliminated, so its own prior is a term of the sum, and is exchanged exactly.
+        """
+        if (sigma == self.calibration_sigma).all():
+            return
+        key, zero = np.array([CALIBRATION_KEY]), np.zeros(POINT)
+        before, after = (
+            jacobian_factor(key, np.diag(1.0 / one), zero) for one in (self.calibration_sigma, sigma)
+        )
+        self.calibration_sigma, self.epoch = sigma, self.epoch + 1
+        self.prior = graph_of(self.prior, after, before.negate())
+        if self.submaps is not None:
+            self.submaps.first = graph_of(self.submaps.first, after, before.negate())
 
     def predict(
         self, t: float, odometry: IntegratedOdometry, sigmas_start: tuple[float, float, float]

@@ -12,7 +12,13 @@ from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import odometry_noise, predict, smoother_settings, vehicle_state
+from pathspace_graph.mapping.prediction import (
+    doubt_calibration,
+    odometry_noise,
+    predict,
+    smoother_settings,
+    vehicle_state,
+)
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult, Stopwatch
@@ -65,6 +71,8 @@ class LandmarkFixedLag:
         watch.lap("create")
         for _ in range(self.settings.steps_grown if created else self.settings.steps):
             self.smoother.step()
+        if not self.closed:
+            doubt_calibration(self.smoother, self.settings.odometry)
         watch.lap("update")
         self._close()
         watch.lap("close")

@@ -99,7 +99,7 @@ def chained(
         first_information=np.linalg.inv(steps[0].covariance + np.diag(settings.sigmas_start) ** 2),
         odometry=OdometryChain(steps[1:]),
         twists=np.array([step.twist for step in steps]),
-        calibration_sigma=np.array([settings.sigma_scale, settings.sigma_bias]),
+        calibration_sigma=np.array(settings.sigmas_calibration),
     )
 
 

@@ -11,7 +11,7 @@ from pathspace_graph.graph.smoother import FixedLagSmoother, SmootherSettings
 from pathspace_graph.graph.window import MapRows
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.io.results import VehicleState
-from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
+from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings, OdometrySettings
 
 from .path import DrivenPath
 
@@ -53,6 +53,28 @@ def predict(
     return integrated
 
 
+def doubted_prior(mean: Array, variance: Array, sigma: Array, settings: OdometrySettings) -> Array:
+    """Returns the standard deviations (2,) of the calibration's prior, wider where the drive contradicts it.
+
+    mean m and variance v (2,) are those of the calibration, sigma (2,) is its prior's. If the prior is right,
+    then m has the variance `sigma^2 - v` before the drive. So the prior has a heavy tail, as that of a
+    mixture of two Gaussians.
+    """
+    first, spread = np.array(settings.sigmas_calibration), sigma**2 - variance
+    shown = spread > np.finfo(np.float32).eps * sigma**2  # the drive says something at all
+    doubted = shown & (mean**2 > settings.doubt**2 * spread) & (sigma == first)
+    return np.where(doubted, settings.wide * first, sigma)
+
+
+def doubt_calibration(smoother: FixedLagSmoother[MapRows], settings: OdometrySettings) -> None:
+    """Widens the prior of the odometry's calibration where the drive so far contradicts it."""
+    if smoother.last_step is None or smoother.next_cycle % settings.doubt_cycles:
+        return
+    variance = np.diag(smoother.last_covariance(np.array([CALIBRATION_KEY])))
+    sigma = doubted_prior(smoother.variables.calibration, variance, smoother.calibration_sigma, settings)
+    smoother.widen_calibration(sigma)
+
+
 def vehicle_state(smoother: FixedLagSmoother[MapRows]) -> VehicleState:
     """Returns the newest pose and the calibration of a smoother, with their joint covariance."""
     variables, keys = smoother.variables, [pose_key(smoother.next_cycle - 1), CALIBRATION_KEY]
@@ -68,7 +90,7 @@ def smoother_settings(settings: MapperSettings) -> SmootherSettings:
         lag=settings.lag,
         tolerances=(settings.relinearize.point, settings.relinearize.heading),
         keyframe_interval=settings.closing.keyframe_interval,
-        sigma_calibration=(settings.odometry.sigma_scale, settings.odometry.sigma_bias),
+        sigma_calibration=settings.odometry.sigmas_calibration,
         sigma_sensor=settings.calibration.sigmas,
         relative=True,
     )

@@ -21,7 +21,13 @@ from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import odometry_noise, predict, smoother_settings, vehicle_state
+from pathspace_graph.mapping.prediction import (
+    doubt_calibration,
+    odometry_noise,
+    predict,
+    smoother_settings,
+    vehicle_state,
+)
 from pathspace_graph.mapping.registration import near_start, register
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
@@ -121,6 +127,8 @@ class FixedLagMapper:
         for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
             self._step()
         watch.lap("update")
+        if not self.closed:
+            doubt_calibration(self.smoother, self.settings.odometry)
         closes = self._close()
         watch.lap("close")
         if closes:
@@ -215,7 +223,8 @@ class FixedLagMapper:
         own, first, cycle = self.settings.open_lap, self.smoother.first_cycle, self.smoother.next_cycle - 1
         wait = max(min(own.cycles, cycle - first), int(own.cycles_share * cycle))
         first_kept = min(first + wait, cycle)
-        self._lap_batch = LapBatch(self._open_lap.lap(first_kept, start), cycle + wait)
+        lap = self._open_lap.lap(first_kept, start, self.smoother.calibration_sigma)
+        self._lap_batch = LapBatch(lap, cycle + wait)
 
     def _try_loop(self) -> None:
         """Sends the lap to a batch from odometry where the drive says that it is over.
@@ -414,6 +423,11 @@ class FixedLagMapper:
     def calibration(self) -> Array:
         """Returns a view of the odometry's calibration: (scale error [-], yaw-rate bias [rad/s])."""
         return self.smoother.variables.calibration
+
+    @property
+    def calibration_sigma(self) -> Array:
+        """Returns the standard deviations (2,) of the prior of the odometry's calibration."""
+        return self.smoother.calibration_sigma
 
     @property
     def calibrations(self) -> Array:

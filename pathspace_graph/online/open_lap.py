@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from functools import cache
 from typing import Any, cast
 
@@ -112,9 +113,13 @@ class OpenLapRecord:
         state = smoother.map.state
         return ClosedMap(state.splines, self.corrected(smoother), state.variables.calibrations.copy())
 
-    def lap(self, first_kept: int, start: ClosedMap | Recurrence) -> OpenLap:
-        """Returns the lap, whose search begins at a map that has just been closed, or at odometry."""
+    def lap(self, first_kept: int, start: ClosedMap | Recurrence, calibration_sigma: Array) -> OpenLap:
+        """Returns the lap, whose search begins at a map that has just been closed, or at odometry.
+
+        The prior of the odometry's calibration has these standard deviations (2,).
+        """
         chain = chained(self._stamps, self._odometry, self.settings.odometry)
+        chain = replace(chain, calibration_sigma=calibration_sigma)
         return OpenLap(
             settings=self.settings,
             chain=chain,

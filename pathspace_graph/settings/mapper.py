@@ -144,16 +144,30 @@ class PlaceSettings(Positive):
 class OdometrySettings(Positive):
     """Describes the constant errors of the odometry, which are estimated along with the map."""
 
+    UNLIMITED = ("doubt",)
+
     sigma_scale: float = 0.005
     """This is the standard deviation of the scale error of the speeds (-)."""
     sigma_bias: float = 0.002
     """This is the standard deviation of the bias of the yaw rate (rad/s)."""
+    doubt: float = 4.0
+    """A calibration that the drive alone puts farther from zero than this number of standard deviations gets
+    a wide prior: the odometry is not what it was said to be. It is infinite where the prior always holds."""
+    wide: float = 10.0
+    """The wide prior has this number of times the standard deviation."""
+    doubt_cycles: int = 10
+    """While the loop is open, the calibration is judged after this number of cycles again."""
     sigma_start: float = 1e-4
     """This is the standard deviation of the position at the first odometry stamp (m); the position is zero by
     definition."""
     sigma_start_heading: float = 1e-5
     """This is the standard deviation of the heading at the first odometry stamp (rad); it is not zero, so
     that the first pose's information is finite."""
+
+    @property
+    def sigmas_calibration(self) -> tuple[float, float]:
+        """Returns the standard deviations of the scale error (-) and of the yaw-rate bias (rad/s)."""
+        return self.sigma_scale, self.sigma_bias
 
     @property
     def sigmas_start(self) -> tuple[float, float, float]:

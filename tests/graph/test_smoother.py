@@ -131,6 +131,25 @@ def test_a_window_on_a_linear_drive_is_full_batch(lag: int, seed: int) -> None:
     np.testing.assert_allclose(smoother.covariance(keys), expected, atol=1e-9 * np.abs(expected).max())
 
 
+def test_a_widened_prior_of_the_calibration_is_one_that_was_wide_from_the_start() -> None:
+    """The window, with poses marginalized before and after, is equal to that of another prior."""
+    wide = np.array([0.7, 3.0])
+    changed, other = LinearDrive(2), LinearDrive(2)
+    other.smoother.widen_calibration(wide)
+    for drive in (changed, other):
+        drive.drive(9)
+    before = changed.smoother.variables.calibration.copy()
+    changed.smoother.widen_calibration(wide)
+    for drive in (changed, other):
+        drive.drive(3)
+    ours, theirs = changed.smoother, other.smoother
+    assert np.abs(ours.variables.calibration - before).max() > 1e-3
+    np.testing.assert_allclose(ours.variables.values, theirs.variables.values, rtol=1e-7, atol=1e-7)
+    keys = ours.variables.keys
+    expected = theirs.covariance(keys)
+    np.testing.assert_allclose(ours.covariance(keys), expected, atol=1e-8 * np.abs(expected).max())
+
+
 def test_covariance_is_in_the_order_of_the_keys() -> None:
     drive = LinearDrive(3)
     drive.drive(6)

@@ -11,7 +11,7 @@ from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.log_odometry import integrate_log
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import integrate_odometry, predict, smoother_settings
+from pathspace_graph.mapping.prediction import doubted_prior, integrate_odometry, predict, smoother_settings
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
 
@@ -76,3 +76,35 @@ def test_the_rows_of_the_priors_have_their_cost(log: Log) -> None:
     assert odometry.prior_cost(first, calibration) == pytest.approx(cost, rel=1e-9)
     expected = 0.5 * float(((calibration / odometry.calibration_sigma) ** 2).sum())
     assert odometry.prior_cost(odometry.first, calibration) == pytest.approx(expected, rel=1e-9)
+
+
+# --- a prior that the drive contradicts ------------------------------------------------------------------
+
+
+def posterior(shown: Array, known: Array, prior: Array) -> tuple[Array, Array]:
+    """Returns mean and variance of what a drive shows with sigmas `known`, given a prior about zero."""
+    variance = 1.0 / (known**-2.0 + prior**-2.0)
+    return variance * shown / known**2, variance
+
+
+@pytest.mark.parametrize(("shown", "wide"), [(0.0189, False), (0.0191, True), (-0.0191, True), (0.0, False)])
+def test_a_prior_is_widened_where_the_drive_is_four_sigmas_off(shown: float, wide: bool) -> None:
+    """The bias is shown to 0.0043 rad/s, its prior has 0.002: both together are 0.00474, four times 0.019."""
+    settings = OdometrySettings()
+    sigma, known = np.array(settings.sigmas_calibration), np.array([0.01, 0.0043])
+    mean, variance = posterior(np.array([0.0, shown]), known, sigma)
+    found = doubted_prior(mean, variance, sigma, settings)
+    np.testing.assert_allclose(found, sigma * [1.0, 10.0 if wide else 1.0])
+
+
+def test_a_prior_is_widened_once() -> None:
+    settings = OdometrySettings()
+    wide = 10.0 * np.array(settings.sigmas_calibration)
+    mean, variance = posterior(np.array([1.0, 1.0]), np.full(2, 1e-4), wide)
+    np.testing.assert_array_equal(doubted_prior(mean, variance, wide, settings), wide)
+
+
+def test_what_a_drive_does_not_show_is_not_doubted() -> None:
+    settings = OdometrySettings()
+    sigma = np.array(settings.sigmas_calibration)
+    np.testing.assert_array_equal(doubted_prior(np.zeros(2), sigma**2, sigma, settings), sigma)

@@ -81,7 +81,9 @@ def test_a_record_that_was_given_up_keeps_the_first_reason() -> None:
 def test_the_chain_of_the_lap_is_the_odometry_that_was_measured() -> None:
     record = driven(0.5, 0.0)
     place = RecognizedPlace(Motion(np.zeros(2), np.zeros(3)), {LEFT: 0.0})
-    chain = record.lap(3, record.recurrence_since(place)).chain
+    sigma = np.array([0.1, 0.2])
+    chain = record.lap(3, record.recurrence_since(place), sigma).chain
+    np.testing.assert_array_equal(chain.calibration_sigma, sigma)
     poses = chain.dead_reckoned(np.zeros(2))
     angle = len(poses) * SPEED * CYCLE / RADIUS
     np.testing.assert_allclose(poses[-1, 2], angle)

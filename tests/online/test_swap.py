@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
+from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
 from pathspace_graph.eval.metrics.table1 import lap_metrics
 from pathspace_graph.graph.gaussian import factorize, graph_of
 from pathspace_graph.io.log import Log
@@ -200,8 +200,8 @@ def test_the_worker_solves_the_lap_as_this_process_does(monkeypatch: pytest.Monk
     laps: list[OpenLap] = []
     record = OpenLapRecord.lap
 
-    def keep(self: OpenLapRecord, smoother: object, first_kept: int) -> OpenLap:
-        laps.append(record(self, smoother, first_kept))  # type: ignore[arg-type]
+    def keep(self: OpenLapRecord, first_kept: int, start: ClosedMap, sigma: Array) -> OpenLap:
+        laps.append(record(self, first_kept, start, sigma))
         return laps[-1]
 
     monkeypatch.setattr(OpenLapRecord, "lap", keep)
