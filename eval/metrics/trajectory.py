@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +14,11 @@ from pathspace_graph.io.results import VehicleState
 from .table1 import root_mean_square
 
 Array = NDArray[np.float64]
+
+LOST: Final = 5.0
+"""A vehicle is lost where its position is wrong by more than this (m)."""
+END: Final = 1.0
+"""The end of a log is this long (s)."""
 
 
 def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
@@ -45,6 +52,16 @@ def trajectory_errors(t: Array, poses: Array, truth: Truth) -> Array:
 def ate(t: Array, poses: Array, truth: Truth) -> float:
     """Returns the absolute trajectory error sqrt(mean |p - p_true|^2) in m, without alignment."""
     return position_rms(trajectory_errors(t, poses, truth))
+
+
+def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
+    """Returns the largest distance from the true path (m), and whether the vehicle is lost at the end."""
+    errors = trajectory_errors(t, poses, truth)
+    if len(errors) == 0:
+        return {}
+    at_end = t >= t[-1] - END
+    lost = position_rms(trajectory_errors(t[at_end], poses[at_end], truth)) > LOST
+    return {"error_max": float(np.linalg.norm(errors[:, :2], axis=1).max()), "lost_at_end": bool(lost)}
 
 
 def vehicle_errors(state: VehicleState, t: float, truth: Truth) -> dict[str, float]:
