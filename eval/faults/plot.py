@@ -61,8 +61,9 @@ def _scale(axes: Axes, ratios: np.ndarray) -> None:
 def _draw(axes: Axes, kind: str, outcomes: Sequence[Outcome]) -> None:
     axes.axhline(1.0, color=DARK, linewidth=0.6)
     for at, outcome in enumerate(outcomes):
-        places = at + np.linspace(-_SPREAD, _SPREAD, max(len(outcome.runs), 1))
-        for place, run in zip(places, outcome.runs, strict=False):
+        spread = _SPREAD if len(outcome.runs) > 1 else 0.0
+        places = at + np.linspace(-spread, spread, len(outcome.runs))
+        for place, run in zip(places, outcome.runs, strict=True):
             _draw_run(axes, float(place), run)
     means = [(at, o.values()["ratio_mean"]) for at, o in enumerate(outcomes) if len(o.ratios)]
     if means:

@@ -67,6 +67,13 @@ def only(study: Study, wanted: Sequence[str]) -> Study:
     for kind in wanted:
         check_name(kind, kinds(study), "--only: expected a known fault")
     keep = {CLEAN, *(wanted or kinds(study))}
-    return replace(
-        study, noise={name: own for name, own in study.noise.items() if fault_of(name).kind in keep}
-    )
+    return _with(study, [noise for noise in study.noise if fault_of(noise).kind in keep])
+
+
+def strongest(study: Study) -> Study:
+    """Returns the suite with the clean run and each fault at the last of its strengths."""
+    return _with(study, list({fault_of(noise).kind: noise for noise in study.noise}.values()))
+
+
+def _with(study: Study, noises: Sequence[str]) -> Study:
+    return replace(study, noise={noise: study.noise[noise] for noise in noises})

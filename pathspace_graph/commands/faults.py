@@ -9,9 +9,10 @@ from rich.console import Console
 
 from pathspace_graph.estimators import DEFAULT
 from pathspace_graph.eval.faults.output import write_suite
-from pathspace_graph.eval.faults.suite import only, suite
+from pathspace_graph.eval.faults.suite import only, strongest, suite
 from pathspace_graph.eval.harness.workers import check_jobs
 from pathspace_graph.eval.study.run import make_plan, run_plan
+from pathspace_graph.eval.study.study import Study
 from pathspace_graph.progress import progress
 
 from .studies import LINES, report_failures, with_drives
@@ -31,6 +32,8 @@ class FaultSuite:
     """This estimator runs, an online or a batch one."""
     only: tuple[str, ...] = ()
     """Only these faults are run, by the names of the table."""
+    quick: bool = False
+    """Each fault is run at its greatest strength only."""
     jobs: int = -1
     """This number of processes runs at a time, -1 being one for each core."""
     cluster: str | None = None
@@ -47,8 +50,7 @@ class FaultSuite:
     def run(self) -> None:
         """Checks, runs, writes and reports the suite; the exit code is 3 where runs failed."""
         check_jobs(self.jobs)
-        chosen = replace(only(suite(), self.only), estimators=(self.estimator,))
-        study = with_drives(chosen, self.tracks, self.seeds, self.laps)
+        study = with_drives(self._chosen(), self.tracks, self.seeds, self.laps)
         plan = make_plan(study)
         with progress("runs", lines=LINES) as advance:
             frame = run_plan(plan, self.out, self.jobs, self.cluster, self.retry_failed, advance)
@@ -57,3 +59,7 @@ class FaultSuite:
         say.print(text)
         say.print(f"written to {self.out}")
         report_failures(frame, len(plan.cells))
+
+    def _chosen(self) -> Study:
+        chosen = replace(only(suite(), self.only), estimators=(self.estimator,))
+        return strongest(chosen) if self.quick else chosen

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.faults.suite import CLEAN, Fault, fault_of, kinds, only, suite
+from pathspace_graph.eval.faults.suite import CLEAN, Fault, fault_of, kinds, only, strongest, suite
 from pathspace_graph.sim.faults import Faults
 from pathspace_graph.sim.simulate import SimulationSettings
 
@@ -65,3 +65,11 @@ def test_only_some_faults_are_chosen_beside_the_clean_run() -> None:
     assert only(study, []) == study
     with pytest.raises(SettingsError, match=r"--only: expected a known fault.*the nearest is 'range bias'"):
         only(study, ["range bia"])
+
+
+def test_the_quick_suite_has_the_greatest_strength_of_each_fault() -> None:
+    study = suite()
+    quick = strongest(study)
+    assert kinds(quick) == kinds(study)
+    assert len(quick.noise) == 1 + len(kinds(study))
+    assert "range bias: 0.4 m" in quick.noise and "range bias: 0.2 m" not in quick.noise
