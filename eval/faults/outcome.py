@@ -17,6 +17,8 @@ from .suite import CLEAN, Fault, fault_of
 
 BY_PRIOR: Final = "_by_prior"
 """Metrics with this suffix are estimates of a calibration by the sigma of its prior."""
+TITLE_BY_PRIOR: Final = " by its prior's sigma"
+"""The titles of these metrics end so."""
 BEYOND: Final = 3.0
 """A calibration is conspicuous beyond this many sigmas of its prior."""
 
@@ -35,6 +37,8 @@ class FaultyRun:
     """The vehicle is lost in the last second where this is true."""
     error_max: float
     """The trajectory is wrong by up to this (m)."""
+    error_end: float
+    """The trajectory is wrong by this in the last second, in the root mean square (m)."""
     said: str
     """These are the notices of the run; it is empty where nothing was said."""
     told_degraded: float
@@ -96,6 +100,7 @@ class Outcome:
             "closed": sum(run.closed for run in runs),
             "lost": sum(run.lost for run in runs),
             "error_max": max((run.error_max for run in runs), default=np.nan),
+            "error_end": max((run.error_end for run in runs), default=np.nan),
             "told": sum(run.is_told for run in runs),
             "told_degraded": mean([run.told_degraded for run in runs]),
             "told_lost": mean([run.told_lost for run in runs]),
@@ -140,7 +145,9 @@ def _faulty_run(row: dict[str, Any], clean: float) -> FaultyRun:
         return float(row.get(name, np.nan))
 
     calibration = {
-        METRICS[name.removesuffix(BY_PRIOR)].title: known(name) for name in row if name.endswith(BY_PRIOR)
+        METRICS[name].title.removesuffix(TITLE_BY_PRIOR): known(name)
+        for name in row
+        if name.endswith(BY_PRIOR)
     }
     return FaultyRun(
         ratio=known("rmse") / clean,
@@ -148,6 +155,7 @@ def _faulty_run(row: dict[str, Any], clean: float) -> FaultyRun:
         closed=known("closed_at_end") == 1.0,
         lost=known("lost_at_end") == 1.0,
         error_max=known("error_max"),
+        error_end=known("error_end"),
         said=row["said"],
         told_degraded=known("told_degraded"),
         told_lost=known("told_lost"),

@@ -149,6 +149,7 @@ _ALL: Final = (
     Metric("false_closing", "loop closed falsely", "%", 1, scope="run"),
     Metric("jump", "jump of the pose where the map is replaced", "m", 2, scope="run"),
     Metric("error_max", "largest trajectory error", "m", 2, scope="run"),
+    Metric("error_end", "trajectory error in the last second", "m", 2, scope="run"),
     Metric("lost_at_end", "vehicle lost at the end", "%", 0, scope="run"),
     Metric("told_degraded", "cycles that the estimator calls degraded", "%", 1, scope="run"),
     Metric("told_lost", "cycles that the estimator calls lost", "%", 1, scope="run"),
@@ -345,7 +346,7 @@ def _calibration_values(run: RunResult) -> dict[str, float]:
     state, priors = vehicle_of(run), run.settings.get("odometry", {})
     if state is None or not all(f"sigma_{name}" in priors for name in CALIBRATION):
         return {}
-    found = zip(CALIBRATION, state.calibration.tolist(), strict=True)
+    found = zip(CALIBRATION, state.calibration.tolist(), strict=False)
     return {f"{name}_by_prior": value / priors[f"sigma_{name}"] for name, value in found}
 
 

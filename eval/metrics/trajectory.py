@@ -55,13 +55,18 @@ def ate(t: Array, poses: Array, truth: Truth) -> float:
 
 
 def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
-    """Returns the largest distance from the true path (m), and whether the vehicle is lost at the end."""
+    """Returns the largest position error (m), its rms in the last second (m), and whether that is a vehicle
+    that is lost."""
     errors = trajectory_errors(t, poses, truth)
     if len(errors) == 0:
         return {}
-    at_end = t >= t[-1] - END
-    lost = position_rms(trajectory_errors(t[at_end], poses[at_end], truth)) > LOST
-    return {"error_max": float(np.linalg.norm(errors[:, :2], axis=1).max()), "lost_at_end": bool(lost)}
+    known = t[(t >= truth.pose_t[0]) & (t <= truth.pose_t[-1])]
+    error_end = position_rms(errors[known >= known[-1] - END])
+    return {
+        "error_max": float(np.linalg.norm(errors[:, :2], axis=1).max()),
+        "error_end": error_end,
+        "lost_at_end": bool(error_end > LOST),
+    }
 
 
 def vehicle_errors(state: VehicleState, t: float, truth: Truth) -> dict[str, float]:

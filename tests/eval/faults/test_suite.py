@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.faults.suite import CLEAN, Fault, fault_of, kinds, only, strongest, suite
+from pathspace_graph.eval.study.overrides import leaves
 from pathspace_graph.sim.faults import Faults
 from pathspace_graph.sim.simulate import SimulationSettings
+
+from ...scenes.paths import ROOT
 
 
 @pytest.mark.parametrize(
@@ -73,3 +78,12 @@ def test_the_quick_suite_has_the_greatest_strength_of_each_fault() -> None:
     assert kinds(quick) == kinds(study)
     assert len(quick.noise) == 1 + len(kinds(study))
     assert "range bias: 0.4 m" in quick.noise and "range bias: 0.2 m" not in quick.noise
+
+
+def test_the_page_names_every_setting_of_a_fault_and_no_other() -> None:
+    page = (ROOT / "docs" / "reliability.md").read_text()
+    known = set(leaves(SimulationSettings()))
+    named = set(re.findall(r"`(faults\.[a-z_.]+|sensor\.[a-z_.]+)`", page))
+    assert named <= known
+    for setting in leaves(Faults()):
+        assert setting.rpartition(".")[2] in page, setting
