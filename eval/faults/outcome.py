@@ -29,6 +29,8 @@ class FaultyRun:
 
     ratio: float
     """This is the map's rmse by that of the clean run; it is NaN where either has no map."""
+    size: float
+    """This is the map's size by that of the clean run; it is NaN where either has no map."""
     missed: float
     """This share of the true cones is missed."""
     closed: bool
@@ -96,6 +98,7 @@ class Outcome:
             "ratio_mean": mean(ratios),
             "ratio_min": float(ratios.min(initial=np.inf)) if len(ratios) else np.nan,
             "ratio_max": float(ratios.max(initial=0.0)) if len(ratios) else np.nan,
+            "size_ratio": mean([run.size for run in runs]),
             "missed": mean([run.missed for run in runs]),
             "closed": sum(run.closed for run in runs),
             "lost": sum(run.lost for run in runs),
@@ -119,12 +122,12 @@ def mean(values: Any) -> float:
 def outcomes(study: Study, frame: pd.DataFrame) -> list[Outcome]:
     """Returns the outcome of every noise of a suite, in its order, each at the end of the last lap."""
     last = last_laps(frame)
-    clean = {_run(row): row["rmse"] for row in _rows(last, CLEAN)}
+    clean = {_run(row): row for row in _rows(last, CLEAN)}
     failures = frame[frame["failure"] != ""].groupby("noise").size()
     return [
         Outcome(
             fault_of(noise),
-            tuple(_faulty_run(row, clean.get(_run(row), np.nan)) for row in _rows(last, noise)),
+            tuple(_faulty_run(row, clean.get(_run(row), {})) for row in _rows(last, noise)),
             int(failures.get(noise, 0)),
         )
         for noise in study.noise
@@ -140,9 +143,13 @@ def _run(row: dict[str, Any]) -> tuple[Any, ...]:
     return tuple(row[name] for name in RUN)
 
 
-def _faulty_run(row: dict[str, Any], clean: float) -> FaultyRun:
+def _faulty_run(row: dict[str, Any], clean: dict[str, Any]) -> FaultyRun:
     def known(name: str) -> float:
         return float(row.get(name, np.nan))
+
+    def by_clean(name: str) -> float:
+        reference = float(clean.get(name, np.nan))
+        return known(name) / reference if reference > 0.0 else np.nan
 
     calibration = {
         METRICS[name].title.removesuffix(TITLE_BY_PRIOR): known(name)
@@ -150,7 +157,8 @@ def _faulty_run(row: dict[str, Any], clean: float) -> FaultyRun:
         if name.endswith(BY_PRIOR)
     }
     return FaultyRun(
-        ratio=known("rmse") / clean,
+        ratio=by_clean("rmse"),
+        size=by_clean("size"),
         missed=known("missed"),
         closed=known("closed_at_end") == 1.0,
         lost=known("lost_at_end") == 1.0,

@@ -18,6 +18,7 @@ HEADER: Final = (
     "strength",
     "rmse by clean",
     "range",
+    "size by clean",
     "missed [%]",
     "closed",
     "lost at the end",
@@ -26,6 +27,8 @@ HEADER: Final = (
     "called degraded, lost [% of cycles]",
     "said",
 )
+NOTHING: Final = "nothing"
+"""The table says this where no run said anything."""
 _SAID_LENGTH: Final = 60
 """A notice is shortened to this number of characters; the JSON file has the whole of it."""
 
@@ -37,7 +40,7 @@ def fault_table(study: Study, outcomes: Sequence[Outcome]) -> TextTable:
     title = (
         f"{study.name}: {study.question} {len(study.tracks)} tracks, {len(study.seeds)} seeds, "
         f"{study.laps} laps, {', '.join(study.estimators)}. The rmse is the map's at the end by that "
-        "of the clean run on the same track and with the same seed: its mean and its range. "
+        "of the clean run on the same track and with the same seed, as its mean and its range. "
         "Lost means more than 5 m off in the last second."
     )
     return TextTable(
@@ -63,13 +66,14 @@ def _row(outcome: Outcome) -> tuple[str, ...]:
         outcome.fault.strength,
         _ratio(values, runs),
         _range(values),
+        _number(values["size_ratio"], 2),
         _number(100.0 * values["missed"], 1),
         f"{values['closed']} of {runs}{failed}",
         f"{values['lost']} of {runs}",
         _number(values["error_max"], 1),
         ", ".join(f"{name} {value:+.1f}" for name, value in values["calibration"].items()),
         _health(values),
-        "; ".join(f"{count} of {runs}: {_short(text)}" for text, count in values["said"].items()),
+        "; ".join(f"{n} of {runs}: {_short(text)}" for text, n in values["said"].items()) or NOTHING,
     )
 
 

@@ -31,6 +31,7 @@ def row(noise: str, seed: int, lap: int, **values: Any) -> dict[str, Any]:
         "estimator": "fixed-lag",
         "variant": "default",
         "rmse": 0.2,
+        "size": 40,
         "missed": 0.0,
         "closed_at_end": True,
         "lost_at_end": False,
@@ -50,7 +51,7 @@ def frame() -> pd.DataFrame:
             row("clean", 0, 1, rmse=9.0),
             row("clean", 0, 2, rmse=0.2),
             row("clean", 1, 2, rmse=0.1),
-            row("latency: 20 ms", 0, 2, rmse=0.3, scale_by_prior=-5.0, said="a notice"),
+            row("latency: 20 ms", 0, 2, rmse=0.3, size=60, scale_by_prior=-5.0, said="a notice"),
             row("latency: 20 ms", 1, 2, rmse=0.35, missed=0.1, lost_at_end=True, scale_by_prior=-3.0),
             row("latency: 50 ms", 0, 2, rmse=np.nan, missed=1.0, closed_at_end=False, error_max=80.0),
             row("latency: 50 ms", 1, 2, failure="ValueError: lost", rmse=np.nan),
@@ -65,6 +66,7 @@ def test_a_run_is_compared_with_the_clean_one_of_its_track_and_seed(frame: pd.Da
     values = mild.values()
     assert values["ratio_mean"] == pytest.approx(2.5)
     assert (values["ratio_min"], values["ratio_max"]) == pytest.approx((1.5, 3.5))
+    assert values["size_ratio"] == pytest.approx(1.25)
     assert (values["missed"], values["closed"], values["lost"]) == (pytest.approx(0.05), 2, 1)
     assert (values["said"], values["told"]) == ({"a notice": 1}, 1)
     assert values["calibration"] == {"scale error of the speeds": pytest.approx(-4.0)}
@@ -87,10 +89,11 @@ def test_what_a_run_calls_itself_is_told_where_it_judges_its_health(frame: pd.Da
 def test_the_table_has_the_columns_that_something_is_known_of(frame: pd.DataFrame) -> None:
     table = fault_table(STUDY, outcomes(STUDY, frame))
     assert table.header == tuple(name for name in HEADER if not name.startswith("called"))
-    assert table.rows[0][:7] == ("clean", "", "1.00", "1.0 to 1.0", "0.0", "2 of 2", "0 of 2")
-    assert table.rows[1][2:8] == ("2.50", "1.5 to 3.5", "5.0", "2 of 2", "1 of 2", "0.5")
+    assert table.rows[0][:7] == ("clean", "", "1.00", "1.0 to 1.0", "1.00", "0.0", "2 of 2")
+    assert table.rows[1][2:8] == ("2.50", "1.5 to 3.5", "1.25", "5.0", "2 of 2", "1 of 2")
     assert table.rows[1][-1] == "1 of 2: a notice"
-    assert table.rows[2][2:6] == ("no map", "–", "100.0", "0 of 1, 1 failed")
+    assert table.rows[0][-1] == "nothing"
+    assert table.rows[2][2:7] == ("no map", "–", "1.00", "100.0", "0 of 1, 1 failed")
     assert table.groups == (1,)
 
 
