@@ -18,6 +18,8 @@ from .suite import CLEAN
 
 _COLUMNS: Final = 4
 """This many panels stand side by side."""
+_LEGEND_COLUMNS: Final = 6
+"""Every look of a mark, and the mean, stand in one row of the legend."""
 _PANEL_HEIGHT: Final = 1.45
 """A panel is this high (in)."""
 _LEGEND_HEIGHT: Final = 0.5
@@ -45,7 +47,7 @@ def plot_faults(outcomes: Sequence[Outcome]) -> Figure:
             axes.set_visible(False)
         _scale(every[0], np.concatenate([np.ones(1), *(o.ratios for o in outcomes)]))
         figure.supylabel("rmse by that of the clean run")
-        shared_legend(figure, columns=4)
+        shared_legend(figure, columns=_LEGEND_COLUMNS)
     return figure
 
 
@@ -68,9 +70,10 @@ def _draw(axes: Axes, kind: str, outcomes: Sequence[Outcome]) -> None:
     means = [(at, o.values()["ratio_mean"]) for at, o in enumerate(outcomes) if len(o.ratios)]
     if means:
         axes.plot(*np.array(means).T, color=BLUE, linewidth=0.9, label="mean", zorder=1)
-    axes.set_xticks(range(len(outcomes)), [outcome.fault.strength for outcome in outcomes])
+    axes.set_xticks(range(len(outcomes)), [f"{outcome.fault.value:g}" for outcome in outcomes])
     axes.set_xlim(-0.5, len(outcomes) - 0.5)
-    axes.set_title(_broken(kind))
+    unit = outcomes[0].fault.unit
+    axes.set_title(_broken(f"{kind} [{unit}]" if unit else kind))
     axes.grid(axis="y")
 
 
