@@ -43,6 +43,9 @@ COMMANDS: Final = {
         "compare", "Compare", "runs every estimator on one log or many, and gives the paper's table"
     ),
     "ablate": Command("ablate", "Ablate", "runs a study of estimators and settings over many drives"),
+    "faults": Command(
+        "faults", "FaultSuite", "measures what each fault of a car costs, and what is said of it"
+    ),
     "figures": Command("figures", "Figures", "draws the paper's isolated tests"),
     "scale": Command(
         "scale", "Scale", "measures the time of an update against map size, detections and laps"

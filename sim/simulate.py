@@ -9,9 +9,11 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth
+from pathspace_graph.io.log import Detections, Log, SensorInfo, Truth
 
-from .sensor import ConeSensor, OdometryNoise, SensorSettings, measure_twists
+from .disturbance import FaultySensor, colours, measure_odometry, put_down, turned_round
+from .faults import Faults
+from .sensor import ConeSensor, OdometryNoise, SensorSettings
 from .track import Track, to_map_frame
 from .vehicle import Drive, VehicleSettings, drive, integrate
 
@@ -31,6 +33,8 @@ class SimulationSettings:
     """These settings describe the errors of the measured twist."""
     sensor: SensorSettings = field(default_factory=SensorSettings)
     """These settings describe what the cone detector sees, and its errors."""
+    faults: Faults = field(default_factory=Faults, repr=False)
+    """These settings describe what is wrong with the vehicle and its sensors."""
 
     def __post_init__(self) -> None:
         if self.laps < 1:
@@ -40,39 +44,52 @@ class SimulationSettings:
 def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     """Returns the log of a drive; a seed gives the same log to the byte.
 
-    Wander, odometry and sensor have random streams of their own, so that a setting of one does not shift the
-    others. A cycle in which nothing is detected is not in the log, since the file format has no row for it.
+    Wander, odometry, sensor and colours that are lost have random streams of their own, so that a setting of
+    one does not shift the others. A cycle in which nothing is detected is not in the log, since the file
+    format has no row for it.
     """
     if seed < 0:
         raise SettingsError(f"seed: expected at least 0, found {seed}")
-    wander_rng, odometry_rng, sensor_rng = np.random.default_rng(seed).spawn(3)
-    track = to_map_frame(track)
-    driven = drive(track, settings.laps, settings.vehicle, wander_rng)
-    twists, calibration = measure_twists(driven.twists, settings.odometry, odometry_rng)
-    cycles, associations = _perceive(track, driven, settings.sensor, sensor_rng)
+    wander_rng, odometry_rng, *sensor_rngs = np.random.default_rng(seed).spawn(4)
+    faults = settings.faults
+    track = to_map_frame(turned_round(track) if faults.vehicle.wrong_way else track)
+    lap = track.centre_line.length
+    driven = put_down(drive(track, settings.laps, settings.vehicle, wander_rng), lap, faults.vehicle)
+    odometry, calibration = measure_odometry(driven, lap, settings.odometry, faults.odometry, odometry_rng)
+    cycles, associations = _perceive(track, driven, settings, *sensor_rngs)
     truth = replace(_truth(track, driven, cycles, associations), calibration=calibration)
     return Log(
-        odometry=Odometry(driven.t, twists),
+        odometry=odometry,
         cycles=tuple(cycles),
         odometry_sigma=np.array(settings.odometry.white),
         sensor=SensorInfo(settings.sensor.range_max, settings.sensor.fov, settings.sensor.rate),
-        source={"track": track.name, "seed": str(seed), "settings": repr(settings)},
+        source=_source(track, settings, seed),
         truth=truth,
     )
 
 
+def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, str]:
+    """Returns what the log says of its making, with its faults where it has any."""
+    source = {"track": track.name, "seed": str(seed), "settings": repr(settings)}
+    return source if settings.faults == Faults() else source | {"faults": repr(settings.faults)}
+
+
 def _perceive(
-    track: Track, driven: Drive, settings: SensorSettings, rng: Generator
+    track: Track, driven: Drive, settings: SimulationSettings, sensor_rng: Generator, colour_rng: Generator
 ) -> tuple[list[Detections], IntArray]:
-    sensor = ConeSensor(track.cones, track.cone_labels, settings, rng)
-    stamps = np.arange(int(driven.t[-1] * settings.rate) + 1) / settings.rate
+    faults = settings.faults
+    cones = ConeSensor(track.cones, colours(track, faults.vehicle.wrong_way), settings.sensor, sensor_rng)
+    lap = track.centre_line.length
+    sensor = FaultySensor(cones, track.cone_labels, driven, lap, faults.sensor, colour_rng)
+    stamps = np.arange(int(driven.t[-1] * settings.sensor.rate) + 1) / settings.sensor.rate
+    poses = _poses_at(driven, np.maximum(stamps - faults.sensor.latency, 0.0))
     cycles: list[Detections] = []
     associations: list[IntArray] = []
-    for t, pose in zip(stamps.tolist(), _poses_at(driven, stamps), strict=True):
-        detections, cones = sensor.detect(t, pose)
-        if len(cones):
+    for t, pose in zip(stamps.tolist(), poses, strict=True):
+        detections, seen = sensor.detect(t, pose)
+        if len(seen):
             cycles.append(detections)
-            associations.append(cones)
+            associations.append(seen)
     return cycles, np.concatenate([np.zeros(0, dtype=int), *associations])
 
 

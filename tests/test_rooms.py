@@ -43,9 +43,10 @@ ARROWS: dict[str, set[str]] = {
     "eval.study": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures"},
     "eval.compare": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "eval.scaling": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
+    "eval.faults": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "commands": BELOW_EVAL
-    | {f"eval.{room}" for room in ("metrics", "harness", "figures", "study", "compare", "scaling")},
+    | {f"eval.{room}" for room in ("metrics", "harness", "figures", "study", "compare", "scaling", "faults")},
     "cli": {"commands"},
     "__main__": {"cli"},
 }

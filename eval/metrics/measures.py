@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pathspace_graph.batch.mapper import BatchResult
-from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.io.log import CALIBRATION, Log, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.labels import BOUNDARIES
@@ -24,7 +24,7 @@ from .limit import limit
 from .reach import reach_values
 from .summary import has_cones, lap_times, vehicle_of
 from .table1 import capped_rmse, cone_distances, lap_metrics, missed_share, root_mean_square
-from .trajectory import position_rms, trajectory_errors, vehicle_errors
+from .trajectory import end_of_trajectory, position_rms, trajectory_errors, vehicle_errors
 from .turn import turn_from_truth
 
 FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3, "°": float(np.rad2deg(1.0)), "mrad/s": 1e3}
@@ -33,6 +33,8 @@ EARLY: Final = 30.0
 """A loop may close this far before the true drive is back at the start (m), which the sensor sees ahead."""
 MEAN_DIGITS: Final = 2
 """A mean with its interval is shown with at least this many digits after the decimal point."""
+UNHEALTHY: Final = ("degraded", "lost")
+"""An estimator that judges its health calls cycles so (FORMATS) where they are not good."""
 UNKNOWN: Final = "–"
 """Tables show this in place of a value that isn't known."""
 
@@ -146,16 +148,23 @@ _ALL: Final = (
     Metric("closed_at_end", "loop closed at the end of the log", "%", 0, scope="run"),
     Metric("false_closing", "loop closed falsely", "%", 1, scope="run"),
     Metric("jump", "jump of the pose where the map is replaced", "m", 2, scope="run"),
+    Metric("error_max", "largest trajectory error", "m", 2, scope="run"),
+    Metric("error_end", "trajectory error in the last second", "m", 2, scope="run"),
+    Metric("lost_at_end", "vehicle lost at the end", "%", 0, scope="run"),
+    Metric("told_degraded", "cycles that the estimator calls degraded", "%", 1, scope="run"),
+    Metric("told_lost", "cycles that the estimator calls lost", "%", 1, scope="run"),
     Metric("scale", "scale error of the speeds", "%", 2, scope="run"),
     Metric("scale_true", "scale error of the speeds, true", "%", 2, scope="run"),
     Metric("scale_sigma", "scale error of the speeds, claimed sigma", "%", 2, scope="run", average="rms"),
     Metric("scale_error", "error of the scale", "%", 2, scope="run", average="rms"),
     Metric("scale_by_sigma", "error of the scale by claimed sigma", digits=2, scope="run", average="rms"),
+    Metric("scale_by_prior", "scale error of the speeds by its prior's sigma", digits=1, scope="run"),
     Metric("bias", "bias of the yaw rate", "mrad/s", 2, scope="run"),
     Metric("bias_true", "bias of the yaw rate, true", "mrad/s", 2, scope="run"),
     Metric("bias_sigma", "bias of the yaw rate, claimed sigma", "mrad/s", 2, scope="run", average="rms"),
     Metric("bias_error", "error of the bias", "mrad/s", 2, scope="run", average="rms"),
     Metric("bias_by_sigma", "error of the bias by claimed sigma", digits=2, scope="run", average="rms"),
+    Metric("bias_by_prior", "bias of the yaw rate by its prior's sigma", digits=1, scope="run"),
     Metric("heading_sigma", "last heading, claimed sigma", "°", 2, scope="run", average="rms"),
     Metric("heading_error", "error of the last heading", "°", 2, scope="run", average="rms"),
     Metric(
@@ -209,6 +218,7 @@ def measure(
     values = _map_values(run.map, log.truth, ghost_settings, marginals)
     values |= _drive_values(run, log.truth, -np.inf, np.inf)
     values |= {"closed_at_end": bool(run.map.closed)} | _end_values(run, log.truth)
+    values |= _told_values(run.cycles) | _calibration_values(run)
     if isinstance(run, BatchRun):
         values |= {"converged": run.converged, "cost": run.cost}
     if isinstance(run, BatchResult) and log.truth is not None and has_cones(log.truth):
@@ -320,8 +330,24 @@ def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
         values |= vehicle_errors(state, float(run.trajectory_t[-1]), truth)
     if len(truth.poses):
         values["false_closing"] = closes_falsely(run, truth)
+        values |= end_of_trajectory(run.trajectory_t, run.trajectory, truth)
     jumps = [np.hypot(*record.jump[:2]) for record in run.cycles if record.jump is not None]
     return values | ({"jump": float(max(jumps))} if jumps else {})
+
+
+def _told_values(cycles: Sequence[CycleRecord]) -> dict[str, float]:
+    """Returns the shares of the cycles whose health the estimator calls so, if it judges its health."""
+    told = [getattr(record, "health", "") for record in cycles]
+    return {f"told_{level}": told.count(level) / len(told) for level in UNHEALTHY} if any(told) else {}
+
+
+def _calibration_values(run: RunResult) -> dict[str, float]:
+    """Returns the calibration in standard deviations of its prior, where both are known."""
+    state, priors = vehicle_of(run), run.settings.get("odometry", {})
+    if state is None or not all(f"sigma_{name}" in priors for name in CALIBRATION):
+        return {}
+    found = zip(CALIBRATION, state.calibration.tolist(), strict=False)
+    return {f"{name}_by_prior": value / priors[f"sigma_{name}"] for name, value in found}
 
 
 def closes_falsely(run: RunResult, truth: Truth) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +14,11 @@ from pathspace_graph.io.results import VehicleState
 from .table1 import root_mean_square
 
 Array = NDArray[np.float64]
+
+LOST: Final = 5.0
+"""A vehicle is lost where its position is wrong by more than this (m)."""
+END: Final = 1.0
+"""The end of a log is this long (s)."""
 
 
 def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
@@ -45,6 +52,21 @@ def trajectory_errors(t: Array, poses: Array, truth: Truth) -> Array:
 def ate(t: Array, poses: Array, truth: Truth) -> float:
     """Returns the absolute trajectory error sqrt(mean |p - p_true|^2) in m, without alignment."""
     return position_rms(trajectory_errors(t, poses, truth))
+
+
+def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
+    """Returns the largest position error (m), its rms in the last second (m), and whether that is a vehicle
+    that is lost."""
+    errors = trajectory_errors(t, poses, truth)
+    if len(errors) == 0:
+        return {}
+    known = t[(t >= truth.pose_t[0]) & (t <= truth.pose_t[-1])]
+    error_end = position_rms(errors[known >= known[-1] - END])
+    return {
+        "error_max": float(np.linalg.norm(errors[:, :2], axis=1).max()),
+        "error_end": error_end,
+        "lost_at_end": bool(error_end > LOST),
+    }
 
 
 def vehicle_errors(state: VehicleState, t: float, truth: Truth) -> dict[str, float]:

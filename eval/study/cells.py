@@ -14,7 +14,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.settings.mapper import MapperSettings
 
-FORMAT: Final = "pathspace-cell/2"
+FORMAT: Final = "pathspace-cell/3"
 
 Record = dict[str, Any]
 """It has the types of JSON only."""
@@ -69,8 +69,14 @@ def record_of(cell: Cell, what: Attempt[list[dict[str, Any]]]) -> Record:
         "versions": versions(),
         "failure": what.failure,
         "traceback": what.trace,
+        "said": said(what.result),
         "laps": what.measured or [],
     }
+
+
+def said(run: RunResult | None) -> str:
+    """Returns the notices of a run's cycles, each once; it is empty where there were none."""
+    return "; ".join(dict.fromkeys(record.notice for record in run.cycles if record.notice)) if run else ""
 
 
 def failed(cell: Cell, error: BaseException) -> Record:

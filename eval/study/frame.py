@@ -35,11 +35,11 @@ def frame_of(study: Study, cells: Sequence[tuple[Cell, Record | None]]) -> pd.Da
     for cell, record in cells:
         assert record is not None, "every cell has been run by now"
         shared = {"study": study.name} | cell.names | _settings_row(study, cell)
-        about = {"failure": record["failure"], **record["versions"]}
+        about = {"failure": record["failure"], "said": record["said"], **record["versions"]}
         rows += [shared | lap | about for lap in record["laps"]] or [shared | {"lap": None} | about]
     add_batch(rows)
     settings = _settings_row(study, cells[0][0])
-    order = ["study", *RUN, *COMBINATION, *settings, "lap", *METRICS, "failure", *versions()]
+    order = ["study", *RUN, *COMBINATION, *settings, "lap", *METRICS, "failure", "said", *versions()]
     known = dict.fromkeys([*order, *(name for row in rows for name in row)])
     frame = pd.DataFrame(rows, columns=[name for name in known if any(name in row for row in rows)])
     return frame.astype({"lap": "Int64"})

@@ -22,15 +22,20 @@ TIMES: Final = "times.csv"
 
 def write_tables(study: Study, frame: pd.DataFrame, out: Path) -> str:
     """Writes `results.csv`, `times.csv` and the summary in three forms, and returns its text."""
-    for name, table in ((RESULTS, without_times(frame)), (TIMES, times_of(frame))):
-        with replacing(out / name) as temporary:
-            table.to_csv(temporary, index=False, lineterminator="\n")
+    write_results(frame, out)
     tables, note = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
     text = as_text(tables, note)
     write_text(out / "summary.txt", text)
     write_text(out / "summary.md", as_markdown(tables, note))
     write_text(out / "summary.tex", as_latex(tables, note))
     return text
+
+
+def write_results(frame: pd.DataFrame, out: Path) -> None:
+    """Writes `results.csv` and `times.csv`."""
+    for name, table in ((RESULTS, without_times(frame)), (TIMES, times_of(frame))):
+        with replacing(out / name) as temporary:
+            table.to_csv(temporary, index=False, lineterminator="\n")
 
 
 def write_figures(study: Study, frame: pd.DataFrame, out: Path) -> None:

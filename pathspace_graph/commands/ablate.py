@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 from rich.console import Console
 from tyro.conf import Positional
 
-from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.harness.workers import check_jobs
 from pathspace_graph.eval.study.file import find_study, read_study
 from pathspace_graph.eval.study.output import write_figures, write_tables
 from pathspace_graph.eval.study.run import make_plan, run_plan
-from pathspace_graph.eval.study.study import Study
 from pathspace_graph.progress import progress
 
-CELLS_FAILED: Final = 3
-"""This is the exit code of a study that is written, but some of whose cells failed."""
-LINES: Final = 20
-"""A whole study writes about this many lines of progress where there is no terminal."""
+from .studies import LINES, report_failures, with_drives
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +41,7 @@ class Ablate:
     def run(self) -> None:
         """Checks, runs, writes and reports the study; the exit code is 3 where cells failed."""
         check_jobs(self.jobs)
-        study = self._study()
+        study = with_drives(read_study(find_study(self.study)), self.tracks, self.seeds, self.laps)
         plan = make_plan(study)
         with progress("cells", lines=LINES) as advance:
             frame = run_plan(plan, self.out, self.jobs, self.cluster, self.retry_failed, advance)
@@ -56,18 +50,4 @@ class Ablate:
         say = Console(soft_wrap=True, highlight=False, markup=False)
         say.print(summary, end="")
         say.print(f"\nwritten to {self.out}")
-        failures = frame[frame["failure"] != ""]
-        if len(failures):
-            first = failures.iloc[0]
-            line = f"{len(failures)} of {len(plan.cells)} cells failed, the first of {first['failure']}"
-            Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(line)
-            raise SystemExit(CELLS_FAILED)
-
-    def _study(self) -> Study:
-        study = read_study(find_study(self.study))
-        own = {name: value for name in ("seeds", "laps") if (value := getattr(self, name))}
-        if self.laps is not None and self.laps < 1:
-            raise SettingsError(f"--laps: expected at least 1, found {self.laps}")
-        if self.tracks:
-            own["tracks"] = tuple(int(t) if t.isdecimal() else Path(t) for t in self.tracks)
-        return replace(study, **own)
+        report_failures(frame, len(plan.cells))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ import pytest
 from pathspace_graph.eval.metrics.measures import METRICS, PAPER, Metric, closes_falsely, measure
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 
 from .straight_maps import landmarks, line, row, truth
@@ -168,3 +168,32 @@ def test_a_metric_is_shown_in_its_unit() -> None:
     assert {key for key, metric in METRICS.items() if metric.time} == {
         *("ms_mean", "ms_median", "ms_p99", "seconds")
     }
+
+
+# --- what a run says of itself ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Judged(CycleRecord):
+    """A record of an estimator that judges its health."""
+
+    health: str = "good"
+
+
+def test_the_health_of_the_cycles_is_counted_where_it_is_told() -> None:
+    true = circle_truth()
+    made = run(true)
+    assert not any(name.startswith("told") for name in measure(made, log(true))[-1].values)
+    told = ["good"] * 20 + ["degraded"] * 12 + ["lost"] * 8
+    cycles = tuple(Judged(k, t, 0.001, 4, 0, 0, 1, health=told[k]) for k, t in enumerate(STAMPS))
+    whole = measure(replace(made, cycles=cycles), log(true))[-1].values
+    assert (whole["told_degraded"], whole["told_lost"]) == (0.3, 0.2)
+
+
+def test_the_calibration_is_told_in_sigmas_of_its_prior() -> None:
+    true = circle_truth()
+    state = VehicleState(np.zeros(3), np.array([0.02, -0.001]), np.eye(5))
+    priors = {"odometry": {"sigma_scale": 0.005, "sigma_bias": 0.002}}
+    whole = measure(replace(run(true), vehicle=state, settings=priors), log(true))[-1].values
+    assert (whole["scale_by_prior"], whole["bias_by_prior"]) == (pytest.approx(4.0), pytest.approx(-0.5))
+    assert "scale_by_prior" not in measure(replace(run(true), vehicle=state), log(true))[-1].values

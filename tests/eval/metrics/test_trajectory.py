@@ -7,6 +7,7 @@ import pytest
 
 from pathspace_graph.eval.metrics.trajectory import (
     ate,
+    end_of_trajectory,
     interpolate_poses,
     trajectory_errors,
     vehicle_errors,
@@ -29,6 +30,23 @@ def test_trajectory_errors_are_along_and_across_the_true_heading() -> None:
     expected = [[0.3, 0, 1.6 - np.pi / 2], [0, 0.4, 0], [0, 0, 0]]
     np.testing.assert_allclose(errors, expected, atol=1e-12)
     assert ate(stamps, poses, true) == pytest.approx(np.sqrt((0.3**2 + 0.4**2) / 3))
+
+
+def test_a_vehicle_is_lost_that_is_5_m_off_in_the_last_second() -> None:
+    t = np.linspace(0.0, 10.0, 101)
+    path = np.column_stack([t, np.zeros((101, 2))])
+    true = Truth(t, path, np.zeros((0, 2)), np.zeros(0, dtype=int))
+    for at_end, lost in ((5.1, True), (4.9, False)):
+        poses = path.copy()
+        poses[50, 1] = 20.0
+        poses[t > 8.9, 1] = at_end
+        found = end_of_trajectory(t, poses, true)
+        assert found == {
+            "error_max": pytest.approx(20.0),
+            "error_end": pytest.approx(at_end),
+            "lost_at_end": lost,
+        }
+    assert end_of_trajectory(t + 100.0, path, true) == {}
 
 
 def test_the_vehicle_at_the_end_is_compared_with_the_truth() -> None:
