@@ -44,20 +44,35 @@ CAUSES: Final = {
 """These are the causes by the name of the calibration."""
 
 
+def by_prior(state: VehicleState, settings: Mapping[str, Any]) -> dict[str, float]:
+    """Returns each calibration by the standard deviation of its prior.
+
+    `settings` are those of the run as plain values. A calibration whose prior is not there is left out.
+    """
+    found = {}
+    for name, value in zip([*CALIBRATION, *SENSOR], _values(state), strict=False):
+        prior = settings.get(CAUSES[name].group, {}).get(f"sigma_{name}")
+        if prior is not None:
+            found[name] = value / prior
+    return found
+
+
 def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
     """Returns a line for each calibration that its prior did not expect, with the likely cause in words.
 
     `settings` are those of the run as plain values. The prior's standard deviations are there.
     """
-    names = [*CALIBRATION, *SENSOR]
-    values = [*state.calibration.tolist(), *state.sensor.tolist()]
+    values = dict(zip([*CALIBRATION, *SENSOR], _values(state), strict=False))
     lines = []
-    sigmas = [*state.sigmas[3:].tolist(), *state.sensor_sigmas.tolist()]
-    for name, value, sigma in zip(names, values, sigmas, strict=False):
-        cause = CAUSES[name]
-        prior = settings.get(cause.group, {}).get(f"sigma_{name}")
-        if prior is None or abs(value) <= LIMIT * prior:
-            continue
-        text = cause.text.format(cause.unit * abs(value), cause.signs[0 if value > 0.0 else 1])
-        lines.append(f"{text} ({abs(value) / prior:.1f} sigmas of its prior, known to {sigma / prior:.2f})")
+    for name, ratio in by_prior(state, settings).items():
+        if abs(ratio) > LIMIT:
+            cause, size = CAUSES[name], CAUSES[name].unit * abs(values[name])
+            text = cause.text.format(size, cause.signs[0 if ratio > 0.0 else 1])
+            lines.append(f"{text} ({abs(ratio):.1f} sigmas of its prior)")
     return lines
+
+
+def _values(state: VehicleState) -> list[float]:
+    """Returns the calibrations of odometry and sensor."""
+    values: list[float] = [*state.calibration.tolist(), *state.sensor.tolist()]
+    return values

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.diagnosis import CAUSES, diagnose
+from pathspace_graph.diagnosis import CAUSES, by_prior, diagnose
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import CALIBRATION
 from pathspace_graph.io.results import VehicleState
@@ -51,9 +51,16 @@ def test_what_the_prior_expects_is_not_worth_a_line() -> None:
     assert diagnose(state(yaw=0.029, latency=-0.029, bias=0.0059), SETTINGS) == []
 
 
-def test_the_line_says_how_far_off_and_how_well_known() -> None:
+def test_the_line_says_how_far_off_it_is() -> None:
     (line,) = diagnose(state(range_bias=0.4), SETTINGS)
-    assert line.endswith("(4.0 sigmas of its prior, known to 0.00)")
+    assert line.endswith("(4.0 sigmas of its prior)")
+
+
+def test_calibrations_are_counted_in_the_sigmas_of_their_priors() -> None:
+    found = by_prior(state(yaw=0.02, bias=-0.001), SETTINGS)
+    assert found["yaw"] == pytest.approx(2.0)
+    assert found["bias"] == pytest.approx(-0.5)
+    assert set(found) == {*CALIBRATION, *SENSOR}
 
 
 def test_settings_of_another_estimator_give_no_line() -> None:

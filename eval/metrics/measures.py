@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pathspace_graph.batch.mapper import BatchResult
-from pathspace_graph.io.log import CALIBRATION, Log, Truth
+from pathspace_graph.diagnosis import by_prior
+from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.labels import BOUNDARIES
@@ -165,6 +166,11 @@ _ALL: Final = (
     Metric("bias_error", "error of the bias", "mrad/s", 2, scope="run", average="rms"),
     Metric("bias_by_sigma", "error of the bias by claimed sigma", digits=2, scope="run", average="rms"),
     Metric("bias_by_prior", "bias of the yaw rate by its prior's sigma", digits=1, scope="run"),
+    Metric("yaw_by_prior", "yaw of the sensor by its prior's sigma", digits=1, scope="run"),
+    Metric("lateral_by_prior", "lateral offset of the sensor by its prior's sigma", digits=1, scope="run"),
+    Metric("latency_by_prior", "latency of detections by its prior's sigma", digits=1, scope="run"),
+    Metric("range_scale_by_prior", "scale error of ranges by its prior's sigma", digits=1, scope="run"),
+    Metric("range_bias_by_prior", "bias of ranges by its prior's sigma", digits=1, scope="run"),
     Metric("heading_sigma", "last heading, claimed sigma", "°", 2, scope="run", average="rms"),
     Metric("heading_error", "error of the last heading", "°", 2, scope="run", average="rms"),
     Metric(
@@ -342,12 +348,10 @@ def _told_values(cycles: Sequence[CycleRecord]) -> dict[str, float]:
 
 
 def _calibration_values(run: RunResult) -> dict[str, float]:
-    """Returns the calibration in standard deviations of its prior, where both are known."""
-    state, priors = vehicle_of(run), run.settings.get("odometry", {})
-    if state is None or not all(f"sigma_{name}" in priors for name in CALIBRATION):
-        return {}
-    found = zip(CALIBRATION, state.calibration.tolist(), strict=False)
-    return {f"{name}_by_prior": value / priors[f"sigma_{name}"] for name, value in found}
+    """Returns the calibrations in standard deviations of their priors, where both are known."""
+    state = vehicle_of(run)
+    found = {} if state is None else by_prior(state, run.settings)
+    return {f"{name}_by_prior": value for name, value in found.items()}
 
 
 def closes_falsely(run: RunResult, truth: Truth) -> bool:

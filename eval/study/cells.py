@@ -6,10 +6,11 @@ from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from typing import Any, Final
 
+from pathspace_graph.diagnosis import diagnose
 from pathspace_graph.eval.harness.attempts import Attempt, attempt
 from pathspace_graph.eval.harness.drives import Drive, identity
 from pathspace_graph.eval.metrics.measures import METRICS, measure
-from pathspace_graph.eval.metrics.summary import versions
+from pathspace_graph.eval.metrics.summary import vehicle_of, versions
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.settings.mapper import MapperSettings
@@ -75,8 +76,13 @@ def record_of(cell: Cell, what: Attempt[list[dict[str, Any]]]) -> Record:
 
 
 def said(run: RunResult | None) -> str:
-    """Returns the notices of a run's cycles, each once; it is empty where there were none."""
-    return "; ".join(dict.fromkeys(record.notice for record in run.cycles if record.notice)) if run else ""
+    """Returns the notices of a run's cycles and its diagnosis, each once, or an empty text."""
+    if run is None:
+        return ""
+    state = vehicle_of(run)
+    lines = [record.notice for record in run.cycles if record.notice]
+    lines += [] if state is None else diagnose(state, run.settings)
+    return "; ".join(dict.fromkeys(lines))
 
 
 def failed(cell: Cell, error: BaseException) -> Record:
