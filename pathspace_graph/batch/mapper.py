@@ -250,9 +250,10 @@ def _records(
     """Returns a record of each cycle, with its share of the seconds, and the number of complete laps."""
     left, right = (state.boundaries[b].size if b in state.boundaries else 0 for b in (LEFT, RIGHT))
     used = np.bincount(detections.cycle[detections.used], minlength=len(chain)).tolist()
+    offered = np.bincount(detections.cycle, minlength=len(chain)).tolist()
     counter, share = LapCounter(), seconds / len(chain)
     records = tuple(
-        CycleRecord(k, t, share, left, right, used[k], counter.update(state.poses[k]))
+        CycleRecord(k, t, share, left, right, used[k], counter.update(state.poses[k]), offered=offered[k])
         for k, t in enumerate(chain.stamps.tolist())
     )
     return records, counter.completed

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,7 @@ from pathspace_graph.factors.projection import ProjectionRows, project, sigma_ac
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.graph.rows import Rows
+from pathspace_graph.health import Evidence
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.detections import DetectionTable
@@ -21,20 +24,37 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
-def associate(smoother: CurveSmoother, retest: frozenset[int]) -> None:
+@dataclass(frozen=True, eq=False)
+class Tested:
+    """Holds the coloured detections of the newest pose, as they were tested."""
+
+    rows: IntArray
+    """(k,) These are the detections, by row of the table."""
+    in_view: NDArray[np.bool_]
+    """(k,) The flag is set when the detection lies beside the part of its curve that the pose sees."""
+    innovation: Array
+    """(k,) This is the distance of each from its curve before the update, in standard deviations of it."""
+
+
+def associate(smoother: CurveSmoother, retest: frozenset[int], use: bool = True) -> Tested:
     """Puts detections into use that lie on a curve: `d^2 < chi^2 (sigma^2 + g' Sigma g)`.
 
     d is the signed distance, sigma its own standard deviation, and g its gradient by pose and control points,
     whose joint covariance is Sigma. The newest pose's detections are tested, and for the labels in `retest`,
     whose curves have grown, all of the window that are not in use. A detection of unknown colour is used only
     if exactly one curve accepts it. The newest pose's parameter on each curve is found in the same search.
+    Without `use`, no detection is tested, and only that parameter is found.
     """
     detections, state = smoother.map.detections, smoother.map.state
     rows, curve = _untested(smoother, retest)
     points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
     foot = _find(smoother, rows, curve, points)
-    if len(rows) and smoother.last_step is not None:
-        _accept(smoother, rows, curve, points, foot)
+    if len(rows) == 0 or smoother.last_step is None or not use:
+        return Tested(rows[:0], np.zeros(0, bool), np.zeros(0))
+    innovation = _accept(smoother, rows, curve, points, foot)
+    newest = detections.cycle[rows] == smoother.next_cycle - 1
+    judged = newest & (detections.label[rows] != UNKNOWN)
+    return Tested(rows[judged], foot.interior[judged], innovation[judged])
 
 
 def reassociate(smoother: CurveSmoother) -> None:
@@ -65,8 +85,11 @@ def _view(smoother: CurveSmoother, rows: IntArray, curve: IntArray, pose_u: Arra
 
 def _accept(
     smoother: CurveSmoother, rows: IntArray, curve: IntArray, points: Array, foot: FootPoints
-) -> None:
-    """Puts those detections (m,) into use that pass the gate of their curve (m,)."""
+) -> Array:
+    """Puts those detections (m,) into use that pass the gate of their curve (m,).
+
+    Returns the distance of each from its curve, in standard deviations (m,).
+    """
     detections, state, gate = smoother.map.detections, smoother.map.state, smoother.map.settings.gate
     poses = state.variables.poses_at(detections.cycle[rows])
     covariances, sigma_model = detections.covariance[rows], smoother.map.settings.spline.sigma_model
@@ -81,6 +104,47 @@ def _accept(
         variance[doubtful] += joint_variance(smoother, detections.cycle[rows[doubtful]], feet, projected)
         accepted[doubtful] = square[doubtful] < gate.chi**2 * variance[doubtful]
     _decide(detections, rows[accepted], state.curves.labels[curve[accepted]], foot.u[accepted])
+    return np.asarray(foot.distance / np.sqrt(variance))
+
+
+def evidence_of(smoother: CurveSmoother, tested: Tested, share: float) -> Evidence:
+    """Returns what the tested detections say about the newest pose, before the update.
+
+    On a closed map every coloured detection should lie on a curve. If fewer than this `share` are in use, the
+    others are searched for on the whole of their curve: they may be of a stretch across the infield.
+    """
+    used = smoother.map.detections.used[tested.rows]
+    closed, in_use = smoother.map.state.closed, int(used.sum())
+    offered = len(used) if closed else int(tested.in_view.sum())
+    explained = in_use
+    if closed and in_use < share * offered:
+        explained += int(_lie_on_own_curve(smoother, tested.rows[~used]).sum())
+    squares = float(np.square(tested.innovation[used]).sum())
+    sigma = _sigma_of_position(smoother) if closed else np.nan
+    return Evidence(smoother.times[-1], offered, explained, in_use, squares, closed, sigma)
+
+
+def _sigma_of_position(smoother: CurveSmoother) -> float:
+    """Returns the standard deviation (m) of the last solved position in its worst direction."""
+    last = smoother.last_step
+    if last is None:
+        return np.nan
+    covariance = last.covariance(last.layout.keys[-1:])
+    return float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+
+
+def _lie_on_own_curve(smoother: CurveSmoother, rows: IntArray) -> NDArray[np.bool_]:
+    """Returns (m,) whether coloured detections lie within `chi` sigmas of a closed curve, anywhere on it."""
+    detections, state, settings = smoother.map.detections, smoother.map.state, smoother.map.settings
+    poses = state.variables.poses_at(detections.cycle[rows])
+    curve = state.curves.number(detections.label[rows])
+    low = np.array([boundary.tables.low for boundary in state.boundaries.values()])[curve]
+    high = np.array([boundary.tables.high for boundary in state.boundaries.values()])[curve]
+    points = to_map(detections.point[rows], poses)
+    smoother.refresh()
+    foot = state.curves.find(state.map_points, points, curve, low, high)
+    sigma = sigma_across(foot.normal_unit, detections.covariance[rows], poses, settings.spline.sigma_model)
+    return np.asarray(np.abs(foot.distance) < settings.gate.chi * np.hypot(sigma, settings.gate.sigma_floor))
 
 
 def _untested(smoother: CurveSmoother, retest: frozenset[int]) -> tuple[IntArray, IntArray]:

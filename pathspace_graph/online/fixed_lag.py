@@ -15,6 +15,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
+from pathspace_graph.health import Evidence, Health, HealthMonitor
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import VehicleState
@@ -28,7 +29,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
 from .activation import deactivate_distant
-from .association import associate
+from .association import associate, evidence_of
 from .closing import apply_correspondences, optimize_loop, simplify
 from .growth import Growth
 from .nonlinear_graph import window_graph
@@ -86,6 +87,8 @@ class FixedLagMapper:
         self._open_lap = OpenLapRecord(self.settings)
         if self.settings.open_lap.prior == "window" or solver is not None:
             self._open_lap.give_up("no batch of the lap was asked for")
+        self._monitor = HealthMonitor(self.settings.health)
+        self._health = Health()
         self._lap_batch: LapBatch | None = None
         self._grown: frozenset[int] = frozenset()
         self._closing_tried = 0.0
@@ -152,9 +155,12 @@ class FixedLagMapper:
     def _classify(self, detections: Detections) -> None:
         """Associates detections with the curves; those that no curve uses become tentative tracks."""
         new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
+        evidence = Evidence(detections.t)
         if self.boundaries:
-            associate(self.smoother, self._grown)
+            tested = associate(self.smoother, self._grown)
+            evidence = evidence_of(self.smoother, tested, self.settings.health.share_degraded)
             self.smoother.map.place_detections(new.start)
+        self._health = self._monitor.update(evidence)
         if not self.closed:
             self.growth.observe(self.smoother, new, detections.t)
 
@@ -269,7 +275,8 @@ class FixedLagMapper:
         detections = self.smoother.map.detections
         used = int(detections.used[detections.cycle.searchsorted(self.smoother.next_cycle - 1) :].sum())
         left, right = (self.boundaries[b].size if b in self.boundaries else 0 for b in (LEFT, RIGHT))
-        return CycleResult(t, self.poses[-1].copy(), (left, right), used, self.closed, stages, jump, notice)
+        pose, sizes = self.poses[-1].copy(), (left, right)
+        return CycleResult(t, pose, sizes, used, self.closed, stages, jump, notice, self._health)
 
     def map(self) -> Map:
         """Returns a copy of the present map, with the joint covariance of each boundary's control points.
