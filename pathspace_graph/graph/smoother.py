@@ -449,6 +449,30 @@ class FixedLagSmoother(Generic[M_co]):
         self.variables.insert(added, points.ravel())
         self.window.clear()
 
+    def forget_poses(self, first_cycle: int) -> None:
+        """Removes the poses before `first_cycle`, and all prior information about where the poses are.
+
+        The window keeps its later poses with their odometry, and the prior keeps what is known of the map and
+        the calibration. A prior must be set for one of the poses, by `add_pose_prior`.
+        """
+        self.reactivate()
+        self.epoch, self.submaps = self.epoch + 1, None
+        window, leaving = pose_keys(self._cycles), np.arange(self.first_cycle, first_cycle)
+        user = self.user_factors.remove(pose_keys(leaving), self.variables)
+        self.prior = marginalize(graph_of(self.prior, *user), window)
+        for cycle in leaving.tolist():
+            self._drop_oldest(cycle)
+        self.variables.first_cycle = first_cycle
+        self.variables.remove(pose_keys(leaving))
+        self.window.clear()
+
+    def add_pose_prior(self, cycle: int, covariance: Array) -> None:
+        """Adds a prior to the pose of a cycle at its present value, with a covariance (3, 3), map frame."""
+        key = pose_keys(np.array([cycle]))
+        root = np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).T, np.float64)
+        now = self.variables.change(self.variables.layout.entries(key))
+        self.prior.push_back(jacobian_factor(key, root, root @ now))
+
     def set_prior(self, keys: IntArray, mean: Array, information: Array) -> None:
         """Sets the prior to a Gaussian of ascending keys (k,), with mean (n,) and information (n, n)."""
         root = np.asarray(np.linalg.cholesky(information).T, np.float64)

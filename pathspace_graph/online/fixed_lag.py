@@ -15,7 +15,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
-from pathspace_graph.health import Evidence, Health, HealthMonitor
+from pathspace_graph.health import DEGRADED, LOST, Evidence, Health, HealthMonitor
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import VehicleState
@@ -31,6 +31,7 @@ from pathspace_graph.spline.boundary import Boundary
 from .activation import deactivate_distant
 from .association import associate, evidence_of
 from .closing import apply_correspondences, optimize_loop, simplify
+from .finding import FOUND, Search, start_anew
 from .growth import Growth
 from .nonlinear_graph import window_graph
 from .open_lap import LapBatch, OpenLapRecord
@@ -89,6 +90,7 @@ class FixedLagMapper:
             self._open_lap.give_up("no batch of the lap was asked for")
         self._monitor = HealthMonitor(self.settings.health)
         self._health = Health()
+        self._search: Search | None = None
         self._lap_batch: LapBatch | None = None
         self._grown: frozenset[int] = frozenset()
         self._closing_tried = 0.0
@@ -130,6 +132,9 @@ class FixedLagMapper:
         watch.lap("simplify")
         jump, notice = self._go_on(closes)
         watch.lap("swap")
+        if self._search is not None:
+            jump, notice = self._find_back()
+        watch.lap("find")
         self.smoother.marginalize(self._lap_batch.first_kept if self._lap_batch else None)
         watch.lap("marginalize")
         return self._result(detections.t, watch.laps, jump, notice)
@@ -157,10 +162,14 @@ class FixedLagMapper:
         new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1)
         evidence = Evidence(detections.t)
         if self.boundaries:
-            tested = associate(self.smoother, self._grown)
+            tested = associate(self.smoother, self._grown, use=self._search is None)
             evidence = evidence_of(self.smoother, tested, self.settings.health.share_degraded)
             self.smoother.map.place_detections(new.start)
-        self._health = self._monitor.update(evidence)
+        if self._search is None:
+            self._health = self._monitor.update(evidence)
+            self._begin_search()
+        else:
+            self._search.observe(self.poses[-1], detections)
         if not self.closed:
             self.growth.observe(self.smoother, new, detections.t)
 
@@ -269,6 +278,29 @@ class FixedLagMapper:
             self.growth.clear()
         self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds
         return go_on_from(self.smoother, marginal), ""
+
+    def _begin_search(self) -> None:
+        """Takes all detections of the window out of use, if the vehicle is lost on a map that is complete.
+
+        So the map stays as it was before. Nothing is done before the batch of the lap has replaced it.
+        """
+        ready = self.closed and self._lap_batch is None and set(self.boundaries) == set(BOUNDARIES)
+        if self._health.condition == LOST and ready:
+            detections = self.smoother.map.detections
+            detections.release(np.arange(len(detections)))
+            self._search = Search(self.smoother)
+
+    def _find_back(self) -> tuple[Array | None, str]:
+        """Starts the window anew where a lost vehicle is found; returns its jump (3,) and a notice."""
+        if self._search is None:
+            return None, ""
+        found = self._search.find(self.smoother.map.state)
+        if found is None:
+            return None, ""
+        first_cycle = max(self._search.first_cycle, self.smoother.first_cycle)
+        self._search, self._health = None, Health(DEGRADED, FOUND)
+        self._monitor.restart()
+        return start_anew(self.smoother, first_cycle, found), FOUND
 
     def _result(self, t: float, stages: dict[str, float], jump: Array | None, notice: str) -> CycleResult:
         """Returns the newest pose, the sizes of the boundaries, and the cycle's detections in use."""

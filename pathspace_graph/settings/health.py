@@ -1,4 +1,4 @@
-"""Settings of the monitor that says in each cycle how far an online estimate can be trusted."""
+"""Settings of the monitor of an online estimate, and of the search for a lost vehicle."""
 
 from __future__ import annotations
 
@@ -40,3 +40,54 @@ class HealthSettings(Positive):
     this in its worst direction (m)."""
     sigma_lost: float = 5.0
     """The vehicle is lost where that standard deviation is larger than this (m)."""
+
+
+@dataclass(frozen=True)
+class FindingSettings(Positive):
+    """Describes how a vehicle that is lost on a closed map is found.
+
+    The detections since it was lost, on at most the newest `memory` of its path, are laid beside each place
+    of the loop.
+    """
+
+    interval: float = 0.5
+    """Two attempts are at least this far apart (s)."""
+    memory: float = 60.0
+    """Detections on this length of the newest path are compared with the map (m)."""
+    readings: int = 200
+    """At most this number of detections, evenly chosen, is compared with the map."""
+    min_readings: int = 40
+    """No place is looked for with fewer detections."""
+    step: float = 2.0
+    """The places along the loop are this far apart (m)."""
+    lead: float = 4.0
+    """The vehicle heads for the middle of the track this far ahead (m)."""
+    misfit: float = 3.0
+    """A place is compared only where the path driven lies within this rms distance of the middle (m)."""
+    sample: float = 0.25
+    """The curves are sampled at this step for the comparison (m)."""
+    reach: float = 3.0
+    """A detection that is farther from its curve than this (m) counts as if it were this far."""
+    starts: int = 12
+    """At most this number of the best places is refined."""
+    apart: float = 4.0
+    """Two places that are less than this apart are one (m)."""
+    sigma_position: float = 3.0
+    """This is the standard deviation (m) of the vehicle's position about a place, before it is refined."""
+    sigma_heading: float = 0.2
+    """This is the standard deviation (rad) of the vehicle's heading about a place, before it is refined."""
+    inlier_distance: float = 0.6
+    """A detection nearer to a curve of its colour than this (m) lies on the map."""
+    inlier_share: float = 0.75
+    """At least this share of the detections must lie on the map at the place that is accepted."""
+    margin: float = 0.12
+    """The share at every other place must be smaller by this."""
+    sigma_max: float = 0.3
+    """The standard deviation of the position at the place must be below this (m) in its worst direction."""
+    confirmations: int = 2
+    """This number of attempts, one after the other, must find the same place."""
+    widening: float = 3.0
+    """The standard deviations of the registration are multiplied by this in the prior of the found pose,
+    since its detections are used again."""
+    steps: int = 2
+    """This number of Gauss-Newton steps is taken at the place that was found."""

@@ -10,7 +10,7 @@ from .checked import Positive
 from .closing import ClosingSettings
 from .comparison import CkfSettings, LandmarkSettings
 from .growth import GrowthSettings, PathSettings, TentativeSettings
-from .health import HealthSettings
+from .health import FindingSettings, HealthSettings
 from .knots import Knots
 
 
@@ -224,6 +224,8 @@ class MapperSettings(Positive):
     """These settings describe how the open lap is solved as a batch when the loop closes."""
     health: HealthSettings = field(default_factory=HealthSettings)
     """These settings describe when an estimate is good, degraded or lost."""
+    finding: FindingSettings = field(default_factory=FindingSettings)
+    """These settings describe how a vehicle that is lost on a closed map is found."""
     far: FarSettings = field(default_factory=FarSettings)
     """These settings describe the inactive part of the map, which is not solved for in every cycle."""
     relinearize: RelinearizeSettings = field(default_factory=RelinearizeSettings)
