@@ -46,5 +46,12 @@ class Plot:
         trajectory = read_trajectory(file)[1] if file.exists() else None
         cycles = self.map / CYCLES_FILE
         health = read_health(cycles) if cycles.exists() else []
-        drawn = {"log": log, "trajectory": trajectory, "health": health}
-        save_plot(plot_map(track, **drawn, band_scale=self.band_scale, title=self.title), self.out)
+        figure = plot_map(
+            track,
+            log=log,
+            trajectory=trajectory,
+            health=health,
+            band_scale=self.band_scale,
+            title=self.title,
+        )
+        save_plot(figure, self.out)

@@ -106,7 +106,7 @@ def register(
     pose of the `beginning` (k, 3), the first stretch of the drive. `times` are the stamps of the poses (s).
     """
     recent, state = _recent(track, times, settings.window), track.state
-    prior = np.linalg.inv(covariance * settings.prior_scale**2)
+    prior = np.asarray(np.linalg.inv(covariance * settings.prior_scale**2), np.float64)
     stretches = {label: _beginning(boundary, settings) for label, boundary in state.boundaries.items()}
     centre = state.poses[-1, :2].copy()
     vector = np.zeros(3)
@@ -161,7 +161,8 @@ def refine(
         matches = _match(state, settings, seen, Motion(start.centre, vector), stretches, reach)
         negative_gradient = matches.negative_gradient - information @ (vector - mean)
         vector = vector + np.linalg.solve(matches.hessian + information, negative_gradient)
-    return RefinedMotion(Motion(start.centre, vector), matches, np.linalg.inv(matches.hessian + information))
+    covariance = np.asarray(np.linalg.inv(matches.hessian + information), np.float64)
+    return RefinedMotion(Motion(start.centre, vector), matches, covariance)
 
 
 def _beginning(boundary: Boundary, settings: ClosingSettings) -> tuple[float, float]:

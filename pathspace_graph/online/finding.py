@@ -88,8 +88,8 @@ class Hypothesis:
 
     found: RefinedMotion
     """The motion moves the window onto the place."""
-    share: float
-    """This share of the detections lies on the map there."""
+    score: float
+    """This says how well the detections lie on the map there, from 0 to 1."""
 
 
 class Search:
@@ -125,18 +125,20 @@ class Search:
         if not self._seen or self._seen[-1].t - self._tried < settings.interval:
             return None
         self._tried, best = self._seen[-1].t, self._best(state)
-        if best is None or not self._confirms(best.motion):
-            self._agreed = 0
-        self._agreed, self._last = self._agreed + (best is not None), best and best.motion
+        if best is None:
+            self._agreed, self._last = 0, None
+            return None
+        self._agreed = self._agreed + 1 if self._confirms(best.motion) else 1
+        self._last = best.motion
         return best if self._agreed >= settings.confirmations else None
 
     def _confirms(self, motion: Motion) -> bool:
         """Returns whether a motion leads to the same place as the last one that was found."""
         newest = self._poses[-1][None, :2]
-        apart = (
-            np.inf if self._last is None else np.hypot(*(motion.apply(newest) - self._last.apply(newest))[0])
-        )
-        return bool(apart < self.settings.finding.apart)
+        if self._last is None:
+            return False
+        apart = motion.apply(newest) - self._last.apply(newest)
+        return bool(np.hypot(*apart[0]) < self.settings.finding.apart)
 
     def _best(self, state: State) -> RefinedMotion | None:
         """Returns the motion onto the place that is clearly better than all others, if there is one."""
@@ -145,12 +147,12 @@ class Search:
             return None
         centre = self._poses[-1][:2]
         places = [self._refined(state, seen, Motion(centre, vector), i) for vector, i in self._starts(seen)]
-        places = sorted(places, key=lambda place: -place.share)
-        if not places or places[0].share < settings.inlier_share:
+        places = sorted(places, key=lambda place: -place.score)
+        if not places or places[0].score < settings.min_score:
             return None
         best = places[0].found
-        rivals = [place.share for place in places[1:] if not self._same(place.found, best)]
-        if rivals and rivals[0] > places[0].share - settings.margin:
+        rivals = [place.score for place in places[1:] if not self._same(place.found, best)]
+        if rivals and rivals[0] > places[0].score - settings.margin:
             return None
         sigma = np.sqrt(np.linalg.eigvalsh(best.covariance[:2, :2])[-1])
         return best if sigma < settings.sigma_max else None
@@ -228,7 +230,7 @@ class Search:
         sigmas = np.array([settings.sigma_position, settings.sigma_position, settings.sigma_heading])
         found = refine(state, seen, start, stretches, (start.vector, np.diag(sigmas**-2)), closing)
         distance = self.loop.distances(seen.labels, found.motion.apply(seen.points), settings.reach)
-        return Hypothesis(found, float((distance < settings.inlier_distance).mean()))
+        return Hypothesis(found, float(np.exp(-0.5 * (distance / settings.sigma_fit) ** 2).mean()))
 
     def _stretch(self, state: State, label: int, u: float, driven: float) -> tuple[float, float]:
         """Returns the stretch of a curve that the vehicle has seen on a path that ends beside u (m)."""

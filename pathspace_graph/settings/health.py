@@ -76,12 +76,13 @@ class FindingSettings(Positive):
     """This is the standard deviation (m) of the vehicle's position about a place, before it is refined."""
     sigma_heading: float = 0.2
     """This is the standard deviation (rad) of the vehicle's heading about a place, before it is refined."""
-    inlier_distance: float = 0.6
-    """A detection nearer to a curve of its colour than this (m) lies on the map."""
-    inlier_share: float = 0.75
-    """At least this share of the detections must lie on the map at the place that is accepted."""
-    margin: float = 0.12
-    """The share at every other place must be smaller by this."""
+    sigma_fit: float = 0.3
+    """A detection at a distance d from a curve of its colour scores `exp(-d^2 / (2 sigma_fit^2))` (m). A
+    place scores the mean of its detections."""
+    min_score: float = 0.6
+    """The place that is accepted has at least this score; the true one has about 0.85."""
+    margin: float = 0.1
+    """The score of every other place must be smaller by this."""
     sigma_max: float = 0.3
     """The standard deviation of the position at the place must be below this (m) in its worst direction."""
     confirmations: int = 2
