@@ -54,66 +54,58 @@ class HealthMonitor:
     def __init__(self, settings: HealthSettings | None = None) -> None:
         self.settings = settings or HealthSettings()
         self._recent: deque[Evidence] = deque()
+        self._offered = 0  # by all the recent cycles together
         self._last_offered: float | None = None
 
     def restart(self) -> None:
         """Forgets the evidence so far, because the map or the pose was replaced."""
         self._recent.clear()
-        self._last_offered = None
+        self._offered, self._last_offered = 0, None
 
     def update(self, evidence: Evidence) -> Health:
         """Returns the health at a cycle."""
         if self._recent and self._recent[-1].closed != evidence.closed:
             self.restart()
         self._remember(evidence)
-        lost = self._why_lost(evidence)
-        if lost:
-            return Health(LOST, lost)
-        degraded = self._why_degraded(evidence)
-        return Health(DEGRADED, degraded) if degraded else Health(GOOD)
+        offered = explained = used = 0
+        squares = 0.0
+        for one in self._recent:
+            offered, explained, used = offered + one.offered, explained + one.explained, used + one.used
+            squares += one.innovations
+        share = explained / offered if offered >= self.settings.min_offered else 1.0
+        innovation = squares / used if used >= self.settings.min_offered else 0.0
+        return self._judge(evidence, share, innovation)
 
     def _remember(self, evidence: Evidence) -> None:
         """Adds the evidence of a cycle, and drops what is too old and not needed for `min_offered`."""
-        recent, offered = self._recent, evidence.offered
+        recent = self._recent
         recent.append(evidence)
-        if offered or self._last_offered is None:
+        self._offered += evidence.offered
+        if evidence.offered or self._last_offered is None:
             self._last_offered = evidence.t
-        total = sum(one.offered for one in recent)
         while recent[0].t <= evidence.t - self.settings.window:
-            if total - recent[0].offered < self.settings.min_offered:
+            if self._offered - recent[0].offered < self.settings.min_offered:
                 return
-            total -= recent.popleft().offered
+            self._offered -= recent.popleft().offered
 
-    def _why_lost(self, newest: Evidence) -> str:
-        """Returns why the vehicle is lost, or an empty text."""
-        limit = self.settings.share_lost if newest.closed else self.settings.open_lost
-        if newest.sigma > self.settings.sigma_lost:
-            return _uncertain(newest.sigma)
-        return self._unexplained(limit)
-
-    def _why_degraded(self, newest: Evidence) -> str:
-        """Returns why the estimate is degraded, or an empty text."""
-        settings, used = self.settings, sum(one.used for one in self._recent)
-        squares = sum(one.innovations for one in self._recent)
+    def _judge(self, newest: Evidence, share: float, innovation: float) -> Health:
+        """Returns the health by the share of explained detections and the mean squared innovation."""
+        settings = self.settings
+        lost = settings.share_lost if newest.closed else settings.open_lost
+        degraded = settings.share_degraded if newest.closed else settings.open_degraded
+        blind = newest.t - (newest.t if self._last_offered is None else self._last_offered)
         if newest.sigma > settings.sigma_degraded:
-            return _uncertain(newest.sigma)
-        if self._last_offered is not None and newest.t - self._last_offered > settings.blind:
-            return f"no detection in view of the map for {newest.t - self._last_offered:.1f} s"
-        if used >= settings.min_offered and squares > settings.innovation * used:
-            return f"detections lie {(squares / used) ** 0.5:.1f} standard deviations beside the map"
-        return self._unexplained(settings.share_degraded if newest.closed else settings.open_degraded)
-
-    def _unexplained(self, limit: float) -> str:
-        """Returns that less than a share of the detections is explained, if that is so."""
-        offered = sum(one.offered for one in self._recent)
-        explained = sum(one.explained for one in self._recent)
-        if offered < self.settings.min_offered or explained >= limit * offered:
-            return ""
-        return f"{explained / offered:.0%} of the detections lie on the map".replace("%", " %")
-
-
-def _uncertain(sigma: float) -> str:
-    return f"the position is uncertain by {sigma:.1f} m"
+            reason = f"the position is uncertain by {newest.sigma:.1f} m"
+            return Health(LOST if newest.sigma > settings.sigma_lost else DEGRADED, reason)
+        if share < degraded:
+            reason = f"{100 * share:.0f} % of the detections lie on the map"
+            return Health(LOST if share < lost else DEGRADED, reason)
+        if blind > settings.blind:
+            return Health(DEGRADED, f"no detection in view of the map for {blind:.1f} s")
+        if innovation > settings.innovation:
+            sigmas = innovation**0.5
+            return Health(DEGRADED, f"detections lie {sigmas:.1f} standard deviations beside the map")
+        return Health(GOOD)
 
 
 # --- a whole run -----------------------------------------------------------------------------------------

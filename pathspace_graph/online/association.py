@@ -12,7 +12,6 @@ from pathspace_graph.factors.projection import ProjectionRows, project, sigma_ac
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.health import Evidence
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.detections import DetectionTable
@@ -105,46 +104,6 @@ def _accept(
         accepted[doubtful] = square[doubtful] < gate.chi**2 * variance[doubtful]
     _decide(detections, rows[accepted], state.curves.labels[curve[accepted]], foot.u[accepted])
     return np.asarray(foot.distance / np.sqrt(variance))
-
-
-def evidence_of(smoother: CurveSmoother, tested: Tested, share: float) -> Evidence:
-    """Returns what the tested detections say about the newest pose, before the update.
-
-    On a closed map every coloured detection should lie on a curve. If fewer than this `share` are in use, the
-    others are searched for on the whole of their curve: they may be of a stretch across the infield.
-    """
-    used = smoother.map.detections.used[tested.rows]
-    closed, in_use = smoother.map.state.closed, int(used.sum())
-    offered = len(used) if closed else int(tested.in_view.sum())
-    explained = in_use
-    if closed and in_use < share * offered:
-        explained += int(_lie_on_own_curve(smoother, tested.rows[~used]).sum())
-    squares = float(np.square(tested.innovation[used]).sum())
-    sigma = _sigma_of_position(smoother) if closed else np.nan
-    return Evidence(smoother.times[-1], offered, explained, in_use, squares, closed, sigma)
-
-
-def _sigma_of_position(smoother: CurveSmoother) -> float:
-    """Returns the standard deviation (m) of the last solved position in its worst direction."""
-    last = smoother.last_step
-    if last is None:
-        return np.nan
-    covariance = last.covariance(last.layout.keys[-1:])
-    return float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
-
-
-def _lie_on_own_curve(smoother: CurveSmoother, rows: IntArray) -> NDArray[np.bool_]:
-    """Returns (m,) whether coloured detections lie within `chi` sigmas of a closed curve, anywhere on it."""
-    detections, state, settings = smoother.map.detections, smoother.map.state, smoother.map.settings
-    poses = state.variables.poses_at(detections.cycle[rows])
-    curve = state.curves.number(detections.label[rows])
-    low = np.array([boundary.tables.low for boundary in state.boundaries.values()])[curve]
-    high = np.array([boundary.tables.high for boundary in state.boundaries.values()])[curve]
-    points = to_map(detections.point[rows], poses)
-    smoother.refresh()
-    foot = state.curves.find(state.map_points, points, curve, low, high)
-    sigma = sigma_across(foot.normal_unit, detections.covariance[rows], poses, settings.spline.sigma_model)
-    return np.asarray(np.abs(foot.distance) < settings.gate.chi * np.hypot(sigma, settings.gate.sigma_floor))
 
 
 def _untested(smoother: CurveSmoother, retest: frozenset[int]) -> tuple[IntArray, IntArray]:

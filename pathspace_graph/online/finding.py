@@ -8,6 +8,7 @@ agree. Once one is clearly better than all others, and twice in a row, the windo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -18,6 +19,9 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.factors.se2 import to_map, wrap_angle
+from pathspace_graph.graph.gaussian import half_solve
+from pathspace_graph.graph.keys import POSE
+from pathspace_graph.health import Evidence
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveSmoother
@@ -25,12 +29,15 @@ from pathspace_graph.mapping.registration import Motion, RefinedMotion, Sighting
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.health import FindingSettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import Boundary
 
-from .association import reassociate
+from .association import Tested, reassociate
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
+_POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])
+"""These unit vectors choose the position of a pose."""
 FOUND: Final = "the vehicle was lost, and is found again"
 """This begins the notice of a cycle in which the window starts anew at the place that was found."""
 
@@ -80,6 +87,61 @@ def lay_out_loop(state: State, settings: FindingSettings) -> Loop:
     stations = np.concatenate([[0.0], steps.cumsum()[:-1]])
     beside = {LEFT: u[LEFT][::every], RIGHT: u[RIGHT][opposite]}
     return Loop(middle, stations, float(steps.sum()), beside, curves)
+
+
+class KnownLoop:
+    """Lays out the closed map when it is asked for, and again once the curves were replaced by others."""
+
+    def __init__(self, smoother: CurveSmoother) -> None:
+        self._smoother = smoother
+        self._laid_out: tuple[list[Boundary], Loop] | None = None
+
+    def get(self) -> Loop:
+        """Returns the loop as it was when it was laid out, which changes no variable."""
+        state = self._smoother.map.state
+        boundaries = [*state.boundaries.values()]
+        if self._laid_out is None or self._laid_out[0] != boundaries:
+            values = state.variables.values.copy()
+            self._smoother.refresh()
+            self._laid_out = boundaries, lay_out_loop(state, self._smoother.map.settings.finding)
+            state.variables.values[:] = values
+        return self._laid_out[1]
+
+
+def evidence_of(smoother: CurveSmoother, tested: Tested, known: KnownLoop) -> Evidence:
+    """Returns what the tested detections say about the newest pose, before the update.
+
+    On a closed map every coloured detection should lie on a curve. If many are not in use, these are looked
+    for on the whole of their curve: they may be of a stretch across the infield.
+    """
+    detections, settings = smoother.map.detections, smoother.map.settings.health
+    closed, used = smoother.map.state.closed, detections.used[tested.rows]
+    offered = len(used) if closed else int(tested.in_view.sum())
+    in_use = explained = int(used.sum())
+    if closed and in_use < settings.share_degraded * offered:
+        others = tested.rows[~used]
+        poses = smoother.map.variables.poses_at(detections.cycle[others])
+        points = to_map(detections.point[others], poses)
+        away = known.get().distances(detections.label[others], points, settings.beside)
+        explained += int((away < settings.beside).sum())
+    innovations = tested.innovation[used]
+    sigma = _sigma_of_position(smoother) if closed else np.nan
+    return Evidence(
+        smoother.times[-1], offered, explained, in_use, float(innovations @ innovations), closed, sigma
+    )
+
+
+def _sigma_of_position(smoother: CurveSmoother) -> float:
+    """Returns the standard deviation (m) of the last solved position in its worst direction.
+
+    The newest pose has the last columns of the system, so that the last block of its factor tells it.
+    """
+    last = smoother.last_step
+    if last is None:
+        return np.nan
+    half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())
+    (xx, xy), (_, yy) = (half.T @ half).tolist()
+    return math.sqrt(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy))
 
 
 @dataclass(frozen=True, eq=False)

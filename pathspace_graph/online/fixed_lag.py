@@ -29,9 +29,9 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
 from .activation import deactivate_distant
-from .association import associate, evidence_of
+from .association import associate
 from .closing import apply_correspondences, optimize_loop, simplify
-from .finding import FOUND, Search, start_anew
+from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
 from .growth import Growth
 from .nonlinear_graph import window_graph
 from .open_lap import LapBatch, OpenLapRecord
@@ -90,6 +90,7 @@ class FixedLagMapper:
             self._open_lap.give_up("no batch of the lap was asked for")
         self._monitor = HealthMonitor(self.settings.health)
         self._health = Health()
+        self._known_loop = KnownLoop(self.smoother)
         self._search: Search | None = None
         self._lap_batch: LapBatch | None = None
         self._grown: frozenset[int] = frozenset()
@@ -163,7 +164,7 @@ class FixedLagMapper:
         evidence = Evidence(detections.t)
         if self.boundaries:
             tested = associate(self.smoother, self._grown, use=self._search is None)
-            evidence = evidence_of(self.smoother, tested, self.settings.health.share_degraded)
+            evidence = evidence_of(self.smoother, tested, self._known_loop)
             self.smoother.map.place_detections(new.start)
         if self._search is None:
             self._health = self._monitor.update(evidence)

@@ -27,6 +27,9 @@ class HealthSettings(Positive):
     """On a closed map, the estimate is degraded where a smaller share of the detections is explained."""
     share_lost: float = 0.55
     """On a closed map, the vehicle is lost where a smaller share of the detections is explained."""
+    beside: float = 1.0
+    """A detection that is not in use is explained if it is nearer than this (m) to the closed curve of its
+    colour."""
     open_degraded: float = 0.35
     """While the loop is open, the estimate is degraded below this share. It is low, since detections of
     stretches that are not mapped yet lie beside the curves."""
