@@ -24,7 +24,7 @@ IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class Tested:
+class Gating:
     """Holds the coloured detections of the newest pose, as they were tested."""
 
     rows: IntArray
@@ -35,7 +35,7 @@ class Tested:
     """(k,) This is the distance of each from its curve before the update, in standard deviations of it."""
 
 
-def associate(smoother: CurveSmoother, retest: frozenset[int], use: bool = True) -> Tested:
+def associate(smoother: CurveSmoother, retest: frozenset[int], use: bool = True) -> Gating:
     """Puts detections into use that lie on a curve: `d^2 < chi^2 (sigma^2 + g' Sigma g)`.
 
     d is the signed distance, sigma its own standard deviation, and g its gradient by pose and control points,
@@ -49,11 +49,11 @@ def associate(smoother: CurveSmoother, retest: frozenset[int], use: bool = True)
     points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
     foot = _find(smoother, rows, curve, points)
     if len(rows) == 0 or smoother.last_step is None or not use:
-        return Tested(rows[:0], np.zeros(0, bool), np.zeros(0))
+        return Gating(rows[:0], np.zeros(0, bool), np.zeros(0))
     innovation = _accept(smoother, rows, curve, points, foot)
     newest = detections.cycle[rows] == smoother.next_cycle - 1
     judged = newest & (detections.label[rows] != UNKNOWN)
-    return Tested(rows[judged], foot.interior[judged], innovation[judged])
+    return Gating(rows[judged], foot.interior[judged], innovation[judged])
 
 
 def reassociate(smoother: CurveSmoother) -> None:

@@ -31,7 +31,7 @@ from pathspace_graph.settings.health import FindingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
-from .association import Tested, reassociate
+from .association import Gating, reassociate
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -108,7 +108,7 @@ class KnownLoop:
         return self._laid_out[1]
 
 
-def evidence_of(smoother: CurveSmoother, tested: Tested, known: KnownLoop) -> Evidence:
+def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop) -> Evidence:
     """Returns what the tested detections say about the newest pose, before the update.
 
     On a closed map every coloured detection should lie on a curve. If many are not in use, these are looked
@@ -158,11 +158,11 @@ class Search:
     """Remembers what a lost vehicle has seen, and looks for its place on a closed map."""
 
     def __init__(self, smoother: CurveSmoother) -> None:
-        """Begins with the newest pose; the curves don't change during the search."""
+        """Begins after the newest pose."""
         self.settings: MapperSettings = smoother.map.settings
-        smoother.refresh()
-        self.loop = lay_out_loop(smoother.map.state, self.settings.finding)
-        """This is the map on which the vehicle is lost."""
+        self.loop: Loop
+        """This is the map as it was in the last attempt."""
+        self._smoother = smoother
         self.first_cycle = smoother.next_cycle
         """The detections of the cycles from this one on are remembered."""
         self._poses: list[Array] = []
@@ -181,12 +181,12 @@ class Search:
             driven = driven[1:]
             del self._poses[0], self._seen[0]
 
-    def find(self, state: State) -> RefinedMotion | None:
+    def find(self) -> RefinedMotion | None:
         """Returns the motion onto the only place that agrees, once it was found several times in a row."""
         settings = self.settings.finding
         if not self._seen or self._seen[-1].t - self._tried < settings.interval:
             return None
-        self._tried, best = self._seen[-1].t, self._best(state)
+        self._tried, best = self._seen[-1].t, self._best()
         if best is None:
             self._agreed, self._last = 0, None
             return None
@@ -202,11 +202,18 @@ class Search:
         apart = motion.apply(newest) - self._last.apply(newest)
         return bool(np.hypot(*apart[0]) < self.settings.finding.apart)
 
-    def _best(self, state: State) -> RefinedMotion | None:
-        """Returns the motion onto the place that is clearly better than all others, if there is one."""
+    def _best(self) -> RefinedMotion | None:
+        """Returns the motion onto the place that is clearly better than all others, if there is one.
+
+        The loop is laid out each time: the map goes on to relax from the detections that were taken out of
+        use.
+        """
         settings, seen = self.settings.finding, self._sightings()
         if len(seen.rows) < settings.min_readings:
             return None
+        self._smoother.refresh()
+        state = self._smoother.map.state
+        self.loop = lay_out_loop(state, settings)
         centre = self._poses[-1][:2]
         places = [self._refined(state, seen, Motion(centre, vector), i) for vector, i in self._starts(seen)]
         places = sorted(places, key=lambda place: -place.score)

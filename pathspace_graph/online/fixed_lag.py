@@ -295,7 +295,7 @@ class FixedLagMapper:
         """Starts the window anew where a lost vehicle is found; returns its jump (3,) and a notice."""
         if self._search is None:
             return None, ""
-        found = self._search.find(self.smoother.map.state)
+        found = self._search.find()
         if found is None:
             return None, ""
         first_cycle = max(self._search.first_cycle, self.smoother.first_cycle)

@@ -86,7 +86,7 @@ class FindingSettings(Positive):
     """The place that is accepted has at least this score; the true one has about 0.85."""
     margin: float = 0.1
     """The score of every other place must be smaller by this."""
-    sigma_max: float = 0.3
+    sigma_max: float = 0.5
     """The standard deviation of the position at the place must be below this (m) in its worst direction."""
     confirmations: int = 2
     """This number of attempts, one after the other, must find the same place."""

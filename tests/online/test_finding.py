@@ -10,26 +10,31 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.table1 import lap_metrics
-from pathspace_graph.factors.se2 import compose, inverse, move_points
+from pathspace_graph.factors.se2 import compose, inverse, move_points, to_vehicle
 from pathspace_graph.graph.gaussian import factorize, marginalize
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.online.finding import FOUND, Search, lay_out_loop
+from pathspace_graph.online.association import Gating
+from pathspace_graph.online.finding import FOUND, KnownLoop, Search, evidence_of, lay_out_loop
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.health import FindingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.drives import map_log, true_poses
+from ..scenes.drives import detections, map_log, true_poses
 from ..scenes.kidnapped import laps_log, pear_track, put_down
 
 Array = NDArray[np.float64]
 
 SECOND_LAP = 20.0
 """The vehicle is put down elsewhere at this stamp (s), early in its second lap."""
+
+
+NOTHING = Gating(np.zeros(0, np.intp), np.zeros(0, bool), np.zeros(0))
+"""No detection was tested."""
 
 
 def mapper_of(log: Log) -> FixedLagMapper:
@@ -98,6 +103,30 @@ def test_two_places_that_look_alike_are_not_told_apart() -> None:
     assert FOUND not in {result.notice for result in results}
 
 
+def test_the_uncertainty_of_the_position_is_that_of_the_last_step() -> None:
+    smoother = clean()[1].smoother
+    assert smoother.last_step is not None
+    newest = smoother.last_step.layout.keys[-1:]
+    covariance = smoother.last_step.covariance(newest)[:2, :2]
+    sigma = evidence_of(smoother, NOTHING, KnownLoop(smoother)).sigma
+    np.testing.assert_allclose(sigma, np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+
+
+def test_detections_across_the_infield_are_explained_by_the_map_and_ghosts_are_not() -> None:
+    log = clean()[0]
+    mapper = map_log(log, mapper_of(log))[0]
+    smoother, table = mapper.smoother, mapper.smoother.map.detections
+    far = np.array([mapper.control_points(LEFT)[k] for k in (5, 12)])
+    ghosts = np.array([[200.0, 0.0], [0.0, 200.0]])
+    seen = to_vehicle(np.concatenate([far, ghosts]), np.tile(mapper.poses[-1], (4, 1)))
+    rows = table.append(detections(0.0, seen, np.full(4, LEFT)), smoother.next_cycle - 1)
+    tested = Gating(np.arange(rows.start, rows.stop), np.zeros(4, bool), np.full(4, 9.0))
+    before = smoother.variables.values.copy()
+    evidence = evidence_of(smoother, tested, KnownLoop(smoother))
+    assert (evidence.offered, evidence.explained, evidence.used) == (4, 2, 0)
+    np.testing.assert_array_equal(smoother.variables.values, before)
+
+
 # --- the search alone ------------------------------------------------------------------------------------
 
 
@@ -121,7 +150,7 @@ def test_the_motion_that_took_the_vehicle_away_is_undone() -> None:
     search._tried = -np.inf
     for pose, cycle in zip(true_poses(log)[150:190], log.cycles[150:190], strict=True):
         search.observe(compose(away, pose), cycle)
-        found = search.find(mapper.smoother.map.state) or found
+        found = search.find() or found
     assert found is not None
     truth = true_poses(log)[[170, 189]]
     moved = move_points(away, truth[:, :2])
@@ -134,7 +163,7 @@ def test_no_place_is_found_with_too_few_detections() -> None:
     search = Search(mapper.smoother)
     search._tried = -np.inf
     search.observe(true_poses(log)[150], log.cycles[150])
-    assert search.find(mapper.smoother.map.state) is None
+    assert search.find() is None
 
 
 def test_the_remembered_path_has_a_bound() -> None:
