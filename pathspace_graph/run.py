@@ -15,6 +15,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 
+from .health import Health
 from .labels import LEFT, RIGHT
 from .laps import LapCounter
 
@@ -42,6 +43,8 @@ class CycleResult:
     cycle by one that was solved as a batch."""
     notice: str = ""
     """This says what a user should know of the cycle; it is empty if there is nothing."""
+    health: Health = field(default_factory=Health)
+    """This says how far the estimate can be trusted; it is empty for an estimator without a monitor."""
 
 
 class OnlineEstimator(Protocol):
@@ -193,6 +196,9 @@ class _Run:
                 closed=result.closed,
                 jump=None if result.jump is None else tuple(np.asarray(result.jump).tolist()),
                 notice=result.notice,
+                offered=len(detections.labels),
+                health=result.health.condition,
+                reason=result.health.reason,
             )
         )
         if self._observer is not None:

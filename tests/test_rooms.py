@@ -18,7 +18,7 @@ EXTRAS = {"distributed"}
 LEAVES = {"errors", "labels", "progress"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "ckf", "landmark"}
-BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "run"}
+BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "health", "run"}
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping"}
 BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"sim", "estimators", "diagnosis"}
 
@@ -31,7 +31,8 @@ ARROWS: dict[str, set[str]] = {
     "io": {"spline", "factors"},
     "sim": {"io"},
     "graph": {"factors"},
-    "run": {"io", "laps"},
+    "health": {"settings"},
+    "run": {"io", "laps", "health"},
     "diagnosis": {"factors", "io"},
     "mapping": BELOW_MAPPING,
     **dict.fromkeys(ESTIMATORS, BELOW_ESTIMATORS),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -13,6 +14,7 @@ from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
@@ -26,7 +28,7 @@ from .marks import (
     draw_points,
     point_blocks,
 )
-from .style import BLUE, DARK, GREEN, ORANGE, WIDTH, figure_context, grouped_legend, set_frame
+from .style import BLUE, DARK, GREEN, ORANGE, PURPLE, RED, WIDTH, figure_context, grouped_legend, set_frame
 
 Array = NDArray[np.float64]
 
@@ -43,6 +45,8 @@ _COLORS: Final = {LEFT: BLUE, RIGHT: ORANGE}
 """Boundaries have their cones' colours; yellow is amber, which can be seen on white paper."""
 _TRAJECTORY_COLOR: Final = GREEN
 """The estimated trajectory has this colour."""
+_HEALTH_COLORS: Final = {DEGRADED: PURPLE, LOST: RED}
+"""The trajectory has these colours where it is not good."""
 _BAND_ALPHA: Final = 0.35
 """The uncertainty band has this opacity."""
 
@@ -73,12 +77,14 @@ def plot_map(
     *,
     log: Log | None = None,
     trajectory: Array | None = None,
+    health: Sequence[str] = (),
     band_scale: float = 1.0,
     title: str | None = None,
 ) -> Figure:
     """Draws the map in metres, with equal scales and the band S(u) +- 2 band_scale sigma(u) n(u).
 
     `log` adds the true cones and the true path where it has truth; trajectory (n, 3) or (n, 2), map frame.
+    It is drawn in another colour where the `health` of its n cycles is not good.
     The legend says so where a `band_scale` other than 1 draws the band wider than it is.
     """
     if not band_scale > 0.0:
@@ -93,6 +99,7 @@ def plot_map(
             draw_truth(axes, log.truth, WHOLE_TRACK)
         if trajectory is not None and len(trajectory):
             _draw_trajectory(axes, np.asarray(trajectory), WHOLE_TRACK)
+            _draw_unhealthy(axes, np.asarray(trajectory), health, WHOLE_TRACK)
         draw_start(axes, WHOLE_TRACK)
         _finish(figure, axes, title)
     return figure
@@ -147,6 +154,17 @@ def _draw_trajectory(axes: Axes, trajectory: Array, style: MapStyle) -> None:
     """Draws poses (n, 3) or positions (n, 2) as a line, map frame (m)."""
     line: dict[str, Any] = {"color": _TRAJECTORY_COLOR, "linewidth": style.path_width, "zorder": 3}
     axes.plot(*trajectory[:, :2].T, label="trajectory", **line)
+
+
+def _draw_unhealthy(axes: Axes, trajectory: Array, health: Sequence[str], style: MapStyle) -> None:
+    """Draws the parts of the trajectory again that were degraded or lost, each in its colour."""
+    for condition, color in _HEALTH_COLORS.items():
+        chosen = np.array([word == condition for word in health], bool)
+        if len(chosen) != len(trajectory) or not chosen.any():
+            continue
+        line: dict[str, Any] = {"color": color, "linewidth": 2.0 * style.path_width, "zorder": 3.2}
+        x, y = np.where(chosen[:, None], trajectory[:, :2], np.nan).T
+        axes.plot(x, y, label=condition, **line)
 
 
 def draw_truth(axes: Axes, truth: Truth, style: MapStyle) -> None:

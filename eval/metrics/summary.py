@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.diagnosis import diagnose
 from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.health import Health, Stretch, counts, stretches
 from pathspace_graph.io.log import CALIBRATION, Log, Truth
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.laps import lap_end_indices
 
@@ -44,6 +45,8 @@ def summarize(result: RunResult, log: Log) -> dict[str, Any]:
     events = _events(result)
     if events:
         summary["events"] = events
+    if any(record.health for record in result.cycles):
+        summary["health"] = _health(result)
     state = vehicle_of(result)
     if state is not None:
         summary |= _vehicle(state)
@@ -81,6 +84,22 @@ def _events(result: RunResult) -> list[dict[str, Any]]:
         for record in result.cycles
         if record.jump is not None or record.notice
     ]
+
+
+def _health(result: RunResult) -> dict[str, Any]:
+    """Returns the number of cycles of each condition, and the stretches (s) that were not good."""
+    not_good = [asdict(stretch) for stretch in stretches_of(result)]
+    return {**counts([health_of(record) for record in result.cycles]), "stretches": not_good}
+
+
+def stretches_of(result: RunResult) -> list[Stretch]:
+    """Returns the stretches of a run that were not good."""
+    return stretches([r.t for r in result.cycles], [health_of(r) for r in result.cycles])
+
+
+def health_of(record: CycleRecord) -> Health:
+    """Returns the health that a cycle's record holds."""
+    return Health(record.health, record.reason)
 
 
 def versions() -> dict[str, str]:

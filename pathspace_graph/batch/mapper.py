@@ -16,7 +16,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
-from pathspace_graph.graph.keys import CALIBRATION_KEY, are_poses, pose_key
+from pathspace_graph.graph.keys import are_poses, pose_key
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, SplineBoundary, joint_covariance
@@ -25,7 +25,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
-from pathspace_graph.mapping.prediction import doubted_prior, odometry_noise
+from pathspace_graph.mapping.prediction import doubted, odometry_noise
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import Stopwatch, settings_dict
 from pathspace_graph.settings.batch import Start
@@ -190,15 +190,16 @@ def _with_doubt(
     settings: MapperSettings,
     on_round: Callable[[], None] | None,
 ) -> tuple[Evaluation, Convergence]:
-    """Returns the optimum, searched again if it contradicts the prior of the odometry's calibration."""
-    system, key = optimizer.system, np.array([CALIBRATION_KEY])
-    variance = np.diag(system.eliminated(at).joint(key))
-    before = system.chain.calibration_sigma
-    sigma = doubted_prior(at.state.calibration, variance, before, settings.odometry)
-    if (sigma == before).all():
+    """Returns the optimum, searched again while it contradicts the prior of a calibration."""
+    system, variables = optimizer.system, at.state.variables
+    variance = np.diag(system.eliminated(at).joint(variables.calibration_keys))
+    believed = doubted(variables.calibrations, variance, settings)
+    if believed == settings:
         return at, convergence
-    system.chain = replace(system.chain, calibration_sigma=sigma)
-    return find_optimum(optimizer, at.state, settings, on_round)
+    system.settings = believed
+    system.chain = replace(system.chain, calibration_sigma=np.array(believed.odometry.sigmas_calibration))
+    at, convergence = find_optimum(optimizer, at.state, believed, on_round)
+    return _with_doubt(optimizer, at, convergence, believed, on_round)
 
 
 def find_optimum_from_odometry(
@@ -269,9 +270,10 @@ def _records(
     """Returns a record of each cycle, with its share of the seconds, and the number of complete laps."""
     left, right = (state.boundaries[b].size if b in state.boundaries else 0 for b in (LEFT, RIGHT))
     used = np.bincount(detections.cycle[detections.used], minlength=len(chain)).tolist()
+    offered = np.bincount(detections.cycle, minlength=len(chain)).tolist()
     counter, share = LapCounter(), seconds / len(chain)
     records = tuple(
-        CycleRecord(k, t, share, left, right, used[k], counter.update(state.poses[k]))
+        CycleRecord(k, t, share, left, right, used[k], counter.update(state.poses[k]), offered=offered[k])
         for k, t in enumerate(chain.stamps.tolist())
     )
     return records, counter.completed

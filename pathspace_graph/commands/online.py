@@ -12,8 +12,17 @@ from tyro.conf import Positional, arg
 
 from pathspace_graph.diagnosis import diagnose
 from pathspace_graph.estimators import DEFAULT, check_online, make_online
-from pathspace_graph.eval.metrics.summary import lap_times, laps_of, not_mapped, summarize, vehicle_of
+from pathspace_graph.eval.metrics.summary import (
+    health_of,
+    lap_times,
+    laps_of,
+    not_mapped,
+    stretches_of,
+    summarize,
+    vehicle_of,
+)
 from pathspace_graph.eval.metrics.table1 import LapMetrics
+from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import Log, read_log
 from pathspace_graph.io.map import MAP_FILE
@@ -86,7 +95,23 @@ def outline(result: RunResult) -> str:
     laps = f"{result.laps} lap{'' if result.laps == 1 else 's'}"
     loop = "loop closed" if result.map.closed else "loop not closed"
     sizes = [f"{NAMES[label]} {boundary.size}" for label, boundary in sorted(result.map.boundaries.items())]
-    return ", ".join([laps, loop, f"control points: {' + '.join(sizes) or 'none'}"])
+    points = f"control points: {' + '.join(sizes) or 'none'}"
+    return ", ".join([laps, loop, points, *health_outline(result)])
+
+
+def health_outline(result: RunResult) -> list[str]:
+    """Returns how many cycles were not good, and why the vehicle is lost at the end, if any were."""
+    number = counts([health_of(record) for record in result.cycles])
+    total = max(len(result.cycles), 1)
+    parts = [
+        f"{condition} in {number[condition] / total:.1%} of the cycles".replace("%", " %")
+        for condition in (DEGRADED, LOST)
+        if number[condition]
+    ]
+    last = stretches_of(result)[-1:]
+    if last and last[0].health == LOST and last[0].end == result.cycles[-1].t:
+        parts.append(f"still lost since {last[0].begin:.1f} s ({last[0].reason})")
+    return parts
 
 
 def laps_table(laps: list[LapMetrics]) -> Table:

@@ -14,6 +14,7 @@ from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.io.files import check_file_target
 from pathspace_graph.io.log import read_log
 from pathspace_graph.io.map import read_map
+from pathspace_graph.io.results import CYCLES_FILE, read_health
 from pathspace_graph.io.trajectory import TRAJECTORY_FILE, read_trajectory
 
 
@@ -43,7 +44,14 @@ class Plot:
         log = None if self.log is None else read_log(self.log)
         file = self.map / TRAJECTORY_FILE
         trajectory = read_trajectory(file)[1] if file.exists() else None
-        save_plot(
-            plot_map(track, log=log, trajectory=trajectory, band_scale=self.band_scale, title=self.title),
-            self.out,
+        cycles = self.map / CYCLES_FILE
+        health = read_health(cycles) if cycles.exists() else []
+        figure = plot_map(
+            track,
+            log=log,
+            trajectory=trajectory,
+            health=health,
+            band_scale=self.band_scale,
+            title=self.title,
         )
+        save_plot(figure, self.out)

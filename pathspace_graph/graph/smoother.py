@@ -111,8 +111,8 @@ class FixedLagSmoother(Generic[M_co]):
         """These hold the prior in submaps, while the loop is open and the user gave no factors on poses."""
         self.last_step: FactoredSystem | None = None
         """The last Gauss-Newton step solved this damped system; it is None before the first step."""
-        self.calibration_sigma: Array = np.array(settings.sigma_calibration)
-        """The prior of the odometry's calibration has these standard deviations (2,)."""
+        self.calibration_sigma: Array = np.array([*settings.sigma_calibration, *settings.sigma_sensor])
+        """The priors of the calibrations have these standard deviations, (2,) or (7,)."""
         self.epoch = 0
         """This counts the changes of the prior other than the marginalization of a pose."""
         self._begin_calibration()
@@ -137,16 +137,16 @@ class FixedLagSmoother(Generic[M_co]):
                 self.variables.insert(keys, zero)
                 self.prior.push_back(jacobian_factor(keys, np.diag(1.0 / np.array(sigma)), zero))
 
-    def widen_calibration(self, sigma: Array) -> None:
-        """Gives the prior of the odometry's calibration other standard deviations (2,).
+    def widen_calibrations(self, sigma: Array) -> None:
+        """Gives the priors of the calibrations other standard deviations, (2,) or (7,).
 
-        The calibration is never eliminated, so its own prior is a term of the sum, and is exchanged exactly.
+        Calibrations are never eliminated, so their priors are terms of the sum, and are exchanged exactly.
         """
         if (sigma == self.calibration_sigma).all():
             return
-        key, zero = np.array([CALIBRATION_KEY]), np.zeros(POINT)
+        keys, zero = self.variables.calibration_keys, np.zeros(len(sigma))
         before, after = (
-            jacobian_factor(key, np.diag(1.0 / one), zero) for one in (self.calibration_sigma, sigma)
+            jacobian_factor(keys, np.diag(1.0 / one), zero) for one in (self.calibration_sigma, sigma)
         )
         self.calibration_sigma, self.epoch = sigma, self.epoch + 1
         self.prior = graph_of(self.prior, after, before.negate())
@@ -473,6 +473,30 @@ class FixedLagSmoother(Generic[M_co]):
         self.variables.remove(np.concatenate([keyframes, pose_keys(leaving), removed]))
         self.variables.insert(added, points.ravel())
         self.window.clear()
+
+    def forget_poses(self, first_cycle: int) -> None:
+        """Removes the poses before `first_cycle`, and all prior information about where the poses are.
+
+        The window keeps its later poses with their odometry, and the prior keeps what is known of the map and
+        the calibration. A prior must be set for one of the poses, by `add_pose_prior`.
+        """
+        self.reactivate()
+        self.epoch, self.submaps = self.epoch + 1, None
+        window, leaving = pose_keys(self._cycles), np.arange(self.first_cycle, first_cycle)
+        user = self.user_factors.remove(pose_keys(leaving), self.variables)
+        self.prior = marginalize(graph_of(self.prior, *user), window)
+        for cycle in leaving.tolist():
+            self._drop_oldest(cycle)
+        self.variables.first_cycle = first_cycle
+        self.variables.remove(pose_keys(leaving))
+        self.window.clear()
+
+    def add_pose_prior(self, cycle: int, covariance: Array) -> None:
+        """Adds a prior to the pose of a cycle at its present value, with a covariance (3, 3), map frame."""
+        key = pose_keys(np.array([cycle]))
+        root = np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).T, np.float64)
+        now = self.variables.change(self.variables.layout.entries(key))
+        self.prior.push_back(jacobian_factor(key, root, root @ now))
 
     def set_prior(self, keys: IntArray, mean: Array, information: Array) -> None:
         """Sets the prior to a Gaussian of ascending keys (k,), with mean (n,) and information (n, n)."""

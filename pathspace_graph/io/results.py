@@ -7,13 +7,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 
+from .csv_table import read_table
 from .files import atomic_folder
 from .json_file import write_json
 from .map import MAP_FILE, Map, map_to_json
@@ -21,7 +22,20 @@ from .trajectory import TRAJECTORY_FILE, write_trajectory
 
 Array = NDArray[np.float64]
 
-_CYCLE_COLUMNS = ("cycle", "t", "seconds", "size_left", "size_right", "readings", "lap")
+CYCLES_FILE: Final = "cycles.csv"
+"""A result folder holds its cycles in this file."""
+_CYCLE_COLUMNS: Final = (
+    "cycle",
+    "t",
+    "seconds",
+    "size_left",
+    "size_right",
+    "readings",
+    "lap",
+    "offered",
+    "health",
+    "reason",
+)
 
 
 @dataclass(frozen=True)
@@ -50,6 +64,12 @@ class CycleRecord:
     """The newest pose jumped by this [m, m, rad], map frame, where the map was replaced in this cycle."""
     notice: str = ""
     """This says what a user should know of the cycle; it is empty if there is nothing."""
+    offered: int = 0
+    """This is the number of the cycle's detections."""
+    health: str = ""
+    """The estimate is good, degraded or lost; this is empty where the estimator does not say it."""
+    reason: str = ""
+    """This says why the estimate is not good."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +160,7 @@ def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, An
     with atomic_folder(Path(folder), marker=MAP_FILE) as temporary:
         write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
         write_trajectory(temporary / TRAJECTORY_FILE, result.trajectory_t, result.trajectory)
-        _write_cycles(temporary / "cycles.csv", result.cycles)
+        _write_cycles(temporary / CYCLES_FILE, result.cycles)
         write_json(temporary / "summary.json", summary)
 
 
@@ -151,6 +171,11 @@ def _write_cycles(file: Path, cycles: Iterable[CycleRecord]) -> None:
         writer.writerows(_cycle_row(record) for record in cycles)
 
 
-def _cycle_row(record: CycleRecord) -> list[float | int]:
+def _cycle_row(record: CycleRecord) -> list[float | int | str]:
     values = (getattr(record, column) for column in _CYCLE_COLUMNS)
     return [value.item() if isinstance(value, np.generic) else value for value in values]
+
+
+def read_health(file: Path) -> list[str]:
+    """Returns the health of each cycle by the file of cycles; the list is empty if it does not say it."""
+    return list(read_table(file, ("cycle",)).columns.get("health", []))

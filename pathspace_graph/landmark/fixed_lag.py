@@ -13,7 +13,7 @@ from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import (
-    doubt_calibration,
+    doubt_calibrations,
     odometry_noise,
     predict,
     smoother_settings,
@@ -51,6 +51,8 @@ class LandmarkFixedLag:
         """This is the path driven."""
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         """These tracks by label are not landmarks yet."""
+        self.believed = self.settings
+        """These are the settings with the priors of the calibrations as they are now."""
         self.closed = False
         """This tells whether the loop has closed."""
         self._last_detected: Array = np.zeros(
@@ -71,8 +73,7 @@ class LandmarkFixedLag:
         watch.lap("create")
         for _ in range(self.settings.steps_grown if created else self.settings.steps):
             self.smoother.step()
-        if not self.closed:
-            doubt_calibration(self.smoother, self.settings.odometry)
+        self.believed = doubt_calibrations(self.smoother, self.believed)
         watch.lap("update")
         self._close()
         watch.lap("close")

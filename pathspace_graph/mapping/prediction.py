@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrate_twists
 from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, pose_key
 from pathspace_graph.graph.smoother import FixedLagSmoother, SmootherSettings
 from pathspace_graph.graph.window import MapRows
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.io.results import VehicleState
-from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings, OdometrySettings
+from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
 from .path import DrivenPath
 
@@ -53,26 +55,40 @@ def predict(
     return integrated
 
 
-def doubted_prior(mean: Array, variance: Array, sigma: Array, settings: OdometrySettings) -> Array:
-    """Returns the standard deviations (2,) of the calibration's prior, wider where the drive contradicts it.
+def doubted(mean: Array, variance: Array, settings: MapperSettings) -> MapperSettings:
+    """Returns the settings, with wide priors of the calibrations if the drive contradicts one of them.
 
-    mean m and variance v (2,) are those of the calibration, sigma (2,) is its prior's. If the prior is right,
-    then m has the variance `sigma^2 - v` before the drive. So the prior has a heavy tail, as that of a
+    mean m and variance v, (2,) or (7,), are those of the calibrations. If a prior with standard deviation
+    sigma is right, then m had the variance `sigma^2 - v` before the drive. The priors that are contradicted
+    most become wide, those of the odometry or those of the sensor. So a prior has a heavy tail, as that of a
     mixture of two Gaussians.
     """
-    first, spread = np.array(settings.sigmas_calibration), sigma**2 - variance
+    sigma = np.array(settings.sigmas_calibrations)
+    limits = np.full(len(sigma), settings.calibration.doubt)
+    limits[:CALIBRATION_SIZE] = settings.odometry.doubt
+    spread = sigma**2 - variance
     shown = spread > np.finfo(np.float32).eps * sigma**2  # the drive says something at all
-    doubted = shown & (mean**2 > settings.doubt**2 * spread) & (sigma == first)
-    return np.where(doubted, settings.wide * first, sigma)
+    square = np.where(shown, mean**2 / np.where(shown, spread, 1.0), 0.0) / limits**2
+    most = int(np.argmax(square))
+    if square[most] <= 1.0:
+        return settings
+    if most < CALIBRATION_SIZE:
+        return replace(settings, odometry=settings.odometry.widened())
+    return replace(settings, calibration=settings.calibration.widened())
 
 
-def doubt_calibration(smoother: FixedLagSmoother[MapRows], settings: OdometrySettings) -> None:
-    """Widens the prior of the odometry's calibration where the drive so far contradicts it."""
-    if smoother.last_step is None or smoother.next_cycle % settings.doubt_cycles:
-        return
-    variance = np.diag(smoother.last_covariance(np.array([CALIBRATION_KEY])))
-    sigma = doubted_prior(smoother.variables.calibration, variance, smoother.calibration_sigma, settings)
-    smoother.widen_calibration(sigma)
+def doubt_calibrations(smoother: FixedLagSmoother[MapRows], settings: MapperSettings) -> MapperSettings:
+    """Widens the priors of calibrations where the drive so far contradicts them.
+
+    It returns the settings with the priors as they are then.
+    """
+    if smoother.last_step is None or smoother.next_cycle % settings.odometry.doubt_cycles:
+        return settings
+    variables = smoother.variables
+    variance = np.diag(smoother.last_covariance(variables.calibration_keys))
+    found = doubted(variables.calibrations, variance, settings)
+    smoother.widen_calibrations(np.array(found.sigmas_calibrations))
+    return found
 
 
 def vehicle_state(smoother: FixedLagSmoother[MapRows]) -> VehicleState:

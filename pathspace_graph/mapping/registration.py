@@ -1,8 +1,8 @@
-"""Registration of the newest detections with the beginning of the curves, which finds the loop closure."""
+"""Registration of detections with a stretch of the curves: it finds the loop closure, and a lost vehicle."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import to_map, wrap_angle
 from pathspace_graph.settings.closing import ClosingSettings
+from pathspace_graph.spline.boundary import Boundary
 
 from .curve_map import CurveMap
 from .path import DrivenPath
+from .state import State
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -35,8 +37,24 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
+class Sightings:
+    """Holds coloured detections, where the vehicle believes that they are."""
+
+    rows: IntArray
+    """(m,) These are the detections, by row of the table that they are from."""
+    labels: IntArray
+    """(m,) Each detection has this label."""
+    points: Array
+    """(m, 2) Each detection is at this point in m, map frame."""
+
+    def where(self, chosen: IntArray) -> Sightings:
+        """Returns some of the detections, by index."""
+        return Sightings(self.rows[chosen], self.labels[chosen], self.points[chosen])
+
+
+@dataclass(frozen=True, eq=False)
 class Matches:
-    """Holds the detections whose foot points are inside the beginning of their curve, for one motion."""
+    """Holds the detections whose foot points are inside a stretch of their curve, for one motion."""
 
     rows: IntArray
     """(m,) These are the detections, by row of the table."""
@@ -87,28 +105,69 @@ def register(
     the motion free. If P is larger than what the iteration can bridge, the iteration starts from the best
     pose of the `beginning` (k, 3), the first stretch of the drive. `times` are the stamps of the poses (s).
     """
-    recent, points = _recent(track, times, settings.window)
-    prior = np.linalg.inv(covariance * settings.prior_scale**2)
-    centre = track.state.poses[-1, :2].copy()
+    recent, state = _recent(track, times, settings.window), track.state
+    prior = np.asarray(np.linalg.inv(covariance * settings.prior_scale**2), np.float64)
+    stretches = {label: _beginning(boundary, settings) for label, boundary in state.boundaries.items()}
+    centre = state.poses[-1, :2].copy()
     vector = np.zeros(3)
     lost = is_lost(covariance, settings)
     if lost:
-        pose = track.state.poses[-1]
-        starts = [v for v in _motions(pose, beginning, settings) if v @ prior @ v < settings.start_chi2]
+        starts = [
+            v for v in _motions(state.poses[-1], beginning, settings) if v @ prior @ v < settings.start_chi2
+        ]
         inliers = [
-            _match(track, settings, recent, points, Motion(centre, v), settings.icp_reach).inlier.sum()
+            _match(state, settings, recent, Motion(centre, v), stretches, settings.icp_reach).inlier.sum()
             for v in [vector, *starts]
         ]
         vector = [vector, *starts][int(np.argmax(inliers))]
-    for reach in _reaches(settings):
-        matches = _match(track, settings, recent, points, Motion(centre, vector), reach)
-        negative_gradient = matches.negative_gradient - prior @ vector
-        vector = vector + np.linalg.solve(matches.hessian + prior, negative_gradient)
-    posterior = np.linalg.inv(matches.hessian + prior)
-    labels = track.state.boundaries
-    if not (agrees(matches, list(labels), settings) and is_certain(matches, posterior, settings, lost)):
+    found = refine(state, recent, Motion(centre, vector), stretches, (np.zeros(3), prior), settings)
+    if not found.agrees(list(state.boundaries), settings, lost):
         return None
-    return Registration(Motion(centre, vector), {label: matches.inliers(label) for label in labels})
+    return Registration(found.motion, {label: found.matches.inliers(label) for label in state.boundaries})
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedMotion:
+    """Holds a motion that the registration has ended with."""
+
+    motion: Motion
+    """The motion moves the detections onto their curves."""
+    matches: Matches
+    """These are the detections at the last iteration."""
+    covariance: Array
+    """(3, 3) This is the covariance of the motion (m, m, rad)."""
+
+    def agrees(self, labels: list[int], settings: ClosingSettings, lost: bool) -> bool:
+        """Returns whether the detections agree with the curves, and hold the motion in every direction."""
+        return agrees(self.matches, labels, settings) and is_certain(
+            self.matches, self.covariance, settings, lost
+        )
+
+
+def refine(
+    state: State,
+    seen: Sightings,
+    start: Motion,
+    stretches: Mapping[int, tuple[float, float]],
+    prior: tuple[Array, Array],
+    settings: ClosingSettings,
+) -> RefinedMotion:
+    """Refines a motion by iterated closest points on a stretch (low, high) of each curve, by label.
+
+    The prior of the motion has the mean (3,) and the information (3, 3).
+    """
+    (mean, information), vector = prior, start.vector
+    for reach in _reaches(settings):
+        matches = _match(state, settings, seen, Motion(start.centre, vector), stretches, reach)
+        negative_gradient = matches.negative_gradient - information @ (vector - mean)
+        vector = vector + np.linalg.solve(matches.hessian + information, negative_gradient)
+    covariance = np.asarray(np.linalg.inv(matches.hessian + information), np.float64)
+    return RefinedMotion(Motion(start.centre, vector), matches, covariance)
+
+
+def _beginning(boundary: Boundary, settings: ClosingSettings) -> tuple[float, float]:
+    """Returns the stretch of a curve that counts as its beginning."""
+    return 0.0, min(settings.beginning, settings.beginning_share * boundary.confirmed_end)
 
 
 def is_lost(covariance: Array, settings: ClosingSettings) -> bool:
@@ -126,12 +185,13 @@ def _motions(pose: Array, beginning: Array, settings: ClosingSettings) -> list[A
     return list(motions)
 
 
-def _recent(track: CurveMap, times: Sequence[float], seconds: float) -> tuple[IntArray, Array]:
-    """Returns the coloured detections (m,) of the newest poses, and their points (m, 2) in the map frame."""
+def _recent(track: CurveMap, times: Sequence[float], seconds: float) -> Sightings:
+    """Returns the coloured detections of the newest poses."""
     detections, variables, stamps = track.detections, track.variables, np.asarray(times)
     rows = np.flatnonzero(stamps[detections.cycle - variables.first_cycle] > stamps[-1] - seconds)
     rows = rows[np.isin(detections.label[rows], list(track.state.boundaries))]
-    return rows, to_map(detections.point[rows], variables.poses_at(detections.cycle[rows]))
+    points = to_map(detections.point[rows], variables.poses_at(detections.cycle[rows]))
+    return Sightings(rows, detections.label[rows], points)
 
 
 def _reaches(settings: ClosingSettings) -> Iterator[float]:
@@ -141,34 +201,32 @@ def _reaches(settings: ClosingSettings) -> Iterator[float]:
 
 
 def _match(
-    track: CurveMap,
+    state: State,
     settings: ClosingSettings,
-    recent: IntArray,
-    points: Array,
+    seen: Sightings,
     motion: Motion,
+    stretches: Mapping[int, tuple[float, float]],
     reach: float,
 ) -> Matches:
-    """Matches moved detections with the beginning, and linearizes those within `reach` (m) by the motion."""
-    state = track.state
-    labels, moved = track.detections.label[recent], motion.apply(points)
+    """Matches moved detections with a stretch of each curve, and linearizes those within `reach` (m)."""
+    moved = motion.apply(seen.points)
     hessian, negative_gradient = np.zeros((3, 3)), np.zeros(3)
-    rows, u, inlier = [recent[:0]], [np.zeros(0)], [np.zeros(0, bool)]
+    matched, u, inlier = [np.zeros(0, np.intp)], [np.zeros(0)], [np.zeros(0, bool)]
     for label, boundary in state.boundaries.items():
-        own = np.flatnonzero(labels == label)
-        low = np.zeros(len(own))
-        high = low + min(settings.beginning, settings.beginning_share * boundary.confirmed_end)
+        own = np.flatnonzero(seen.labels == label)
+        low, high = (np.full(len(own), end) for end in stretches[label])
         foot = boundary.find(state.control_points(label), moved[own], low, high)
         used = foot.interior & (np.abs(foot.distance) < reach)
         n, arm = foot.normal_unit[used], moved[own[used]] - motion.centre - motion.vector[:2]
         by_motion = np.column_stack([n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]]) / settings.sigma_reading
         hessian += by_motion.T @ by_motion
         negative_gradient -= by_motion.T @ foot.distance[used] / settings.sigma_reading
-        rows.append(recent[own[foot.interior]])
+        matched.append(own[foot.interior])
         u.append(foot.u[foot.interior])
         inlier.append(np.abs(foot.distance[foot.interior]) < settings.inlier_distance)
-    matched = np.concatenate(rows)
-    labels = track.detections.label[matched]
-    return Matches(matched, labels, np.concatenate(u), np.concatenate(inlier), hessian, negative_gradient)
+    inside, parameters, inliers = np.concatenate(matched), np.concatenate(u), np.concatenate(inlier)
+    rows, labels = seen.rows[inside], seen.labels[inside]
+    return Matches(rows, labels, parameters, inliers, hessian, negative_gradient)
 
 
 def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,20 +22,37 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
-def associate(smoother: CurveSmoother, retest: frozenset[int]) -> None:
+@dataclass(frozen=True, eq=False)
+class Gating:
+    """Holds the coloured detections of the newest pose, as they were tested."""
+
+    rows: IntArray
+    """(k,) These are the detections, by row of the table."""
+    in_view: NDArray[np.bool_]
+    """(k,) The flag is set when the detection lies beside the part of its curve that the pose sees."""
+    innovation: Array
+    """(k,) This is the distance of each from its curve before the update, in standard deviations of it."""
+
+
+def associate(smoother: CurveSmoother, retest: frozenset[int], use: bool = True) -> Gating:
     """Puts detections into use that lie on a curve: `d^2 < chi^2 (sigma^2 + g' Sigma g)`.
 
     d is the signed distance, sigma its own standard deviation, and g its gradient by pose and control points,
     whose joint covariance is Sigma. The newest pose's detections are tested, and for the labels in `retest`,
     whose curves have grown, all of the window that are not in use. A detection of unknown colour is used only
     if exactly one curve accepts it. The newest pose's parameter on each curve is found in the same search.
+    Without `use`, no detection is tested, and only that parameter is found.
     """
     detections, state = smoother.map.detections, smoother.map.state
     rows, curve = _untested(smoother, retest)
     points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
     foot = _find(smoother, rows, curve, points)
-    if len(rows) and smoother.last_step is not None:
-        _accept(smoother, rows, curve, points, foot)
+    if len(rows) == 0 or smoother.last_step is None or not use:
+        return Gating(rows[:0], np.zeros(0, bool), np.zeros(0))
+    innovation = _accept(smoother, rows, curve, points, foot)
+    newest = detections.cycle[rows] == smoother.next_cycle - 1
+    judged = newest & (detections.label[rows] != UNKNOWN)
+    return Gating(rows[judged], foot.interior[judged], innovation[judged])
 
 
 def reassociate(smoother: CurveSmoother) -> None:
@@ -64,8 +83,11 @@ def _view(smoother: CurveSmoother, rows: IntArray, curve: IntArray, pose_u: Arra
 
 def _accept(
     smoother: CurveSmoother, rows: IntArray, curve: IntArray, points: Array, foot: FootPoints
-) -> None:
-    """Puts those detections (m,) into use that pass the gate of their curve (m,)."""
+) -> Array:
+    """Puts those detections (m,) into use that pass the gate of their curve (m,).
+
+    Returns the distance of each from its curve, in standard deviations (m,).
+    """
     detections, state, gate = smoother.map.detections, smoother.map.state, smoother.map.settings.gate
     poses = state.variables.poses_at(detections.cycle[rows])
     covariances, sigma_model = detections.covariance[rows], smoother.map.settings.spline.sigma_model
@@ -80,6 +102,7 @@ def _accept(
         variance[doubtful] += joint_variance(smoother, rows[doubtful], feet, projected)
         accepted[doubtful] = square[doubtful] < gate.chi**2 * variance[doubtful]
     _decide(detections, rows[accepted], state.curves.labels[curve[accepted]], foot.u[accepted])
+    return np.asarray(foot.distance / np.sqrt(variance))
 
 
 def _untested(smoother: CurveSmoother, retest: frozenset[int]) -> tuple[IntArray, IntArray]:

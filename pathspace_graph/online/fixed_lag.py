@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import gtsam
@@ -15,6 +16,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
+from pathspace_graph.health import DEGRADED, LOST, Evidence, Health, HealthMonitor
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import VehicleState
@@ -22,7 +24,7 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import (
-    doubt_calibration,
+    doubt_calibrations,
     odometry_noise,
     predict,
     smoother_settings,
@@ -36,6 +38,7 @@ from pathspace_graph.spline.boundary import Boundary
 from .activation import deactivate_distant
 from .association import associate
 from .closing import apply_correspondences, optimize_loop, simplify
+from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
 from .growth import Growth
 from .nonlinear_graph import window_graph
 from .open_lap import LapBatch, OpenLapRecord
@@ -92,9 +95,14 @@ class FixedLagMapper:
         self._open_lap = OpenLapRecord(self.settings)
         if self.settings.open_lap.prior == "window" or solver is not None:
             self._open_lap.give_up("no batch of the lap was asked for")
+        self._monitor = HealthMonitor(self.settings.health)
+        self._health = Health()
+        self._known_loop = KnownLoop(self.smoother)
+        self._search: Search | None = None
         self._lap_batch: LapBatch | None = None
         self._grown: frozenset[int] = frozenset()
         self._twist = np.zeros(POSE)
+        self._believed = self.settings  # with the priors of the calibrations as they are now
         self._closing_tried = 0.0
         self._loop_tried, self._recognition_tried = 0.0, 0.0
 
@@ -127,8 +135,8 @@ class FixedLagMapper:
         for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
             self._step()
         watch.lap("update")
-        if not self.closed:
-            doubt_calibration(self.smoother, self.settings.odometry)
+        if self._search is None:
+            self._believed = doubt_calibrations(self.smoother, self._believed)
         closes = self._close()
         watch.lap("close")
         if closes:
@@ -136,6 +144,9 @@ class FixedLagMapper:
         watch.lap("simplify")
         jump, notice = self._go_on(closes)
         watch.lap("swap")
+        if self._search is not None:
+            jump, notice = self._find_back()
+        watch.lap("find")
         self.smoother.marginalize(self._lap_batch.first_kept if self._lap_batch else None)
         watch.lap("marginalize")
         return self._result(detections.t, watch.laps, jump, notice)
@@ -163,9 +174,17 @@ class FixedLagMapper:
         """Associates detections with the curves; those that no curve uses become tentative tracks."""
         new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1, self._twist)
         self.smoother.map.correct()
+        evidence = Evidence(detections.t)
         if self.boundaries:
-            associate(self.smoother, self._grown)
+            tested = associate(self.smoother, self._grown, use=self._search is None)
+            evidence = evidence_of(self.smoother, tested, self._known_loop)
             self.smoother.map.place_detections(new.start)
+        if self._search is None:
+            self._health = self._monitor.update(evidence)
+            self._begin_search()
+        else:
+            corrected = self.smoother.map.detections.point[new].copy()
+            self._search.observe(self.poses[-1], replace(detections, points_vehicle=corrected))
         if not self.closed:
             self.growth.observe(self.smoother, new, detections.t)
 
@@ -223,7 +242,7 @@ class FixedLagMapper:
         own, first, cycle = self.settings.open_lap, self.smoother.first_cycle, self.smoother.next_cycle - 1
         wait = max(min(own.cycles, cycle - first), int(own.cycles_share * cycle))
         first_kept = min(first + wait, cycle)
-        lap = self._open_lap.lap(first_kept, start, self.smoother.calibration_sigma)
+        lap = self._open_lap.lap(first_kept, start, self._believed)
         self._lap_batch = LapBatch(lap, cycle + wait)
 
     def _try_loop(self) -> None:
@@ -276,12 +295,36 @@ class FixedLagMapper:
         self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds
         return go_on_from(self.smoother, marginal), ""
 
+    def _begin_search(self) -> None:
+        """Takes all detections of the window out of use, if the vehicle is lost on a map that is complete.
+
+        So the map stays as it was before. Nothing is done before the batch of the lap has replaced it.
+        """
+        ready = self.closed and self._lap_batch is None and set(self.boundaries) == set(BOUNDARIES)
+        if self._health.condition == LOST and ready:
+            detections = self.smoother.map.detections
+            detections.release(np.arange(len(detections)))
+            self._search = Search(self.smoother)
+
+    def _find_back(self) -> tuple[Array | None, str]:
+        """Starts the window anew where a lost vehicle is found; returns its jump (3,) and a notice."""
+        if self._search is None:
+            return None, ""
+        found = self._search.find()
+        if found is None:
+            return None, ""
+        first_cycle = max(self._search.first_cycle, self.smoother.first_cycle)
+        self._search, self._health = None, Health(DEGRADED, FOUND)
+        self._monitor.restart()
+        return start_anew(self.smoother, first_cycle, found), FOUND
+
     def _result(self, t: float, stages: dict[str, float], jump: Array | None, notice: str) -> CycleResult:
         """Returns the newest pose, the sizes of the boundaries, and the cycle's detections in use."""
         detections = self.smoother.map.detections
         used = int(detections.used[detections.cycle.searchsorted(self.smoother.next_cycle - 1) :].sum())
         left, right = (self.boundaries[b].size if b in self.boundaries else 0 for b in (LEFT, RIGHT))
-        return CycleResult(t, self.poses[-1].copy(), (left, right), used, self.closed, stages, jump, notice)
+        pose, sizes = self.poses[-1].copy(), (left, right)
+        return CycleResult(t, pose, sizes, used, self.closed, stages, jump, notice, self._health)
 
     def map(self) -> Map:
         """Returns a copy of the present map, with the joint covariance of each boundary's control points.
@@ -423,11 +466,6 @@ class FixedLagMapper:
     def calibration(self) -> Array:
         """Returns a view of the odometry's calibration: (scale error [-], yaw-rate bias [rad/s])."""
         return self.smoother.variables.calibration
-
-    @property
-    def calibration_sigma(self) -> Array:
-        """Returns the standard deviations (2,) of the prior of the odometry's calibration."""
-        return self.smoother.calibration_sigma
 
     @property
     def calibrations(self) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
 from functools import cache
 from typing import Any, cast
 
@@ -113,15 +112,14 @@ class OpenLapRecord:
         state = smoother.map.state
         return ClosedMap(state.splines, self.corrected(smoother), state.variables.calibrations.copy())
 
-    def lap(self, first_kept: int, start: ClosedMap | Recurrence, calibration_sigma: Array) -> OpenLap:
+    def lap(self, first_kept: int, start: ClosedMap | Recurrence, settings: MapperSettings) -> OpenLap:
         """Returns the lap, whose search begins at a map that has just been closed, or at odometry.
 
-        The prior of the odometry's calibration has these standard deviations (2,).
+        The priors of the calibrations are those of the settings, which may have become wide.
         """
-        chain = chained(self._stamps, self._odometry, self.settings.odometry)
-        chain = replace(chain, calibration_sigma=calibration_sigma)
+        chain = chained(self._stamps, self._odometry, settings.odometry)
         return OpenLap(
-            settings=self.settings,
+            settings=settings,
             chain=chain,
             detections=DetectionTable.of(self._detections, twists=chain.twists),
             first_kept=first_kept,

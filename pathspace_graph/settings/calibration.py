@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf
 
 from .checked import Positive
 
@@ -11,21 +12,29 @@ from .checked import Positive
 class CalibrationSettings(Positive):
     """Describes how well the sensor's mounting, stamps and ranges are known before the drive.
 
-    What a drive does not show stays at zero, with the standard deviation given here.
+    The priors are those of a sensor that was calibrated. Where the drive contradicts one of them, all of them
+    become wide: then the sensor is not what it was said to be. What a drive does not show stays at zero.
     """
+
+    UNLIMITED = ("doubt",)
 
     sensor: bool = True
     """The sensor's constant errors are estimated along with the map."""
-    sigma_yaw: float = 0.01
+    sigma_yaw: float = 0.001
     """This is the standard deviation of the sensor's yaw (rad)."""
-    sigma_lateral: float = 0.05
+    sigma_lateral: float = 0.005
     """This is the standard deviation of the sensor's lateral offset (m)."""
-    sigma_latency: float = 0.02
+    sigma_latency: float = 0.001
     """This is the standard deviation of the age of detections at their stamps (s)."""
-    sigma_range_scale: float = 0.01
+    sigma_range_scale: float = 0.0005
     """This is the standard deviation of the scale error of the ranges (-)."""
-    sigma_range_bias: float = 0.1
+    sigma_range_bias: float = 0.005
     """This is the standard deviation of the bias of the ranges (m)."""
+    doubt: float = 4.0
+    """The drive contradicts a prior by this number of standard deviations. It is infinite where the priors
+    always hold."""
+    wide: float = 20.0
+    """The wide priors have this number of times the standard deviations."""
 
     @property
     def sigmas(self) -> tuple[float, ...]:
@@ -38,3 +47,15 @@ class CalibrationSettings(Positive):
             self.sigma_range_bias,
         )
         return own if self.sensor else ()
+
+    def widened(self) -> CalibrationSettings:
+        """Returns the settings of wide priors, which are not doubted again."""
+        return replace(
+            self,
+            doubt=inf,
+            sigma_yaw=self.wide * self.sigma_yaw,
+            sigma_lateral=self.wide * self.sigma_lateral,
+            sigma_latency=self.wide * self.sigma_latency,
+            sigma_range_scale=self.wide * self.sigma_range_scale,
+            sigma_range_bias=self.wide * self.sigma_range_bias,
+        )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from math import inf
 from typing import Literal
 
 from .batch import BatchSettings, OpenLapSettings
@@ -11,6 +12,7 @@ from .checked import Positive
 from .closing import ClosingSettings
 from .comparison import CkfSettings, LandmarkSettings
 from .growth import GrowthSettings, PathSettings, TentativeSettings
+from .health import FindingSettings, HealthSettings
 from .knots import Knots
 
 
@@ -151,18 +153,23 @@ class OdometrySettings(Positive):
     sigma_bias: float = 0.002
     """This is the standard deviation of the bias of the yaw rate (rad/s)."""
     doubt: float = 4.0
-    """A calibration that the drive alone puts farther from zero than this number of standard deviations gets
-    a wide prior: the odometry is not what it was said to be. It is infinite where the prior always holds."""
+    """Where the drive contradicts a prior by this number of standard deviations, both become wide: the
+    odometry is not what it was said to be. It is infinite where the priors always hold."""
     wide: float = 10.0
-    """The wide prior has this number of times the standard deviation."""
+    """The wide priors have this number of times the standard deviations."""
     doubt_cycles: int = 10
-    """While the loop is open, the calibration is judged after this number of cycles again."""
+    """All calibrations are judged again after this number of cycles."""
     sigma_start: float = 1e-4
     """This is the standard deviation of the position at the first odometry stamp (m); the position is zero by
     definition."""
     sigma_start_heading: float = 1e-5
     """This is the standard deviation of the heading at the first odometry stamp (rad); it is not zero, so
     that the first pose's information is finite."""
+
+    def widened(self) -> OdometrySettings:
+        """Returns the settings of wide priors, which are not doubted again."""
+        scale, bias = self.wide * self.sigma_scale, self.wide * self.sigma_bias
+        return replace(self, doubt=inf, sigma_scale=scale, sigma_bias=bias)
 
     @property
     def sigmas_calibration(self) -> tuple[float, float]:
@@ -236,6 +243,10 @@ class MapperSettings(Positive):
     """These settings describe loop closing."""
     open_lap: OpenLapSettings = field(default_factory=OpenLapSettings)
     """These settings describe how the open lap is solved as a batch when the loop closes."""
+    health: HealthSettings = field(default_factory=HealthSettings)
+    """These settings describe when an estimate is good, degraded or lost."""
+    finding: FindingSettings = field(default_factory=FindingSettings)
+    """These settings describe how a vehicle that is lost on a closed map is found."""
     far: FarSettings = field(default_factory=FarSettings)
     """These settings describe the inactive part of the map, which is not solved for in every cycle."""
     relinearize: RelinearizeSettings = field(default_factory=RelinearizeSettings)
@@ -250,6 +261,11 @@ class MapperSettings(Positive):
     """These settings describe the Hungarian landmark graph."""
     ckf: CkfSettings = field(default_factory=CkfSettings)
     """These settings describe the paper's filters."""
+
+    @property
+    def sigmas_calibrations(self) -> tuple[float, ...]:
+        """Returns the priors' standard deviations, (2,) or (7,), of odometry and sensor."""
+        return (*self.odometry.sigmas_calibration, *self.calibration.sigmas)
 
 
 ODOMETRY_SIGMA = (0.25, 0.12, 0.035)

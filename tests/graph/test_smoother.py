@@ -135,11 +135,11 @@ def test_a_widened_prior_of_the_calibration_is_one_that_was_wide_from_the_start(
     """The window, with poses marginalized before and after, is equal to that of another prior."""
     wide = np.array([0.7, 3.0])
     changed, other = LinearDrive(2), LinearDrive(2)
-    other.smoother.widen_calibration(wide)
+    other.smoother.widen_calibrations(wide)
     for drive in (changed, other):
         drive.drive(9)
     before = changed.smoother.variables.calibration.copy()
-    changed.smoother.widen_calibration(wide)
+    changed.smoother.widen_calibrations(wide)
     for drive in (changed, other):
         drive.drive(3)
     ours, theirs = changed.smoother, other.smoother

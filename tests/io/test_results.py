@@ -10,7 +10,7 @@ import pytest
 
 from pathspace_graph.errors import OutputError
 from pathspace_graph.io.map import Map, PointBoundary
-from pathspace_graph.io.results import CycleRecord, RunResult, write_result
+from pathspace_graph.io.results import CYCLES_FILE, CycleRecord, RunResult, read_health, write_result
 from pathspace_graph.labels import LEFT
 
 
@@ -25,7 +25,7 @@ def result() -> RunResult:
         trajectory=np.column_stack([rng.normal(0.0, 10.0, (3, 2)), [0.0, np.pi, -3.0]]),
         cycles=(
             CycleRecord(0, 0.1, 1e-3, 0, 4, 7, 1),
-            CycleRecord(1, 0.2, np.float64(2e-3), 9, 7, 12, 2),
+            CycleRecord(1, 0.2, np.float64(2e-3), 9, 7, 12, 2, offered=15, health="lost", reason="no way"),
         ),
     )
 
@@ -45,8 +45,9 @@ def test_the_folder_holds_the_four_files_of_the_contract(tmp_path: Path) -> None
         "summary.json",
     }
     rows = (tmp_path / "map" / "cycles.csv").read_text().splitlines()
-    assert rows[:2] == ["cycle,t,seconds,size_left,size_right,readings,lap", "0,0.1,0.001,0,4,7,1"]
-    assert rows[2] == "1,0.2,0.002,9,7,12,2"
+    assert rows[0] == "cycle,t,seconds,size_left,size_right,readings,lap,offered,health,reason"
+    assert rows[1:] == ["0,0.1,0.001,0,4,7,1,0,,", "1,0.2,0.002,9,7,12,2,15,lost,no way"]
+    assert read_health(tmp_path / "map" / CYCLES_FILE) == ["", "lost"]
     read = json.loads((tmp_path / "map" / "summary.json").read_text())
     assert read == {"estimator": "fixed-lag", "ate": None, "laps": [{"lap": 1, "rmse": 0.5}]}
 

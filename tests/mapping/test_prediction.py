@@ -11,7 +11,7 @@ from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.log_odometry import integrate_log
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import doubted_prior, integrate_odometry, predict, smoother_settings
+from pathspace_graph.mapping.prediction import doubted, integrate_odometry, predict, smoother_settings
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
 
@@ -87,24 +87,42 @@ def posterior(shown: Array, known: Array, prior: Array) -> tuple[Array, Array]:
     return variance * shown / known**2, variance
 
 
-@pytest.mark.parametrize(("shown", "wide"), [(0.0189, False), (0.0191, True), (-0.0191, True), (0.0, False)])
-def test_a_prior_is_widened_where_the_drive_is_four_sigmas_off(shown: float, wide: bool) -> None:
+SETTINGS = MapperSettings()
+
+
+def shown(entry: int, value: float, sigma: float) -> MapperSettings:
+    """Returns what is left of the priors after a drive that shows one calibration with a sigma."""
+    prior = np.array(SETTINGS.sigmas_calibrations)
+    values, sigmas = np.zeros(7), 1e3 * prior
+    values[entry], sigmas[entry] = value, sigma
+    return doubted(*posterior(values, sigmas, prior), SETTINGS)
+
+
+@pytest.mark.parametrize(("value", "wide"), [(0.0189, False), (0.0191, True), (-0.0191, True), (0.0, False)])
+def test_a_prior_is_widened_where_the_drive_is_four_sigmas_off(value: float, wide: bool) -> None:
     """The bias is shown to 0.0043 rad/s, its prior has 0.002: both together are 0.00474, four times 0.019."""
-    settings = OdometrySettings()
-    sigma, known = np.array(settings.sigmas_calibration), np.array([0.01, 0.0043])
-    mean, variance = posterior(np.array([0.0, shown]), known, sigma)
-    found = doubted_prior(mean, variance, sigma, settings)
-    np.testing.assert_allclose(found, sigma * [1.0, 10.0 if wide else 1.0])
+    found = shown(1, value, 0.0043)
+    assert found.odometry == (SETTINGS.odometry.widened() if wide else SETTINGS.odometry)
+    assert found.calibration == SETTINGS.calibration
+
+
+@pytest.mark.parametrize("entry", range(2, 7))
+def test_an_error_of_the_sensor_widens_all_of_its_priors(entry: int) -> None:
+    prior = SETTINGS.sigmas_calibrations[entry]
+    found = shown(entry, 10.0 * prior, prior)
+    assert found.odometry == SETTINGS.odometry
+    np.testing.assert_allclose(found.calibration.sigmas, 20.0 * np.array(SETTINGS.calibration.sigmas))
 
 
 def test_a_prior_is_widened_once() -> None:
-    settings = OdometrySettings()
-    wide = 10.0 * np.array(settings.sigmas_calibration)
-    mean, variance = posterior(np.array([1.0, 1.0]), np.full(2, 1e-4), wide)
-    np.testing.assert_array_equal(doubted_prior(mean, variance, wide, settings), wide)
+    wide = shown(1, 1.0, 1e-4)
+    mean, variance = posterior(np.ones(7), np.full(7, 1e-6), np.array(wide.sigmas_calibrations))
+    again = doubted(mean, variance, wide)
+    assert again.odometry == wide.odometry
+    assert again.calibration == wide.calibration.widened()
+    assert doubted(mean, variance, again) == again
 
 
 def test_what_a_drive_does_not_show_is_not_doubted() -> None:
-    settings = OdometrySettings()
-    sigma = np.array(settings.sigmas_calibration)
-    np.testing.assert_array_equal(doubted_prior(np.zeros(2), sigma**2, sigma, settings), sigma)
+    sigma = np.array(SETTINGS.sigmas_calibrations)
+    assert doubted(np.zeros(7), sigma**2, SETTINGS) == SETTINGS

@@ -14,7 +14,7 @@ from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.state import State
 from pathspace_graph.online.open_lap import OpenLapRecord
 from pathspace_graph.online.recognition import RecognizedPlace
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
 
 from ..scenes.curves import boundary_through
 
@@ -81,9 +81,9 @@ def test_a_record_that_was_given_up_keeps_the_first_reason() -> None:
 def test_the_chain_of_the_lap_is_the_odometry_that_was_measured() -> None:
     record = driven(0.5, 0.0)
     place = RecognizedPlace(Motion(np.zeros(2), np.zeros(3)), {LEFT: 0.0})
-    sigma = np.array([0.1, 0.2])
-    chain = record.lap(3, record.recurrence_since(place), sigma).chain
-    np.testing.assert_array_equal(chain.calibration_sigma, sigma)
+    settings = MapperSettings(odometry=OdometrySettings(sigma_scale=0.1, sigma_bias=0.2))
+    chain = record.lap(3, record.recurrence_since(place), settings).chain
+    np.testing.assert_array_equal(chain.calibration_sigma, [0.1, 0.2])
     poses = chain.dead_reckoned(np.zeros(2))
     angle = len(poses) * SPEED * CYCLE / RADIUS
     np.testing.assert_allclose(poses[-1, 2], angle)

@@ -200,8 +200,8 @@ def test_the_worker_solves_the_lap_as_this_process_does(monkeypatch: pytest.Monk
     laps: list[OpenLap] = []
     record = OpenLapRecord.lap
 
-    def keep(self: OpenLapRecord, first_kept: int, start: ClosedMap, sigma: Array) -> OpenLap:
-        laps.append(record(self, first_kept, start, sigma))
+    def keep(self: OpenLapRecord, first_kept: int, start: ClosedMap, settings: MapperSettings) -> OpenLap:
+        laps.append(record(self, first_kept, start, settings))
         return laps[-1]
 
     monkeypatch.setattr(OpenLapRecord, "lap", keep)

@@ -41,6 +41,16 @@ def test_the_legend_names_what_is_there_and_an_exaggerated_band() -> None:
     assert not {"true cones", "true path", "trajectory"} & set(bare)
 
 
+def test_the_trajectory_has_other_colours_where_it_is_not_good() -> None:
+    trajectory, health = np.arange(12.0).reshape(4, 3), ["good", "lost", "lost", "good"]
+    figure = plot_map(ring_map(), trajectory=trajectory, health=health)
+    lines = {line.get_label(): line for line in figure.axes[0].get_lines()}
+    drawn = lines["lost"].get_xydata()
+    np.testing.assert_array_equal(drawn[1:3], trajectory[1:3, :2])
+    assert np.isnan(drawn[[0, 3]]).all() and "degraded" not in lines
+    assert "lost" not in legend(plot_map(ring_map(), trajectory=trajectory, health=[]))
+
+
 def test_a_tentative_stretch_is_dashed() -> None:
     ring = shifted_ring(18.0)
     ring = replace(ring, confirmed_until=0.5 * sum(ring.spline.domain))

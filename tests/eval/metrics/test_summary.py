@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.eval.metrics.summary import lap_times, laps_of, not_mapped, summarize
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 
 from .straight_maps import line, row, truth
@@ -48,6 +48,21 @@ RUN = RunResult(
     lap_maps=((1, map_at(0.5)),),
     snapshots=(map_at(0.3), map_at(0.2)),
 )
+
+
+def test_the_health_of_a_run_is_counted_and_its_bad_stretches_are_listed() -> None:
+    assert "health" not in summarize(RUN, log())
+    words = [("good", ""), ("lost", "why"), ("lost", "still")]
+    records = tuple(
+        CycleRecord(k, 0.1 * k, 0.0, 1, 1, 1, 1, health=word, reason=reason)
+        for k, (word, reason) in enumerate(words)
+    )
+    assert summarize(replace(RUN, cycles=records), log())["health"] == {
+        "good": 1,
+        "degraded": 0,
+        "lost": 2,
+        "stretches": [{"health": "lost", "begin": 0.1, "end": 0.2, "reason": "why"}],
+    }
 
 
 def test_true_laps_end_where_the_path_comes_round() -> None:

@@ -1,0 +1,141 @@
+"""Health: how far an online estimate can be trusted, cycle by cycle, with a reason in plain words."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from math import nan
+from typing import Final
+
+from .settings.health import HealthSettings
+
+GOOD: Final = "good"
+DEGRADED: Final = "degraded"
+LOST: Final = "lost"
+CONDITIONS: Final = (GOOD, DEGRADED, LOST)
+
+
+@dataclass(frozen=True)
+class Health:
+    """Says how far the estimate of a cycle can be trusted."""
+
+    condition: str = ""
+    """The estimate is good, degraded or lost; this is empty for an estimator without a monitor."""
+    reason: str = ""
+    """This says why the condition is not good."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Holds what a cycle's detections say about the estimate, before they change it."""
+
+    t: float
+    """This is the stamp of the cycle (s)."""
+    offered: int = 0
+    """This number of coloured detections lies in the view of the curves."""
+    explained: int = 0
+    """This number of them lies on a curve of its colour."""
+    used: int = 0
+    """This number of them is in use."""
+    innovations: float = 0.0
+    """This is the sum of squared normalized innovations of those in use."""
+    closed: bool = False
+    """This says whether the loop has closed."""
+    sigma: float = nan
+    """This is the standard deviation (m) of the position in its worst direction on a closed map, where it is
+    known."""
+
+
+class HealthMonitor:
+    """Judges the evidence of the newest cycles together."""
+
+    def __init__(self, settings: HealthSettings | None = None) -> None:
+        self.settings = settings or HealthSettings()
+        self._recent: deque[Evidence] = deque()
+        self._offered = 0  # by all the recent cycles together
+        self._last_offered: float | None = None
+
+    def restart(self) -> None:
+        """Forgets the evidence so far, because the map or the pose was replaced."""
+        self._recent.clear()
+        self._offered, self._last_offered = 0, None
+
+    def update(self, evidence: Evidence) -> Health:
+        """Returns the health at a cycle."""
+        if self._recent and self._recent[-1].closed != evidence.closed:
+            self.restart()
+        self._remember(evidence)
+        offered = explained = used = 0
+        squares = 0.0
+        for one in self._recent:
+            offered, explained, used = offered + one.offered, explained + one.explained, used + one.used
+            squares += one.innovations
+        share = explained / offered if offered >= self.settings.min_offered else 1.0
+        innovation = squares / used if used >= self.settings.min_offered else 0.0
+        return self._judge(evidence, share, innovation)
+
+    def _remember(self, evidence: Evidence) -> None:
+        """Adds the evidence of a cycle, and drops what is too old and not needed for `min_offered`."""
+        recent = self._recent
+        recent.append(evidence)
+        self._offered += evidence.offered
+        if evidence.offered or self._last_offered is None:
+            self._last_offered = evidence.t
+        while recent[0].t <= evidence.t - self.settings.window:
+            if self._offered - recent[0].offered < self.settings.min_offered:
+                return
+            self._offered -= recent.popleft().offered
+
+    def _judge(self, newest: Evidence, share: float, innovation: float) -> Health:
+        """Returns the health by the share of explained detections and the mean squared innovation."""
+        settings = self.settings
+        lost = settings.share_lost if newest.closed else settings.open_lost
+        degraded = settings.share_degraded if newest.closed else settings.open_degraded
+        blind = newest.t - (newest.t if self._last_offered is None else self._last_offered)
+        if newest.sigma > settings.sigma_degraded:
+            reason = f"the position is uncertain by {newest.sigma:.1f} m"
+            return Health(LOST if newest.sigma > settings.sigma_lost else DEGRADED, reason)
+        if share < degraded:
+            reason = f"{100 * share:.0f} % of the detections lie on the map"
+            return Health(LOST if share < lost else DEGRADED, reason)
+        if blind > settings.blind:
+            return Health(DEGRADED, f"no detection in view of the map for {blind:.1f} s")
+        if innovation > settings.innovation:
+            sigmas = innovation**0.5
+            return Health(DEGRADED, f"detections lie {sigmas:.1f} standard deviations beside the map")
+        return Health(GOOD)
+
+
+# --- a whole run -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A stretch is a run of cycles of one condition that is not good."""
+
+    health: str
+    """The cycles have this condition."""
+    begin: float
+    """This is the stamp of its first cycle (s)."""
+    end: float
+    """This is the stamp of its last cycle (s)."""
+    reason: str
+    """This is the reason that its first cycle gives."""
+
+
+def stretches(t: Sequence[float], healths: Sequence[Health]) -> list[Stretch]:
+    """Returns the stretches of a run that were not good, from the stamps and the health of its cycles."""
+    found = []
+    for condition, group in groupby(zip(t, healths, strict=True), key=lambda cycle: cycle[1].condition):
+        cycles = list(group)
+        if condition in (DEGRADED, LOST):
+            found.append(Stretch(condition, cycles[0][0], cycles[-1][0], cycles[0][1].reason))
+    return found
+
+
+def counts(healths: Sequence[Health]) -> dict[str, int]:
+    """Returns the number of cycles of each condition."""
+    number = Counter(health.condition for health in healths)
+    return {condition: number[condition] for condition in CONDITIONS}

@@ -1,0 +1,330 @@
+"""Finding a vehicle that is lost on a closed map: hypotheses along the loop, until one is left.
+
+While the vehicle is lost, its detections are not used, so the map stays as it was. They are remembered on the
+path that odometry gives since then. The path and the detections are laid rigidly beside each place of the
+loop, and the best places are refined by the registration. The farther the vehicle drives, the fewer places
+agree. Once one is clearly better than all others, and twice in a row, the window starts anew there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from pathspace_graph.batch.association import locate_poses
+from pathspace_graph.factors.se2 import to_map, wrap_angle
+from pathspace_graph.graph.gaussian import half_solve
+from pathspace_graph.graph.keys import POSE
+from pathspace_graph.health import Evidence
+from pathspace_graph.io.log import Detections
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.mapping.curve_map import CurveSmoother
+from pathspace_graph.mapping.registration import Motion, RefinedMotion, Sightings, refine
+from pathspace_graph.mapping.state import State
+from pathspace_graph.settings.health import FindingSettings
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import Boundary
+
+from .association import Gating, reassociate
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+_POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])
+"""These unit vectors choose the position of a pose."""
+FOUND: Final = "the vehicle was lost, and is found again"
+"""This begins the notice of a cycle in which the window starts anew at the place that was found."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """Holds a closed map as the search needs it."""
+
+    middle: Array
+    """(n, 2) These points lie on the middle of the track in driving order, in m, map frame."""
+    stations: Array
+    """(n,) Each point has this length along the middle (m)."""
+    length: float
+    """The middle is this long (m)."""
+    beside: Mapping[int, Array]
+    """Each boundary has its parameters (n,) beside the points of the middle (m)."""
+    curves: Mapping[int, KDTree]
+    """Each boundary has densely sampled points."""
+
+    def at(self, stations: Array) -> Array:
+        """Returns the points of the middle at stations of any shape, as complex numbers x + i y."""
+        x, y = (np.interp(stations, self.stations, axis, period=self.length) for axis in self.middle.T)
+        return np.asarray(x + 1j * y)
+
+    def distances(self, labels: IntArray, points: Array, most: float) -> Array:
+        """Returns the distance (..., m) of points (..., m, 2) from their curve (m,), in m, at most `most`."""
+        found = np.full(points.shape[:-1], most)
+        for label, curve in self.curves.items():
+            own = labels == label
+            distance, _ = curve.query(points[..., own, :], distance_upper_bound=most)
+            found[..., own] = np.minimum(distance, most)
+        return found
+
+
+def lay_out_loop(state: State, settings: FindingSettings) -> Loop:
+    """Returns the loop between the two closed curves of a state."""
+    u, points = {}, {}
+    for label, boundary in state.boundaries.items():
+        u[label] = np.arange(boundary.tables.low, boundary.tables.high, settings.sample)
+        points[label] = boundary.evaluate(state.control_points(label), u[label])
+    curves = {label: KDTree(own) for label, own in points.items()}
+    every = max(int(settings.step / settings.sample), 1)
+    left = points[LEFT][::every]
+    opposite = curves[RIGHT].query(left)[1]
+    middle = 0.5 * (left + points[RIGHT][opposite])
+    steps = np.hypot(*np.diff(middle, axis=0, append=middle[:1]).T)
+    stations = np.concatenate([[0.0], steps.cumsum()[:-1]])
+    beside = {LEFT: u[LEFT][::every], RIGHT: u[RIGHT][opposite]}
+    return Loop(middle, stations, float(steps.sum()), beside, curves)
+
+
+class KnownLoop:
+    """Lays out the closed map when it is asked for, and again once the curves were replaced by others."""
+
+    def __init__(self, smoother: CurveSmoother) -> None:
+        self._smoother = smoother
+        self._laid_out: tuple[list[Boundary], Loop] | None = None
+
+    def get(self) -> Loop:
+        """Returns the loop as it was when it was laid out, which changes no variable."""
+        state = self._smoother.map.state
+        boundaries = [*state.boundaries.values()]
+        if self._laid_out is None or self._laid_out[0] != boundaries:
+            values = state.variables.values.copy()
+            self._smoother.refresh()
+            self._laid_out = boundaries, lay_out_loop(state, self._smoother.map.settings.finding)
+            state.variables.values[:] = values
+        return self._laid_out[1]
+
+
+def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop) -> Evidence:
+    """Returns what the tested detections say about the newest pose, before the update.
+
+    On a closed map every coloured detection should lie on a curve. If many are not in use, these are looked
+    for on the whole of their curve: they may be of a stretch across the infield.
+    """
+    detections, settings = smoother.map.detections, smoother.map.settings.health
+    closed, used = smoother.map.state.closed, detections.used[tested.rows]
+    offered = len(used) if closed else int(tested.in_view.sum())
+    in_use = explained = int(used.sum())
+    if closed and in_use < settings.share_degraded * offered:
+        others = tested.rows[~used]
+        poses = smoother.map.variables.poses_at(detections.cycle[others])
+        points = to_map(detections.point[others], poses)
+        away = known.get().distances(detections.label[others], points, settings.beside)
+        explained += int((away < settings.beside).sum())
+    innovations = tested.innovation[used]
+    sigma = _sigma_of_position(smoother) if closed else np.nan
+    return Evidence(
+        smoother.times[-1], offered, explained, in_use, float(innovations @ innovations), closed, sigma
+    )
+
+
+def _sigma_of_position(smoother: CurveSmoother) -> float:
+    """Returns the standard deviation (m) of the last solved position in its worst direction.
+
+    The newest pose has the last columns of the system, so that the last block of its factor tells it.
+    """
+    last = smoother.last_step
+    if last is None:
+        return np.nan
+    half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())
+    (xx, xy), (_, yy) = (half.T @ half).tolist()
+    return math.sqrt(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy))
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """Holds a place where the vehicle may be."""
+
+    found: RefinedMotion
+    """The motion moves the window onto the place."""
+    score: float
+    """This says how well the detections lie on the map there, from 0 to 1."""
+
+
+class Search:
+    """Remembers what a lost vehicle has seen, and looks for its place on a closed map."""
+
+    def __init__(self, smoother: CurveSmoother) -> None:
+        """Begins after the newest pose."""
+        self.settings: MapperSettings = smoother.map.settings
+        self.loop: Loop
+        """This is the map as it was in the last attempt."""
+        self._smoother = smoother
+        self.first_cycle = smoother.next_cycle
+        """The detections of the cycles from this one on are remembered."""
+        self._poses: list[Array] = []
+        self._seen: list[Detections] = []
+        self._tried = smoother.times[-1]
+        self._last: Motion | None = None
+        self._agreed = 0
+
+    def observe(self, pose: Array, detections: Detections) -> None:
+        """Remembers a cycle: its pose (3,) by odometry, and its detections."""
+        self._poses.append(pose.copy())
+        self._seen.append(detections)
+        poses = np.array(self._poses)
+        driven = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+        while len(driven) and driven.sum() > self.settings.finding.memory:
+            driven = driven[1:]
+            del self._poses[0], self._seen[0]
+
+    def find(self) -> RefinedMotion | None:
+        """Returns the motion onto the only place that agrees, once it was found several times in a row."""
+        settings = self.settings.finding
+        if not self._seen or self._seen[-1].t - self._tried < settings.interval:
+            return None
+        self._tried, best = self._seen[-1].t, self._best()
+        if best is None:
+            self._agreed, self._last = 0, None
+            return None
+        self._agreed = self._agreed + 1 if self._confirms(best.motion) else 1
+        self._last = best.motion
+        return best if self._agreed >= settings.confirmations else None
+
+    def _confirms(self, motion: Motion) -> bool:
+        """Returns whether a motion leads to the same place as the last one that was found."""
+        newest = self._poses[-1][None, :2]
+        if self._last is None:
+            return False
+        apart = motion.apply(newest) - self._last.apply(newest)
+        return bool(np.hypot(*apart[0]) < self.settings.finding.apart)
+
+    def _best(self) -> RefinedMotion | None:
+        """Returns the motion onto the place that is clearly better than all others, if there is one.
+
+        The loop is laid out each time: the map goes on to relax from the detections that were taken out of
+        use.
+        """
+        settings, seen = self.settings.finding, self._sightings()
+        if len(seen.rows) < settings.min_readings:
+            return None
+        self._smoother.refresh()
+        state = self._smoother.map.state
+        self.loop = lay_out_loop(state, settings)
+        centre = self._poses[-1][:2]
+        places = [self._refined(state, seen, Motion(centre, vector), i) for vector, i in self._starts(seen)]
+        places = sorted(places, key=lambda place: -place.score)
+        if not places or places[0].score < settings.min_score:
+            return None
+        best = places[0].found
+        rivals = [place.score for place in places[1:] if not self._same(place.found, best)]
+        if rivals and rivals[0] > places[0].score - settings.margin:
+            return None
+        sigma = np.sqrt(np.linalg.eigvalsh(best.covariance[:2, :2])[-1])
+        return best if sigma < settings.sigma_max else None
+
+    def _same(self, a: RefinedMotion, b: RefinedMotion) -> bool:
+        """Returns whether two motions lead to one place."""
+        apart = np.hypot(*(a.motion.vector - b.motion.vector)[:2])
+        return bool(apart < self.settings.finding.apart)
+
+    def _sightings(self) -> Sightings:
+        """Returns the remembered coloured detections, or evenly chosen ones if there are too many."""
+        labels = np.concatenate([one.labels for one in self._seen])
+        cycles = np.repeat(np.arange(len(self._seen)), [len(one.labels) for one in self._seen])
+        points = np.concatenate([one.points_vehicle for one in self._seen])
+        rows = np.flatnonzero(np.isin(labels, BOUNDARIES))
+        rows = rows[:: max(-(-len(rows) // self.settings.finding.readings), 1)]
+        return Sightings(rows, labels[rows], to_map(points[rows], np.array(self._poses)[cycles[rows]]))
+
+    # --- hypotheses --------------------------------------------------------------------------------------
+
+    def _starts(self, seen: Sightings) -> list[tuple[Array, int]]:
+        """Returns motions (3,) onto the likeliest places, each with the index of its point of the middle."""
+        settings = self.settings.finding
+        motions, misfit = self._beside_the_loop()
+        possible = np.flatnonzero(misfit < settings.misfit)
+        if len(possible) == 0:
+            return []
+        turn = np.exp(1j * motions[possible, 2])[:, None]
+        centre = self._poses[-1][:2]
+        arms = (seen.points - centre) @ np.array([1.0, 1j])
+        moved = turn * arms + (centre + motions[possible, :2]) @ np.array([[1.0], [1j]])
+        points = np.stack([moved.real, moved.imag], axis=2)
+        cost = np.square(self.loop.distances(seen.labels, points, settings.reach)).mean(axis=1)
+        return [(motions[i], int(i)) for i in self._spread(possible, cost)]
+
+    def _spread(self, places: IntArray, cost: Array) -> list[int]:
+        """Returns the places of least cost that are no nearer to each other than `apart`."""
+        settings, chosen = self.settings.finding, list[int]()
+        for i in places[np.argsort(cost)].tolist():
+            away = np.abs(self.loop.stations[chosen] - self.loop.stations[i])
+            if (np.minimum(away, self.loop.length - away) >= settings.apart).all():
+                chosen.append(i)
+            if len(chosen) == settings.starts:
+                break
+        return chosen
+
+    def _beside_the_loop(self) -> tuple[Array, Array]:
+        """Returns motions (n, 3) that lay the path onto the middle before each of its points.
+
+        They are of least squares; the rms distances (n,) of the path from the middle are returned, too.
+        """
+        settings, poses = self.settings.finding, np.array(self._poses)
+        behind = np.hypot(*np.diff(poses[:, :2], axis=0).T)[::-1].cumsum()[::-1]
+        behind = np.append(behind, 0.0)
+        _, first = np.unique(behind // settings.step, return_index=True)
+        ahead = poses[-1, :2] + settings.lead * np.array([np.cos(poses[-1, 2]), np.sin(poses[-1, 2])])
+        own = np.concatenate([poses[first, :2], ahead[None]]) @ np.array([1.0, 1j])
+        target = self.loop.at(self.loop.stations[:, None] - np.append(behind[first], -settings.lead))
+        mean, means = own.mean(), target.mean(axis=1)
+        turn = ((own - mean).conj() * (target - means[:, None])).sum(axis=1)
+        turn /= np.maximum(np.abs(turn), np.finfo(float).tiny)
+        misfit = np.abs(turn[:, None] * (own - mean) - (target - means[:, None]))
+        centre = poses[-1, :2] @ np.array([1.0, 1j])
+        shift = means - centre - turn * (mean - centre)
+        return np.column_stack([shift.real, shift.imag, np.angle(turn)]), np.sqrt((misfit**2).mean(axis=1))
+
+    def _refined(self, state: State, seen: Sightings, start: Motion, i: int) -> Hypothesis:
+        """Returns the hypothesis that registration makes of a motion onto point `i` of the middle."""
+        settings, closing = self.settings.finding, self.settings.closing
+        poses = np.array(self._poses)
+        driven = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
+        stretches = {
+            label: self._stretch(state, label, float(u[i]), driven) for label, u in self.loop.beside.items()
+        }
+        sigmas = np.array([settings.sigma_position, settings.sigma_position, settings.sigma_heading])
+        found = refine(state, seen, start, stretches, (start.vector, np.diag(sigmas**-2)), closing)
+        distance = self.loop.distances(seen.labels, found.motion.apply(seen.points), settings.reach)
+        return Hypothesis(found, float(np.exp(-0.5 * (distance / settings.sigma_fit) ** 2).mean()))
+
+    def _stretch(self, state: State, label: int, u: float, driven: float) -> tuple[float, float]:
+        """Returns the stretch of a curve that the vehicle has seen on a path that ends beside u (m)."""
+        gate, tables = self.settings.gate, state.boundaries[label].tables
+        low, high = u - driven - gate.station_room, u + gate.view_ahead + gate.station_room
+        return (low, high) if high - low < tables.high - tables.low else (tables.low, tables.high)
+
+
+def start_anew(smoother: CurveSmoother, first_cycle: int, found: RefinedMotion) -> Array:
+    """Moves the window onto the place that was found, and returns the jump (3,) of the newest pose.
+
+    The poses before `first_cycle` leave the window. The map and its prior stay; what the prior says about the
+    poses is replaced by the covariance of the registration.
+    """
+    state, settings = smoother.map.state, smoother.map.settings
+    smoother.forget_poses(first_cycle)
+    before = state.poses[-1].copy()
+    state.poses[:, :2] = found.motion.apply(state.poses[:, :2])
+    state.poses[:, 2] += found.motion.vector[2]
+    smoother.add_pose_prior(smoother.next_cycle - 1, found.covariance * settings.finding.widening**2)
+    locate_poses(state, settings.batch.association)
+    reassociate(smoother)
+    smoother.map.place_detections(0)
+    for _ in range(settings.finding.steps):
+        smoother.step(settings.sigma_step)
+    jump = state.poses[-1] - before
+    jump[2] = wrap_angle(jump[2])
+    return np.asarray(jump)

@@ -1,0 +1,192 @@
+"""Finding back: a vehicle that is put down elsewhere on a closed map is told to be lost, and found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.factors.se2 import compose, inverse, move_points, to_vehicle
+from pathspace_graph.graph.gaussian import factorize, marginalize
+from pathspace_graph.graph.keys import pose_keys
+from pathspace_graph.graph.variables import Layout
+from pathspace_graph.health import DEGRADED, GOOD, LOST
+from pathspace_graph.io.log import Log
+from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.online.association import Gating
+from pathspace_graph.online.finding import FOUND, KnownLoop, Search, evidence_of, lay_out_loop
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.run import CycleResult, split_odometry
+from pathspace_graph.settings.health import FindingSettings
+from pathspace_graph.settings.mapper import MapperSettings
+
+from ..scenes.drives import detections, map_log, true_poses
+from ..scenes.kidnapped import laps_log, pear_track, put_down
+
+Array = NDArray[np.float64]
+
+SECOND_LAP = 20.0
+"""The vehicle is put down elsewhere at this stamp (s), early in its second lap."""
+
+
+NOTHING = Gating(np.zeros(0, np.intp), np.zeros(0, bool), np.zeros(0))
+"""No detection was tested."""
+
+
+def mapper_of(log: Log) -> FixedLagMapper:
+    """Returns a mapper that goes on from the window's own prior when its loop closes."""
+    settings = MapperSettings()
+    settings = replace(settings, open_lap=replace(settings.open_lap, prior="window"))
+    return FixedLagMapper(settings, log.odometry_sigma)
+
+
+@cache
+def clean() -> tuple[Log, FixedLagMapper, list[CycleResult]]:
+    log = laps_log(pear_track(), laps=2)
+    return log, *map_log(log, mapper_of(log))
+
+
+def apart(log: Log, results: list[CycleResult]) -> Array:
+    """Returns the distance (n,) of each cycle's position from the true one, in m."""
+    return np.hypot(*(np.array([r.pose[:2] for r in results]) - true_poses(log)[:, :2]).T)
+
+
+def test_a_clean_drive_is_good_in_every_cycle() -> None:
+    _, _, results = clean()
+    assert {result.health.condition for result in results} == {GOOD}
+    assert FOUND not in {result.notice for result in results}
+
+
+@pytest.mark.parametrize("distance", [5.0, 30.0])
+def test_a_vehicle_that_is_put_down_farther_on_is_lost_and_found(distance: float) -> None:
+    log = put_down(laps_log(pear_track()), SECOND_LAP, distance)
+    results = map_log(log, mapper_of(log))[1]
+    conditions, stamps = [r.health.condition for r in results], [r.t for r in results]
+    lost = stamps[conditions.index(LOST)]
+    assert SECOND_LAP < lost < SECOND_LAP + 4.0
+    (found,) = [k for k, result in enumerate(results) if result.notice == FOUND]
+    jump = results[found].jump
+    assert jump is not None and np.hypot(*jump[:2]) > 1.0
+    assert conditions[found] == DEGRADED and set(conditions[found + 12 :]) == {GOOD}
+    assert stamps[found] < lost + 6.0
+    assert apart(log, results)[found:].max() < 1.0
+    assert results[found].stages["find"] > 0.0
+
+
+def test_the_map_does_not_move_while_the_vehicle_is_lost() -> None:
+    log = put_down(laps_log(pear_track()), SECOND_LAP, 30.0)
+    mapper, known = mapper_of(log), list[Array]()
+    for odometry, cycle in split_odometry(log):
+        result = mapper.update(odometry, cycle)
+        if result.notice == FOUND:
+            break
+        if result.health.condition == LOST:
+            assert result.readings == 0
+            known.append(np.concatenate([mapper.control_points(label) for label in (LEFT, RIGHT)]))
+    assert len(known) > 10
+    # the first steps bring the map back to what is known without the detections that were taken out of use
+    moved = np.abs(np.diff(known, axis=0)).max(axis=(1, 2))
+    assert moved[-5:].max() < 0.01
+    truth = log.truth
+    assert truth is not None
+    assert lap_metrics(mapper.map(), truth, 0).rmse < 1.05 * lap_metrics(clean()[1].map(), truth, 0).rmse
+
+
+def test_two_places_that_look_alike_are_not_told_apart() -> None:
+    log = put_down(laps_log(pear_track(skew=0.0)), SECOND_LAP, 12.0)
+    _, results = map_log(log, mapper_of(log))
+    assert results[-1].health.condition == LOST
+    assert FOUND not in {result.notice for result in results}
+
+
+def test_the_uncertainty_of_the_position_is_that_of_the_last_step() -> None:
+    smoother = clean()[1].smoother
+    assert smoother.last_step is not None
+    newest = smoother.last_step.layout.keys[-1:]
+    covariance = smoother.last_step.covariance(newest)[:2, :2]
+    sigma = evidence_of(smoother, NOTHING, KnownLoop(smoother)).sigma
+    np.testing.assert_allclose(sigma, np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+
+
+def test_detections_across_the_infield_are_explained_by_the_map_and_ghosts_are_not() -> None:
+    log = clean()[0]
+    mapper = map_log(log, mapper_of(log))[0]
+    smoother, table = mapper.smoother, mapper.smoother.map.detections
+    far = np.array([mapper.control_points(LEFT)[k] for k in (5, 12)])
+    ghosts = np.array([[200.0, 0.0], [0.0, 200.0]])
+    seen = to_vehicle(np.concatenate([far, ghosts]), np.tile(mapper.poses[-1], (4, 1)))
+    rows = table.append(detections(0.0, seen, np.full(4, LEFT)), smoother.next_cycle - 1)
+    tested = Gating(np.arange(rows.start, rows.stop), np.zeros(4, bool), np.full(4, 9.0))
+    before = smoother.variables.values.copy()
+    evidence = evidence_of(smoother, tested, KnownLoop(smoother))
+    assert (evidence.offered, evidence.explained, evidence.used) == (4, 2, 0)
+    np.testing.assert_array_equal(smoother.variables.values, before)
+
+
+# --- the search alone ------------------------------------------------------------------------------------
+
+
+def test_the_middle_of_the_loop_lies_between_the_curves() -> None:
+    _, mapper, _ = clean()
+    state = mapper.smoother.map.state
+    loop = lay_out_loop(state, FindingSettings())
+    for label, u in loop.beside.items():
+        points = state.boundaries[label].evaluate(mapper.control_points(label), u)
+        across = np.hypot(*(points - loop.middle).T)
+        assert np.abs(across - 1.8).max() < 0.4
+    at = loop.at(loop.stations)
+    np.testing.assert_allclose(np.column_stack([at.real, at.imag]), loop.middle, atol=1e-9)
+    np.testing.assert_allclose(loop.at(loop.stations + loop.length), at, atol=1e-9)
+
+
+def test_the_motion_that_took_the_vehicle_away_is_undone() -> None:
+    log, mapper, _ = clean()
+    away = np.array([25.0, -8.0, 1.2])
+    search, found = Search(mapper.smoother), None
+    search._tried = -np.inf
+    for pose, cycle in zip(true_poses(log)[150:190], log.cycles[150:190], strict=True):
+        search.observe(compose(away, pose), cycle)
+        found = search.find() or found
+    assert found is not None
+    truth = true_poses(log)[[170, 189]]
+    moved = move_points(away, truth[:, :2])
+    np.testing.assert_allclose(found.motion.apply(moved), truth[:, :2], atol=0.5)
+    np.testing.assert_allclose(found.motion.vector[2], inverse(away)[2], atol=0.05)
+
+
+def test_no_place_is_found_with_too_few_detections() -> None:
+    log, mapper, _ = clean()
+    search = Search(mapper.smoother)
+    search._tried = -np.inf
+    search.observe(true_poses(log)[150], log.cycles[150])
+    assert search.find() is None
+
+
+def test_the_remembered_path_has_a_bound() -> None:
+    log, mapper, _ = clean()
+    search = Search(mapper.smoother)
+    for pose, cycle in zip(true_poses(log), log.cycles, strict=True):
+        search.observe(pose, cycle)
+    poses = np.array(search._poses)
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() <= FindingSettings().memory
+
+
+def test_forgetting_the_poses_keeps_all_that_the_prior_knows_of_the_map() -> None:
+    log = laps_log(pear_track(), laps=2)
+    smoother = map_log(log, mapper_of(log))[0].smoother
+    smoother.reactivate()
+    window = pose_keys(np.arange(smoother.first_cycle, smoother.next_cycle))
+    others = np.setdiff1d(smoother.layout.keys, window)
+    before = factorize(marginalize(smoother.prior, window), Layout(others)).covariance(others)
+    first = smoother.next_cycle - 10
+    smoother.forget_poses(first)
+    assert smoother.first_cycle == first and len(smoother.times) == 10
+    np.testing.assert_allclose(factorize(smoother.prior, Layout(others)).covariance(others), before)
+    covariance = np.diag([0.04, 0.09, 0.01])
+    smoother.add_pose_prior(smoother.next_cycle - 1, covariance)
+    smoother.map.detections.release(np.arange(len(smoother.map.detections)))
+    np.testing.assert_allclose(smoother.covariance(window[-1:]), covariance, atol=1e-9)
