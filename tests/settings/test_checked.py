@@ -13,7 +13,14 @@ import pytest
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.settings.mapper import MapperSettings
 
-UNLIMITED = {"gate.huber", "growth.forget_after", "open_lap.max_cycles", "open_lap.max_cones"}
+UNLIMITED = {
+    "gate.huber",
+    "growth.forget_after",
+    "open_lap.max_cycles",
+    "open_lap.max_cones",
+    "odometry.doubt",
+    "calibration.doubt",
+}
 
 
 def numbers(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
