@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrate_twists
+from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, pose_key
 from pathspace_graph.graph.smoother import FixedLagSmoother, SmootherSettings
 from pathspace_graph.graph.window import MapRows
@@ -74,7 +75,8 @@ def doubted(mean: Array, variance: Array, settings: MapperSettings) -> MapperSet
         return settings
     if most < CALIBRATION_SIZE:
         return replace(settings, odometry=settings.odometry.widened())
-    return replace(settings, calibration=settings.calibration.widened())
+    scale = most == CALIBRATION_SIZE + SENSOR.index("range_scale")
+    return replace(settings, calibration=settings.calibration.widened(scale))
 
 
 def doubt_calibrations(smoother: FixedLagSmoother[MapRows], settings: MapperSettings) -> MapperSettings:

@@ -12,8 +12,8 @@ from .checked import Positive
 class CalibrationSettings(Positive):
     """Describes how well the sensor's mounting, stamps and ranges are known before the drive.
 
-    The priors are those of a sensor that was calibrated. Where the drive contradicts one of them, all of them
-    become wide: then the sensor is not what it was said to be. What a drive does not show stays at zero.
+    The priors are those of a sensor that was calibrated. Where the drive contradicts one of them, they become
+    wide: then the sensor is not what it was said to be. What a drive does not show stays at zero.
     """
 
     UNLIMITED = ("doubt",)
@@ -48,14 +48,19 @@ class CalibrationSettings(Positive):
         )
         return own if self.sensor else ()
 
-    def widened(self) -> CalibrationSettings:
-        """Returns the settings of wide priors, which are not doubted again."""
+    def widened(self, by_range_scale: bool = False) -> CalibrationSettings:
+        """Returns the settings of wide priors, which are not doubted again.
+
+        The scale of the ranges stays as it is known, unless it is what the drive contradicts: with it, the
+        scale of the world would rest on the scale of the speeds alone.
+        """
+        if by_range_scale:
+            return replace(self, doubt=inf, sigma_range_scale=self.wide * self.sigma_range_scale)
         return replace(
             self,
             doubt=inf,
             sigma_yaw=self.wide * self.sigma_yaw,
             sigma_lateral=self.wide * self.sigma_lateral,
             sigma_latency=self.wide * self.sigma_latency,
-            sigma_range_scale=self.wide * self.sigma_range_scale,
             sigma_range_bias=self.wide * self.sigma_range_bias,
         )
