@@ -112,3 +112,19 @@ def sensor_rows(
     jacobian *= factor[:, None]
     jacobian[:, RANGE] += residual[:, None] * rates
     return SensorRows(factor, jacobian)
+
+
+def restored(residual: Array, measured: Array, twists: Array, sensor: Array) -> tuple[Array, Array]:
+    """Returns `M^-1` (m, 2, 2) and the derivatives of `M^-1 r` (m, 2, 5) by the sensor's calibration.
+
+    r (m, 2) are the expected minus the corrected detections, vehicle frame, which were measured at (m, 2)
+    while the vehicle moved with twists (m, 3). The derivatives are `-M^-1 C`, and `d M^-1 r` for the errors
+    of the ranges. For a calibration that is empty, M is the identity, and the derivatives are (m, 2, 0).
+    """
+    if len(sensor) == 0:
+        return np.tile(np.eye(2), (len(measured), 1, 1)), np.zeros((len(measured), 2, 0))
+    rates = by_range(measured)
+    inverse = np.eye(2) + np.einsum("mkij,k->mij", rates, sensor[RANGE])
+    jacobian = -inverse @ by_sensor(measured, twists)
+    jacobian[:, :, RANGE] += np.einsum("mkij,mj->mik", rates, residual)
+    return inverse, jacobian

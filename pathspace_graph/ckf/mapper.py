@@ -38,8 +38,6 @@ class CkfMapper:
             Belief.at_start(self.settings.odometry, self.settings.calibration), self.settings
         )
         """This holds the pose, the curves and their joint covariance."""
-        self.believed = self.settings
-        """These are the settings with the priors of the calibrations as they are now."""
         self.path = DrivenPath(self.settings.path)
         """This is the path driven."""
         self.expansion = Expansion(self.settings)
@@ -60,7 +58,6 @@ class CkfMapper:
         found = self._expand(detections, found)
         watch.lap("expand")
         update(self.state, detections, found)
-        self.believed = self.state.belief.doubt_calibrations(self.believed)
         watch.lap("update")
         self._close(detections)
         watch.lap("close")

@@ -50,8 +50,6 @@ class LandmarkCkf:
         self.odometry_sigma = odometry_noise(odometry_sigma)
         self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
         """This is the state `x = [pose | calibration | landmarks]`."""
-        self.believed = self.settings
-        """These are the settings with the priors of the calibrations as they are now."""
         self.labels: IntArray = np.zeros(0, np.intp)
         """(n,) These are the labels of the landmarks."""
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
@@ -66,7 +64,6 @@ class LandmarkCkf:
         found = self._associate(detections)
         watch.lap("associate")
         self._update(detections, found.landmark)
-        self.believed = self.belief.doubt_calibrations(self.believed)
         watch.lap("update")
         self._create(detections, found.new)
         watch.lap("create")

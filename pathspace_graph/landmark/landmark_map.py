@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.landmark import landmark_residuals
 from pathspace_graph.factors.noise import huber_weights, whiteners
-from pathspace_graph.factors.sensor import RANGE, by_range, by_sensor
+from pathspace_graph.factors.sensor import restored
 from pathspace_graph.graph.keys import POINT, POSE, SENSOR_KEY, landmark_keys, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
@@ -123,26 +123,21 @@ def landmark_rows(
 ) -> Rows:
     """Returns the rows `w W (R^T (l - t) - z)` of associated detections (m,), with `W' W = K^-1`.
 
-    The factor w is the square root of each row's own Huber weight.
+    The factor w is the square root of each row's own Huber weight. The detections z are corrected by the
+    sensor's calibration, and the residuals are those of measured ones (`factors.sensor:restored`).
     """
     cycles, numbers = detections.cycle[chosen], detections.landmark[chosen]
     points = state.landmarks[state.positions(numbers)]
     sensor = state.variables.sensor
     seen = detections.corrected(chosen, sensor)
     predicted = landmark_residuals(state.variables.poses_at(cycles), points, seen)
+    measured, twists = detections.measured[chosen], detections.twist[chosen]
+    inverse, by_calibration = restored(predicted.residual, measured, twists, sensor)
     white = whiteners(detections.covariance[chosen])
-    by_calibration = np.zeros((len(chosen), POINT, 0))
-    if len(sensor):
-        measured, twists = detections.measured[chosen], detections.twist[chosen]
-        rates = by_range(measured)
-        restored = np.eye(POINT) + np.einsum("mkij,k->mij", rates, sensor[RANGE])
-        by_calibration = -by_sensor(measured, twists)
-        by_range_errors = np.linalg.solve(restored[:, None], rates @ predicted.residual[:, None, :, None])
-        by_calibration[:, :, RANGE] += by_range_errors[..., 0].transpose(0, 2, 1)
-        white = white @ restored
-    residual = np.einsum("mij,mj->mi", white, predicted.residual)
+    residual = np.einsum("mij,mj->mi", white @ inverse, predicted.residual)
     weight = np.sqrt(huber_weights(residual, huber))
-    jacobian = white @ np.concatenate([predicted.by_pose, by_calibration, predicted.by_landmark], axis=2)
+    blocks = inverse @ predicted.by_pose, by_calibration, inverse @ predicted.by_landmark
+    jacobian = white @ np.concatenate(blocks, axis=2)
     return two_rows(cycles, numbers, jacobian * weight[:, :, None], residual * weight)
 
 

@@ -17,10 +17,9 @@ from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.settings.calibration import CalibrationSettings
-from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
+from pathspace_graph.settings.mapper import OdometrySettings
 
 from .cubature import Transformed, square_root, transform
-from .prediction import doubted
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -55,9 +54,13 @@ class Belief:
 
     @classmethod
     def at_start(cls, settings: OdometrySettings, sensor: CalibrationSettings) -> Belief:
-        """Returns the belief at the first odometry stamp, with an empty map."""
+        """Returns the belief at the first odometry stamp, with an empty map.
+
+        The priors of the sensor are the wide ones: a filter that has explained its errors by something else
+        cannot take that back, as a window can.
+        """
         sigmas = np.array([settings.sigma_start, settings.sigma_start, settings.sigma_start_heading])
-        calibration = np.array([settings.sigma_scale, settings.sigma_bias, *sensor.sigmas])
+        calibration = np.array([settings.sigma_scale, settings.sigma_bias, *sensor.widened().sigmas])
         return cls(np.zeros(POSE), np.diag(sigmas**2), calibration)
 
     @property
@@ -107,24 +110,6 @@ class Belief:
         self.covariance[:POSE, :POSE] = moved.covariance
         self.covariance[:POSE, POSE:] = cross
         self.covariance[POSE:, :POSE] = cross.T
-
-    def doubt_calibrations(self, settings: MapperSettings) -> MapperSettings:
-        """Widens the priors of calibrations where the drive contradicts them; returns them in the settings.
-
-        For each entry the information grows by `1 / after^2 - 1 / before^2`, which is negative: a Kalman
-        update with the negative variance whose inverse that is, of the measurement zero.
-        """
-        entries = np.arange(POSE, POSE + len(settings.sigmas_calibrations))
-        variance = np.diagonal(self.covariance)[entries]
-        found = doubted(self.mean[entries], variance, settings)
-        before, after = np.array(settings.sigmas_calibrations), np.array(found.sigmas_calibrations)
-        for entry in np.flatnonzero(before != after):
-            noise = 1.0 / (after[entry] ** -2.0 - before[entry] ** -2.0)
-            column = self.covariance[:, entries[entry]].copy()
-            gain = column / (column[entries[entry]] + noise)
-            self.mean -= gain * self.mean[entries[entry]]
-            self.covariance -= np.outer(gain, column)
-        return found
 
     def update(
         self, columns: IntArray, function: Callable[[Array], Array], measured: Array, noise: Array

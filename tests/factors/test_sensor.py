@@ -15,6 +15,7 @@ from pathspace_graph.factors.sensor import (
     by_sensor,
     in_vehicle,
     range_rates,
+    restored,
     sensor_rows,
 )
 
@@ -125,3 +126,26 @@ def test_the_motion_since_the_cone_was_seen_is_taken_back() -> None:
     moved = compose(inverse(se2_exp(latency * TWIST)[0]), np.append(seen, 0.0))
     shift = by_sensor(seen[None], TWIST)[0, :, 2] * latency
     np.testing.assert_allclose(seen + shift, moved[:2], atol=1e-5)
+
+
+@given(st.integers(0, 10**6))
+def test_restored_residuals_have_their_derivatives(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    seen, expected = rng.uniform([3.0, -6.0], [15.0, 6.0], (4, 2)), rng.normal(0.0, 5.0, (4, 2))
+    twists, sensor = np.tile(TWIST, (4, 1)), rng.normal(0.0, 0.02, 5)
+
+    def residual(b: Array) -> tuple[Array, Array]:
+        corrected = seen + by_sensor(seen, twists) @ b
+        inverse, jacobian = restored(expected - corrected, seen, twists, b)
+        return np.einsum("mij,mj->mi", inverse, expected - corrected), jacobian
+
+    _, jacobian = residual(sensor)
+    for k, step in enumerate(1e-5 * np.eye(5)):
+        numeric = (residual(sensor + step)[0] - residual(sensor - step)[0]) / 2e-5
+        np.testing.assert_allclose(jacobian[:, :, k], numeric, rtol=1e-6, atol=1e-6)
+
+
+def test_residuals_of_a_known_sensor_are_as_they_are() -> None:
+    inverse, jacobian = restored(np.ones((3, 2)), np.ones((3, 2)), np.zeros((3, 3)), np.zeros(0))
+    np.testing.assert_array_equal(inverse, np.tile(np.eye(2), (3, 1, 1)))
+    assert jacobian.shape == (3, 2, 0)

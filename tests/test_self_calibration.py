@@ -1,0 +1,69 @@
+"""Whole drives with a sensor that is not what it was said to be, and with one that is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pathspace_graph.estimators import make_online
+from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.io.log import Log
+from pathspace_graph.run import run_online
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.faults import Faults, SensorFaults
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
+
+SETTINGS = MapperSettings()
+KNOWN = replace(SETTINGS, calibration=replace(SETTINGS.calibration, sensor=False))
+
+
+@cache
+def driven(name: str = "", value: float = 0.0) -> Log:
+    """Returns a lap and the first metres of the next one, by a sensor that has one error."""
+    faults = Faults(sensor=SensorFaults(**({name: value} if name else {})))
+    settings = SimulationSettings(laps=1, faults=faults)
+    return simulate(generate_track(np.random.default_rng(3)), settings, 3)
+
+
+def rmse_of(log: Log, settings: MapperSettings, estimator: str = "fixed-lag") -> float:
+    run = run_online(log, make_online(estimator, settings, log))
+    assert log.truth is not None
+    return lap_metrics(run.map, log.truth, 1).rmse
+
+
+@pytest.mark.parametrize(("name", "value"), [("yaw", 0.035), ("latency", 0.05), ("range_bias", 0.4)])
+def test_the_error_of_a_sensor_is_found_within_its_claimed_uncertainty(name: str, value: float) -> None:
+    log = driven(name, value)
+    mapper = make_online("fixed-lag", SETTINGS, log)
+    run_online(log, mapper)
+    state = mapper.vehicle_state()  # type: ignore[attr-defined]
+    entry = SENSOR.index(name)
+    sigma = float(np.sqrt(state.sensor_covariance[entry, entry]))
+    assert abs(state.sensor[entry] - value) < 3.0 * sigma + 0.01 * value
+    assert sigma < 0.2 * value
+
+
+@pytest.mark.parametrize("estimator", ["fixed-lag", "landmark-fixed-lag", "ckf", "landmark-ckf"])
+def test_every_estimator_finds_a_sensor_that_is_turned(estimator: str) -> None:
+    log = driven("yaw", 0.035)
+    mapper = make_online(estimator, SETTINGS, log)
+    run_online(log, mapper)
+    assert mapper.vehicle_state().sensor[0] == pytest.approx(0.035, abs=0.012)  # type: ignore[attr-defined]
+
+
+def test_a_sensor_that_is_what_it_was_said_to_be_is_not_doubted() -> None:
+    mapper = make_online("fixed-lag", SETTINGS, driven())
+    run_online(driven(), mapper)
+    state = mapper.vehicle_state()  # type: ignore[attr-defined]
+    assert (np.abs(state.sensor) < 3.0 * np.array(SETTINGS.calibration.sigmas)).all()
+    assert rmse_of(driven(), SETTINGS) < 1.1 * rmse_of(driven(), KNOWN)
+
+
+def test_the_map_of_a_late_sensor_is_better_if_its_latency_is_estimated() -> None:
+    log = driven("latency", 0.05)
+    assert rmse_of(log, SETTINGS) < 0.8 * rmse_of(log, KNOWN)
