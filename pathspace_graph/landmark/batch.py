@@ -46,7 +46,7 @@ class LandmarkBatch:
     def _solve(self, log: Log) -> BatchRun:
         settings = self.settings.landmark
         system = LandmarkSystem.of_log(log, self.settings, self.odometry_sigma)
-        state = start_online(log, system, self.odometry_sigma)
+        system, state = start_online(log, system, self.odometry_sigma)
         system.optimize(state)
         rounds, converged = 0, False
         while not converged and rounds < settings.max_rounds:
@@ -81,8 +81,13 @@ class LandmarkBatch:
         )
 
 
-def start_online(log: Log, system: LandmarkSystem, odometry_sigma: Array) -> LandmarkState:
-    """Returns the last map of the online run, with each pose and association as it left the window."""
+def start_online(
+    log: Log, system: LandmarkSystem, odometry_sigma: Array
+) -> tuple[LandmarkSystem, LandmarkState]:
+    """Returns the last map of the online run, with each pose and association as it left the window.
+
+    The problem is returned with the priors of the calibrations as the online run believed them in the end.
+    """
     online, detections = LandmarkFixedLag(system.settings, odometry_sigma), system.detections
     smoother, track = online.smoother, online.smoother.map
     poses = np.zeros((len(log.cycles), POSE))
@@ -102,4 +107,4 @@ def start_online(log: Log, system: LandmarkSystem, odometry_sigma: Array) -> Lan
     state.add(track.state.landmarks, track.state.labels, track.state.numbers)
     state.votes, state.next_number = track.state.votes, track.state.next_number
     insert_drive(state, smoother.variables.calibrations, poses)
-    return state
+    return system.believing(online.believed), state

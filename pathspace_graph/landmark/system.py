@@ -41,6 +41,11 @@ class LandmarkSystem:
         chain = integrate_log(log, odometry_sigma, settings.odometry)
         return cls(LandmarkDetections.of(log.cycles, twists=chain.twists), chain, settings)
 
+    def believing(self, settings: MapperSettings) -> LandmarkSystem:
+        """Returns the same problem with the priors of the calibrations that other settings have."""
+        sigma = np.array(settings.odometry.sigmas_calibration)
+        return replace(self, settings=settings, chain=replace(self.chain, calibration_sigma=sigma))
+
     def cost(self, state: LandmarkState) -> float:
         """Returns half the sum of squares at a state, with Huber's loss of the detections."""
         poses, calibration = state.variables.poses, state.variables.calibration
