@@ -73,7 +73,8 @@ class LandmarkFixedLag:
         watch.lap("create")
         for _ in range(self.settings.steps_grown if created else self.settings.steps):
             self.smoother.step()
-        self.believed = doubt_calibrations(self.smoother, self.believed)
+        if not self.closed:
+            self.believed = doubt_calibrations(self.smoother, self.believed)
         watch.lap("update")
         self._close()
         watch.lap("close")

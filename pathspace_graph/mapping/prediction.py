@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrate_twists
-from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, pose_key
 from pathspace_graph.graph.smoother import FixedLagSmoother, SmootherSettings
 from pathspace_graph.graph.window import MapRows
@@ -75,14 +74,14 @@ def doubted(mean: Array, variance: Array, settings: MapperSettings) -> MapperSet
         return settings
     if most < CALIBRATION_SIZE:
         return replace(settings, odometry=settings.odometry.widened())
-    scale = most == CALIBRATION_SIZE + SENSOR.index("range_scale")
-    return replace(settings, calibration=settings.calibration.widened(scale))
+    return replace(settings, calibration=settings.calibration.widened())
 
 
 def doubt_calibrations(smoother: FixedLagSmoother[MapRows], settings: MapperSettings) -> MapperSettings:
     """Widens the priors of calibrations where the drive so far contradicts them.
 
-    It returns the settings with the priors as they are then.
+    It returns the settings with the priors as they are then. It is for an open loop: the prior of a closed
+    one is linearized where the calibration was then, and is surer of it than it may be.
     """
     if smoother.last_step is None or smoother.next_cycle % settings.odometry.doubt_cycles:
         return settings

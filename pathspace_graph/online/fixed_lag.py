@@ -135,7 +135,7 @@ class FixedLagMapper:
         for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
             self._step()
         watch.lap("update")
-        if self._search is None:
+        if not self.closed:
             self._believed = doubt_calibrations(self.smoother, self._believed)
         closes = self._close()
         watch.lap("close")

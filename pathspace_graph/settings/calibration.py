@@ -48,14 +48,12 @@ class CalibrationSettings(Positive):
         )
         return own if self.sensor else ()
 
-    def widened(self, by_range_scale: bool = False) -> CalibrationSettings:
+    def widened(self) -> CalibrationSettings:
         """Returns the settings of wide priors, which are not doubted again.
 
-        The scale of the ranges stays as it is known, unless it is what the drive contradicts: with it, the
-        scale of the world would rest on the scale of the speeds alone.
+        The scale of the ranges stays as it is known: it cannot be told from the scale of the speeds, and the
+        size of the map would rest on the wheels alone.
         """
-        if by_range_scale:
-            return replace(self, doubt=inf, sigma_range_scale=self.wide * self.sigma_range_scale)
         return replace(
             self,
             doubt=inf,
