@@ -71,7 +71,8 @@ def map_with_both(log: Log) -> tuple[RunResult, RunResult]:
         rival = Parallel(n_jobs=2, return_as="generator")([delayed(run_estimator)(RIVAL, settings, log)])
         result = map_online(log, settings, DEFAULT)
         with progress(RIVAL):
-            return result, next(rival)
+            (landmarks,) = rival  # to the end, or joblib warns of tasks that were cancelled
+        return result, landmarks
 
 
 def write_demo(out: Path, log: Log, result: RunResult) -> None:
