@@ -17,7 +17,7 @@ from .noise import huber_roots, huber_weights
 from .odometry import IntegratedOdometry, odometry_residuals
 from .projection import project
 from .se2 import rotation, to_map
-from .sensor import by_sensor, range_rates, sensor_rows
+from .sensor import corrected, sensor_rows
 from .spans import SpanPolynomials
 
 Array = NDArray[np.float64]
@@ -210,14 +210,11 @@ class _Projection:
         pose, measured = values.atPose2(self.pose_key), self.points_vehicle
         poses = np.tile(pose_array(pose), (len(measured), 1))
         sensor = np.zeros(0) if self.sensor_key is None else np.array(values.atVector(self.sensor_key))
-        corrected = measured + by_sensor(measured, self.twists) @ sensor if len(sensor) else measured
-        points = to_map(corrected, poses)
+        points = to_map(corrected(measured, self.twists, sensor), poses)
         foot = self.curve.find(values, points)
         rows = project(points, self.covariances, poses, foot, self.sigma_model)
         usable, slots = self.curve.usable(foot)
-        normals = foot.normal_unit
-        rates = range_rates(normals, poses, measured)
-        by = sensor_rows(normals, rows.residual, poses, measured, self.twists, sensor, rates)
+        by = sensor_rows(foot.normal_unit, rows.residual, poses, measured, self.twists, sensor)
         whitened = by.factor * rows.residual / rows.sigma
         if H is None:
             return np.asarray(huber_roots(whitened, self.huber) * usable)

@@ -46,6 +46,16 @@ def by_sensor(points_vehicle: Array, twists: Array) -> Array:
     return columns
 
 
+def corrected(measured: Array, twists: Array, sensor: Array) -> Array:
+    """Returns the detections `z + C b` (m, 2), or z as measured where the calibration b (5,) is empty.
+
+    They were measured at (m, 2), vehicle frame, while the vehicle moved with twists (m, 3).
+    """
+    if len(sensor) == 0:
+        return measured
+    return np.asarray(measured + by_sensor(measured, twists) @ sensor)
+
+
 def in_vehicle(directions: Array, poses: Array) -> Array:
     """Returns vectors (m, 2), map frame, in the vehicle frames of poses (m, 3)."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
@@ -97,16 +107,17 @@ def sensor_rows(
     measured: Array,
     twists: Array,
     sensor: Array,
-    rates: Array,
+    rates: Array | None = None,
 ) -> SensorRows:
     """Returns factors `f = 1 + rates b` and derivatives `f d' R C + r rates` of residuals `r = d . (p - q)`.
 
     d (m, 2) are unit vectors in the map frame and p corrected detections, measured at (m, 2), vehicle frame,
     from poses (m, 3) while the vehicle moved with twists (m, 3). C is `by_sensor`, b the sensor's calibration
-    (5,), which is empty where it is not estimated, and `rates` (m, 2) are those of `range_rates`.
+    (5,), which is empty where it is not estimated, and `rates` (m, 2) are by default those of `range_rates`.
     """
     if len(sensor) == 0:
         return SensorRows(np.ones(len(residual)), np.zeros((len(residual), 0)))
+    rates = range_rates(directions, poses, measured) if rates is None else rates
     factor = 1.0 + rates @ sensor[RANGE]
     jacobian = np.einsum("mi,mik->mk", in_vehicle(directions, poses), by_sensor(measured, twists))
     jacobian *= factor[:, None]

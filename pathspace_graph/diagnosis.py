@@ -8,8 +8,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from pathspace_graph.factors.sensor import SENSOR
-from pathspace_graph.io.log import CALIBRATION
 from pathspace_graph.io.results import VehicleState
 
 LIMIT: Final = 3.0
@@ -50,7 +48,7 @@ def by_prior(state: VehicleState, settings: Mapping[str, Any]) -> dict[str, floa
     `settings` are those of the run as plain values. A calibration whose prior is not there is left out.
     """
     found = {}
-    for name, value in zip([*CALIBRATION, *SENSOR], _values(state), strict=False):
+    for name, (value, _) in state.by_name.items():
         prior = settings.get(CAUSES[name].group, {}).get(f"sigma_{name}")
         if prior is not None:
             found[name] = value / prior
@@ -62,17 +60,10 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
 
     `settings` are those of the run as plain values. The prior's standard deviations are there.
     """
-    values = dict(zip([*CALIBRATION, *SENSOR], _values(state), strict=False))
-    lines = []
+    values, lines = state.by_name, []
     for name, ratio in by_prior(state, settings).items():
         if abs(ratio) > LIMIT:
-            cause, size = CAUSES[name], CAUSES[name].unit * abs(values[name])
+            cause, size = CAUSES[name], CAUSES[name].unit * abs(values[name][0])
             text = cause.text.format(size, cause.signs[0 if ratio > 0.0 else 1])
             lines.append(f"{text} ({abs(ratio):.1f} sigmas of its prior)")
     return lines
-
-
-def _values(state: VehicleState) -> list[float]:
-    """Returns the calibrations of odometry and sensor."""
-    values: list[float] = [*state.calibration.tolist(), *state.sensor.tolist()]
-    return values

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
+from pathspace_graph.diagnosis import LIMIT
 from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.eval.study.frame import RUN, last_laps
 from pathspace_graph.eval.study.study import Study
@@ -19,8 +20,6 @@ BY_PRIOR: Final = "_by_prior"
 """Metrics with this suffix are estimates of a calibration by the sigma of its prior."""
 TITLE_BY_PRIOR: Final = " by its prior's sigma"
 """The titles of these metrics end so."""
-BEYOND: Final = 3.0
-"""A calibration is conspicuous beyond this many sigmas of its prior."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class Outcome:
         """Returns the mean of each estimate by its prior's sigma, where it is conspicuous."""
         names = dict.fromkeys(name for run in self.runs for name in run.calibration)
         means = {name: mean([run.calibration.get(name, np.nan) for run in self.runs]) for name in names}
-        return {name: value for name, value in means.items() if abs(value) > BEYOND}
+        return {name: value for name, value in means.items() if abs(value) > LIMIT}
 
     def values(self) -> dict[str, Any]:
         """Returns the outcome as a row of plain values; what is not known is NaN."""

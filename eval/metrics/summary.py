@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.diagnosis import diagnose
-from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import Health, Stretch, counts, stretches
-from pathspace_graph.io.log import CALIBRATION, Log, Truth
+from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES, NAMES
@@ -67,14 +66,10 @@ def _vehicle(state: VehicleState) -> dict[str, Any]:
 
     Those of the odometry are in (-, rad/s), those of the sensor in the units of `factors.sensor:SENSOR`.
     """
-    vehicle: list[float] = state.sigmas.tolist()
-    sigmas = [*vehicle[3:], *state.sensor_sigmas.tolist()]
-    names = [*CALIBRATION, *SENSOR]
-    values = [*state.calibration.tolist(), *state.sensor.tolist()]
-    known = list(zip(names, values, sigmas, strict=False))
-    calibration = {name: value for name, value, _ in known}
-    calibration |= {f"{name}_sigma": sigma for name, _, sigma in known}
-    return {"calibration": calibration, "heading_sigma": vehicle[2]}
+    known = state.by_name
+    calibration = {name: value for name, (value, _) in known.items()}
+    calibration |= {f"{name}_sigma": sigma for name, (_, sigma) in known.items()}
+    return {"calibration": calibration, "heading_sigma": float(state.sigmas[2])}
 
 
 def _events(result: RunResult) -> list[dict[str, Any]]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.registration import by_motion, sigma_of_information
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -139,9 +140,5 @@ def _sigma_of_motion(feet: Sequence[FootPoints], sigma_reading: float) -> float:
     )
     if len(point) == 0:
         return np.inf
-    arm = point - point.mean(axis=0)
-    by_motion = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
-    information = by_motion.T @ by_motion / sigma_reading**2
-    if np.linalg.matrix_rank(information) < len(information):
-        return np.inf
-    return float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(information)[:2, :2])[-1]))
+    jacobian = by_motion(normal, point - point.mean(axis=0)) / sigma_reading
+    return sigma_of_information(jacobian.T @ jacobian)

@@ -14,6 +14,7 @@ from pathspace_graph.settings.batch import ConeSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import find_anywhere
+from .recurrence import path_lengths
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -102,7 +103,7 @@ def in_order_of_drive(cones: Cones, lap: Array) -> Cones:
 
     A cone is passed at the path length of its nearest pose, plus its distance ahead of that pose.
     """
-    driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(lap[:, :2], axis=0).T)))
+    driven = path_lengths(lap)
     offset = cones.points[:, None] - lap[:, :2]
     nearest = (offset**2).sum(axis=2).argmin(axis=1)
     dx, dy = offset[np.arange(len(nearest)), nearest].T

@@ -13,7 +13,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.factors.sensor import SENSOR_SIZE
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POINT, POSE, SENSOR_KEY, pose_key, pose_keys
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POINT, POSE, pose_key, pose_keys
 from pathspace_graph.graph.odometry import odometry_factor
 from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.spline.boundary import Boundary
@@ -48,9 +48,10 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
         graph.add(factor)
     for factor in _priors(system.chain, at.state.poses[0, 2]):
         graph.add(factor)
-    if len(at.state.variables.sensor):
+    sensor_key = at.state.variables.sensor_key
+    if sensor_key is not None:
         sigmas = gtsam.noiseModel.Diagonal.Sigmas(np.array(system.settings.calibration.sigmas))
-        graph.add(gtsam.PriorFactorVector(SENSOR_KEY, np.zeros(SENSOR_SIZE), sigmas))
+        graph.add(gtsam.PriorFactorVector(sensor_key, np.zeros(SENSOR_SIZE), sigmas))
     for label, gauge in system.gauges.items():
         for factor in (*_gauge(gauge, at.state.control_points(label)), *_projections(system, at, label)):
             graph.add(factor)
@@ -150,7 +151,7 @@ def _projections(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.
         high=u + room,
         sigma_model=0.0,
         huber=np.inf,
-        sensor_key=SENSOR_KEY if len(variables.sensor) else None,
+        sensor_key=variables.sensor_key,
         twists=detections.twist[rows],
     )
 

@@ -95,6 +95,11 @@ def _mean_products(values: ComplexArray, lags: IntArray) -> ComplexArray:
     return np.asarray(ifft(np.abs(transform) ** 2)[lags] / (len(values) - lags))
 
 
+def path_lengths(poses: Array) -> Array:
+    """Returns the path length (P,) from the first of poses (P, 3) to each of them (m)."""
+    return np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+
+
 def find_recurrence(poses: Array, settings: MapperSettings) -> Recurrence:
     """Returns the shortest path length after which the curvature of dead-reckoned poses (P, 3) recurs.
 
@@ -102,7 +107,7 @@ def find_recurrence(poses: Array, settings: MapperSettings) -> Recurrence:
     is the best within `closing.radius` after it. That is the lap.
     """
     own, closing = settings.batch.recurrence, settings.closing
-    driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+    driven = path_lengths(poses)
     profile = profile_of(poses, driven, own)
     first, last = int(closing.min_path / own.profile_step), int(own.min_overlap / own.profile_step)
     lags = np.arange(first, len(profile.heading) - last)

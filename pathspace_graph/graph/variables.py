@@ -205,6 +205,11 @@ class Variables:
         return self.values[first.start : last.stop]
 
     @property
+    def sensor_key(self) -> int | None:
+        """Returns the key of the sensor's calibration, if it is estimated."""
+        return SENSOR_KEY if len(self.sensor) else None
+
+    @property
     def calibration_keys(self) -> IntArray:
         """Returns the keys of the calibrations: the odometry's, and the sensor's if it is estimated."""
         return np.asarray(self.keys[self.keys <= SENSOR_KEY])

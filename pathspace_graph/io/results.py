@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
+from pathspace_graph.factors.sensor import SENSOR
 
 from .csv_table import read_table
 from .files import atomic_folder
 from .json_file import write_json
+from .log import CALIBRATION
 from .map import MAP_FILE, Map, map_to_json
 from .trajectory import TRAJECTORY_FILE, write_trajectory
 
@@ -91,6 +93,14 @@ class VehicleState:
     def sensor_sigmas(self) -> Array:
         """Returns the standard deviations (5,) of the sensor's calibration, or (0,)."""
         return np.sqrt(np.diag(self.sensor_covariance))
+
+    @property
+    def by_name(self) -> dict[str, tuple[float, float]]:
+        """Returns each calibration with its standard deviation, by its name in `CALIBRATION` and `SENSOR`."""
+        values = [*self.calibration.tolist(), *self.sensor.tolist()]
+        sigmas = [*self.sigmas[len(self.pose) :].tolist(), *self.sensor_sigmas.tolist()]
+        known = zip([*CALIBRATION, *SENSOR], values, sigmas, strict=False)
+        return {name: (value, sigma) for name, value, sigma in known}
 
     @classmethod
     def split(cls, pose: Array, calibrations: Array, joint: Array) -> VehicleState:

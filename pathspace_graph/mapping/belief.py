@@ -12,7 +12,7 @@ from scipy.linalg import block_diag, lapack
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
-from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor
+from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor, corrected
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.results import VehicleState
@@ -81,8 +81,8 @@ class Belief:
     def corrected(self, detections: Detections) -> Detections:
         """Returns the newest detections, corrected by the mean calibration of the sensor."""
         points = detections.points_vehicle
-        shift = self.by_sensor(points) @ self.sensor
-        return replace(detections, points_vehicle=points + shift)
+        twists = np.tile(self.twist, (len(points), 1))
+        return replace(detections, points_vehicle=corrected(points, twists, self.sensor))
 
     def by_sensor(self, points_vehicle: Array) -> Array:
         """Returns the derivatives (m, 2, 5) of the newest detections (m, 2) by the sensor's calibration."""

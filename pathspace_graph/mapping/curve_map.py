@@ -139,8 +139,8 @@ class CurveMap:
     def _place_rows(self, places: ConePlaces, rows: IntArray, points: Array, poses: Array) -> Rows:
         """Returns `w_i t . (R z_i + t - S(u_k)) / sigma_i` for the detections (m,) that are of a place u_k.
 
-        The keys are [pose | control points of the place's span]. points (m, 2) and poses (m, 3) are in the
-        map frame.
+        The keys are `measuring_keys` and the control points of the place's span. points (m, 2) and poses
+        (m, 3) are in the map frame.
         """
         detections, settings = self.detections, self.settings
         placed = np.flatnonzero(detections.place[rows] != NOWHERE)

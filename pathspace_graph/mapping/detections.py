@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.sensor import SensorRows, by_sensor, range_rates, sensor_rows
+from pathspace_graph.factors.sensor import SensorRows, corrected, sensor_rows
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
 
@@ -84,10 +84,7 @@ class DetectionColumns:
 
     def corrected(self, rows: IntArray | slice, sensor: Array) -> Array:
         """Returns positions (m, 2) corrected by the sensor's calibration (5,), which may be empty."""
-        if len(sensor) == 0:
-            return self.measured[rows]
-        measured = self.measured[rows]
-        return np.asarray(measured + by_sensor(measured, self.twist[rows]) @ sensor)
+        return corrected(self.measured[rows], self.twist[rows], sensor)
 
     def sensor_rows(
         self, rows: IntArray, directions: Array, residual: Array, poses: Array, sensor: Array
@@ -96,9 +93,7 @@ class DetectionColumns:
 
         The detections were made from poses (m, 3), and the sensor's calibration (5,) may be empty.
         """
-        measured = self.measured[rows]
-        rates = range_rates(directions, poses, measured) if len(sensor) else np.zeros((len(rows), 2))
-        return sensor_rows(directions, residual, poses, measured, self.twist[rows], sensor, rates)
+        return sensor_rows(directions, residual, poses, self.measured[rows], self.twist[rows], sensor)
 
     def correct(self, sensor: Array) -> None:
         """Corrects all positions by the sensor's calibration (5,), which is empty where there is none."""

@@ -35,6 +35,11 @@ class Motion:
         turned = (points - self.centre) @ np.array([[c, s], [-s, c]])
         return np.asarray(turned + self.centre + self.vector[:2])
 
+    def move(self, poses: Array) -> None:
+        """Moves poses (m, 3) in place."""
+        poses[:, :2] = self.apply(poses[:, :2])
+        poses[:, 2] += self.vector[2]
+
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
@@ -218,15 +223,36 @@ def _match(
         foot = boundary.find(state.control_points(label), moved[own], low, high)
         used = foot.interior & (np.abs(foot.distance) < reach)
         n, arm = foot.normal_unit[used], moved[own[used]] - motion.centre - motion.vector[:2]
-        by_motion = np.column_stack([n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]]) / settings.sigma_reading
-        hessian += by_motion.T @ by_motion
-        negative_gradient -= by_motion.T @ foot.distance[used] / settings.sigma_reading
+        jacobian = by_motion(n, arm) / settings.sigma_reading
+        hessian += jacobian.T @ jacobian
+        negative_gradient -= jacobian.T @ foot.distance[used] / settings.sigma_reading
         matched.append(own[foot.interior])
         u.append(foot.u[foot.interior])
         inlier.append(np.abs(foot.distance[foot.interior]) < settings.inlier_distance)
     inside, parameters, inliers = np.concatenate(matched), np.concatenate(u), np.concatenate(inlier)
     rows, labels = seen.rows[inside], seen.labels[inside]
     return Matches(rows, labels, parameters, inliers, hessian, negative_gradient)
+
+
+def by_motion(normals: Array, arms: Array) -> Array:
+    """Returns the derivatives (m, 3) of distances across curves by a motion about the arms' origin.
+
+    The normals (m, 2) are unit vectors, and the arms (m, 2) lead to the points (m), both in the map frame.
+    """
+    turning = normals[:, 1] * arms[:, 0] - normals[:, 0] * arms[:, 1]
+    return np.column_stack([normals, turning])
+
+
+def worst_sigma(covariance: Array) -> float:
+    """Returns the standard deviation (m) of a position in its worst direction, by covariance (3, 3)."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+
+
+def sigma_of_information(information: Array) -> float:
+    """Returns `worst_sigma` of an information (3, 3); it is infinite where a direction is not held."""
+    if np.linalg.matrix_rank(information) < len(information):
+        return np.inf
+    return worst_sigma(np.asarray(np.linalg.inv(information), np.float64))
 
 
 def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bool:
@@ -245,7 +271,7 @@ def is_certain(matches: Matches, posterior: Array, settings: ClosingSettings, lo
     would add little. It is not wider if the vehicle is `lost`: then one place along a straight agrees as well
     as the next.
     """
-    sigma = float(np.sqrt(np.linalg.eigvalsh(posterior[:2, :2])[-1]))
+    sigma = worst_sigma(posterior)
     driven_again = float(np.median(matches.u[matches.inlier]))
     patient = driven_again >= settings.patience and not lost
     return sigma <= (settings.sigma_patience if patient else settings.sigma_max)

@@ -16,9 +16,7 @@ from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
 def apply_correspondences(smoother: CurveSmoother, registration: Registration) -> None:
     """Moves the window onto the beginning, and associates its inliers with the beginning."""
     smoother.reactivate(with_prior=smoother.submaps is None)
-    poses = smoother.map.state.poses
-    poses[:, :2] = registration.motion.apply(poses[:, :2])
-    poses[:, 2] += registration.motion.vector[2]
+    registration.motion.move(smoother.map.state.poses)
     for label, (rows, u) in registration.matches.items():
         smoother.map.detections.take(rows, label, u)
 

@@ -25,7 +25,7 @@ from pathspace_graph.health import Evidence
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveSmoother
-from pathspace_graph.mapping.registration import Motion, RefinedMotion, Sightings, refine
+from pathspace_graph.mapping.registration import Motion, RefinedMotion, Sightings, refine, worst_sigma
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.health import FindingSettings
 from pathspace_graph.settings.mapper import MapperSettings
@@ -223,8 +223,7 @@ class Search:
         rivals = [place.score for place in places[1:] if not self._same(place.found, best)]
         if rivals and rivals[0] > places[0].score - settings.margin:
             return None
-        sigma = np.sqrt(np.linalg.eigvalsh(best.covariance[:2, :2])[-1])
-        return best if sigma < settings.sigma_max else None
+        return best if worst_sigma(best.covariance) < settings.sigma_max else None
 
     def _same(self, a: RefinedMotion, b: RefinedMotion) -> bool:
         """Returns whether two motions lead to one place."""
@@ -317,8 +316,7 @@ def start_anew(smoother: CurveSmoother, first_cycle: int, found: RefinedMotion) 
     state, settings = smoother.map.state, smoother.map.settings
     smoother.forget_poses(first_cycle)
     before = state.poses[-1].copy()
-    state.poses[:, :2] = found.motion.apply(state.poses[:, :2])
-    state.poses[:, 2] += found.motion.vector[2]
+    found.motion.move(state.poses)
     smoother.add_pose_prior(smoother.next_cycle - 1, found.covariance * settings.finding.widening**2)
     locate_poses(state, settings.batch.association)
     reassociate(smoother)

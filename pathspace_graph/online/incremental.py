@@ -127,7 +127,7 @@ class IncrementalSolver:
         self._held.update(identities)
         rows = rows[fresh & ~np.isin(detections.cycle[rows], marginalized)]
         room = np.full(len(rows), self.settings.spline.refine_room)
-        sensor_key = SENSOR_KEY if len(smoother.variables.sensor) else None
+        sensor_key = smoother.variables.sensor_key
         for factor in detection_factors(
             label, boundary, detections, rows, self.settings, (room, room), sensor_key
         ):

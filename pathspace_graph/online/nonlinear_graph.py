@@ -14,7 +14,7 @@ from pathspace_graph.factors.gtsam_factors import (
     spline_projection_factors,
 )
 from pathspace_graph.graph.gaussian import factors_of
-from pathspace_graph.graph.keys import SENSOR_KEY, control_keys, pose_keys
+from pathspace_graph.graph.keys import control_keys, pose_keys
 from pathspace_graph.graph.odometry import odometry_factor
 from pathspace_graph.graph.user_factors import as_nonlinear
 from pathspace_graph.mapping.curve_map import CurveSmoother
@@ -37,7 +37,7 @@ def window_graph(smoother: CurveSmoother) -> gtsam.NonlinearFactorGraph:
         active = state.active(label)
         rows = detections.used_on(label)
         room = _room(boundary, active, detections.u[rows], settings.spline.refine_room)
-        sensor_key = SENSOR_KEY if len(smoother.variables.sensor) else None
+        sensor_key = smoother.variables.sensor_key
         _add(graph, detection_factors(label, boundary, detections, rows, settings, room, sensor_key))
         if not smoother.map.held_by_prior:
             _add(graph, gauge_factors(label, boundary, active, settings.gauge))

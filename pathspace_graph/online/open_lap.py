@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.closure import is_worth_trying
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
-from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
+from pathspace_graph.batch.recurrence import Recurrence, find_recurrence, path_lengths
 from pathspace_graph.batch.start import unwrap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.odometry import IntegratedOdometry
@@ -88,7 +88,7 @@ class OpenLapRecord:
         poses, (label, u) = np.array(self._reckoned), next(iter(place.beside.items()))
         places = self._places[label]
         before = places[int(np.argmin([abs(at.u - u) for at in places]))].cycle
-        driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+        driven = path_lengths(poses)
         turn = float(poses[-1, 2] - poses[before, 2])
         return Recurrence(driven, float(driven[-1] - driven[before]), turn, 1.0)
 

@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.se2 import wrap_angle
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
-from pathspace_graph.mapping.registration import Motion, is_lost
+from pathspace_graph.mapping.registration import (
+    Motion,
+    Sightings,
+    by_motion,
+    is_lost,
+    refine,
+    sigma_of_information,
+)
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.spline.boundary import Boundary
@@ -51,8 +58,15 @@ class Stretch:
         A straight does not: it could as well lie farther along.
         """
         arms = {label: cones - centre for label, cones in self.cones.items()}
-        rows = np.concatenate([_by_motion(self.normals[b], arms[b], settings) for b in arms])
-        return _sigma(rows.T @ rows) <= settings.sigma_max
+        rows = np.concatenate([by_motion(self.normals[b], arms[b]) for b in arms]) / settings.sigma_reading
+        return sigma_of_information(rows.T @ rows) <= settings.sigma_max
+
+    @property
+    def sightings(self) -> Sightings:
+        """Returns the cones as the registration takes them."""
+        labels = np.repeat(list(self.cones), [len(cones) for cones in self.cones.values()])
+        points = np.concatenate(list(self.cones.values()))
+        return Sightings(np.arange(len(points)), labels, points)
 
 
 def recognize(smoother: CurveSmoother) -> RecognizedPlace | None:
@@ -124,19 +138,6 @@ def newest_stretch(state: State, length: float) -> Stretch:
     return Stretch(length, cones, normals)
 
 
-def _by_motion(normals: Array, arms: Array, settings: ClosingSettings) -> Array:
-    """Returns the derivative (k, 3) of cones' distances across a curve by a motion about the arms' origin."""
-    turning = normals[:, 1] * arms[:, 0] - normals[:, 0] * arms[:, 1]
-    return np.column_stack([normals, turning]) / settings.sigma_reading
-
-
-def _sigma(information: Array) -> float:
-    """Returns the standard deviation (m) of the position in its worst direction, by information (3, 3)."""
-    if np.linalg.matrix_rank(information) < len(information):
-        return np.inf
-    return float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(information)[:2, :2])[-1]))
-
-
 def _same(a: RecognizedPlace, b: RecognizedPlace, settings: ClosingSettings) -> bool:
     """Returns whether two places are one."""
     return bool(np.hypot(*(a.motion.vector - b.motion.vector)[:2]) < settings.overlap)
@@ -189,16 +190,12 @@ def _register(
     ends = np.array([low, low + newest.length])
     corners = state.boundaries[first].evaluate(state.control_points(first), ends)
     stretches = {label: _beside(state, label, corners, settings) for label in state.boundaries}
-    vector = start.vector
-    for iteration in range(settings.icp_iterations):
-        reach = max(settings.inlier_distance, settings.icp_reach * settings.icp_shrink**iteration)
-        motion = Motion(start.centre, vector)
-        hessian, gradient, shares = _linearize(state, newest, motion, stretches, reach, settings)
-        vector = vector + np.linalg.solve(hessian + prior, gradient - prior @ vector)
-    if min(shares) < settings.inlier_share or _sigma(hessian) > settings.sigma_max:
+    found = refine(state, newest.sightings, start, stretches, (np.zeros(3), prior), settings)
+    shares = [len(found.matches.inliers(b)[0]) / max(len(cones), 1) for b, cones in newest.cones.items()]
+    sigma = sigma_of_information(found.matches.hessian)
+    if min(shares) < settings.inlier_share or sigma > settings.sigma_max:
         return None
-    motion = Motion(start.centre, vector)
-    return RecognizedPlace(motion, _beside_newest(state, motion, stretches))
+    return RecognizedPlace(found.motion, _beside_newest(state, found.motion, stretches))
 
 
 def _beside_newest(
@@ -221,27 +218,3 @@ def _beside(state: State, label: int, corners: Array, settings: ClosingSettings)
     high = zero + settings.beginning_share * boundary.confirmed_end
     u = boundary.find(state.control_points(label), corners, zero, high).u
     return max(float(u[0]) - room, 0.0), float(u[1]) + room
-
-
-def _linearize(
-    state: State,
-    newest: Stretch,
-    motion: Motion,
-    stretches: dict[int, tuple[float, float]],
-    reach: float,
-    settings: ClosingSettings,
-) -> tuple[Array, Array, list[float]]:
-    """Returns the information (3, 3) about the motion, the negative gradient (3,), and shares of inliers."""
-    hessian, gradient, shares = np.zeros((3, 3)), np.zeros(3), []
-    for label, cones in newest.cones.items():
-        moved, (low, high) = motion.apply(cones), stretches[label]
-        at = np.zeros(len(cones))
-        foot = state.boundaries[label].find(state.control_points(label), moved, at + low, at + high)
-        used = foot.interior & (np.abs(foot.distance) < reach)
-        arms = moved[used] - motion.centre - motion.vector[:2]
-        by_motion = _by_motion(foot.normal_unit[used], arms, settings)
-        hessian += by_motion.T @ by_motion
-        gradient -= by_motion.T @ foot.distance[used] / settings.sigma_reading
-        inliers = np.abs(foot.distance) < settings.inlier_distance
-        shares.append(float(np.mean(foot.interior & inliers)) if len(cones) else 0.0)
-    return hessian, gradient, shares
