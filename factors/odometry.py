@@ -56,24 +56,24 @@ def integrate_twists(durations: Array, twists: Array, sigma: Array) -> Integrate
     """Returns `prod_k exp(dt_k xi_k)` with its first-order covariance and its calibration derivative.
 
     durations (k,) are in s. twists (k, 3) are body twists (vx m/s, vy m/s, wz rad/s), each held over its
-    duration, and sigma (3,) is the standard deviation of each sample. An error e of sample k, in its own
-    frame, reaches the end as `Ad(T_end^-1 T_k) e` with T_k the middle of its step. Samples are independent,
-    so their covariances add. The odometry measures `(1 + scale) v` and `w + bias`, so the calibrated end pose
-    is the end pose minus `calibration_jacobian @ (scale, bias)`. Without samples, or in no time, the result
-    is the identity with zero covariance.
+    duration, and sigma, (3,) or (k, 3), is the standard deviation of each sample. An error e of sample k, in
+    its own frame, reaches the end as `Ad(T_end^-1 T_k) e` with T_k the middle of its step. Samples are
+    independent, so their covariances add. The odometry measures `(1 + scale) v` and `w + bias`, so the
+    calibrated end pose is the end pose minus `calibration_jacobian @ (scale, bias)`. Without samples, or in
+    no time, the result is the identity with zero covariance.
     """
     if len(durations) == 0:
-        return _integrated(np.zeros(3), np.zeros((3, 3)), np.zeros((3, CALIBRATION_SIZE)))
+        return integrated_odometry(np.zeros(3), np.zeros((3, 3)), np.zeros((3, CALIBRATION_SIZE)))
     poses = integrate_poses(durations, twists)
     end = poses[-1]
     adjoints = _adjoints_to_end(_midpoints(poses, durations, twists), end)
     scaled = (adjoints * (durations[:, None] * sigma)[:, None, :]).transpose(1, 0, 2).reshape(3, -1)
     by_speed, by_rate = adjoints[:, :, :2] @ twists[:, :2, None], adjoints[:, :, 2:]
     by_calibration = np.concatenate([by_speed, by_rate], axis=2).transpose(1, 2, 0) @ durations
-    return replace(_integrated(end, scaled @ scaled.T, by_calibration), twist=twists[-1])
+    return replace(integrated_odometry(end, scaled @ scaled.T, by_calibration), twist=twists[-1])
 
 
-def _integrated(delta: Array, covariance: Array, calibration_jacobian: Array) -> IntegratedOdometry:
+def integrated_odometry(delta: Array, covariance: Array, calibration_jacobian: Array) -> IntegratedOdometry:
     """Returns the odometry with its whitener; `MIN_SIGMA` lifts a covariance of zero."""
     floored = covariance + np.eye(3) * MIN_SIGMA**2
     root, _ = lapack.dpotrf(floored, lower=1)

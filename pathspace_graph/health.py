@@ -46,6 +46,8 @@ class Evidence:
     sigma: float = nan
     """This is the standard deviation (m) of the position in its worst direction on a closed map, where it is
     known."""
+    odometry: str = ""
+    """This says what is wrong with the odometry since the cycle before; it is empty where nothing is."""
 
 
 class HealthMonitor:
@@ -100,6 +102,8 @@ class HealthMonitor:
         if share < degraded:
             reason = f"{100 * share:.0f} % of the detections lie on the map"
             return Health(LOST if share < lost else DEGRADED, reason)
+        if newest.odometry:
+            return Health(DEGRADED, newest.odometry)
         if blind > settings.blind:
             return Health(DEGRADED, f"no detection in view of the map for {blind:.1f} s")
         if innovation > settings.innovation:

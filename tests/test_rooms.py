@@ -19,7 +19,7 @@ LEAVES = {"errors", "labels", "progress"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "ckf", "landmark"}
 BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "health", "run"}
-BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping"}
+BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
 BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"sim", "estimators", "diagnosis"}
 
 ARROWS: dict[str, set[str]] = {
@@ -35,6 +35,7 @@ ARROWS: dict[str, set[str]] = {
     "run": {"io", "laps", "health"},
     "diagnosis": {"factors", "io"},
     "mapping": BELOW_MAPPING,
+    "front_end": BELOW_MAPPING | {"mapping"},
     **dict.fromkeys(ESTIMATORS, BELOW_ESTIMATORS),
     "online": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes
     "estimators": BELOW_ESTIMATORS | ESTIMATORS,

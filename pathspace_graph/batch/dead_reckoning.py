@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.front_end.log_odometry import LogOdometry, no_errors
 from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_keys
 from pathspace_graph.graph.rows import Rows
@@ -16,7 +17,6 @@ from pathspace_graph.graph.variables import Variables
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.candidates import SIDES
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.log_odometry import LogOdometry, no_errors
 from pathspace_graph.mapping.path import along_and_across
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.batch import LapCorrespondenceSettings

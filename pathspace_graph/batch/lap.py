@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system, linear_graph
 from pathspace_graph.graph.keys import POSE, are_poses, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.log_odometry import LogOdometry
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.batch import BatchSettings
 from pathspace_graph.settings.mapper import MapperSettings

@@ -14,6 +14,8 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
+from pathspace_graph.front_end.front_end import judge_log
+from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
 from pathspace_graph.graph.keys import are_poses, pose_key
@@ -24,7 +26,6 @@ from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, Vehicle
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.mapping.prediction import doubted, odometry_noise
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import Stopwatch, settings_dict
@@ -135,8 +136,8 @@ class BatchMapper:
 
     def _solve(self, log: Log, start: Start, on_round: Callable[[], None] | None) -> BatchResult:
         settings, batch, watch = own_settings(self.settings), self.settings.batch, Stopwatch()
-        chain = integrate_log(log, self.odometry_sigma, settings.odometry)
-        detections = DetectionTable.of(log.cycles, twists=chain.twists)
+        judged = judge_log(log, self.odometry_sigma, settings)
+        chain, detections = judged.chain, DetectionTable.of(judged.cycles, twists=judged.chain.twists)
         system = BatchSystem(detections, chain, settings, Biweight(batch.loose_gate))
         optimizer = Optimizer(system, batch)
         watch.lap("integrate")

@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.front_end.front_end import FrontEnd
+from pathspace_graph.front_end.motion import Motion
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import integrate_odometry, odometry_noise
+from pathspace_graph.mapping.prediction import odometry_noise
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
@@ -34,6 +36,8 @@ class CkfMapper:
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
         self.odometry_sigma = odometry_noise(odometry_sigma)
+        self.front_end = FrontEnd(self.settings, self.odometry_sigma)
+        """It judges the readings of each cycle."""
         self.state = CurveState(
             Belief.at_start(self.settings.odometry, self.settings.calibration), self.settings
         )
@@ -50,8 +54,9 @@ class CkfMapper:
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """Processes one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
-        self._predict(odometry, detections.t)
-        detections = self.state.belief.corrected(detections)
+        reading = self.front_end.update(odometry, detections)
+        self._predict(reading.motion)
+        detections = self.state.belief.corrected(reading.detections)
         watch.lap("predict")
         found = classify(self.state, detections)
         watch.lap("classify")
@@ -64,12 +69,12 @@ class CkfMapper:
         used = sum(len(on.rows) for on in found.values())
         return self._result(detections.t, used, watch.laps)
 
-    def _predict(self, odometry: Odometry, t: float) -> None:
-        """Predicts the pose by the odometry since the last cycle, and locates it on the curves."""
-        self.state.belief.predict(integrate_odometry(odometry, t, self.odometry_sigma))
+    def _predict(self, motion: Motion) -> None:
+        """Predicts the pose by the motion since the last cycle, and locates it on the curves."""
+        self.state.belief.predict(motion.odometry)
         self.state.locate_vehicle()
         self.path.update(self.state.pose.copy())
-        self.path.steer(odometry.twist)
+        self.path.steer(motion.twists)
 
     def _expand(self, detections: Detections, found: dict[int, OnCurve]) -> dict[int, OnCurve]:
         """Expands the curves; then detections on the new stretch update it with the rest."""

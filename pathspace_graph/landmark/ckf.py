@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.front_end.front_end import FrontEnd
 from pathspace_graph.graph.keys import POINT
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
-from pathspace_graph.mapping.prediction import integrate_odometry, odometry_noise
+from pathspace_graph.mapping.prediction import odometry_noise
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
@@ -48,6 +49,8 @@ class LandmarkCkf:
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
         self.odometry_sigma = odometry_noise(odometry_sigma)
+        self.front_end = FrontEnd(self.settings, self.odometry_sigma)
+        """It judges the readings of each cycle."""
         self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
         """This is the state `x = [pose | calibration | landmarks]`."""
         self.labels: IntArray = np.zeros(0, np.intp)
@@ -58,8 +61,9 @@ class LandmarkCkf:
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """Processes one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
-        self.belief.predict(integrate_odometry(odometry, detections.t, self.odometry_sigma))
-        detections = self.belief.corrected(detections)
+        reading = self.front_end.update(odometry, detections)
+        self.belief.predict(reading.motion.odometry)
+        detections = self.belief.corrected(reading.detections)
         watch.lap("predict")
         found = self._associate(detections)
         watch.lap("associate")

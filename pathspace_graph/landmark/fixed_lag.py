@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.front_end.front_end import FrontEnd
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
@@ -44,6 +45,8 @@ class LandmarkFixedLag:
     def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
         self.settings = settings or MapperSettings()
         self.odometry_sigma = odometry_noise(odometry_sigma)
+        self.front_end = FrontEnd(self.settings, self.odometry_sigma)
+        """It judges the readings of each cycle."""
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), LandmarkMap(self.settings))
         """This holds the variables, the window and its prior."""
         self.smoother.window.exact = True
@@ -63,10 +66,11 @@ class LandmarkFixedLag:
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """Processes one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
-        sigma = self.odometry_sigma
-        integrated = predict(self.smoother, self.path, odometry, detections.t, sigma, self.settings)
+        reading = self.front_end.update(odometry, detections)
+        motion, detections = reading.motion.odometry, reading.detections
+        predict(self.smoother, self.path, motion, reading.motion.twists, detections.t, self.settings)
         watch.lap("predict")
-        new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, integrated.twist)
+        new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, motion.twist)
         associate_newest(self.smoother, new, self._eligible())
         watch.lap("associate")
         created = self._create(new, detections.t)

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.front_end.log_odometry import no_errors
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
-from pathspace_graph.mapping.log_odometry import no_errors
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .state import LandmarkState

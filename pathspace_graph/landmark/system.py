@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.noise import huber_loss
+from pathspace_graph.front_end.front_end import judge_log
+from pathspace_graph.front_end.log_odometry import LogOdometry, sensor_prior, sensor_prior_cost
 from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
 from pathspace_graph.graph.keys import indices, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import RIGHT
-from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log, sensor_prior, sensor_prior_cost
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .landmark_map import landmark_rows
@@ -38,8 +39,9 @@ class LandmarkSystem:
     @classmethod
     def of_log(cls, log: Log, settings: MapperSettings, odometry_sigma: Array) -> LandmarkSystem:
         """Returns the problem of a log without any association; `odometry_sigma` (3,) is that of a twist."""
-        chain = integrate_log(log, odometry_sigma, settings.odometry)
-        return cls(LandmarkDetections.of(log.cycles, twists=chain.twists), chain, settings)
+        judged = judge_log(log, odometry_sigma, settings)
+        twists = judged.chain.twists
+        return cls(LandmarkDetections.of(judged.cycles, twists=twists), judged.chain, settings)
 
     def believing(self, settings: MapperSettings) -> LandmarkSystem:
         """Returns the same problem with the priors of the calibrations that other settings have."""

@@ -31,7 +31,7 @@ def odometry_noise(sigma: Array | None) -> Array:
 def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:
     """Integrates twists, each held until the next and the last one until a stamp (s).
 
-    sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s).
+    sigma, (3,) or (k, 3), is the standard deviation of one measured twist (m/s, m/s, rad/s).
     """
     return integrate_twists(np.diff(np.append(odometry.t, until)), odometry.twist, sigma)
 
@@ -39,20 +39,17 @@ def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> Integr
 def predict(
     smoother: FixedLagSmoother[MapRows],
     path: DrivenPath,
-    odometry: Odometry,
+    odometry: IntegratedOdometry,
+    twists: Array,
     t: float,
-    sigma: Array,
     settings: MapperSettings,
-) -> IntegratedOdometry:
+) -> None:
     """Adds the pose at t (s) by the calibrated odometry since the newest one, and extends the driven path.
 
-    sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s). The integrated odometry is
-    returned.
+    The vehicle moved with twists (k, 3) meanwhile, in m/s, m/s and rad/s.
     """
-    integrated = integrate_odometry(odometry, t, sigma)
-    path.update(smoother.predict(t, integrated, settings.odometry.sigmas_start))
-    path.steer(odometry.twist)
-    return integrated
+    path.update(smoother.predict(t, odometry, settings.odometry.sigmas_start))
+    path.steer(twists)
 
 
 def doubted(mean: Array, variance: Array, settings: MapperSettings) -> MapperSettings:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.lap import ClosedMap
 from pathspace_graph.batch.recurrence import Recurrence
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
@@ -76,6 +77,8 @@ class FixedLagMapper:
     ) -> None:
         self.settings = settings or MapperSettings()
         self.odometry_sigma = odometry_noise(odometry_sigma)
+        self.front_end = FrontEnd(self.settings, self.odometry_sigma)
+        """It judges the readings of each cycle."""
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), CurveMap(self.settings))
         """The smoother holds the variables, the factors of the window, and the prior."""
         self.smoother.window.exact = True
@@ -101,7 +104,6 @@ class FixedLagMapper:
         self._search: Search | None = None
         self._lap_batch: LapBatch | None = None
         self._grown: frozenset[int] = frozenset()
-        self._twist = np.zeros(POSE)
         self._believed = self.settings  # with the priors of the calibrations as they are now
         self._closing_tried = 0.0
         self._loop_tried, self._recognition_tried = 0.0, 0.0
@@ -124,9 +126,9 @@ class FixedLagMapper:
         self.smoother.add_factors(factors)
         if factors:
             self._open_lap.give_up("the batch of the lap does not know the user's factors")
-        self._predict(odometry, detections)
+        reading = self._predict(odometry, detections)
         watch.lap("predict")
-        self._classify(detections)  # detections that no curve explains may expand one
+        self._classify(reading)  # detections that no curve explains may expand one
         watch.lap("classify")
         self._expand()
         if self.solver is None:
@@ -160,19 +162,24 @@ class FixedLagMapper:
 
     # --- the steps of the paper --------------------------------------------------------------------------
 
-    def _predict(self, odometry: Odometry, detections: Detections) -> None:
-        """Adds the pose of the cycle by the calibrated odometry, and extends the driven path."""
-        sigma, t = self.odometry_sigma, detections.t
-        integrated = predict(self.smoother, self.path, odometry, t, sigma, self.settings)
-        self._twist = integrated.twist
+    def _predict(self, odometry: Odometry, detections: Detections) -> Reading:
+        """Adds the pose of the cycle by the calibrated odometry, and extends the driven path.
+
+        Returns the readings as the front end has judged them.
+        """
+        reading = self.front_end.update(odometry, detections)
+        motion, t = reading.motion, detections.t
+        predict(self.smoother, self.path, motion.odometry, motion.twists, t, self.settings)
         if not self.closed:
-            self._open_lap.measured(t, integrated, detections)
+            self._open_lap.measured(t, motion.odometry, reading.detections)
         if self.solver is not None:
             self.smoother.submaps = None  # another solver's loop closure relinearizes no submap
+        return reading
 
-    def _classify(self, detections: Detections) -> None:
+    def _classify(self, reading: Reading) -> None:
         """Associates detections with the curves; those that no curve uses become tentative tracks."""
-        new = self.smoother.map.detections.append(detections, self.smoother.next_cycle - 1, self._twist)
+        detections, motion, cycle = reading.detections, reading.motion, self.smoother.next_cycle - 1
+        new = self.smoother.map.detections.append(detections, cycle, motion.odometry.twist)
         self.smoother.map.correct()
         evidence = Evidence(detections.t)
         if self.boundaries:
@@ -180,7 +187,7 @@ class FixedLagMapper:
             evidence = evidence_of(self.smoother, tested, self._known_loop)
             self.smoother.map.place_detections(new.start)
         if self._search is None:
-            self._health = self._monitor.update(evidence)
+            self._health = self._monitor.update(replace(evidence, odometry=motion.fault))
             self._begin_search()
         else:
             corrected = self.smoother.map.detections.point[new].copy()

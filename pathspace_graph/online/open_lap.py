@@ -19,10 +19,10 @@ from pathspace_graph.batch.start import unwrap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
+from pathspace_graph.front_end.log_odometry import chained
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.log_odometry import chained
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 

@@ -11,6 +11,7 @@ from .calibration import CalibrationSettings
 from .checked import Positive
 from .closing import ClosingSettings
 from .comparison import CkfSettings, LandmarkSettings
+from .front_end import MotionSettings
 from .growth import GrowthSettings, PathSettings, TentativeSettings
 from .health import FindingSettings, HealthSettings
 from .knots import Knots
@@ -251,6 +252,8 @@ class MapperSettings(Positive):
     """These settings describe the inactive part of the map, which is not solved for in every cycle."""
     relinearize: RelinearizeSettings = field(default_factory=RelinearizeSettings)
     """These settings say which factors are linearized anew in a step."""
+    motion: MotionSettings = field(default_factory=MotionSettings)
+    """These settings describe how the odometry is checked against the detections."""
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     """These settings describe the constant errors of the odometry."""
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)

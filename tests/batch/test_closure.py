@@ -20,9 +20,9 @@ from pathspace_graph.batch.mapper import (
 from pathspace_graph.batch.optimizer import Optimizer
 from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
 from pathspace_graph.batch.system import BatchSystem, Biweight
+from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.io.log import Log
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.log_odometry import integrate_log
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.batch import COURSE, course_log
@@ -69,7 +69,7 @@ def test_a_closed_result_needs_evidence_in_every_respect(against: dict[str, floa
 
 def optimizer_of(log: Log) -> Optimizer:
     """Returns the optimizer of a log's batch."""
-    chain = integrate_log(log, log.odometry_sigma, SETTINGS.odometry)
+    chain = judge_log(log, log.odometry_sigma, SETTINGS).chain
     system = BatchSystem(DetectionTable.of(log.cycles), chain, SETTINGS, Biweight(SETTINGS.batch.loose_gate))
     return Optimizer(system, SETTINGS.batch)
 

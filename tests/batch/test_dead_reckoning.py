@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.dead_reckoning import align_laps, lap_correspondences, start_odometry
 from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
+from pathspace_graph.front_end.front_end import judge_log
+from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.batch import course_log
@@ -35,7 +36,7 @@ def drifting() -> tuple[Log, LogOdometry]:
     log = course_log(2.6)
     twists = log.odometry.twist * [1.0 + SCALE, 1.0 + SCALE, 1.0] + [0.0, 0.0, BIAS]
     log = replace(log, odometry=replace(log.odometry, twist=twists))
-    return log, integrate_log(log, log.odometry_sigma, SETTINGS.odometry)
+    return log, judge_log(log, log.odometry_sigma, SETTINGS).chain
 
 
 # --- correspondences -------------------------------------------------------------------------------------
@@ -128,7 +129,7 @@ def test_the_curves_of_a_closed_course_stand_beside_its_path() -> None:
 def test_a_path_that_does_not_recur_is_dead_reckoned() -> None:
     cones, labels = corridor(60.0)
     log = exact_log(ahead(6.0, 5.0), cones, labels)
-    chain = integrate_log(log, log.odometry_sigma, SETTINGS.odometry)
+    chain = judge_log(log, log.odometry_sigma, SETTINGS).chain
     state = start_odometry(chain, DetectionTable.of(log.cycles), SETTINGS)
     np.testing.assert_array_equal(state.poses, chain.dead_reckoned(np.zeros(2)))
     np.testing.assert_array_equal(state.calibration, 0.0)
@@ -139,7 +140,7 @@ def test_a_path_that_does_not_recur_is_dead_reckoned() -> None:
 
 def test_a_circuit_of_21_metres_has_both_boundaries() -> None:
     log = exact_log(ahead(6.0, 5.0), *corridor(60.0, half_width=10.5))
-    chain = integrate_log(log, log.odometry_sigma, SETTINGS.odometry)
+    chain = judge_log(log, log.odometry_sigma, SETTINGS).chain
     state = start_odometry(chain, DetectionTable.of(log.cycles), SETTINGS)
     for label, y in ((LEFT, 10.5), (RIGHT, -10.5)):
         np.testing.assert_allclose(state.control_points(label)[:, 1], y, atol=1e-6)

@@ -24,6 +24,7 @@ from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
 from pathspace_graph.batch.system import BatchSystem, Evaluation
 from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.graph.elimination import eliminated_system, linear_graph
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor
 from pathspace_graph.graph.keys import CALIBRATION_KEY, are_poses, indices, pose_keys
@@ -33,7 +34,6 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.log_odometry import integrate_log
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings, PlaceSettings
 from pathspace_graph.spline.knots import fit_spline
@@ -61,7 +61,7 @@ def open_lap(settings: MapperSettings | None = None) -> OpenLap:
         splines[label] = fit_spline(cones, len(cones) // 2, periodic=True)
     return OpenLap(
         settings=settings,
-        chain=integrate_log(drive, drive.odometry_sigma, settings.odometry),
+        chain=judge_log(drive, drive.odometry_sigma, settings).chain,
         detections=DetectionTable.of(drive.cycles),
         first_kept=len(drive.cycles) - WINDOW,
         start=ClosedMap(splines, true_poses(drive), np.zeros(2)),
@@ -178,7 +178,7 @@ def test_a_search_from_odometry_has_a_result_where_the_loop_is_driven_again(
 ) -> None:
     """The path is said to recur after a lap, or too early."""
     drive, settings = noisy(course_log(laps), seed=3), MapperSettings()
-    chain = integrate_log(drive, drive.odometry_sigma, settings.odometry)
+    chain = judge_log(drive, drive.odometry_sigma, settings).chain
     driven = find_recurrence(chain.dead_reckoned(np.zeros(2)), settings).driven
     recurrence = Recurrence(driven, lap * COURSE, 2.0 * np.pi, 1.0)
     detections, first_kept = DetectionTable.of(drive.cycles), len(drive.cycles) - WINDOW

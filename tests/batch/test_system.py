@@ -13,9 +13,10 @@ from pathspace_graph.batch.dead_reckoning import start_odometry
 from pathspace_graph.batch.mapper import own_settings
 from pathspace_graph.batch.optimizer import gradient
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved
+from pathspace_graph.front_end.front_end import judge_log
+from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.keys import pose_key
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -31,7 +32,7 @@ def small_system() -> tuple[BatchSystem, State]:
     """Returns an exact lap with some noise on its detections, linearized beside the optimum."""
     log = lap_log(bean_track())
     settings = own_settings(MapperSettings())
-    chain = integrate_log(log, log.odometry_sigma, settings.odometry)
+    chain = judge_log(log, log.odometry_sigma, settings).chain
     detections = DetectionTable.of(log.cycles)
     noise = np.random.default_rng(1).normal(0.0, 0.1, detections.measured.shape)
     detections.measured = detections.point = detections.measured + noise
@@ -47,7 +48,7 @@ def small_system() -> tuple[BatchSystem, State]:
 
 def test_dead_reckoning_of_an_exact_log_is_the_truth() -> None:
     log = lap_log(bean_track())
-    chain: LogOdometry = integrate_log(log, log.odometry_sigma, MapperSettings().odometry)
+    chain: LogOdometry = judge_log(log, log.odometry_sigma, MapperSettings()).chain
     np.testing.assert_allclose(chain.dead_reckoned(np.zeros(2))[:, :2], true_poses(log)[:, :2], atol=1e-6)
 
 

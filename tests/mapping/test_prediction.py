@@ -7,14 +7,14 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.log_odometry import integrate_log
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import doubted, integrate_odometry, predict, smoother_settings
 from pathspace_graph.run import split_odometry
-from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import DT, ODOMETRY_SIGMA, ahead, exact_log, true_poses
 
@@ -40,7 +40,8 @@ def test_every_cycle_adds_its_pose_and_extends_the_path(log: Log) -> None:
     settings = MapperSettings()
     smoother, path = FixedLagSmoother(smoother_settings(settings), CurveMap(settings)), DrivenPath()
     for odometry, cycle in split_odometry(log):
-        predict(smoother, path, odometry, cycle.t, ODOMETRY_SIGMA, settings)
+        integrated = integrate_odometry(odometry, cycle.t, ODOMETRY_SIGMA)
+        predict(smoother, path, integrated, odometry.twist, cycle.t, settings)
     np.testing.assert_allclose(smoother.variables.poses, true_poses(log), atol=1e-9)
     assert smoother.times == [cycle.t for cycle in log.cycles]
     driven = np.hypot(*np.diff(true_poses(log)[:, :2], axis=0).T).sum()
@@ -49,7 +50,7 @@ def test_every_cycle_adds_its_pose_and_extends_the_path(log: Log) -> None:
 
 
 def test_a_log_is_dead_reckoned_along_its_true_poses(log: Log) -> None:
-    odometry = integrate_log(log, ODOMETRY_SIGMA, OdometrySettings())
+    odometry = judge_log(log, ODOMETRY_SIGMA, MapperSettings()).chain
     np.testing.assert_allclose(odometry.dead_reckoned(np.zeros(2)), true_poses(log), atol=1e-9)
     assert len(odometry) == len(log.cycles) == len(odometry.stamps)
     residual, _ = odometry.terms(true_poses(log), np.zeros(2))
@@ -61,14 +62,14 @@ def test_a_calibration_frees_the_odometry_of_a_bias(log: Log) -> None:
     biased = exact_log(
         log.odometry.twist + np.array([0.0, 0.0, 0.02]), np.zeros((0, 2)), np.zeros(0, np.intp)
     )
-    odometry = integrate_log(biased, ODOMETRY_SIGMA, OdometrySettings())
+    odometry = judge_log(biased, ODOMETRY_SIGMA, MapperSettings()).chain
     poses = odometry.dead_reckoned(np.array([0.0, 0.02]))
     np.testing.assert_allclose(poses[:, 2], true_poses(log)[:, 2], atol=1e-9)
     np.testing.assert_allclose(poses, true_poses(log), atol=2 * DT**2)
 
 
 def test_the_rows_of_the_priors_have_their_cost(log: Log) -> None:
-    odometry = integrate_log(log, ODOMETRY_SIGMA, OdometrySettings())
+    odometry = judge_log(log, ODOMETRY_SIGMA, MapperSettings()).chain
     rng = np.random.default_rng(0)
     first = odometry.first + np.array([1e-4, -2e-4, 1e-5])
     calibration = odometry.calibration_sigma * rng.normal(size=2)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.mapping.prediction import predict
+from pathspace_graph.mapping.prediction import integrate_odometry, predict
 from pathspace_graph.online.association import associate
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 
@@ -87,7 +87,7 @@ def variance_of_residual(mapper: FixedLagMapper) -> float:
 def test_the_gate_is_three_sigmas_of_detection_pose_and_curve_together() -> None:
     """The odometry of the cycle is so poor that the detection's own uncertainty is half of the variance."""
     mapper = driven()
-    mapper.odometry_sigma = np.array([0.25, 6.0, 0.035])
+    mapper.odometry_sigma[:] = [0.25, 6.0, 0.035]
     variance = variance_of_residual(mapper)
     assert variance > 1.8 * OWN_VARIANCE
     shares = [-1.5, -1.03, -0.97, -0.3, 0.0, 0.5, 0.97, 1.03, 1.5]
@@ -142,7 +142,8 @@ def test_older_detections_are_tested_again_only_where_a_curve_has_grown() -> Non
     labels = table.boundary[released].copy()
     table.release(released)
     odometry, cycle = next_cycle(mapper, at([]), [])
-    predict(smoother, mapper.path, odometry, cycle.t, ODOMETRY_SIGMA, mapper.settings)
+    step = integrate_odometry(odometry, cycle.t, ODOMETRY_SIGMA)
+    predict(smoother, mapper.path, step, odometry.twist, cycle.t, mapper.settings)
     associate(smoother, frozenset())
     assert not table.used[released].any()
     for label in (LEFT, RIGHT):  # the newest pose's parameter was appended; it is found anew

@@ -15,10 +15,11 @@ from pathspace_graph.batch.mapper import own_settings
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import by_sensor
+from pathspace_graph.front_end.front_end import judge_log
+from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.log_odometry import LogOdometry, integrate_log
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import MapperSettings
@@ -51,7 +52,7 @@ def straight(
     log = exact_log(ahead(6.0, seconds), cones, labels)
     settings = own_settings(whole)
     chain, detections = (
-        integrate_log(log, log.odometry_sigma, settings.odometry),
+        judge_log(log, log.odometry_sigma, settings).chain,
         DetectionTable.of(log.cycles),
     )
     detections.twist[:] = ahead(6.0, 1.0)[0]

@@ -19,6 +19,8 @@ UNLIMITED = {
     "open_lap.max_cycles",
     "open_lap.max_cones",
     "odometry.doubt",
+    "motion.doubt",
+    "motion.huber",
     "calibration.doubt",
 }
 

@@ -15,12 +15,8 @@ from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, pose_key
 from pathspace_graph.graph.odometry import OdometryChain, calibrated_delta, odometry_rows
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Variables
-from pathspace_graph.io.log import Log
-from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import OdometrySettings
-
-from .prediction import integrate_odometry
 
 Array = NDArray[np.float64]
 
@@ -78,15 +74,6 @@ class LogOdometry:
 def _prior(key: int, root: Array, off: Array) -> Rows:
     """Returns the rows `root off` on one variable; they belong to the first factor."""
     return Rows(np.full((len(off), 1), key), root, root @ off, np.zeros(len(off), np.intp))
-
-
-def integrate_log(log: Log, sigma: Array, settings: OdometrySettings) -> LogOdometry:
-    """Integrates the odometry between the cycles of a log.
-
-    sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s).
-    """
-    steps = [integrate_odometry(odometry, cycle.t, sigma) for odometry, cycle in split_odometry(log)]
-    return chained([cycle.t for cycle in log.cycles], steps, settings)
 
 
 def chained(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from pathspace_graph.front_end.log_odometry import no_errors, sensor_prior, sensor_prior_cost
 from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, control_keys, pose_keys
 from pathspace_graph.graph.variables import Variables
-from pathspace_graph.mapping.log_odometry import no_errors, sensor_prior, sensor_prior_cost
 from pathspace_graph.settings.calibration import CalibrationSettings
 
 KNOWN, ESTIMATED = CalibrationSettings(sensor=False), CalibrationSettings()

@@ -1,0 +1,62 @@
+"""The front end of all estimators: what they are given of each cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.run import split_odometry
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .log_odometry import LogOdometry, chained
+from .motion import Motion, MotionCheck
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """Holds the readings of a cycle after they were judged."""
+
+    motion: Motion
+    """This motion leads to the cycle."""
+    detections: Detections
+    """These are the detections of the cycle."""
+
+
+class FrontEnd:
+    """Judges the readings of each cycle by those of the cycles before, without any map."""
+
+    def __init__(self, settings: MapperSettings, odometry_sigma: Array) -> None:
+        """Keeps the settings, and the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
+        self._motion = MotionCheck(odometry_sigma, settings.motion)
+
+    def update(self, odometry: Odometry, detections: Detections) -> Reading:
+        """Returns the judged readings of a cycle: the twists since the last one, and its detections."""
+        return Reading(self._motion.update(odometry, detections), detections)
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedLog:
+    """Holds the readings of a whole log after they were judged cycle by cycle."""
+
+    chain: LogOdometry
+    """This is the motion from each cycle to the next."""
+    cycles: Sequence[Detections]
+    """These are the detections of each cycle."""
+
+
+def judge_log(log: Log, odometry_sigma: Array, settings: MapperSettings) -> JudgedLog:
+    """Returns a log as the front end gives it to an estimator of whole logs.
+
+    odometry_sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s).
+    """
+    front_end = FrontEnd(settings, odometry_sigma)
+    readings = [front_end.update(odometry, cycle) for odometry, cycle in split_odometry(log)]
+    steps = [reading.motion.odometry for reading in readings]
+    chain = chained([cycle.t for cycle in log.cycles], steps, settings.odometry)
+    return JudgedLog(chain, [reading.detections for reading in readings])

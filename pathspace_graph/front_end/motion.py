@@ -1,0 +1,215 @@
+"""The motion between two cycles: odometry, checked against what the detections say of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.odometry import (
+    CALIBRATION_SIZE,
+    IntegratedOdometry,
+    integrated_odometry,
+)
+from pathspace_graph.factors.se2 import compose, relative, rotation, to_map
+from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.mapping.prediction import integrate_odometry
+from pathspace_graph.settings.front_end import MotionSettings
+
+from .scan_matching import Match, RecentDetections, match
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Holds the motion that leads to a cycle, and what was found out about the odometry."""
+
+    odometry: IntegratedOdometry
+    """This is the relative pose, with its covariance."""
+    twists: Array
+    """(k, 3) The vehicle moved with these twists since the last cycle, in m/s, m/s and rad/s."""
+    doubted: bool = False
+    """The flag is set where the detections contradict the odometry, and their own motion replaces it."""
+    missing: bool = False
+    """The flag is set where no twist was measured for long."""
+    stuck: bool = False
+    """The flag is set where the twist stays the same to the last digit."""
+
+    @property
+    def fault(self) -> str:
+        """Returns what is wrong with the odometry in plain words; it is empty where nothing is."""
+        if self.missing:
+            return "there is no odometry"
+        return "the detections contradict the odometry" if self.doubted else ""
+
+
+class MotionCheck:
+    """Integrates the odometry of each cycle, and checks it against the detections of the newest cycles.
+
+    The frame of this check is that of the motion so far. It drifts, and only its newest part is used.
+    """
+
+    def __init__(self, sigma: Array, settings: MotionSettings) -> None:
+        """Keeps the settings, and the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
+        self.settings = settings
+        self.sigma = sigma
+        self._recent = RecentDetections(settings)
+        self._pose: Array = np.zeros(3)
+        self._velocity: Array | None = None
+        self._rate = 0.0
+        self._t: float | None = None
+        self._reading: tuple[float, Array] = (-np.inf, np.full(3, np.nan))
+        self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
+
+    def update(self, odometry: Odometry, detections: Detections) -> Motion:
+        """Returns the motion since the last cycle."""
+        t = detections.t
+        motion = self._integrate(odometry, t)
+        variances = 0.5 * np.trace(detections.covariances, axis1=1, axis2=2)
+        self._recent.forget(t)
+        motion = self._checked(motion, detections, variances)
+        self._pose = compose(self._pose, motion.odometry.delta)
+        poses = np.broadcast_to(self._pose, (len(variances), 3))
+        self._recent.add(t, to_map(detections.points_vehicle, poses))
+        if self._t is not None and t > self._t:
+            self._velocity = motion.odometry.delta / (t - self._t)
+            share = min((t - self._t) / (0.5 * self.settings.memory), 1.0)
+            self._rate += share * (float(self._velocity[2]) - self._rate)
+        self._t = t
+        return motion
+
+    # --- the odometry ------------------------------------------------------------------------------------
+
+    def _integrate(self, odometry: Odometry, t: float) -> Motion:
+        """Returns the motion by odometry, whose noise grows where a twist is held for long."""
+        if len(odometry.t) == 0:
+            return Motion(integrate_odometry(odometry, t, self.sigma), odometry.twist)
+        settings, (before, twist) = self.settings, self._reading
+        same = (odometry.twist == np.concatenate([twist[None], odometry.twist[:-1]])).all(axis=1)
+        measured = odometry.t.copy()
+        if self._t is not None and odometry.t[0] <= self._t and same[0]:
+            measured[0] = before  # the row only goes on with the last twist
+        self._reading = float(measured[-1]), odometry.twist[-1]
+        held = np.maximum(np.append(odometry.t[1:], t) - measured - self._hold(measured), 0.0)
+        growth = settings.acceleration, settings.acceleration, settings.angular_acceleration
+        sigma = np.hypot(self.sigma, held[:, None] * np.array(growth)) if held.any() else self.sigma
+        integrated, stuck = integrate_odometry(odometry, t, sigma), same[1:].sum() >= settings.stuck
+        return Motion(integrated, odometry.twist, missing=bool(held[-1] > 0.0), stuck=bool(stuck))
+
+    def _hold(self, measured: Array) -> float:
+        """Returns how long a twist may be held, from the stamps of newly measured ones (k,)."""
+        intervals = np.diff(measured)
+        if len(intervals):
+            shortest = float(intervals.min())
+            self._interval = min(self._interval, shortest)
+        return max(self.settings.hold, self.settings.hold_intervals * self._interval)
+
+    # --- the check ---------------------------------------------------------------------------------------
+
+    def _checked(self, motion: Motion, detections: Detections, variances: Array) -> Motion:
+        """Returns the motion, or that of the detections where they contradict it, or where it is missing."""
+        settings = self.settings
+        if self._t is None or detections.t <= self._t:
+            return motion
+        dt = detections.t - self._t
+        going_on = dt * (motion.odometry.twist if self._velocity is None else self._velocity)
+        predicted = compose(self._pose, motion.odometry.delta)
+        found = self._match(detections, variances, predicted, settings.iterations_first)
+        if found is not None and found.misfit > settings.max_misfit:
+            found = None
+        told = found is not None and found.matched >= settings.min_doubting
+        stuck = motion.stuck and not told and self._has_jumped(motion.odometry, going_on, dt)
+        failed = motion.missing or (stuck and settings.doubt < np.inf)
+        if found is not None and not failed and not self._is_contradicted(motion, predicted, found):
+            return motion
+        best = self._best(detections, variances, (compose(self._pose, going_on), predicted), dt)
+        if failed or (best is not None and self._is_contradicted(motion, predicted, best)):
+            return self._replaced(motion, best, going_on, dt)
+        return motion
+
+    def _best(
+        self, detections: Detections, variances: Array, starts: tuple[Array, Array], dt: float
+    ) -> Match | None:
+        """Returns the better match of those that begin at two poses (3,), the first going on as before.
+
+        A vehicle that was put down elsewhere sees other cones, which agree with no motion, or with one that
+        no vehicle can make. Nothing is told from them.
+        """
+        settings = self.settings
+        found = [self._match(detections, variances, start, settings.iterations) for start in starts]
+        possible = [one for one in found if one is not None and self._is_possible(one, starts[0], dt)]
+        return max(possible, key=lambda one: one.matched - one.misfit, default=None)
+
+    def _is_possible(self, found: Match, going_on: Array, dt: float) -> bool:
+        """Returns whether a match is that of a vehicle which went on from pose to pose (3,)."""
+        sigmas = self._sigmas_going_on(dt) + np.sqrt(np.diag(np.linalg.inv(found.information)))
+        change = np.abs(relative(going_on, found.pose))
+        fits = found.misfit < self.settings.max_misfit
+        return fits and bool((change < self.settings.max_change * sigmas).all())
+
+    def _is_contradicted(self, motion: Motion, predicted: Array, found: Match) -> bool:
+        """Returns whether a match of detections, which begins at the predicted pose (3,), denies a motion."""
+        off, covariance = self._contradiction(motion.odometry, predicted, found)
+        enough = found.matched >= self.settings.min_doubting
+        return enough and bool(off @ np.linalg.solve(covariance, off) > self.settings.doubt**2)
+
+    def _has_jumped(self, odometry: IntegratedOdometry, going_on: Array, dt: float) -> bool:
+        """Returns whether a motion differs from going on (3,) as before by more than a vehicle can do."""
+        return bool((np.abs(odometry.delta - going_on) > self._sigmas_going_on(dt)).any())
+
+    def _sigmas_going_on(self, dt: float) -> Array:
+        """Returns the standard deviations (3,) of going on as before for a time (s), in m, m and rad."""
+        settings = self.settings
+        return np.array([settings.sigma_speed, settings.sigma_lateral, settings.sigma_rate]) * dt
+
+    def _match(self, detections: Detections, variances: Array, start: Array, iterations: int) -> Match | None:
+        """Returns the match of a cycle's detections that begins at a pose (3,), if it holds the pose."""
+        points = detections.points_vehicle
+        found = match(self._recent, points, variances, start, self.settings, iterations)
+        return found if found.matched >= self.settings.min_matched and found.is_certain else None
+
+    def _contradiction(
+        self, odometry: IntegratedOdometry, predicted: Array, found: Match
+    ) -> tuple[Array, Array]:
+        """Returns how far (3,) the detections are from the predicted pose, and its covariance (3, 3).
+
+        It is in the vehicle's frame. Detections may be late, which looks like another turn where the yaw rate
+        changes.
+        """
+        turn = _to_vehicle(predicted[2])
+        covariance = turn @ np.linalg.inv(found.information) @ turn.T + odometry.covariance
+        covariance[2, 2] += (self.settings.sigma_latency * (odometry.twist[2] - self._rate)) ** 2
+        return turn @ (found.pose - predicted), covariance
+
+    def _replaced(self, motion: Motion, best: Match | None, going_on: Array, dt: float) -> Motion:
+        """Returns the motion by the detections together with going on (3,) as before."""
+        settings, odometry = self.settings, motion.odometry
+        mean, covariance = going_on.copy(), np.diag(self._sigmas_going_on(dt) ** 2)
+        if best is not None:
+            predicted = compose(self._pose, odometry.delta)
+            off, spread = self._contradiction(odometry, predicted, best)
+            near = settings.doubt_rate * np.sqrt(spread[2, 2])
+            if not motion.missing and not motion.stuck and abs(off[2]) <= near:  # the gyro is right
+                mean[2], covariance[2, 2] = odometry.delta[2], odometry.covariance[2, 2]
+            own = relative(self._pose, best.pose)
+            turn = _to_vehicle(best.pose[2])
+            information = turn @ best.information @ turn.T / settings.widening**2
+            prior = np.linalg.inv(covariance)
+            covariance = np.linalg.inv(information + prior)
+            delta = covariance @ (information @ own + prior @ mean)
+            if not motion.missing:
+                off = delta - odometry.delta
+                covariance += np.outer(off, off) * settings.before**2
+            mean = delta
+        nothing = np.zeros((3, CALIBRATION_SIZE))
+        replaced = replace(integrated_odometry(mean, covariance, nothing), twist=mean / dt)
+        return Motion(replaced, replaced.twist[None], not motion.missing, motion.missing, motion.stuck)
+
+
+def _to_vehicle(theta: float) -> Array:
+    """Returns the matrix (3, 3) that turns a small motion from the frame of the check to the vehicle's."""
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(theta).T
+    return turn

@@ -1,0 +1,114 @@
+"""Scan matching: the detections of a cycle are laid on those of the cycles just before.
+
+Cones stand still, so that the detections tell how the vehicle has moved, in every direction. No cone needs an
+identity: each detection is drawn to the weighted mean of the earlier ones beside it, and the weights sharpen
+from iteration to iteration (EM-ICP; Granger and Pennec 2002).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.noise import huber_weights
+from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.settings.front_end import MotionSettings
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_REACHES = 3.0
+"""Remembered detections farther than this many reaches have no weight."""
+
+
+class RecentDetections:
+    """Holds the detections of the newest cycles in one frame."""
+
+    def __init__(self, settings: MotionSettings) -> None:
+        self.settings = settings
+        self.points: Array = np.zeros((0, 2))
+        """(n, 2) Each detection is at this point in m."""
+        self._stamps: Array = np.zeros(0)
+
+    def add(self, t: float, points: Array) -> None:
+        """Adds the detections at points (m, 2) of a cycle at t (s), and drops those that are too old."""
+        kept = self._stamps > t - self.settings.memory
+        self.points = np.concatenate([self.points[kept], points])
+        self._stamps = np.append(self._stamps[kept], np.full(len(points), t))
+
+    def forget(self, t: float) -> None:
+        """Drops the detections that are too old at t (s)."""
+        self.add(t, np.zeros((0, 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """Holds the pose that lays detections on earlier ones."""
+
+    pose: Array
+    """(3,) This is the pose in the frame of the earlier detections, in m, m and rad."""
+    information: Array
+    """(3, 3) This is the information about the pose, in the same frame, from the matched detections."""
+    matched: int
+    """This number of detections lies on earlier ones."""
+    misfit: float
+    """This is the mean square of the matched detections' whitened distances."""
+
+    @property
+    def is_certain(self) -> bool:
+        """Returns whether the detections hold the pose in every direction."""
+        return bool(np.linalg.matrix_rank(self.information) == len(self.information))
+
+
+def match(
+    recent: RecentDetections,
+    points_vehicle: Array,
+    variances: Array,
+    start: Array,
+    settings: MotionSettings,
+    iterations: int,
+) -> Match:
+    """Lays detections (m, 2), vehicle frame, on the recent ones by Gauss-Newton steps from a pose (3,).
+
+    Each step minimizes `sum_i |R z_i + t - m_i|^2 / sigma_i^2` with m_i the weighted mean of the recent
+    detections beside the point, and `sigma_i^2 = variance_i (1 + 1/n_i) + sigma_cone^2` with n_i the sum of
+    the weights. The variances (m,) are those of one coordinate (m^2).
+    """
+    pose, reaches = start.copy(), np.geomspace(settings.reach, settings.reach_last, max(iterations, 1))
+    for reach in reaches:
+        points = to_map(points_vehicle, np.broadcast_to(pose, (len(points_vehicle), 3)))
+        means, weights = _means(points, recent.points, float(reach))
+        matched = weights > settings.min_weight
+        off, arm = (points - means)[matched], (points - pose[:2])[matched]
+        precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + settings.sigma_cone**2)
+        precision *= huber_weights(np.hypot(*off.T) * np.sqrt(precision), settings.huber)
+        information, gradient = _normal_equations(off, arm, precision)
+        if matched.sum() < settings.min_matched:
+            break
+        pose = pose - np.linalg.solve(information + np.eye(3) * np.finfo(float).eps, gradient)
+    count = int(matched.sum())
+    misfit = float((off**2).sum(axis=1) @ precision) / max(count, 1)
+    return Match(pose, information, count, misfit)
+
+
+def _means(points: Array, recent: Array, reach: float) -> tuple[Array, Array]:
+    """Returns the weighted means (m, 2) of recent points (n, 2) beside points (m, 2), and sums of weights."""
+    dx = points[:, 0, None] - recent[:, 0]
+    dy = points[:, 1, None] - recent[:, 1]
+    square = (dx * dx + dy * dy) / reach**2
+    weights = np.where(square < _REACHES**2, np.exp(-0.5 * square), 0.0)
+    total = weights.sum(axis=1)
+    return (weights @ recent) / np.maximum(total, np.finfo(float).tiny)[:, None], total
+
+
+def _normal_equations(off: Array, arm: Array, precision: Array) -> tuple[Array, Array]:
+    """Returns the information (3, 3) and the gradient (3,) of offsets (m, 2) by (x, y, theta)."""
+    ax, ay = arm.T
+    ex, ey = off.T
+    w, wx, wy = precision.sum(), -(precision @ ay), precision @ ax
+    turning = precision @ (ax * ax + ay * ay)
+    information = np.array([[w, 0.0, wx], [0.0, w, wy], [wx, wy, turning]])
+    gradient = np.array([precision @ ex, precision @ ey, precision @ (ax * ey - ay * ex)])
+    return information, gradient

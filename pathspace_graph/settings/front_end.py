@@ -1,0 +1,80 @@
+"""Settings of the front end, which judges the readings before an estimator takes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .checked import Positive
+
+
+@dataclass(frozen=True)
+class MotionSettings(Positive):
+    """Describes how the motion from one perception cycle to the next is told from the detections.
+
+    The detections of a cycle are laid on those of the cycles just before. Where that contradicts the
+    odometry, the wheels slip or the readings fail, and the motion of the detections takes their place.
+    """
+
+    UNLIMITED = ("doubt", "huber")
+
+    doubt: float = 5.0
+    """The detections contradict the odometry by this number of standard deviations. It is infinite where the
+    odometry is always believed."""
+    doubt_rate: float = 2.0
+    """The yaw rate of an odometry that is contradicted is still believed if the detections agree with it
+    within this number of standard deviations."""
+    memory: float = 0.65
+    """Detections are remembered for this time (s)."""
+    reach: float = 1.0
+    """A remembered detection at distance d counts as the same cone with the weight `exp(-d^2 / 2 reach^2)`
+    (m), in the first iteration."""
+    reach_last: float = 0.4
+    """This is the reach in the last iteration (m)."""
+    iterations: int = 6
+    """The detections are laid on the earlier ones in this number of iterations."""
+    iterations_first: int = 2
+    """The check of the odometry takes this number of iterations, since it begins near the solution."""
+    min_weight: float = 0.7
+    """A detection is matched if the weights of the remembered detections add up to this at least."""
+    min_matched: int = 3
+    """No motion is told from fewer matched detections than this."""
+    min_doubting: int = 4
+    """A contradiction of the odometry rests on this number of matched detections at least."""
+    huber: float = 2.5
+    """Beyond this whitened distance, the Huber loss reduces the weight of a matched detection."""
+    max_misfit: float = 3.0
+    """No motion is told where the mean square of the whitened distances is larger than this. It is about 1
+    where the vehicle has moved, and 4 and more where it was put down elsewhere."""
+    max_change: float = 3.5
+    """No motion is told that differs from the one before by more than this number of standard deviations of
+    `sigma_speed`, `sigma_lateral` and `sigma_rate`."""
+    sigma_cone: float = 0.05
+    """This standard deviation (m) is added to that of a detection, since one side of a cone is seen."""
+    sigma_latency: float = 0.05
+    """Detections are older than their stamps by this (s, one sigma), as far as the check is concerned."""
+    before: float = 0.5
+    """A contradiction may have begun a few cycles before it was noticed. So its size, times this, is added to
+    the standard deviation of the motion."""
+    widening: float = 1.5
+    """The standard deviations of a motion told from detections are multiplied by this, since the estimator
+    uses the detections again."""
+    sigma_speed: float = 3.0
+    """Where the odometry is not believed, the speed ahead differs from that a cycle before by this standard
+    deviation (m/s)."""
+    sigma_lateral: float = 1.0
+    """Where the odometry is not believed, the speed to the left differs from that a cycle before by this
+    standard deviation (m/s)."""
+    sigma_rate: float = 0.5
+    """Where the odometry is not believed, the yaw rate differs from that a cycle before by this standard
+    deviation (rad/s)."""
+    hold: float = 0.15
+    """A twist is held for this time (s) without a loss of certainty."""
+    stuck: int = 3
+    """Readings have stuck where this number of twists in one cycle is equal to the one before, to the last
+    digit, and where the vehicle could not change its velocity so."""
+    hold_intervals: float = 3.0
+    """It may also be held for this number of the shortest interval between two twists."""
+    acceleration: float = 5.0
+    """The speeds of a twist that is held longer are uncertain by this for each second more (m/s^2)."""
+    angular_acceleration: float = 1.5
+    """The yaw rate of a twist that is held longer is uncertain by this for each second more (rad/s^2)."""

@@ -1,0 +1,153 @@
+"""The check of the odometry: slip, zeros and gaps are told from the detections, and nothing else is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.se2 import relative
+from pathspace_graph.front_end.motion import Motion, MotionCheck
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.run import split_odometry
+from pathspace_graph.settings.front_end import MotionSettings
+from pathspace_graph.sim.sensor import OdometryNoise
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.vehicle import VehicleSettings
+
+from ..scenes.drives import bean_track
+
+Array = NDArray[np.float64]
+WINDOW = 5.0, 6.0
+"""The fault lasts from and to these stamps (s)."""
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    """A drive of one noisy lap, with the simulator's noise."""
+    odometry = OdometryNoise(scale=0.0, gyro_bias=0.0)
+    settings = SimulationSettings(laps=1, vehicle=VehicleSettings(speed_start=8.0), odometry=odometry)
+    return simulate(bean_track(), settings, seed=3)
+
+
+def checked(log: Log, settings: MotionSettings | None = None) -> list[Motion]:
+    check = MotionCheck(log.odometry_sigma, settings or MotionSettings())
+    return [check.update(odometry, cycle) for odometry, cycle in split_odometry(log)]
+
+
+def errors(log: Log, motions: list[Motion]) -> Array:
+    """The errors (k, 3) of the motions from cycle to cycle, in the frame of the earlier pose."""
+    truth = log.truth
+    assert truth is not None
+    at = np.searchsorted(truth.pose_t, [cycle.t for cycle in log.cycles])
+    steps = [relative(truth.poses[a], truth.poses[b]) for a, b in pairwise(at)]
+    off = np.array([m.odometry.delta for m in motions[1:]]) - np.array(steps)
+    off[:, 2] = np.arctan2(np.sin(off[:, 2]), np.cos(off[:, 2]))
+    return off
+
+
+def faulty(log: Log, change: Callable[[Array], Array]) -> Log:
+    twist, (begin, end) = log.odometry.twist.copy(), WINDOW
+    inside = (log.odometry.t >= begin) & (log.odometry.t < end)
+    twist[inside] = change(twist[inside])
+    return replace(log, odometry=Odometry(log.odometry.t, twist))
+
+
+def without_readings(log: Log) -> Log:
+    begin, end = WINDOW
+    kept = (log.odometry.t < begin) | (log.odometry.t >= end)
+    return replace(log, odometry=Odometry(log.odometry.t[kept], log.odometry.twist[kept]))
+
+
+def told(log: Log, motions: list[Motion]) -> Array:
+    """The stamps of the cycles where something is wrong with the odometry."""
+    return np.array([cycle.t for cycle, m in zip(log.cycles, motions, strict=True) if m.fault])
+
+
+def test_a_right_odometry_is_left_as_it_is(log: Log) -> None:
+    motions, unchecked = checked(log), checked(log, MotionSettings(doubt=np.inf))
+    assert not any(motion.fault for motion in motions)
+    for motion, own in zip(motions, unchecked, strict=True):
+        np.testing.assert_array_equal(motion.odometry.delta, own.odometry.delta)
+        np.testing.assert_array_equal(motion.odometry.covariance, own.odometry.covariance)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda twist: 0.0 * twist, lambda twist: twist * [1.5, 1.5, 1.0], lambda twist: twist * [0.3, 0.3, 1.0]],
+    ids=["zero", "slip", "locked"],
+)
+def test_a_second_of_wrong_readings_is_told_and_replaced(log: Log, change: Callable[[Array], Array]) -> None:
+    wrong = faulty(log, change)
+    motions, unchecked = checked(wrong), checked(wrong, MotionSettings(doubt=np.inf))
+    at = told(wrong, motions)
+    assert len(at) >= 6
+    assert at.min() >= WINDOW[0]
+    assert at.max() <= WINDOW[1] + 0.6  # what was not noticed at once is made good afterwards
+    lost, kept = (np.abs(errors(log, m).cumsum(axis=0)).max(axis=0)[:2].max() for m in (unchecked, motions))
+    assert kept < 0.7
+    assert lost > 3.0 * kept
+
+
+def test_the_scale_of_the_speeds_is_not_learned_from_a_slip(log: Log) -> None:
+    motions = checked(faulty(log, lambda twist: twist * [1.5, 1.5, 1.0]))
+    for motion in motions:
+        if motion.doubted:
+            np.testing.assert_array_equal(motion.odometry.calibration_jacobian, 0.0)
+            assert motion.odometry.covariance[0, 0] > 0.03**2
+
+
+def test_a_gap_is_filled_by_the_detections(log: Log) -> None:
+    motions = checked(without_readings(log))
+    at = told(log, motions)
+    assert len(at) >= 7
+    assert at.min() > WINDOW[0]
+    assert at.max() <= WINDOW[1] + 0.1
+    assert np.abs(errors(log, motions).cumsum(axis=0)).max() < 0.7
+    assert {motion.fault for motion in motions} == {"", "there is no odometry"}
+
+
+def test_a_gap_without_detections_is_as_uncertain_as_it_is_long() -> None:
+    """A straight drive with odometry until 1 s and none afterwards: it is held, and its variance grows."""
+    settings = MotionSettings()
+    check = MotionCheck(np.array([0.1, 0.1, 0.01]), settings)
+    nothing = np.zeros((0, 2))
+    spreads, held = [], np.zeros(3)
+    for k in range(20):
+        t, start = 0.1 * (k + 1), 0.1 * k
+        stamps = start + 0.01 * np.arange(10) if k < 10 else np.array([start])
+        speeds = 5.0 + 0.1 * np.sin(np.arange(len(stamps)))
+        twist = np.column_stack([speeds, np.zeros((len(stamps), 2))])
+        twist = twist if k < 10 else held[None]
+        held = twist[-1]
+        motion = check.update(Odometry(stamps, twist), _cycle(t, nothing))
+        spreads.append(float(np.sqrt(motion.odometry.covariance[0, 0])))
+        if k >= 12:
+            assert motion.missing
+            assert motion.odometry.delta[0] == pytest.approx(0.1 * 5.0, abs=0.02)
+    assert spreads[-1] > 10 * spreads[5]
+
+
+def test_readings_that_never_change_are_believed_if_the_detections_agree() -> None:
+    """An exact drive at constant speed has the same twist in each row."""
+    cones = np.array([[x, side] for x in np.arange(0.0, 60.0, 4.0) for side in (-2.0, 2.0)])
+    check, twist = (
+        MotionCheck(np.array([0.1, 0.1, 0.01]), MotionSettings()),
+        np.tile([5.0, 0.0, 0.0], (10, 1)),
+    )
+    for k in range(40):
+        t = 0.1 * (k + 1)
+        seen = cones - [5.0 * t, 0.0]
+        seen = seen[(seen[:, 0] > 0.0) & (seen[:, 0] < 15.0)]
+        motion = check.update(Odometry(t - 0.1 + 0.01 * np.arange(10), twist), _cycle(t, seen))
+        assert not motion.fault
+        np.testing.assert_allclose(motion.odometry.delta, [0.5, 0.0, 0.0], atol=1e-12)
+
+
+def _cycle(t: float, points: Array) -> Detections:
+    covariances = np.tile(0.01 * np.eye(2), (len(points), 1, 1))
+    return Detections(t, points, covariances, np.full(len(points), 2))

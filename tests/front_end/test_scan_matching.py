@@ -1,0 +1,81 @@
+"""Scan matching: the pose that lays the detections of a cycle on those of the cycles before."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pathspace_graph.factors.se2 import to_map, to_vehicle
+from pathspace_graph.front_end.scan_matching import RecentDetections, match
+from pathspace_graph.settings.front_end import MotionSettings
+
+SETTINGS = MotionSettings()
+CONES = np.array([[2.0, 2.0], [6.0, 2.2], [10.0, 2.0], [2.5, -1.9], [7.0, -2.0], [11.0, -2.1]])
+
+
+def seen_once(cones: np.ndarray = CONES) -> RecentDetections:
+    """The cones as they were detected once, without noise, from the origin."""
+    recent = RecentDetections(SETTINGS)
+    recent.add(0.0, cones)
+    return recent
+
+
+def detected(pose: np.ndarray, cones: np.ndarray = CONES) -> np.ndarray:
+    return to_vehicle(cones, np.tile(pose, (len(cones), 1)))
+
+
+@given(x=st.floats(0.0, 1.2), y=st.floats(-0.3, 0.3), theta=st.floats(-0.05, 0.05))
+def test_exact_detections_give_the_exact_motion(x: float, y: float, theta: float) -> None:
+    pose = np.array([x, y, theta])
+    start = np.array([x - 0.4, 0.0, 0.0])
+    found = match(seen_once(), detected(pose), np.full(6, 0.01), start, SETTINGS, 8)
+    np.testing.assert_allclose(found.pose, pose, atol=1e-3)
+    assert found.matched == 6
+    assert found.is_certain
+
+
+def test_the_information_is_that_of_two_detections_of_every_cone() -> None:
+    """Each offset has the variance of two detections and of the cone: `2 * 0.01 + sigma_cone^2`."""
+    found = match(seen_once(), CONES, np.full(6, 0.01), np.zeros(3), SETTINGS, 1)
+    precision = 1.0 / (2 * 0.01 + SETTINGS.sigma_cone**2)
+    assert found.information[0, 0] == pytest.approx(6 * precision)
+    assert found.information[2, 2] == pytest.approx(precision * (CONES**2).sum())
+    assert found.information[1, 2] == pytest.approx(precision * CONES[:, 0].sum())
+    assert found.misfit == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_covariance_is_that_of_many_noisy_matches() -> None:
+    rng, sigma = np.random.default_rng(0), 0.1
+    settings = MotionSettings(sigma_cone=1e-6, huber=np.inf)
+    errors = []
+    for _ in range(400):
+        recent = RecentDetections(settings)
+        recent.add(0.0, CONES + sigma * rng.standard_normal(CONES.shape))
+        points = CONES + sigma * rng.standard_normal(CONES.shape)
+        found = match(recent, points, np.full(6, sigma**2), np.zeros(3), settings, 4)
+        errors.append(found.pose)
+    covariance = np.linalg.inv(found.information)
+    np.testing.assert_allclose(
+        np.cov(np.array(errors).T), covariance, atol=0.15 * covariance.max(), rtol=0.25
+    )
+
+
+def test_a_detection_of_nothing_has_no_say() -> None:
+    points = np.vstack([detected(np.array([0.5, 0.0, 0.0])), [[4.0, 0.0]]])
+    found = match(seen_once(), points, np.full(7, 0.01), np.array([0.3, 0.0, 0.0]), SETTINGS, 6)
+    assert found.matched == 6
+    np.testing.assert_allclose(found.pose, [0.5, 0.0, 0.0], atol=1e-3)
+
+
+def test_one_cone_holds_no_motion() -> None:
+    found = match(seen_once(CONES[:1]), CONES[:1], np.full(1, 0.01), np.zeros(3), SETTINGS, 3)
+    assert found.matched == 1
+    assert not found.is_certain
+
+
+def test_old_detections_are_forgotten() -> None:
+    recent = seen_once()
+    recent.add(SETTINGS.memory + 0.01, to_map(CONES[:2], np.zeros((2, 3))))
+    assert len(recent.points) == 2
