@@ -14,6 +14,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .log_odometry import LogOdometry, chained
 from .motion import Motion, MotionCheck
+from .sides import SideJudge
 
 Array = NDArray[np.float64]
 
@@ -34,10 +35,12 @@ class FrontEnd:
     def __init__(self, settings: MapperSettings, odometry_sigma: Array) -> None:
         """Keeps the settings, and the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
         self._motion = MotionCheck(odometry_sigma, settings.motion)
+        self._sides = SideJudge(settings.sides, settings.path)
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Returns the judged readings of a cycle: the twists since the last one, and its detections."""
-        return Reading(self._motion.update(odometry, detections), detections)
+        motion = self._motion.update(odometry, detections)
+        return Reading(motion, self._sides.update(self._motion.pose, motion.twists, detections))
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,7 +56,8 @@ class MotionCheck:
         self.settings = settings
         self.sigma = sigma
         self._recent = RecentDetections(settings)
-        self._pose: Array = np.zeros(3)
+        self.pose: Array = np.zeros(3)
+        """(3,) This is the newest pose in the frame of the front end, in which the drive began at 0."""
         self._velocity: Array | None = None
         self._rate = 0.0
         self._t: float | None = None
@@ -70,8 +71,8 @@ class MotionCheck:
         variances = 0.5 * np.trace(detections.covariances, axis1=1, axis2=2)
         self._recent.forget(t)
         motion = self._checked(motion, detections, variances)
-        self._pose = compose(self._pose, motion.odometry.delta)
-        poses = np.broadcast_to(self._pose, (len(variances), 3))
+        self.pose = compose(self.pose, motion.odometry.delta)
+        poses = np.broadcast_to(self.pose, (len(variances), 3))
         self._recent.add(t, to_map(detections.points_vehicle, poses))
         if self._t is not None and t > self._t:
             self._velocity = motion.odometry.delta / (t - self._t)
@@ -115,7 +116,7 @@ class MotionCheck:
             return motion
         dt = detections.t - self._t
         going_on = dt * (motion.odometry.twist if self._velocity is None else self._velocity)
-        predicted = compose(self._pose, motion.odometry.delta)
+        predicted = compose(self.pose, motion.odometry.delta)
         found = self._match(detections, variances, predicted, settings.iterations_first)
         if found is not None and found.misfit > settings.max_misfit:
             found = None
@@ -124,7 +125,7 @@ class MotionCheck:
         failed = motion.missing or (stuck and settings.doubt < np.inf)
         if found is not None and not failed and not self._is_contradicted(motion, predicted, found):
             return motion
-        best = self._best(detections, variances, (compose(self._pose, going_on), predicted), dt)
+        best = self._best(detections, variances, (compose(self.pose, going_on), predicted), dt)
         if failed or (best is not None and self._is_contradicted(motion, predicted, best)):
             return self._replaced(motion, best, going_on, dt)
         return motion
@@ -188,12 +189,12 @@ class MotionCheck:
         settings, odometry = self.settings, motion.odometry
         mean, covariance = going_on.copy(), np.diag(self._sigmas_going_on(dt) ** 2)
         if best is not None:
-            predicted = compose(self._pose, odometry.delta)
+            predicted = compose(self.pose, odometry.delta)
             off, spread = self._contradiction(odometry, predicted, best)
             near = settings.doubt_rate * np.sqrt(spread[2, 2])
             if not motion.missing and not motion.stuck and abs(off[2]) <= near:  # the gyro is right
                 mean[2], covariance[2, 2] = odometry.delta[2], odometry.covariance[2, 2]
-            own = relative(self._pose, best.pose)
+            own = relative(self.pose, best.pose)
             turn = _to_vehicle(best.pose[2])
             information = turn @ best.information @ turn.T / settings.widening**2
             prior = np.linalg.inv(covariance)

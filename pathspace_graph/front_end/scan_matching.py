@@ -21,6 +21,9 @@ BoolArray = NDArray[np.bool_]
 
 _REACHES = 3.0
 """Remembered detections farther than this many reaches have no weight."""
+_LEAST_SHARE = 1e-6
+"""The pose is held where the determinant of its information, by the product of its diagonal, is larger."""
+_TINY = float(np.finfo(float).tiny)
 
 
 class RecentDetections:
@@ -59,7 +62,8 @@ class Match:
     @property
     def is_certain(self) -> bool:
         """Returns whether the detections hold the pose in every direction."""
-        return bool(np.linalg.matrix_rank(self.information) == len(self.information))
+        share = np.linalg.det(self.information) / max(float(self.information.diagonal().prod()), _TINY)
+        return bool(share > _LEAST_SHARE)
 
 
 def match(
@@ -76,10 +80,10 @@ def match(
     detections beside the point, and `sigma_i^2 = variance_i (1 + 1/n_i) + sigma_cone^2` with n_i the sum of
     the weights. The variances (m,) are those of one coordinate (m^2).
     """
-    pose, reaches = start.copy(), np.geomspace(settings.reach, settings.reach_last, max(iterations, 1))
-    for reach in reaches:
+    pose, shrink = start.copy(), (settings.reach_last / settings.reach) ** (1.0 / max(iterations - 1, 1))
+    for iteration in range(iterations):
         points = to_map(points_vehicle, np.broadcast_to(pose, (len(points_vehicle), 3)))
-        means, weights = _means(points, recent.points, float(reach))
+        means, weights = _means(points, recent.points, settings.reach * shrink**iteration)
         matched = weights > settings.min_weight
         off, arm = (points - means)[matched], (points - pose[:2])[matched]
         precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + settings.sigma_cone**2)

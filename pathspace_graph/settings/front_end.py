@@ -17,7 +17,7 @@ class MotionSettings(Positive):
 
     UNLIMITED = ("doubt", "huber")
 
-    doubt: float = 5.0
+    doubt: float = 4.5
     """The detections contradict the odometry by this number of standard deviations. It is infinite where the
     odometry is always believed."""
     doubt_rate: float = 2.0
@@ -78,3 +78,54 @@ class MotionSettings(Positive):
     """The speeds of a twist that is held longer are uncertain by this for each second more (m/s^2)."""
     angular_acceleration: float = 1.5
     """The yaw rate of a twist that is held longer is uncertain by this for each second more (rad/s^2)."""
+
+
+@dataclass(frozen=True)
+class SidesSettings(Positive):
+    """Describes how the side of a cone is told from the way driven."""
+
+    reach: float = 8.0
+    """Coloured cones up to this far ahead along the predicted path say what the colours mean (m)."""
+    min_lateral: float = 0.5
+    """The path tells the side of a cone that is farther from it than this (m)."""
+    max_lateral: float = 8.0
+    """The path tells the side of a cone that is nearer to it than this (m)."""
+    min_votes: int = 3
+    """The colours are swapped after this number of cones on the side of the other colour."""
+    enough_votes: int = 30
+    """This number of cones settles what the colours mean."""
+    majority: float = 2.5
+    """These must be this number of times as many as those on the side of their own colour."""
+    colourless: float = 0.7
+    """Sides are told from the rows of cones where a larger share of the detections has no colour; at 1, they
+    never are."""
+    remembered: float = 0.98
+    """From cycle to cycle, the detections so far count by this factor less in that share."""
+    min_detections: int = 6
+    """The share is taken of at least this number of detections."""
+    merge_radius: float = 1.0
+    """Detections that are nearer to each other than this (m) are of one cone."""
+    forget_after: float = 3.0
+    """A cone is forgotten when it was not detected for this time (s)."""
+    sightings: int = 2
+    """A cone has a side once it was detected this number of times."""
+    behind: float = 8.0
+    """The rows begin this far behind the vehicle (m along the path)."""
+    sure: float = 3.0
+    """The path tells sides up to this far ahead of the vehicle (m); beyond, the rows do."""
+    beside: float = 2.0
+    """Cones that are less than this apart (m along the path) stand beside each other."""
+    lateral_gap: float = 0.8
+    """A cone belongs to another stretch if one beside it is nearer to the path by more than this (m)."""
+    half_width: float = 1.5
+    """A row without any cone begins at this distance beside the vehicle (m)."""
+    gap: float = 8.0
+    """Neighbouring cones of a row are at most this far apart (m)."""
+    turn: float = 1.3
+    """A row turns by at most this from one cone to the next (rad)."""
+    turn_cost: float = 2.0
+    """The next cone of a row has the least `distance (1 + turn_cost turn^2)` (rad^-2)."""
+    clear: float = 1.3
+    """The next cone of a row would cost the other row this number of times as much, at least."""
+    min_width: float = 1.8
+    """A cone of one row is farther from each cone of the other row than this (m)."""

@@ -11,7 +11,7 @@ from .calibration import CalibrationSettings
 from .checked import Positive
 from .closing import ClosingSettings
 from .comparison import CkfSettings, LandmarkSettings
-from .front_end import MotionSettings
+from .front_end import MotionSettings, SidesSettings
 from .growth import GrowthSettings, PathSettings, TentativeSettings
 from .health import FindingSettings, HealthSettings
 from .knots import Knots
@@ -254,6 +254,8 @@ class MapperSettings(Positive):
     """These settings say which factors are linearized anew in a step."""
     motion: MotionSettings = field(default_factory=MotionSettings)
     """These settings describe how the odometry is checked against the detections."""
+    sides: SidesSettings = field(default_factory=SidesSettings)
+    """These settings describe how the side of a cone is told from the way driven."""
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     """These settings describe the constant errors of the odometry."""
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)

@@ -17,6 +17,7 @@ from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.run import run_online, split_odometry
+from pathspace_graph.settings.front_end import SidesSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
@@ -30,8 +31,8 @@ def lap() -> Log:
     return lap_log(bean_track(), overrun=25.0)
 
 
-def run(log: Log) -> LandmarkFixedLag:
-    estimator = LandmarkFixedLag(odometry_sigma=log.odometry_sigma)
+def run(log: Log, settings: MapperSettings | None = None) -> LandmarkFixedLag:
+    estimator = LandmarkFixedLag(settings, log.odometry_sigma)
     run_online(log, estimator)
     return estimator
 
@@ -107,12 +108,14 @@ def test_two_detections_create_no_landmark_and_three_do() -> None:
 
 
 def test_detections_with_unknown_labels_are_used_and_create_nothing() -> None:
+    """This is so where sides are not told from the way driven."""
     cones, labels = corridor(60.0)
     log = exact_log(ahead(5.0, 4.0), cones, labels)
     blank = [replace(c, labels=np.full(len(c.labels), UNKNOWN)) for c in log.cycles]
-    assert run(with_cycles(log, blank)).map().size == 0
+    settings = MapperSettings(sides=SidesSettings(colourless=1.0))
+    assert run(with_cycles(log, blank), settings).map().size == 0
     late = [c if i < 20 else blank[i] for i, c in enumerate(log.cycles)]
-    estimator = LandmarkFixedLag(odometry_sigma=log.odometry_sigma)
+    estimator = LandmarkFixedLag(settings, log.odometry_sigma)
     used = [estimator.update(o, c).readings for o, c in split_odometry(with_cycles(log, late))]
     assert min(used[20:30]) > 0
 
@@ -125,7 +128,8 @@ def test_a_cone_first_detected_with_the_wrong_label_gets_its_own() -> None:
     swapped = np.array([RIGHT, LEFT, UNKNOWN])
     for i in range(6):
         cycles[i] = replace(cycles[i], labels=swapped[cycles[i].labels])
-    track = run(with_cycles(log, cycles)).map()
+    believed = MapperSettings(sides=SidesSettings(min_votes=1000))  # colours are not swapped
+    track = run(with_cycles(log, cycles), believed).map()
     for label in BOUNDARIES:
         assert (np.sign(points(track, label)[:, 1]) == (1 if label == LEFT else -1)).all()
     assert track.size == run(log).map().size

@@ -18,6 +18,7 @@ from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, OutliningEstimator, VehicleEstimator, split_odometry
+from pathspace_graph.settings.front_end import SidesSettings
 from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.settings.mapper import GaugeSettings, MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -210,14 +211,24 @@ def test_one_boundary_alone_is_mapped(label: int) -> None:
     assert straightness(track, label, 2.0 if label == LEFT else -2.0, 64.0) < 1e-6
 
 
-def test_unknown_labels_alone_map_nothing() -> None:
+def test_unknown_labels_alone_map_nothing_where_sides_are_not_told() -> None:
     cones, labels = corridor(60.0)
     log = exact_log(ahead(8.0, 4.0), cones, np.full_like(labels, UNKNOWN))
-    mapper, results = map_log(log)
+    settings = MapperSettings(sides=SidesSettings(colourless=1.0))
+    mapper, results = map_log(log, FixedLagMapper(settings, log.odometry_sigma))
     assert mapper.map().boundaries == {}
     assert results[-1].sizes == (0, 0)
     assert all(result.readings == 0 for result in results)
     np.testing.assert_allclose(poses_of(results), true_poses(log), atol=1e-9)
+
+
+def test_unknown_labels_alone_are_mapped_on_the_side_where_they_are() -> None:
+    cones, labels = corridor(60.0)
+    mapper, results = map_log(exact_log(ahead(8.0, 4.0), cones, np.full_like(labels, UNKNOWN)))
+    track = mapper.map()
+    assert min(results[-1].sizes) > 8
+    assert straightness(track, LEFT, 2.0, 30.0) < 1e-6
+    assert straightness(track, RIGHT, -2.0, 30.0) < 1e-6
 
 
 def test_unknown_readings_that_either_curve_would_take_are_left_out() -> None:

@@ -1,0 +1,107 @@
+"""Sides: what is left of the way driven is left, without colours, and with colours the other way round."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pathspace_graph.front_end.cones import NearCones
+from pathspace_graph.front_end.front_end import FrontEnd, judge_log
+from pathspace_graph.io.log import Detections, Log
+from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.run import split_odometry
+from pathspace_graph.settings.front_end import SidesSettings
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.faults import Faults, SensorFaults, VehicleFaults
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.vehicle import VehicleSettings
+
+from ..scenes.drives import bean_track
+
+
+def drive(faults: Faults | None = None, wrong_colour: float = 0.01) -> Log:
+    settings = SimulationSettings(laps=1, vehicle=VehicleSettings(speed_start=8.0), faults=faults or Faults())
+    settings = replace(settings, sensor=replace(settings.sensor, wrong_colour=wrong_colour))
+    return simulate(bean_track(), settings, seed=1)
+
+
+def labels_of(log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """The labels that the front end gives, and the true ones, of all detections of cones."""
+    truth = log.truth
+    assert truth is not None and truth.associations is not None
+    judged = np.concatenate([c.labels for c in judge_log(log, log.odometry_sigma, MapperSettings()).cycles])
+    real = truth.associations >= 0
+    return judged[real], truth.cone_labels[truth.associations[real]]
+
+
+def test_right_colours_are_left_as_they_are() -> None:
+    log = drive()
+    front_end = FrontEnd(MapperSettings(), log.odometry_sigma)
+    for odometry, cycle in split_odometry(log):
+        assert front_end.update(odometry, cycle).detections is cycle
+
+
+def test_one_wrong_colour_in_five_swaps_nothing() -> None:
+    log = drive(wrong_colour=0.2)
+    given = np.concatenate([cycle.labels for cycle in log.cycles])
+    judged = judge_log(log, log.odometry_sigma, MapperSettings()).cycles
+    later = slice(len(log.cycles[0].labels) * 3, None)
+    np.testing.assert_array_equal(np.concatenate([c.labels for c in judged])[later], given[later])
+
+
+def test_blue_on_the_right_is_found_out_at_once() -> None:
+    log = drive(Faults(vehicle=VehicleFaults(wrong_way=True)))
+    found, true = labels_of(log)
+    assert (found != true).mean() < 0.03  # one colour in a hundred is wrong
+
+
+@pytest.mark.parametrize("wrong_way", [False, True])
+@pytest.mark.parametrize("share", [0.9, 1.0])
+def test_sides_are_told_without_colours(share: float, wrong_way: bool) -> None:
+    faults = Faults(sensor=SensorFaults(colourless=share), vehicle=VehicleFaults(wrong_way=wrong_way))
+    found, true = labels_of(drive(faults))
+    known = found != UNKNOWN
+    assert known.mean() > 0.7
+    assert (found[known] != true[known]).mean() < 0.02
+
+
+def test_where_colours_are_common_an_unknown_one_stays_unknown() -> None:
+    """The large cones of a start line have no colour, and stand beside the boundary."""
+    log = drive(Faults(sensor=SensorFaults(colourless=0.4)))
+    for given, judged in zip(
+        log.cycles, judge_log(log, log.odometry_sigma, MapperSettings()).cycles, strict=True
+    ):
+        np.testing.assert_array_equal(given.labels, judged.labels)
+
+
+def test_near_cones_are_means_of_their_detections() -> None:
+    near = NearCones(SidesSettings())
+    first = near.add(0.0, np.array([[0.0, 0.0], [5.0, 0.0]]), np.array([LEFT, UNKNOWN]))
+    second = near.add(0.1, np.array([[5.2, 0.0], [0.0, 0.3], [9.0, 9.0]]), np.array([RIGHT, LEFT, UNKNOWN]))
+    np.testing.assert_array_equal(first, [0, 1])
+    np.testing.assert_array_equal(second, [1, 0, 2])
+    np.testing.assert_allclose(near.points, [[0.0, 0.15], [5.1, 0.0], [9.0, 9.0]])
+    np.testing.assert_array_equal(near.counts, [2, 2, 1])
+    np.testing.assert_array_equal(near.votes, [[2, 0], [0, 1], [0, 0]])
+
+
+def test_near_cones_are_forgotten_once_they_are_old() -> None:
+    near, settings = NearCones(SidesSettings()), SidesSettings()
+    near.add(0.0, np.zeros((1, 2)), np.array([LEFT]))
+    near.add(settings.forget_after + 0.1, np.ones((1, 2)), np.array([LEFT]))
+    np.testing.assert_array_equal(near.points, [[1.0, 1.0]])
+
+
+def test_two_detections_of_a_new_cone_in_one_cycle_are_two_cones() -> None:
+    near = NearCones(SidesSettings())
+    np.testing.assert_array_equal(near.add(0.0, np.zeros((2, 2)), np.array([LEFT, LEFT])), [0, 1])
+
+
+def test_a_cycle_without_detections_is_possible() -> None:
+    log = drive()
+    front_end = FrontEnd(MapperSettings(), log.odometry_sigma)
+    odometry, _ = next(split_odometry(log))
+    nothing = Detections(0.0, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp))
+    assert front_end.update(odometry, nothing).detections is nothing
