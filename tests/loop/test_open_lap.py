@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.loop.open_lap import OpenLapRecord
+from pathspace_graph.loop.recognition import RecognizedPlace
 from pathspace_graph.mapping.prediction import integrate_odometry
 from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.state import State
-from pathspace_graph.online.open_lap import OpenLapRecord
-from pathspace_graph.online.recognition import RecognizedPlace
 from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
 
 from ..scenes.curves import boundary_through

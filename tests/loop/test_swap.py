@@ -15,10 +15,10 @@ from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
 from pathspace_graph.eval.metrics.table1 import lap_metrics
 from pathspace_graph.graph.gaussian import factorize, graph_of
 from pathspace_graph.io.log import Log
+from pathspace_graph.loop import open_lap
+from pathspace_graph.loop.open_lap import LapBatch, OpenLapRecord
 from pathspace_graph.mapping.detections import NOWHERE
-from pathspace_graph.online import open_lap
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.online.open_lap import LapBatch, OpenLapRecord
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings, PlaceSettings
 
@@ -193,7 +193,7 @@ def test_the_record_gives_the_poses_of_the_lap_in_the_closed_map() -> None:
     mapper, results = run()
     closes = closing_cycle(results)
     assert len(mapper.corrected_poses) == closes + 1
-    assert isinstance(mapper._open_lap, OpenLapRecord)
+    assert isinstance(mapper.loop.open_lap, OpenLapRecord)
 
 
 def test_the_worker_solves_the_lap_as_this_process_does(monkeypatch: pytest.MonkeyPatch) -> None:

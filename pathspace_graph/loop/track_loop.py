@@ -1,0 +1,212 @@
+"""The loop of the track: when it closes, what is done once, and what is done afterwards."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.batch.lap import ClosedMap
+from pathspace_graph.batch.recurrence import Recurrence
+from pathspace_graph.factors.odometry import IntegratedOdometry
+from pathspace_graph.health import DEGRADED, LOST, Evidence, Health, HealthMonitor
+from pathspace_graph.io.log import Detections
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.curve_map import CurveSmoother
+from pathspace_graph.mapping.path import DrivenPath
+from pathspace_graph.mapping.prediction import doubt_calibrations
+from pathspace_graph.mapping.registration import near_start
+
+from .association import Gating
+from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
+from .open_lap import LapBatch, OpenLapRecord
+from .recognition import recognize
+from .swap import go_on_from
+
+Array = NDArray[np.float64]
+
+OWN_PRIOR = "the map goes on from the window's own prior"
+"""This begins the notice of a cycle in which the batch of the lap does not replace the prior."""
+
+
+class TrackLoop:
+    """Looks after the loop: the batch of the open lap when it closes, and a vehicle that is lost on it."""
+
+    def __init__(self, smoother: CurveSmoother, path: DrivenPath) -> None:
+        self.settings = smoother.map.settings
+        self.closed = False
+        """The flag is set when the loop has closed: the map has its final size."""
+        self.health = Health()
+        """This says how far the newest estimate can be trusted."""
+        self.corrected_poses: Array = np.zeros((0, 3))
+        """(k, 3) These are the poses of the first k cycles as the closing of the loop has corrected them."""
+        self.lap_seconds = float("nan")
+        """The batch of the lap took this wall time (s) in its own process, once it has replaced the prior."""
+        self.open_lap = OpenLapRecord(self.settings)
+        """This is the lap as it was measured, while the loop is open."""
+        self._smoother = smoother
+        self._path = path
+        self._monitor = HealthMonitor(self.settings.health)
+        self._known_loop = KnownLoop(smoother)
+        self._search: Search | None = None
+        self._lap_batch: LapBatch | None = None
+        self._believed = self.settings  # with the priors of the calibrations as they are now
+        self._closing_tried = 0.0
+        self._loop_tried, self._recognition_tried = 0.0, 0.0
+
+    @property
+    def is_searching(self) -> bool:
+        """Returns whether the vehicle is lost on a closed map, and is looked for."""
+        return self._search is not None
+
+    @property
+    def first_kept(self) -> int | None:
+        """Returns the cycle whose pose must stay in the window until the lap is solved, if there is one."""
+        return self._lap_batch.first_kept if self._lap_batch else None
+
+    def may_close(self) -> bool:
+        """Returns whether it is time to register the newest detections with the beginning of an open loop."""
+        settings, length = self.settings.closing, self._path.length
+        newest = self._smoother.variables.poses[-1]
+        if self.closed or not near_start(self._path, newest, settings):
+            return False
+        if length - self._closing_tried < settings.check_interval:
+            return False
+        self._closing_tried = length
+        return True
+
+    # --- what a cycle tells ------------------------------------------------------------------------------
+
+    def measured(self, t: float, odometry: IntegratedOdometry, detections: Detections) -> None:
+        """Records the odometry that leads to the pose at t (s), and the detections there."""
+        if not self.closed:
+            self.open_lap.measured(t, odometry, detections)
+
+    def judge(self, tested: Gating | None, new: slice, detections: Detections) -> None:
+        """Judges the estimate by the detections that were tested, or remembers those of a lost vehicle.
+
+        The detections of the cycle are the rows `new` of the table.
+        """
+        smoother = self._smoother
+        if self._search is not None:
+            corrected = smoother.map.detections.point[new].copy()
+            self._search.observe(smoother.variables.poses[-1], replace(detections, points_vehicle=corrected))
+            return
+        evidence = Evidence(detections.t)
+        if tested is not None:
+            evidence = evidence_of(smoother, tested, self._known_loop)
+        self.health = self._monitor.update(evidence)
+        self._begin_search()
+
+    def doubt_calibrations(self) -> None:
+        """Widens the priors of calibrations that the drive contradicts, while the loop is open."""
+        if not self.closed:
+            self._believed = doubt_calibrations(self._smoother, self._believed)
+
+    # --- the batch of the open lap -----------------------------------------------------------------------
+
+    def go_on(self, closes: bool) -> tuple[Array | None, str]:
+        """Records the open lap, has it solved when it closes, and goes on from the result when it is due.
+
+        Returns the jump (3,) of the newest pose if the map was replaced, and a notice if it was not.
+        """
+        smoother, batch = self._smoother, self._lap_batch
+        if closes:
+            self._closes()
+            return None, self._solve_lap()
+        if not self.closed:
+            self.open_lap.estimated(smoother.map.state)
+            if self._path.length > self.settings.closing.min_path:
+                self.open_lap.prepare()
+                if batch is None:
+                    self._try_loop()
+        if batch is None or smoother.next_cycle - 1 < batch.due:
+            return None, ""
+        self._lap_batch, marginal = None, batch.marginal()
+        if isinstance(marginal, str):
+            return None, f"{OWN_PRIOR}: {marginal}" if self.closed else ""
+        if not self.closed:
+            self._closes()
+        self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds
+        return go_on_from(smoother, marginal), ""
+
+    def _closes(self) -> None:
+        """Notes that the loop has closed; hardly anything moves from now on."""
+        self.closed, self._smoother.window.exact = True, False
+
+    def _solve_lap(self) -> str:
+        """Sends the lap to be solved as a batch in the cycle in which the loop has closed.
+
+        Returns a notice that says why it cannot be solved, or an empty one.
+        """
+        smoother, record = self._smoother, self.open_lap
+        closed = record.closed_map(smoother)
+        self.corrected_poses = closed.poses
+        cones = len(smoother.map.state.map_keys) / self.settings.spline.size_share
+        if cones > self.settings.open_lap.max_cones:
+            record.give_up("the lap has too many cones for a batch")
+        if record.unsolvable is not None:
+            return f"{OWN_PRIOR}: {record.unsolvable}"
+        self._begin_batch(closed)
+        return ""
+
+    def _begin_batch(self, start: ClosedMap | Recurrence) -> None:
+        """Sends the lap to its batch, which begins at a map that has just been closed, or at odometry."""
+        own, first, cycle = self.settings.open_lap, self._smoother.first_cycle, self._smoother.next_cycle - 1
+        wait = max(min(own.cycles, cycle - first), int(own.cycles_share * cycle))
+        first_kept = min(first + wait, cycle)
+        lap = self.open_lap.lap(first_kept, start, self._believed)
+        self._lap_batch = LapBatch(lap, cycle + wait)
+
+    def _try_loop(self) -> None:
+        """Sends the lap to a batch from odometry where the drive says that it is over.
+
+        That happens where the registration keeps refusing to close the loop.
+        """
+        boundaries, length = self._smoother.map.state.boundaries, self._path.length
+        if length < self._loop_tried or set(boundaries) != set(BOUNDARIES):
+            return
+        self._loop_tried = length + self.settings.closing.check_interval
+        recurrence = self._recurrence()
+        if recurrence is not None:
+            self._loop_tried = length + self.settings.open_lap.retry
+            self._begin_batch(recurrence)
+
+    def _recurrence(self) -> Recurrence | None:
+        """Returns after which length the drive recurs, by its odometry or by the shape of the curves."""
+        record, settings = self.open_lap, self.settings.closing.recognition
+        if record.unsolvable is not None:
+            return None
+        found = record.recurrence()
+        if found is not None or self._path.length < self._recognition_tried + settings.interval:
+            return found
+        self._recognition_tried = self._path.length
+        place = recognize(self._smoother)
+        return None if place is None else record.recurrence_since(place)
+
+    # --- a vehicle that is lost --------------------------------------------------------------------------
+
+    def _begin_search(self) -> None:
+        """Takes all detections of the window out of use, if the vehicle is lost on a map that is complete.
+
+        So the map stays as it was before. Nothing is done before the batch of the lap has replaced it.
+        """
+        boundaries = set(self._smoother.map.state.boundaries)
+        ready = self.closed and self._lap_batch is None and boundaries == set(BOUNDARIES)
+        if self.health.condition == LOST and ready:
+            detections = self._smoother.map.detections
+            detections.release(np.arange(len(detections)))
+            self._search = Search(self._smoother)
+
+    def find_back(self) -> tuple[Array | None, str]:
+        """Starts the window anew where a lost vehicle is found; returns its jump (3,) and a notice."""
+        if self._search is None:
+            return None, ""
+        found = self._search.find()
+        if found is None:
+            return None, ""
+        first_cycle = max(self._search.first_cycle, self._smoother.first_cycle)
+        self._search, self.health = None, Health(DEGRADED, FOUND)
+        self._monitor.restart()
+        return start_anew(self._smoother, first_cycle, found), FOUND
