@@ -9,6 +9,7 @@ from itertools import groupby
 from math import nan
 from typing import Final
 
+from .labels import BOUNDARIES, NAMES
 from .settings.health import HealthSettings
 
 GOOD: Final = "good"
@@ -46,6 +47,12 @@ class Evidence:
     sigma: float = nan
     """This is the standard deviation (m) of the position in its worst direction on a closed map, where it is
     known."""
+    offered_by: tuple[int, int] = (0, 0)
+    """These numbers of the offered detections are of the left and of the right boundary of a closed map."""
+    explained_by: tuple[int, int] = (0, 0)
+    """These numbers of the explained detections are."""
+    unmapped: tuple[int, int] = (0, 0)
+    """These numbers of other coloured detections, left and right, lie beside a gap of a closed map."""
 
 
 class HealthMonitor:
@@ -74,7 +81,29 @@ class HealthMonitor:
             squares += one.innovations
         share = explained / offered if offered >= self.settings.min_offered else 1.0
         innovation = squares / used if used >= self.settings.min_offered else 0.0
-        return self._judge(evidence, share, innovation)
+        health = self._judge(evidence, share, innovation)
+        return self._beside_gap(offered) if health == Health(GOOD) else health
+
+    def _beside_gap(self, offered: int) -> Health:
+        """Returns the health where nothing is wrong, but the map may have a gap of a boundary."""
+        unmapped = [sum(one.unmapped[label] for one in self._recent) for label in BOUNDARIES]
+        most = (1.0 - self.settings.share_degraded) * (offered + sum(unmapped))
+        names = [NAMES[label] for label in BOUNDARIES if unmapped[label] > most]
+        reason = f"the {' and the '.join(names)} boundary is not mapped here"
+        return Health(DEGRADED, reason) if names else Health(GOOD)
+
+    def _wrong_side(self) -> str:
+        """Returns which boundary is wrong where the other one explains its detections, or an empty string.
+
+        It is the map that is wrong then: a vehicle that is lost has both boundaries beside it.
+        """
+        for label, name in zip(BOUNDARIES, reversed(NAMES[: len(BOUNDARIES)]), strict=True):
+            offered = sum(one.offered_by[label] for one in self._recent)
+            explained = sum(one.explained_by[label] for one in self._recent)
+            enough = offered >= self.settings.min_offered / len(BOUNDARIES)
+            if enough and explained >= self.settings.share_degraded * offered:
+                return f"the {name} boundary is not where the map has it"
+        return ""
 
     def _remember(self, evidence: Evidence) -> None:
         """Adds the evidence of a cycle, and drops what is too old and not needed for `min_offered`."""
@@ -98,8 +127,9 @@ class HealthMonitor:
             reason = f"the position is uncertain by {newest.sigma:.1f} m"
             return Health(LOST if newest.sigma > settings.sigma_lost else DEGRADED, reason)
         if share < degraded:
-            reason = f"{100 * share:.0f} % of the detections lie on the map"
-            return Health(LOST if share < lost else DEGRADED, reason)
+            wrong = self._wrong_side() if share < lost and newest.closed else ""
+            reason = wrong or f"{100 * share:.0f} % of the detections lie on the map"
+            return Health(LOST if share < lost and not wrong else DEGRADED, reason)
         if blind > settings.blind:
             return Health(DEGRADED, f"no detection in view of the map for {blind:.1f} s")
         if innovation > settings.innovation:

@@ -78,6 +78,14 @@ class OpenLapRecord:
             (pose,) = curve_poses(boundary, state.control_points(label), u)
             self._places.setdefault(label, []).append(Place(cycle, float(u[0]), pose))
 
+    def followed(self, newest: Array) -> None:
+        """Adds the newest pose (3,) on a closed map."""
+        self.poses.append(newest.copy())
+
+    def replaced(self, earlier: Array, window: Array) -> None:
+        """Replaces all poses by those (k, 3) before the window and those (P, 3) in it, after a swap."""
+        self.poses = [*unwrap(np.concatenate([earlier, window]))]
+
     def recurrence(self) -> Recurrence | None:
         """Returns the recurrence of the path driven, if odometry alone says that the lap is over."""
         found = find_recurrence(np.array(self._reckoned), self.settings)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.lap import ClosedMap
+from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.recurrence import Recurrence
 from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.health import DEGRADED, LOST, Evidence, Health, HealthMonitor
@@ -20,6 +20,7 @@ from pathspace_graph.mapping.registration import near_start
 
 from .association import Gating
 from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
+from .mending import Mending
 from .open_lap import LapBatch, OpenLapRecord
 from .recognition import recognize
 from .swap import go_on_from
@@ -45,6 +46,8 @@ class TrackLoop:
         """The batch of the lap took this wall time (s) in its own process, once it has replaced the prior."""
         self.open_lap = OpenLapRecord(self.settings)
         """This is the lap as it was measured, while the loop is open."""
+        self.mending = Mending(smoother)
+        """This mends the closed map where detections contradict it."""
         self._smoother = smoother
         self._path = path
         self._monitor = HealthMonitor(self.settings.health)
@@ -80,8 +83,7 @@ class TrackLoop:
 
     def measured(self, t: float, odometry: IntegratedOdometry, detections: Detections) -> None:
         """Records the odometry that leads to the pose at t (s), and the detections there."""
-        if not self.closed:
-            self.open_lap.measured(t, odometry, detections)
+        self.open_lap.measured(t, odometry, detections)
 
     def judge(self, tested: Gating | None, new: slice, detections: Detections) -> None:
         """Judges the estimate by the detections that were tested, or remembers those of a lost vehicle.
@@ -97,6 +99,8 @@ class TrackLoop:
         if tested is not None:
             evidence = evidence_of(smoother, tested, self._known_loop)
         self.health = self._monitor.update(evidence)
+        if self.closed:
+            self.mending.contradictions.observe(smoother, new, detections.t)
         self._begin_search()
 
     def doubt_calibrations(self) -> None:
@@ -109,27 +113,54 @@ class TrackLoop:
     def go_on(self, closes: bool) -> tuple[Array | None, str]:
         """Records the open lap, has it solved when it closes, and goes on from the result when it is due.
 
-        Returns the jump (3,) of the newest pose if the map was replaced, and a notice if it was not.
+        Returns the jump (3,) of the newest pose if the map was replaced, and a notice.
         """
-        smoother, batch = self._smoother, self._lap_batch
         if closes:
             self._closes()
             return None, self._solve_lap()
-        if not self.closed:
-            self.open_lap.estimated(smoother.map.state)
-            if self._path.length > self.settings.closing.min_path:
-                self.open_lap.prepare()
-                if batch is None:
-                    self._try_loop()
-        if batch is None or smoother.next_cycle - 1 < batch.due:
-            return None, ""
-        self._lap_batch, marginal = None, batch.marginal()
+        if self.closed:
+            self.open_lap.followed(self._smoother.variables.poses[-1])
+        else:
+            self._record_open_lap()
+        batch = self._lap_batch
+        if batch is None:
+            self._try_mending()
+        elif self._smoother.next_cycle - 1 >= batch.due:
+            self._lap_batch = None
+            return self._take(batch.marginal())
+        return None, ""
+
+    def _record_open_lap(self) -> None:
+        """Records the estimate of an open lap, and tries to close it where the drive says that it is over."""
+        self.open_lap.estimated(self._smoother.map.state)
+        if self._path.length > self.settings.closing.min_path:
+            self.open_lap.prepare()
+            if self._lap_batch is None:
+                self._try_loop()
+
+    def _take(self, marginal: LapMarginal | str) -> tuple[Array | None, str]:
+        """Goes on from the result of a batch, unless the present map is better."""
+        mends, smoother = self.mending.is_tried(), self._smoother
+        notice = self.mending.end(marginal) if mends else ""
         if isinstance(marginal, str):
-            return None, f"{OWN_PRIOR}: {marginal}" if self.closed else ""
+            return None, f"{OWN_PRIOR}: {marginal}" if self.closed and not mends else ""
+        if mends and not notice:
+            return None, ""
         if not self.closed:
             self._closes()
         self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds
-        return go_on_from(smoother, marginal), ""
+        jump = go_on_from(smoother, marginal)
+        self.open_lap.replaced(marginal.poses[: marginal.first_kept], smoother.variables.poses)
+        return jump, notice
+
+    def _try_mending(self) -> None:
+        """Sends the drive to a batch that begins with other curves, where the closed map is contradicted."""
+        record = self.open_lap
+        if not self.closed or self._search is not None or record.unsolvable is not None:
+            return
+        start = self.mending.begin(self._known_loop.get(), np.array(record.poses))
+        if start is not None:
+            self._begin_batch(start)
 
     def _closes(self) -> None:
         """Notes that the loop has closed; hardly anything moves from now on."""
@@ -143,6 +174,7 @@ class TrackLoop:
         smoother, record = self._smoother, self.open_lap
         closed = record.closed_map(smoother)
         self.corrected_poses = closed.poses
+        record.replaced(closed.poses, np.zeros((0, 3)))
         cones = len(smoother.map.state.map_keys) / self.settings.spline.size_share
         if cones > self.settings.open_lap.max_cones:
             record.give_up("the lap has too many cones for a batch")
@@ -198,6 +230,8 @@ class TrackLoop:
             detections = self._smoother.map.detections
             detections.release(np.arange(len(detections)))
             self._search = Search(self._smoother)
+            self.mending.contradictions.clear()
+            self.open_lap.give_up("the vehicle was lost")
 
     def find_back(self) -> tuple[Array | None, str]:
         """Starts the window anew where a lost vehicle is found; returns its jump (3,) and a notice."""
