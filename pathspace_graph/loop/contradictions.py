@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +15,8 @@ from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.settings.health import MendingSettings
 from pathspace_graph.settings.mapper import MapperSettings
+
+from .finding import KnownLoop, Loop
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -40,10 +41,14 @@ class Contradictions:
         own = replace(settings.growth, sightings=self.settings.sightings, forget_after=self.settings.memory)
         self._tracks = {label: TentativeTracks(own) for label in BOUNDARIES}
 
-    def observe(self, smoother: CurveSmoother, new: slice, t: float) -> None:
-        """Adds the new coloured detections that are not in use, seen at t (s)."""
-        detections = smoother.map.detections
-        rows = np.arange(new.start, new.stop)[~detections.used[new]]
+    def observe(self, smoother: CurveSmoother, known: KnownLoop, new: slice, t: float) -> None:
+        """Adds the new coloured detections, seen at t (s), that are not in use, or are used beside a gap."""
+        detections, rows = smoother.map.detections, np.arange(new.start, new.stop)
+        unexplained = ~detections.used[new]
+        for label in known.with_gaps():
+            own = rows[detections.boundary[new] == label]
+            unexplained[own - new.start] |= ~known.is_mapped(label, detections.u[own])
+        rows = rows[unexplained]
         points = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
         variances = np.trace(detections.covariance[rows], axis1=1, axis2=2)
         for label, tracks in self._tracks.items():
@@ -55,8 +60,8 @@ class Contradictions:
         for tracks in self._tracks.values():
             tracks.clear()
 
-    def stretches(self, curves: Mapping[int, KDTree], t: float) -> list[Stretch]:
-        """Returns the stretches whose cones contradict the curves, which are densely sampled.
+    def stretches(self, loop: Loop, t: float) -> list[Stretch]:
+        """Returns the stretches whose cones contradict the curves of the loop, or stand in a gap.
 
         There are none until the vehicle has passed all of them at t (s), and has not seen their cones for a
         while. It does not pass a very long one as a whole.
@@ -64,7 +69,7 @@ class Contradictions:
         found, settings = list[Stretch](), self.settings
         for label, tracks in self._tracks.items():
             chosen = tracks.confirmed()
-            chosen = chosen[_far_from_all(tracks.points[chosen], curves, settings.beside)]
+            chosen = chosen[_is_new(loop, label, tracks.points[chosen], settings.beside)]
             chosen = chosen[self._undisputed(label, chosen)]
             points, passed = tracks.points[chosen], tracks.last_t[chosen] < t - settings.settle
             for row in in_rows(points, settings.row):
@@ -83,12 +88,14 @@ class Contradictions:
         return np.asarray(own.counts[chosen] > rival)
 
 
-def _far_from_all(points: Array, curves: Mapping[int, KDTree], distance: float) -> BoolArray:
-    """Returns which points (k, 2) are farther from every curve than the distance (m)."""
-    far = np.ones(len(points), bool)
-    for curve in curves.values():
-        far &= curve.query(points)[0] > distance if len(points) else far
-    return far
+def _is_new(loop: Loop, label: int, points: Array, beside: float) -> BoolArray:
+    """Returns which points (k, 2) of a colour are farther than this (m) from all curves, or in a gap."""
+    new = loop.beside_gaps(np.full(len(points), label), points)
+    new |= loop.curves[label].query(points)[0] > beside
+    for number, curve in loop.curves.items():
+        if number != label:
+            new &= curve.query(points)[0] > beside
+    return new
 
 
 def in_rows(points: Array, apart: float) -> list[IntArray]:

@@ -9,7 +9,7 @@ agree. Once one is clearly better than all others, and twice in a row, the windo
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -84,25 +84,28 @@ class Loop:
         return found
 
 
-def is_mapped(u: Array, cones: Array, length: float, gap: float) -> BoolArray:
+def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) -> BoolArray:
     """Returns which parameters (m,) of a closed curve lie between cones (k,) that are neighbours (m).
 
-    The others lie in a gap: it is longer than `gap` times the median distance of neighbours. Where the cones
-    are not known, all of the curve counts as mapped.
+    The others lie in a gap, which is longer than `gap` times the median distance of neighbours, and farther
+    than the margin (m) from its ends. Where the cones are not known, all of the curve counts as mapped.
     """
     if len(cones) < 2:
         return np.ones(len(u), bool)
     places = np.unique(np.mod(cones, length))
     steps = np.diff(places, append=places[0] + length)
-    return np.asarray((steps <= gap * np.median(steps))[np.searchsorted(places, np.mod(u, length)) - 1])
+    before = np.searchsorted(places, np.mod(u, length)) - 1
+    past = np.mod(u - places[before], length)
+    near_end = np.minimum(past, steps[before] - past) < margin
+    return np.asarray(near_end | (steps <= gap * np.median(steps))[before])
 
 
 def lay_out_loop(
-    state: State, settings: FindingSettings, cones: Mapping[int, Array] | None = None, gap: float = np.inf
+    state: State, settings: FindingSettings, is_mapped_on: Callable[[int, Array], BoolArray] | None = None
 ) -> Loop:
-    """Returns the loop between the two closed curves of a state, whose cones (k,) are at parameters (m).
+    """Returns the loop between the two closed curves of a state.
 
-    A gap in them is `gap` times as long as their median distance.
+    `is_mapped_on` says which parameters (m,) of a boundary lie between cones; without it, all of them do.
     """
     u, points = {}, {}
     for label, boundary in state.boundaries.items():
@@ -117,7 +120,7 @@ def lay_out_loop(
     stations = np.concatenate([[0.0], steps.cumsum()[:-1]])
     beside = {LEFT: u[LEFT][::every], RIGHT: u[RIGHT][opposite]}
     mapped = {
-        label: is_mapped(own, (cones or {}).get(label, np.zeros(0)), state.boundaries[label].length, gap)
+        label: is_mapped_on(label, own) if is_mapped_on else np.ones(len(own), bool)
         for label, own in u.items()
     }
     return Loop(middle, stations, float(steps.sum()), beside, curves, mapped)
@@ -137,10 +140,20 @@ class KnownLoop:
         if self._laid_out is None or self._laid_out[0] != boundaries:
             values = state.variables.values.copy()
             self._smoother.refresh()
-            settings, cones = self._smoother.map.settings, self._smoother.map.cones
-            self._laid_out = boundaries, lay_out_loop(state, settings.finding, cones, settings.health.gap)
+            settings = self._smoother.map.settings.finding
+            self._laid_out = boundaries, lay_out_loop(state, settings, self.is_mapped)
             state.variables.values[:] = values
         return self._laid_out[1]
+
+    def with_gaps(self) -> list[int]:
+        """Returns the boundaries whose curves have gaps."""
+        return [label for label, mapped in self.get().mapped.items() if not mapped.all()]
+
+    def is_mapped(self, label: int, u: Array) -> BoolArray:
+        """Returns which parameters (m,) of a boundary lie between cones that were detected."""
+        track, settings = self._smoother.map, self._smoother.map.settings
+        cones, length = track.cones.get(label, np.zeros(0)), track.state.boundaries[label].length
+        return is_mapped(u, cones, length, settings.health.gap, settings.growth.merge_radius)
 
 
 def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop) -> Evidence:

@@ -10,16 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from pathspace_graph.batch.knots import dense_fit_through
+from pathspace_graph.batch.knots import fit_through
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.recurrence import path_lengths
 from pathspace_graph.labels import NAMES
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import along_and_across
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 
 from .contradictions import Contradictions, Stretch
-from .finding import Loop
+from .crossing import sampled
+from .finding import KnownLoop
 
 Array = NDArray[np.float64]
 
@@ -40,25 +42,30 @@ class Mending:
         self._wait_until = 0.0
         self._attempts = 0
 
-    def begin(self, loop: Loop, poses: Array) -> ClosedMap | None:
-        """Returns the map that a batch of the drive begins with, if the closed map is contradicted.
+    def is_due(self, known: KnownLoop, driven: float) -> bool:
+        """Returns whether the closed map is contradicted, after a path of this length (m)."""
+        t = self._smoother.times[-1]
+        if t < self._asked + self.settings.interval or driven < self._wait_until:
+            return False
+        self._asked = t
+        if self._attempts >= self.settings.attempts:
+            return False
+        loop = known.get()
+        self._stretches = self.contradictions.stretches(loop, t)
+        if self._stretches:
+            self._attempts, self._wait_until = self._attempts + 1, driven + loop.length
+        return bool(self._stretches)
+
+    def begin(self, poses: Array) -> ClosedMap:
+        """Returns the map that the batch of the drive begins with, whose curves are led anew.
 
         The poses (P, 3) are those of all cycles, in the map frame.
         """
-        t, driven = self._smoother.times[-1], float(path_lengths(poses)[-1])
-        if t < self._asked + self.settings.interval or driven < self._wait_until:
-            return None
-        self._asked = t
-        if self._attempts >= self.settings.attempts:
-            return None
-        self._stretches = self.contradictions.stretches(loop.curves, t)
-        if not self._stretches:
-            return None
-        self._attempts, self._wait_until = self._attempts + 1, driven + loop.length
-        lap, state = newest_lap(poses, loop.length), self._smoother.map.state
         self._smoother.refresh()
+        state = self._smoother.map.state
         splines = {
-            label: led_through(self._smoother.map, label, self._stretches, lap) for label in state.boundaries
+            label: led_through(self._smoother.map, label, self._stretches, poses)
+            for label in state.boundaries
         }
         return ClosedMap(splines, poses, state.variables.calibrations.copy())
 
@@ -92,24 +99,11 @@ def _cones(stretches: list[Stretch]) -> tuple[NDArray[np.intp], Array]:
     return labels, np.concatenate([one.cones for one in stretches])
 
 
-def sampled(spline: BSpline, step: float) -> Array:
-    """Returns points (n, 2) on a spline that are about this step (m) apart."""
-    low, high = spline.domain
-    return spline.evaluate(np.linspace(low, high, max(int((high - low) / step), 1) + 1))
-
-
-def newest_lap(poses: Array, length: float) -> Array:
-    """Returns the positions (n, 2) on the newest lap of a length (m), the first one again at the end."""
-    driven = path_lengths(poses)
-    lap = poses[driven > driven[-1] - length, :2]
-    return np.concatenate([lap, lap[:1]])
-
-
-def led_through(track: CurveMap, label: int, stretches: list[Stretch], lap: Array) -> BSpline:
+def led_through(track: CurveMap, label: int, stretches: list[Stretch], poses: Array) -> BSpline:
     """Returns the closed curve of a boundary, led through the cones of its stretches.
 
-    The cones of the curve are in the order in which the lap, positions (n, 2), passes them. Those that lie
-    beside a row of the stretches' cones are removed.
+    The cones of the curve are in the order in which the newest lap of the poses (P, 3) passes them. Those
+    that lie beside a row of the stretches' cones, or are one of them, are removed.
     """
     state, settings = track.state, track.settings
     own = [stretch for stretch in stretches if stretch.label == label]
@@ -118,17 +112,36 @@ def led_through(track: CurveMap, label: int, stretches: list[Stretch], lap: Arra
     boundary = state.boundaries[label]
     u = track.cones.get(label, np.arange(boundary.tables.low, boundary.tables.high, settings.spline.spacing))
     cones = boundary.evaluate(state.control_points(label), u)
-    stations = np.append(0.0, np.hypot(*np.diff(lap, axis=0).T).cumsum())
+    lap, stations = newest_lap(poses, boundary.length)
     at = along_and_across(cones, lap, stations)[0]
     for stretch in own:
         new_at = along_and_across(stretch.cones, lap, stations)[0]
-        kept = ~_is_replaced(cones, at, stretch.cones, new_at, settings.mending.beside)
+        kept = ~_is_replaced(cones, at, stretch.cones, new_at, settings)
         cones, at = np.concatenate([cones[kept], stretch.cones]), np.append(at[kept], new_at)
-    return dense_fit_through(cones[np.argsort(at)], True, settings)
+    if len(cones) < settings.spline.min_size:
+        return state.spline(label)
+    return fit_through(cones[np.argsort(at)], True, settings, settings.batch.dense_share)
 
 
-def _is_replaced(cones: Array, at: Array, row: Array, row_at: Array, beside: float) -> NDArray[np.bool_]:
-    """Returns which cones (k, 2) at stations (k,) lie beside a row of other cones (r, 2), but not on it."""
-    order = np.argsort(row_at)
+def newest_lap(poses: Array, length: float) -> tuple[Array, Array]:
+    """Returns the positions (n, 2) on the newest lap of poses (P, 3), the first one again at the end.
+
+    It begins at the place nearest to the newest pose about a lap of this length (m) before. The stations (n,)
+    of the positions along it are returned, too.
+    """
+    driven = path_lengths(poses)
+    before = np.flatnonzero(np.abs(driven[-1] - driven - length) < 0.5 * length)
+    first = before[np.hypot(*(poses[before, :2] - poses[-1, :2]).T).argmin()] if len(before) else 0
+    lap = np.concatenate([poses[first:, :2], poses[first : first + 1, :2]])
+    return lap, np.append(0.0, np.hypot(*np.diff(lap, axis=0).T).cumsum())
+
+
+def _is_replaced(
+    cones: Array, at: Array, row: Array, row_at: Array, settings: MapperSettings
+) -> NDArray[np.bool_]:
+    """Returns which cones (k, 2) at stations (k,) are those of a row (r, 2), or lie beside it."""
+    order, beside = np.argsort(row_at), settings.mending.beside
     away = np.abs(along_and_across(cones, row[order], row_at[order])[1])
-    return np.asarray((at > row_at.min() - beside) & (at < row_at.max() + beside) & (away > beside))
+    within = (at > row_at.min() - beside) & (at < row_at.max() + beside)
+    same = KDTree(row).query(cones)[0] < settings.growth.merge_radius
+    return np.asarray(same | (within & (away > beside)))

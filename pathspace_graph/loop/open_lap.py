@@ -80,7 +80,8 @@ class OpenLapRecord:
 
     def followed(self, newest: Array) -> None:
         """Adds the newest pose (3,) on a closed map."""
-        self.poses.append(newest.copy())
+        if self.unsolvable is None:
+            self.poses.append(newest.copy())
 
     def replaced(self, earlier: Array, window: Array) -> None:
         """Replaces all poses by those (k, 3) before the window and those (P, 3) in it, after a swap."""

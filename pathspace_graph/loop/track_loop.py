@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,15 +11,17 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.recurrence import Recurrence
 from pathspace_graph.factors.odometry import IntegratedOdometry
-from pathspace_graph.health import DEGRADED, LOST, Evidence, Health, HealthMonitor
+from pathspace_graph.health import DEGRADED, GOOD, LOST, Evidence, Health, HealthMonitor
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import doubt_calibrations
 from pathspace_graph.mapping.registration import near_start
+from pathspace_graph.spline.bspline import BSpline
 
 from .association import Gating
+from .crossing import boundaries_cross
 from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
 from .mending import Mending
 from .open_lap import LapBatch, OpenLapRecord
@@ -54,6 +57,7 @@ class TrackLoop:
         self._known_loop = KnownLoop(smoother)
         self._search: Search | None = None
         self._lap_batch: LapBatch | None = None
+        self._boundaries_cross = False
         self._believed = self.settings  # with the priors of the calibrations as they are now
         self._closing_tried = 0.0
         self._loop_tried, self._recognition_tried = 0.0, 0.0
@@ -99,8 +103,10 @@ class TrackLoop:
         if tested is not None:
             evidence = evidence_of(smoother, tested, self._known_loop)
         self.health = self._monitor.update(evidence)
-        if self.closed:
-            self.mending.contradictions.observe(smoother, new, detections.t)
+        if self._boundaries_cross and self.health.condition == GOOD:
+            self.health = Health(DEGRADED, "the two boundaries of the map cross")
+        if self.closed and self.open_lap.unsolvable is None:
+            self.mending.contradictions.observe(smoother, self._known_loop, new, detections.t)
         self._begin_search()
 
     def doubt_calibrations(self) -> None:
@@ -117,6 +123,7 @@ class TrackLoop:
         """
         if closes:
             self._closes()
+            self._boundaries_cross = self._crosses()
             return None, self._solve_lap()
         if self.closed:
             self.open_lap.followed(self._smoother.variables.poses[-1])
@@ -144,23 +151,30 @@ class TrackLoop:
         notice = self.mending.end(marginal) if mends else ""
         if isinstance(marginal, str):
             return None, f"{OWN_PRIOR}: {marginal}" if self.closed and not mends else ""
-        if mends and not notice:
+        if mends and (not notice or self._crosses(marginal.splines) > self._boundaries_cross):
             return None, ""
         if not self.closed:
             self._closes()
         self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds
         jump = go_on_from(smoother, marginal)
         self.open_lap.replaced(marginal.poses[: marginal.first_kept], smoother.variables.poses)
+        self._boundaries_cross = self._crosses()
         return jump, notice
+
+    def _crosses(self, splines: Mapping[int, BSpline] | None = None) -> bool:
+        """Returns whether two boundaries cross, by default those of the present map."""
+        if splines is None:
+            self._smoother.refresh()
+            splines = self._smoother.map.state.splines
+        return set(splines) == set(BOUNDARIES) and boundaries_cross(splines, self.settings.finding.sample)
 
     def _try_mending(self) -> None:
         """Sends the drive to a batch that begins with other curves, where the closed map is contradicted."""
         record = self.open_lap
         if not self.closed or self._search is not None or record.unsolvable is not None:
             return
-        start = self.mending.begin(self._known_loop.get(), np.array(record.poses))
-        if start is not None:
-            self._begin_batch(start)
+        if self.mending.is_due(self._known_loop, self._path.length):
+            self._begin_batch(self.mending.begin(np.array(record.poses)))
 
     def _closes(self) -> None:
         """Notes that the loop has closed; hardly anything moves from now on."""

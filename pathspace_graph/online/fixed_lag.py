@@ -125,7 +125,7 @@ class FixedLagMapper:
             self.growth.clear()
         self.smoother.marginalize(self.loop.first_kept)
         watch.lap("marginalize")
-        return self._result(detections.t, watch.laps, jump, notice)
+        return self._result(detections.t, watch.laps, jump, notice or self.growth.notice)
 
     def _step(self) -> None:
         """Takes one Gauss-Newton step, relinearized at the current estimate, or the solver's step."""
