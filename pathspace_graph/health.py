@@ -89,8 +89,9 @@ class HealthMonitor:
         unmapped = [sum(one.unmapped[label] for one in self._recent) for label in BOUNDARIES]
         most = (1.0 - self.settings.share_degraded) * (offered + sum(unmapped))
         names = [NAMES[label] for label in BOUNDARIES if unmapped[label] > most]
-        reason = f"the {' and the '.join(names)} boundary is not mapped here"
-        return Health(DEGRADED, reason) if names else Health(GOOD)
+        if len(names) == len(BOUNDARIES):
+            return Health(DEGRADED, "no boundary is mapped here")
+        return Health(DEGRADED, f"the {names[0]} boundary is not mapped here") if names else Health(GOOD)
 
     def _wrong_side(self) -> str:
         """Returns which boundary is wrong where the other one explains its detections, or an empty string.

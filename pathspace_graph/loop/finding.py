@@ -145,6 +145,12 @@ class KnownLoop:
             state.variables.values[:] = values
         return self._laid_out[1]
 
+    @property
+    def is_whole(self) -> bool:
+        """Returns whether the loop has closed, with both boundaries."""
+        state = self._smoother.map.state
+        return state.closed and set(state.boundaries) == set(BOUNDARIES)
+
     def with_gaps(self) -> list[int]:
         """Returns the boundaries whose curves have gaps."""
         return [label for label, mapped in self.get().mapped.items() if not mapped.all()]
@@ -167,7 +173,7 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop) -> Ev
     closed, used = smoother.map.state.closed, detections.used[tested.rows]
     offered = len(used) if closed else int(tested.in_view.sum())
     labels, explained, unmapped = detections.label[tested.rows], used.copy(), np.zeros(len(used), bool)
-    if closed and used.sum() < settings.share_degraded * offered:
+    if known.is_whole and used.sum() < settings.share_degraded * offered:
         others = np.flatnonzero(~used)
         rows = tested.rows[others]
         points = to_map(detections.point[rows], smoother.map.variables.poses_at(detections.cycle[rows]))

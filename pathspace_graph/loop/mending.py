@@ -89,8 +89,7 @@ class Mending:
         self._wait_until = 0.0
         self.contradictions.clear()
         names = [name for number, name in enumerate(NAMES) if (label[explained] == number).any()]
-        whose = f"the {' and the '.join(names)} boundary"
-        return f"{MENDED}: {int(explained.sum())} more cones of {whose} lie on it"
+        return f"{MENDED}: {int(explained.sum())} more cones on the {' and on the '.join(names)} lie on it"
 
 
 def _cones(stretches: list[Stretch]) -> tuple[NDArray[np.intp], Array]:

@@ -105,7 +105,7 @@ class TrackLoop:
         self.health = self._monitor.update(evidence)
         if self._boundaries_cross and self.health.condition == GOOD:
             self.health = Health(DEGRADED, "the two boundaries of the map cross")
-        if self.closed and self.open_lap.unsolvable is None:
+        if self._known_loop.is_whole and self.open_lap.unsolvable is None:
             self.mending.contradictions.observe(smoother, self._known_loop, new, detections.t)
         self._begin_search()
 
@@ -171,7 +171,7 @@ class TrackLoop:
     def _try_mending(self) -> None:
         """Sends the drive to a batch that begins with other curves, where the closed map is contradicted."""
         record = self.open_lap
-        if not self.closed or self._search is not None or record.unsolvable is not None:
+        if not self._known_loop.is_whole or self._search is not None or record.unsolvable is not None:
             return
         if self.mending.is_due(self._known_loop, self._path.length):
             self._begin_batch(self.mending.begin(np.array(record.poses)))
@@ -238,8 +238,7 @@ class TrackLoop:
 
         So the map stays as it was before. Nothing is done before the batch of the lap has replaced it.
         """
-        boundaries = set(self._smoother.map.state.boundaries)
-        ready = self.closed and self._lap_batch is None and boundaries == set(BOUNDARIES)
+        ready = self._known_loop.is_whole and self._lap_batch is None
         if self.health.condition == LOST and ready:
             detections = self._smoother.map.detections
             detections.release(np.arange(len(detections)))

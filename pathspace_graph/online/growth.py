@@ -59,7 +59,8 @@ class Growth:
         if label not in self._full:
             self._full.add(label)
             size = f"{boundary.size} control points on {boundary.confirmed_end:.0f} m"
-            self.notice = f"the open {NAMES[label]} boundary grows no further, with {size}"
+            notice = f"the open {NAMES[label]} boundary grows no further, with {size}"
+            self.notice = f"{self.notice}; {notice}" if self.notice else notice
         return True
 
     def move(self, motion: Array) -> None:
