@@ -22,9 +22,9 @@ from pathspace_graph.spline.bspline import BSpline
 
 from .association import Gating
 from .crossing import boundaries_cross
+from .drive_record import DriveRecord, LapBatch
 from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
 from .mending import Mending
-from .open_lap import LapBatch, OpenLapRecord
 from .recognition import recognize
 from .swap import go_on_from
 
@@ -47,8 +47,8 @@ class TrackLoop:
         """(k, 3) These are the poses of the first k cycles as the closing of the loop has corrected them."""
         self.lap_seconds = float("nan")
         """The batch of the lap took this wall time (s) in its own process, once it has replaced the prior."""
-        self.open_lap = OpenLapRecord(self.settings)
-        """This is the lap as it was measured, while the loop is open."""
+        self.record = DriveRecord(self.settings)
+        """This is the drive as it was measured."""
         self.mending = Mending(smoother)
         """This mends the closed map where detections contradict it."""
         self._smoother = smoother
@@ -87,7 +87,7 @@ class TrackLoop:
 
     def measured(self, t: float, odometry: IntegratedOdometry, detections: Detections) -> None:
         """Records the odometry that leads to the pose at t (s), and the detections there."""
-        self.open_lap.measured(t, odometry, detections)
+        self.record.measured(t, odometry, detections)
 
     def judge(self, tested: Gating | None, new: slice, detections: Detections) -> None:
         """Judges the estimate by the detections that were tested, or remembers those of a lost vehicle.
@@ -105,7 +105,7 @@ class TrackLoop:
         self.health = self._monitor.update(evidence)
         if self._boundaries_cross and self.health.condition == GOOD:
             self.health = Health(DEGRADED, "the two boundaries of the map cross")
-        if self._known_loop.is_whole and self.open_lap.unsolvable is None:
+        if self._known_loop.is_whole and self.record.unsolvable is None:
             self.mending.contradictions.observe(smoother, self._known_loop, new, detections.t)
         self._begin_search()
 
@@ -126,7 +126,7 @@ class TrackLoop:
             self._boundaries_cross = self._crosses()
             return None, self._solve_lap()
         if self.closed:
-            self.open_lap.followed(self._smoother.variables.poses[-1])
+            self.record.followed(self._smoother.variables.poses[-1])
         else:
             self._record_open_lap()
         batch = self._lap_batch
@@ -139,9 +139,9 @@ class TrackLoop:
 
     def _record_open_lap(self) -> None:
         """Records the estimate of an open lap, and tries to close it where the drive says that it is over."""
-        self.open_lap.estimated(self._smoother.map.state)
+        self.record.estimated(self._smoother.map.state)
         if self._path.length > self.settings.closing.min_path:
-            self.open_lap.prepare()
+            self.record.prepare()
             if self._lap_batch is None:
                 self._try_loop()
 
@@ -157,7 +157,7 @@ class TrackLoop:
             self._closes()
         self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds
         jump = go_on_from(smoother, marginal)
-        self.open_lap.replaced(marginal.poses[: marginal.first_kept], smoother.variables.poses)
+        self.record.replaced(marginal.poses[: marginal.first_kept], smoother.variables.poses)
         self._boundaries_cross = self._crosses()
         return jump, notice
 
@@ -170,7 +170,7 @@ class TrackLoop:
 
     def _try_mending(self) -> None:
         """Sends the drive to a batch that begins with other curves, where the closed map is contradicted."""
-        record = self.open_lap
+        record = self.record
         if not self._known_loop.is_whole or self._search is not None or record.unsolvable is not None:
             return
         if self.mending.is_due(self._known_loop, self._path.length):
@@ -185,7 +185,7 @@ class TrackLoop:
 
         Returns a notice that says why it cannot be solved, or an empty one.
         """
-        smoother, record = self._smoother, self.open_lap
+        smoother, record = self._smoother, self.record
         closed = record.closed_map(smoother)
         self.corrected_poses = closed.poses
         record.replaced(closed.poses, np.zeros((0, 3)))
@@ -202,7 +202,7 @@ class TrackLoop:
         own, first, cycle = self.settings.open_lap, self._smoother.first_cycle, self._smoother.next_cycle - 1
         wait = max(min(own.cycles, cycle - first), int(own.cycles_share * cycle))
         first_kept = min(first + wait, cycle)
-        lap = self.open_lap.lap(first_kept, start, self._believed)
+        lap = self.record.lap(first_kept, start, self._believed)
         self._lap_batch = LapBatch(lap, cycle + wait)
 
     def _try_loop(self) -> None:
@@ -221,7 +221,7 @@ class TrackLoop:
 
     def _recurrence(self) -> Recurrence | None:
         """Returns after which length the drive recurs, by its odometry or by the shape of the curves."""
-        record, settings = self.open_lap, self.settings.closing.recognition
+        record, settings = self.record, self.settings.closing.recognition
         if record.unsolvable is not None:
             return None
         found = record.recurrence()
@@ -244,7 +244,7 @@ class TrackLoop:
             detections.release(np.arange(len(detections)))
             self._search = Search(self._smoother)
             self.mending.contradictions.clear()
-            self.open_lap.give_up("the vehicle was lost")
+            self.record.give_up("the vehicle was lost")
 
     def find_back(self) -> tuple[Array | None, str]:
         """Starts the window anew where a lost vehicle is found; returns its jump (3,) and a notice."""

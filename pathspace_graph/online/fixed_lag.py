@@ -77,7 +77,7 @@ class FixedLagMapper:
         self.loop = TrackLoop(self.smoother, self.path)
         """This closes the loop of the track, and looks after the closed map."""
         if self.settings.open_lap.prior == "window" or solver is not None:
-            self.loop.open_lap.give_up("no batch of the lap was asked for")
+            self.loop.record.give_up("no batch of the lap was asked for")
         self._grown: frozenset[int] = frozenset()
         self._twist = np.zeros(POSE)
 
@@ -98,7 +98,7 @@ class FixedLagMapper:
         watch = Stopwatch()
         self.smoother.add_factors(factors)
         if factors:
-            self.loop.open_lap.give_up("the batch of the lap does not know the user's factors")
+            self.loop.record.give_up("the batch of the lap does not know the user's factors")
         self._predict(odometry, detections)
         watch.lap("predict")
         self._classify(detections)  # detections that no curve explains may expand one

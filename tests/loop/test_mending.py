@@ -102,7 +102,7 @@ def test_a_map_without_holes_is_never_solved_again(
 
 def test_the_record_has_the_pose_of_every_cycle_in_the_frame_of_the_mended_map() -> None:
     mapper, results = mended()
-    poses = np.array(mapper.loop.open_lap.poses)
+    poses = np.array(mapper.loop.record.poses)
     assert len(poses) == len(results)
     assert np.hypot(*(poses - true_poses(clean()))[:, :2].T).max() < 0.3
 
@@ -121,7 +121,7 @@ def test_a_map_that_does_not_explain_the_contradictions_is_refused() -> None:
 
 def test_a_curve_is_led_through_new_cones_and_stays_elsewhere() -> None:
     mapper, _ = map_log(unseen(clean(), [LEFT], *HOLE))
-    track, poses = mapper.smoother.map, np.array(mapper.loop.open_lap.poses)
+    track, poses = mapper.smoother.map, np.array(mapper.loop.record.poses)
     before = sampled(track.state.spline(LEFT), 0.25)
     u = np.array([30.0, 33.0, 36.0, 39.0])
     boundary, points = track.state.boundaries[LEFT], mapper.control_points(LEFT)
