@@ -63,11 +63,14 @@ class HealthMonitor:
         self._recent: deque[Evidence] = deque()
         self._offered = 0  # by all the recent cycles together
         self._last_offered: float | None = None
+        self._wrong: int | None = (
+            None  # the boundary that is wrong, as long as the map is worse than degraded
+        )
 
     def restart(self) -> None:
         """Forgets the evidence so far, because the map or the pose was replaced."""
         self._recent.clear()
-        self._offered, self._last_offered = 0, None
+        self._offered, self._last_offered, self._wrong = 0, None, None
 
     def update(self, evidence: Evidence) -> Health:
         """Returns the health at a cycle."""
@@ -94,17 +97,25 @@ class HealthMonitor:
         return Health(DEGRADED, f"the {names[0]} boundary is not mapped here") if names else Health(GOOD)
 
     def _wrong_side(self) -> str:
-        """Returns which boundary is wrong where the other one explains its detections, or an empty string.
+        """Returns which boundary is wrong, where the other one explains its detections, or an empty string.
 
-        It is the map that is wrong then: a vehicle that is lost has both boundaries beside it.
+        It is the map that is wrong then: a vehicle that is lost has both boundaries beside it. A boundary
+        stays wrong while too little of the other one is mapped to say anything.
         """
-        for label, name in zip(BOUNDARIES, reversed(NAMES[: len(BOUNDARIES)]), strict=True):
-            offered = sum(one.offered_by[label] for one in self._recent)
-            explained = sum(one.explained_by[label] for one in self._recent)
-            enough = offered >= self.settings.min_offered / len(BOUNDARIES)
-            if enough and explained >= self.settings.share_degraded * offered:
-                return f"the {name} boundary is not where the map has it"
-        return ""
+        holds = [self._holds(label) for label in BOUNDARIES]
+        if True in holds:
+            self._wrong = 1 - holds.index(True)
+        elif self._wrong is not None and holds[1 - self._wrong] is False:
+            self._wrong = None
+        return "" if self._wrong is None else f"the {NAMES[self._wrong]} boundary is not where the map has it"
+
+    def _holds(self, label: int) -> bool | None:
+        """Returns whether a boundary explains its detections, or None if there are too few of them."""
+        offered = sum(one.offered_by[label] for one in self._recent)
+        explained = sum(one.explained_by[label] for one in self._recent)
+        if offered < self.settings.min_offered / len(BOUNDARIES):
+            return None
+        return explained >= self.settings.share_degraded * offered
 
     def _remember(self, evidence: Evidence) -> None:
         """Adds the evidence of a cycle, and drops what is too old and not needed for `min_offered`."""
@@ -131,6 +142,7 @@ class HealthMonitor:
             wrong = self._wrong_side() if share < lost and newest.closed else ""
             reason = wrong or f"{100 * share:.0f} % of the detections lie on the map"
             return Health(LOST if share < lost and not wrong else DEGRADED, reason)
+        self._wrong = None
         if blind > settings.blind:
             return Health(DEGRADED, f"no detection in view of the map for {blind:.1f} s")
         if innovation > settings.innovation:

@@ -65,6 +65,17 @@ def test_a_boundary_that_is_wrong_beside_one_that_is_right_does_not_lose_the_veh
     assert drive((CLEAN, 3.0), (neither, 3.0))[-1].condition == LOST
 
 
+def test_a_boundary_that_was_wrong_stays_wrong_while_the_other_one_is_not_mapped() -> None:
+    left_wrong = replace(CLEAN, explained=5, used=5, offered_by=(5, 5), explained_by=(0, 5))
+    right_in_gap = replace(CLEAN, offered=5, explained=0, used=0, offered_by=(5, 0), unmapped=(0, 5))
+    assert drive((CLEAN, 3.0), (left_wrong, 3.0), (right_in_gap, 3.0))[-1].condition == DEGRADED
+    assert drive((CLEAN, 3.0), (right_in_gap, 3.0))[-1].condition == LOST
+    neither = replace(CLEAN, explained=0, used=0, offered_by=(5, 5))
+    assert drive((CLEAN, 3.0), (left_wrong, 3.0), (neither, 3.0))[-1].condition == LOST
+    again = drive((CLEAN, 3.0), (left_wrong, 3.0), (CLEAN, 3.0), (right_in_gap, 3.0))
+    assert again[-1].condition == LOST
+
+
 def test_a_boundary_of_few_detections_does_not_hold_the_vehicle() -> None:
     single = replace(CLEAN, offered=10, explained=1, used=1, offered_by=(9, 1), explained_by=(0, 1))
     health = HealthMonitor().update(replace(single, t=1.0, offered=20, offered_by=(19, 1)))

@@ -113,7 +113,7 @@ class MendingSettings(Positive):
     passes are detected about twenty times, and a place in clutter hardly more than once."""
     cones: int = 3
     """At least this number of contradictions in a row is mended."""
-    beside: float = 0.8
+    beside: float = 0.5
     """A cone that is nearer to a curve than this (m) does not contradict it."""
     row: float = 11.0
     """Neighbours in a row are at most this far apart (m): two regular gaps, since a cone may never be
