@@ -63,9 +63,7 @@ class HealthMonitor:
         self._recent: deque[Evidence] = deque()
         self._offered = 0  # by all the recent cycles together
         self._last_offered: float | None = None
-        self._wrong: int | None = (
-            None  # the boundary that is wrong, as long as the map is worse than degraded
-        )
+        self._wrong: int | None = None  # this boundary is wrong, as long as it explains too little
 
     def restart(self) -> None:
         """Forgets the evidence so far, because the map or the pose was replaced."""
