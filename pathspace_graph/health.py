@@ -9,6 +9,7 @@ from itertools import groupby
 from math import nan
 from typing import Final
 
+from .labels import BOUNDARIES, NAMES
 from .settings.health import HealthSettings
 
 GOOD: Final = "good"
@@ -46,6 +47,12 @@ class Evidence:
     sigma: float = nan
     """This is the standard deviation (m) of the position in its worst direction on a closed map, where it is
     known."""
+    offered_by: tuple[int, int] = (0, 0)
+    """These numbers of the offered detections are of the left and of the right boundary of a closed map."""
+    explained_by: tuple[int, int] = (0, 0)
+    """These numbers of the explained detections are."""
+    unmapped: tuple[int, int] = (0, 0)
+    """These numbers of other coloured detections, left and right, lie beside a gap of a closed map."""
     odometry: str = ""
     """This says what is wrong with the odometry since the cycle before; it is empty where nothing is."""
 
@@ -58,11 +65,12 @@ class HealthMonitor:
         self._recent: deque[Evidence] = deque()
         self._offered = 0  # by all the recent cycles together
         self._last_offered: float | None = None
+        self._wrong: int | None = None  # this boundary is wrong, as long as it explains too little
 
     def restart(self) -> None:
         """Forgets the evidence so far, because the map or the pose was replaced."""
         self._recent.clear()
-        self._offered, self._last_offered = 0, None
+        self._offered, self._last_offered, self._wrong = 0, None, None
 
     def update(self, evidence: Evidence) -> Health:
         """Returns the health at a cycle."""
@@ -76,7 +84,38 @@ class HealthMonitor:
             squares += one.innovations
         share = explained / offered if offered >= self.settings.min_offered else 1.0
         innovation = squares / used if used >= self.settings.min_offered else 0.0
-        return self._judge(evidence, share, innovation)
+        health = self._judge(evidence, share, innovation)
+        return self._beside_gap(offered) if health == Health(GOOD) else health
+
+    def _beside_gap(self, offered: int) -> Health:
+        """Returns the health where nothing is wrong, but the map may have a gap of a boundary."""
+        unmapped = [sum(one.unmapped[label] for one in self._recent) for label in BOUNDARIES]
+        most = (1.0 - self.settings.share_degraded) * (offered + sum(unmapped))
+        names = [NAMES[label] for label in BOUNDARIES if unmapped[label] > most]
+        if len(names) == len(BOUNDARIES):
+            return Health(DEGRADED, "no boundary is mapped here")
+        return Health(DEGRADED, f"the {names[0]} boundary is not mapped here") if names else Health(GOOD)
+
+    def _wrong_side(self) -> str:
+        """Returns which boundary is wrong, where the other one explains its detections, or an empty string.
+
+        It is the map that is wrong then: a vehicle that is lost has both boundaries beside it. A boundary
+        stays wrong while too little of the other one is mapped to say anything.
+        """
+        holds = [self._holds(label) for label in BOUNDARIES]
+        if True in holds:
+            self._wrong = 1 - holds.index(True)
+        elif self._wrong is not None and holds[1 - self._wrong] is False:
+            self._wrong = None
+        return "" if self._wrong is None else f"the {NAMES[self._wrong]} boundary is not where the map has it"
+
+    def _holds(self, label: int) -> bool | None:
+        """Returns whether a boundary explains its detections, or None if there are too few of them."""
+        offered = sum(one.offered_by[label] for one in self._recent)
+        explained = sum(one.explained_by[label] for one in self._recent)
+        if offered < self.settings.min_offered / len(BOUNDARIES):
+            return None
+        return explained >= self.settings.share_degraded * offered
 
     def _remember(self, evidence: Evidence) -> None:
         """Adds the evidence of a cycle, and drops what is too old and not needed for `min_offered`."""
@@ -100,8 +139,10 @@ class HealthMonitor:
             reason = f"the position is uncertain by {newest.sigma:.1f} m"
             return Health(LOST if newest.sigma > settings.sigma_lost else DEGRADED, reason)
         if share < degraded:
-            reason = f"{100 * share:.0f} % of the detections lie on the map"
-            return Health(LOST if share < lost else DEGRADED, reason)
+            wrong = self._wrong_side() if share < lost and newest.closed else ""
+            reason = wrong or f"{100 * share:.0f} % of the detections lie on the map"
+            return Health(LOST if share < lost and not wrong else DEGRADED, reason)
+        self._wrong = None
         if newest.odometry:
             return Health(DEGRADED, newest.odometry)
         if blind > settings.blind:

@@ -55,6 +55,41 @@ def test_half_of_the_detections_beside_the_curves_is_no_alarm_while_the_loop_is_
     assert drive((replace(hairpin, explained=1, used=1), 3.0))[-1].condition == LOST
 
 
+def test_a_boundary_that_is_wrong_beside_one_that_is_right_does_not_lose_the_vehicle() -> None:
+    right_holds = replace(CLEAN, explained=5, used=5, offered_by=(5, 5), explained_by=(0, 5))
+    health = drive((CLEAN, 3.0), (right_holds, 3.0))[-1]
+    assert health == Health(DEGRADED, "the left boundary is not where the map has it")
+    left_holds = replace(right_holds, explained_by=(5, 0))
+    assert "right" in drive((CLEAN, 3.0), (left_holds, 3.0))[-1].reason
+    neither = replace(CLEAN, explained=5, used=5, offered_by=(5, 5), explained_by=(2, 3))
+    assert drive((CLEAN, 3.0), (neither, 3.0))[-1].condition == LOST
+
+
+def test_a_boundary_that_was_wrong_stays_wrong_while_the_other_one_is_not_mapped() -> None:
+    left_wrong = replace(CLEAN, explained=5, used=5, offered_by=(5, 5), explained_by=(0, 5))
+    right_in_gap = replace(CLEAN, offered=5, explained=0, used=0, offered_by=(5, 0), unmapped=(0, 5))
+    assert drive((CLEAN, 3.0), (left_wrong, 3.0), (right_in_gap, 3.0))[-1].condition == DEGRADED
+    assert drive((CLEAN, 3.0), (right_in_gap, 3.0))[-1].condition == LOST
+    neither = replace(CLEAN, explained=0, used=0, offered_by=(5, 5))
+    assert drive((CLEAN, 3.0), (left_wrong, 3.0), (neither, 3.0))[-1].condition == LOST
+    again = drive((CLEAN, 3.0), (left_wrong, 3.0), (CLEAN, 3.0), (right_in_gap, 3.0))
+    assert again[-1].condition == LOST
+
+
+def test_a_boundary_of_few_detections_does_not_hold_the_vehicle() -> None:
+    single = replace(CLEAN, offered=10, explained=1, used=1, offered_by=(9, 1), explained_by=(0, 1))
+    health = HealthMonitor().update(replace(single, t=1.0, offered=20, offered_by=(19, 1)))
+    assert health.condition == LOST
+
+
+def test_beside_a_gap_of_the_map_it_is_said_which_boundary_is_not_mapped() -> None:
+    beside = replace(CLEAN, offered=5, explained=5, used=5, unmapped=(5, 0))
+    assert drive((beside, 3.0))[-1] == Health(DEGRADED, "the left boundary is not mapped here")
+    both = replace(beside, offered=2, explained=2, used=2, innovations=0.6, unmapped=(5, 5))
+    assert drive((both, 3.0))[-1].reason == "no boundary is mapped here"
+    assert drive((replace(CLEAN, unmapped=(1, 1)), 3.0))[-1] == Health(GOOD)
+
+
 def test_a_few_detections_are_not_judged_alone() -> None:
     sparse = replace(CLEAN, offered=1, explained=0, used=0)
     healths = drive((CLEAN, 2.0), (sparse, 0.5))

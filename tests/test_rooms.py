@@ -20,7 +20,7 @@ LEAVES = {"errors", "labels", "progress"}
 ESTIMATORS = {"online", "batch", "ckf", "landmark"}
 BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "health", "run"}
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
-BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"sim", "estimators", "diagnosis"}
+BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "diagnosis"}
 
 ARROWS: dict[str, set[str]] = {
     **{leaf: set() for leaf in LEAVES},
@@ -37,7 +37,8 @@ ARROWS: dict[str, set[str]] = {
     "mapping": BELOW_MAPPING,
     "front_end": BELOW_MAPPING | {"mapping"},
     **dict.fromkeys(ESTIMATORS, BELOW_ESTIMATORS),
-    "online": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes
+    "loop": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes
+    "online": BELOW_ESTIMATORS | {"loop"},
     "estimators": BELOW_ESTIMATORS | ESTIMATORS,
     "eval.metrics": BELOW_EVAL,
     "eval.figures": BELOW_EVAL | {"eval.metrics"},

@@ -99,6 +99,8 @@ class LapMarginal:
     """For each boundary, its cones have these parameters (k,) on the simplified curve (m)."""
     scatter: dict[int, Array]
     """For each boundary, cones scatter about the curve by this sigma (m,) at each control point (m)."""
+    cones: dict[int, Array]
+    """For each boundary, the cones that were detected are at these parameters (k,) of its curve (m)."""
     seconds: float
     """The solution took this wall time (s)."""
 
@@ -131,6 +133,7 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
             information=information,
             places=places_on(few, at.state, system),
             scatter={label: scatter.sigma(label, b.abscissae) for label, b in few.boundaries.items()},
+            cones=scatter.places,
             seconds=time.perf_counter() - begin,
         )
 

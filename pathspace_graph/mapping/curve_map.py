@@ -46,6 +46,8 @@ class CurveMap:
         self.scatter: dict[int, Array] = {}
         """Cones scatter about a boundary's curve by this sigma (m,) at each control point (m), where it is
         known."""
+        self.cones: dict[int, Array] = {}
+        """The cones of a closed boundary were detected at these parameters (k,) (m), where they are known."""
         self.reached_inactive = False
         """The flag is set when a foot point of the latest `rows` has slid to an inactive part of a curve."""
         self.places: ConePlaces | None = None

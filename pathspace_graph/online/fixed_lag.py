@@ -3,55 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Protocol
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.lap import ClosedMap
-from pathspace_graph.batch.recurrence import Recurrence
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
-from pathspace_graph.health import DEGRADED, LOST, Evidence, Health, HealthMonitor
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import VehicleState
-from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.loop.association import associate
+from pathspace_graph.loop.closing import apply_correspondences, optimize_loop, simplify
+from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import (
-    doubt_calibrations,
     odometry_noise,
     predict,
     smoother_settings,
     vehicle_state,
 )
-from pathspace_graph.mapping.registration import near_start, register
+from pathspace_graph.mapping.registration import register
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
 from .activation import deactivate_distant
-from .association import associate
-from .closing import apply_correspondences, optimize_loop, simplify
-from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
 from .growth import Growth
 from .nonlinear_graph import window_graph
-from .open_lap import LapBatch, OpenLapRecord
 from .outlook import Outlook, confirmed, joint_covariance_of, look_ahead
-from .recognition import recognize
-from .swap import go_on_from
 
 Array = NDArray[np.float64]
-
-
-OWN_PRIOR = "the map goes on from the window's own prior"
-"""This begins the notice of a cycle in which the batch of the lap does not replace the prior."""
 
 
 class Solver(Protocol):
@@ -89,24 +77,11 @@ class FixedLagMapper:
         self.growth = Growth(self.settings.growth)
         """The open curves grow through the tentative tracks that are collected here."""
         self.smoother.followers = [self.smoother.map, self.path, self.growth]
-        self.closed = False
-        """The flag is set when the loop has closed: the map has its final size."""
-        self.corrected_poses: Array = np.zeros((0, 3))
-        """(k, 3) These are the poses of the first k cycles as the closing of the loop has corrected them."""
-        self.lap_seconds = float("nan")
-        """The batch of the lap took this wall time (s) in its own process, once it has replaced the prior."""
-        self._open_lap = OpenLapRecord(self.settings)
+        self.loop = TrackLoop(self.smoother, self.path)
+        """This closes the loop of the track, and looks after the closed map."""
         if self.settings.open_lap.prior == "window" or solver is not None:
-            self._open_lap.give_up("no batch of the lap was asked for")
-        self._monitor = HealthMonitor(self.settings.health)
-        self._health = Health()
-        self._known_loop = KnownLoop(self.smoother)
-        self._search: Search | None = None
-        self._lap_batch: LapBatch | None = None
+            self.loop.record.give_up("no batch of the lap was asked for")
         self._grown: frozenset[int] = frozenset()
-        self._believed = self.settings  # with the priors of the calibrations as they are now
-        self._closing_tried = 0.0
-        self._loop_tried, self._recognition_tried = 0.0, 0.0
 
     def update(
         self,
@@ -125,7 +100,7 @@ class FixedLagMapper:
         watch = Stopwatch()
         self.smoother.add_factors(factors)
         if factors:
-            self._open_lap.give_up("the batch of the lap does not know the user's factors")
+            self.loop.record.give_up("the batch of the lap does not know the user's factors")
         reading = self._predict(odometry, detections)
         watch.lap("predict")
         self._classify(reading)  # detections that no curve explains may expand one
@@ -137,21 +112,22 @@ class FixedLagMapper:
         for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
             self._step()
         watch.lap("update")
-        if not self.closed:
-            self._believed = doubt_calibrations(self.smoother, self._believed)
+        self.loop.doubt_calibrations()
         closes = self._close()
         watch.lap("close")
         if closes:
             self._simplify()
         watch.lap("simplify")
-        jump, notice = self._go_on(closes)
+        jump, notice = self.loop.go_on(closes)
         watch.lap("swap")
-        if self._search is not None:
-            jump, notice = self._find_back()
+        if self.loop.is_searching:
+            jump, notice = self.loop.find_back()
         watch.lap("find")
-        self.smoother.marginalize(self._lap_batch.first_kept if self._lap_batch else None)
+        if self.closed:
+            self.growth.clear()
+        self.smoother.marginalize(self.loop.first_kept)
         watch.lap("marginalize")
-        return self._result(detections.t, watch.laps, jump, notice)
+        return self._result(detections.t, watch.laps, jump, notice or self.growth.notice)
 
     def _step(self) -> None:
         """Takes one Gauss-Newton step, relinearized at the current estimate, or the solver's step."""
@@ -170,8 +146,7 @@ class FixedLagMapper:
         reading = self.front_end.update(odometry, detections)
         motion, t = reading.motion, detections.t
         predict(self.smoother, self.path, motion.odometry, motion.twists, t, self.settings)
-        if not self.closed:
-            self._open_lap.measured(t, motion.odometry, reading.detections)
+        self.loop.measured(t, motion.odometry, reading.detections)
         if self.solver is not None:
             self.smoother.submaps = None  # another solver's loop closure relinearizes no submap
         return reading
@@ -181,17 +156,11 @@ class FixedLagMapper:
         detections, motion, cycle = reading.detections, reading.motion, self.smoother.next_cycle - 1
         new = self.smoother.map.detections.append(detections, cycle, motion.odometry.twist)
         self.smoother.map.correct()
-        evidence = Evidence(detections.t)
+        tested = None
         if self.boundaries:
-            tested = associate(self.smoother, self._grown, use=self._search is None)
-            evidence = evidence_of(self.smoother, tested, self._known_loop)
+            tested = associate(self.smoother, self._grown, use=not self.loop.is_searching)
             self.smoother.map.place_detections(new.start)
-        if self._search is None:
-            self._health = self._monitor.update(replace(evidence, odometry=motion.fault))
-            self._begin_search()
-        else:
-            corrected = self.smoother.map.detections.point[new].copy()
-            self._search.observe(self.poses[-1], replace(detections, points_vehicle=corrected))
+        self.loop.judge(tested, new, reading)
         if not self.closed:
             self.growth.observe(self.smoother, new, detections.t)
 
@@ -204,126 +173,22 @@ class FixedLagMapper:
 
     def _close(self) -> bool:
         """Closes the loop if the newest detections are registered with the beginning; True if it closes."""
-        settings, length = self.settings.closing, self.path.length
-        if self.closed or not self.boundaries or not near_start(self.path, self.poses[-1], settings):
+        if not self.boundaries or not self.loop.may_close():
             return False
-        if length - self._closing_tried < settings.check_interval:
-            return False
-        self._closing_tried = length
         self.smoother.carry()
         self.smoother.refresh()
         covariance = self.smoother.covariance(pose_keys(np.array([self.smoother.next_cycle - 1])))
-        beginning = self.path.beginning
+        beginning, settings = self.path.beginning, self.settings.closing
         registration = register(self.smoother.map, self.smoother.times, covariance, beginning, settings)
         if registration is None:
             return False
         apply_correspondences(self.smoother, registration)
         optimize_loop(self.smoother)
-        self.closed = True
         return True
 
     def _simplify(self) -> None:
         """Makes both curves periodic; they have their final size then."""
         simplify(self.smoother)
-        self.growth.clear()
-        self.smoother.window.exact = False  # hardly anything moves from now on
-
-    def _solve_lap(self) -> str:
-        """Sends the lap to be solved as a batch in the cycle in which the loop has closed.
-
-        Returns a notice that says why it cannot be solved, or an empty one.
-        """
-        smoother, record = self.smoother, self._open_lap
-        closed = record.closed_map(smoother)
-        self.corrected_poses = closed.poses
-        cones = len(smoother.map.state.map_keys) / self.settings.spline.size_share
-        if cones > self.settings.open_lap.max_cones:
-            record.give_up("the lap has too many cones for a batch")
-        if record.unsolvable is not None:
-            return f"{OWN_PRIOR}: {record.unsolvable}"
-        self._begin_batch(closed)
-        return ""
-
-    def _begin_batch(self, start: ClosedMap | Recurrence) -> None:
-        """Sends the lap to its batch, which begins at a map that has just been closed, or at odometry."""
-        own, first, cycle = self.settings.open_lap, self.smoother.first_cycle, self.smoother.next_cycle - 1
-        wait = max(min(own.cycles, cycle - first), int(own.cycles_share * cycle))
-        first_kept = min(first + wait, cycle)
-        lap = self._open_lap.lap(first_kept, start, self._believed)
-        self._lap_batch = LapBatch(lap, cycle + wait)
-
-    def _try_loop(self) -> None:
-        """Sends the lap to a batch from odometry where the drive says that it is over.
-
-        That happens where the registration keeps refusing to close the loop.
-        """
-        if self.path.length < self._loop_tried or set(self.boundaries) != set(BOUNDARIES):
-            return
-        self._loop_tried = self.path.length + self.settings.closing.check_interval
-        recurrence = self._recurrence()
-        if recurrence is not None:
-            self._loop_tried = self.path.length + self.settings.open_lap.retry
-            self._begin_batch(recurrence)
-
-    def _recurrence(self) -> Recurrence | None:
-        """Returns after which length the drive recurs, by its odometry or by the shape of the curves."""
-        record, settings = self._open_lap, self.settings.closing.recognition
-        if record.unsolvable is not None:
-            return None
-        found = record.recurrence()
-        if found is not None or self.path.length < self._recognition_tried + settings.interval:
-            return found
-        self._recognition_tried = self.path.length
-        place = recognize(self.smoother)
-        return None if place is None else record.recurrence_since(place)
-
-    def _go_on(self, closes: bool) -> tuple[Array | None, str]:
-        """Records the open lap, has it solved when it closes, and goes on from the result when it is due.
-
-        Returns the jump (3,) of the newest pose if the map was replaced, and a notice if it was not.
-        """
-        batch = self._lap_batch
-        if closes:
-            return None, self._solve_lap()
-        if not self.closed:
-            self._open_lap.estimated(self.smoother.map.state)
-            if self.path.length > self.settings.closing.min_path:
-                self._open_lap.prepare()
-                if batch is None:
-                    self._try_loop()
-        if batch is None or self.smoother.next_cycle - 1 < batch.due:
-            return None, ""
-        self._lap_batch, marginal = None, batch.marginal()
-        if isinstance(marginal, str):
-            return None, f"{OWN_PRIOR}: {marginal}" if self.closed else ""
-        if not self.closed:
-            self.closed, self.smoother.window.exact = True, False
-            self.growth.clear()
-        self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds
-        return go_on_from(self.smoother, marginal), ""
-
-    def _begin_search(self) -> None:
-        """Takes all detections of the window out of use, if the vehicle is lost on a map that is complete.
-
-        So the map stays as it was before. Nothing is done before the batch of the lap has replaced it.
-        """
-        ready = self.closed and self._lap_batch is None and set(self.boundaries) == set(BOUNDARIES)
-        if self._health.condition == LOST and ready:
-            detections = self.smoother.map.detections
-            detections.release(np.arange(len(detections)))
-            self._search = Search(self.smoother)
-
-    def _find_back(self) -> tuple[Array | None, str]:
-        """Starts the window anew where a lost vehicle is found; returns its jump (3,) and a notice."""
-        if self._search is None:
-            return None, ""
-        found = self._search.find()
-        if found is None:
-            return None, ""
-        first_cycle = max(self._search.first_cycle, self.smoother.first_cycle)
-        self._search, self._health = None, Health(DEGRADED, FOUND)
-        self._monitor.restart()
-        return start_anew(self.smoother, first_cycle, found), FOUND
 
     def _result(self, t: float, stages: dict[str, float], jump: Array | None, notice: str) -> CycleResult:
         """Returns the newest pose, the sizes of the boundaries, and the cycle's detections in use."""
@@ -331,7 +196,7 @@ class FixedLagMapper:
         used = int(detections.used[detections.cycle.searchsorted(self.smoother.next_cycle - 1) :].sum())
         left, right = (self.boundaries[b].size if b in self.boundaries else 0 for b in (LEFT, RIGHT))
         pose, sizes = self.poses[-1].copy(), (left, right)
-        return CycleResult(t, pose, sizes, used, self.closed, stages, jump, notice, self._health)
+        return CycleResult(t, pose, sizes, used, self.closed, stages, jump, notice, self.loop.health)
 
     def map(self) -> Map:
         """Returns a copy of the present map, with the joint covariance of each boundary's control points.
@@ -447,6 +312,23 @@ class FixedLagMapper:
         """Returns the keys of a boundary's control points, which change only when the loop closes."""
         keys: list[int] = self.smoother.map.state.keys(label).tolist()
         return keys
+
+    # --- the loop ----------------------------------------------------------------------------------------
+
+    @property
+    def closed(self) -> bool:
+        """Returns whether the loop has closed: the map has its final size."""
+        return self.loop.closed
+
+    @property
+    def corrected_poses(self) -> Array:
+        """Returns the poses (k, 3) of the first k cycles as the closing of the loop has corrected them."""
+        return self.loop.corrected_poses
+
+    @property
+    def lap_seconds(self) -> float:
+        """Returns the wall time (s) of the batch of the lap, once it has replaced the prior."""
+        return self.loop.lap_seconds
 
     # --- the estimate ------------------------------------------------------------------------------------
 

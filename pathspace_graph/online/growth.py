@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.labels import BOUNDARIES, UNKNOWN
+from pathspace_graph.labels import BOUNDARIES, NAMES, UNKNOWN
 from pathspace_graph.mapping.candidates import SIDES, Candidates, End, chain
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.path import PathAhead
@@ -25,6 +25,9 @@ class Growth:
         self.settings = settings
         self.tentative = {label: TentativeTracks(settings) for label in BOUNDARIES}
         """Detections that no curve explains are collected here, by label."""
+        self.notice = ""
+        """This says in the cycle in which a boundary stops growing that it does."""
+        self._full: set[int] = set()
 
     def observe(self, smoother: CurveSmoother, new: slice, t: float) -> None:
         """Adds the new detections that no curve uses to the tentative tracks, seen at t (s)."""
@@ -39,13 +42,26 @@ class Growth:
 
     def expand(self, smoother: CurveSmoother, path_ahead: PathAhead) -> frozenset[int]:
         """Begins or extends each boundary; returns the labels of the curves that were extended."""
-        grown = set()
+        self.notice, grown = "", set()
         for label in BOUNDARIES:
             if label not in smoother.map.state.boundaries:
                 self._begin(smoother, label, path_ahead)
-            elif self._grow(smoother, label, path_ahead):
+            elif not self._is_full(smoother, label, path_ahead) and self._grow(smoother, label, path_ahead):
                 grown.add(label)
         return frozenset(grown)
+
+    def _is_full(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> bool:
+        """Returns whether an open curve grows no further, since it is longer than it can be."""
+        boundary, settings = smoother.map.state.boundaries[label], self.settings
+        longest = settings.length_free + settings.length_driven * path_ahead.driven
+        if boundary.size < settings.max_size and boundary.confirmed_end < longest:
+            return False
+        if label not in self._full:
+            self._full.add(label)
+            size = f"{boundary.size} control points on {boundary.confirmed_end:.0f} m"
+            notice = f"the open {NAMES[label]} boundary grows no further, with {size}"
+            self.notice = f"{self.notice}; {notice}" if self.notice else notice
+        return True
 
     def move(self, motion: Array) -> None:
         """Moves all tentative tracks by a rigid motion (3,) of the map frame."""
@@ -54,6 +70,7 @@ class Growth:
 
     def clear(self) -> None:
         """Removes all tentative tracks."""
+        self.notice = ""
         for tentative in self.tentative.values():
             tentative.clear()
 

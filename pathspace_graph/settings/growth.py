@@ -30,7 +30,7 @@ class PathSettings(Positive):
 class GrowthSettings(Positive):
     """Describes how the open end of a curve grows."""
 
-    UNLIMITED = ("forget_after",)
+    UNLIMITED = ("forget_after", "max_size", "length_driven")
 
     reach: float = 7.0
     """A boundary is extended up to this far ahead of the vehicle (m along the predicted path)."""
@@ -72,6 +72,13 @@ class GrowthSettings(Positive):
     """A carried end keeps at least this distance from the path (m)."""
     min_carry: float = 0.5
     """An end is carried on by at least this distance (m), or not at all."""
+    max_size: float = 5000.0
+    """An open curve grows no further once it has this number of control points."""
+    length_driven: float = 2.0
+    """It grows no further, either, once it is longer than `length_free` plus this number of times the path
+    driven; on 11 tracks it is at most 1.44 times as long. A curve that zigzags between false cones is."""
+    length_free: float = 50.0
+    """This length of an open curve is not held against the path driven (m)."""
 
 
 @dataclass(frozen=True)

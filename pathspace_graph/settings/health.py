@@ -30,6 +30,9 @@ class HealthSettings(Positive):
     beside: float = 1.0
     """A detection that is not in use is explained if it is nearer than this (m) to the closed curve of its
     colour."""
+    gap: float = 3.0
+    """A closed curve has a gap where neighbouring cones are farther apart than this number of times their
+    median distance. A detection beside a gap says nothing about the vehicle."""
     open_degraded: float = 0.35
     """While the loop is open, the estimate is degraded below this share. It is low, since detections of
     stretches that are not mapped yet lie beside the curves."""
@@ -95,3 +98,39 @@ class FindingSettings(Positive):
     since its detections are used again."""
     steps: int = 2
     """This number of Gauss-Newton steps is taken at the place that was found."""
+
+
+@dataclass(frozen=True)
+class MendingSettings(Positive):
+    """Describes how a closed map is mended where detections keep contradicting it.
+
+    A contradiction is a cone beside which no curve passes. A stretch where several of them stand in a row is
+    led anew through them, and the whole drive is solved again as a batch.
+    """
+
+    sightings: int = 6
+    """A cone contradicts the map once it was detected this number of times. The cones that the vehicle
+    passes are detected about twenty times, and a place in clutter hardly more than once."""
+    cones: int = 3
+    """At least this number of contradictions in a row is mended."""
+    beside: float = 0.5
+    """A cone that is nearer to a curve than this (m) does not contradict it."""
+    row: float = 11.0
+    """Neighbours in a row are at most this far apart (m): two regular gaps, since a cone may never be
+    detected."""
+    settle: float = 1.5
+    """The vehicle has passed a stretch once its cones have not been detected for this time (s)."""
+    most: int = 20
+    """A stretch is mended before the vehicle has passed all of it where it has passed this number of its
+    contradictions."""
+    memory: float = 30.0
+    """A contradiction is forgotten when it has not been detected for this time (s)."""
+    interval: float = 0.5
+    """Contradictions are looked for again after this time (s)."""
+    attempts: int = 8
+    """The map is mended at most this number of times."""
+    explained: float = 0.5
+    """A mended map explains at least this share of the contradictions. If it does not, the old map stays, and
+    the next attempt is a lap later."""
+    sample: float = 0.25
+    """The curves of a mended map are sampled at this step to compare them with the contradictions (m)."""

@@ -13,7 +13,7 @@ from .closing import ClosingSettings
 from .comparison import CkfSettings, LandmarkSettings
 from .front_end import MotionSettings, SidesSettings
 from .growth import GrowthSettings, PathSettings, TentativeSettings
-from .health import FindingSettings, HealthSettings
+from .health import FindingSettings, HealthSettings, MendingSettings
 from .knots import Knots
 
 
@@ -248,6 +248,8 @@ class MapperSettings(Positive):
     """These settings describe when an estimate is good, degraded or lost."""
     finding: FindingSettings = field(default_factory=FindingSettings)
     """These settings describe how a vehicle that is lost on a closed map is found."""
+    mending: MendingSettings = field(default_factory=MendingSettings)
+    """These settings describe how a closed map is mended."""
     far: FarSettings = field(default_factory=FarSettings)
     """These settings describe the inactive part of the map, which is not solved for in every cycle."""
     relinearize: RelinearizeSettings = field(default_factory=RelinearizeSettings)

@@ -15,6 +15,7 @@ from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.path import PathAhead
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.online.growth import count_in_order, undisputed
+from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.curves import boundary_through
@@ -278,3 +279,23 @@ def test_an_end_led_on_in_the_wrong_order_is_taken_back() -> None:
     settings = MapperSettings()
     never = replace(settings, growth=replace(settings.growth, recall=0.1))
     assert backwards(map_log(log, FixedLagMapper(never, log.odometry_sigma))[0], log) > 2.0
+
+
+# --- the bound -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "bound",
+    [GrowthSettings(max_size=10.0), GrowthSettings(length_driven=0.01, length_free=25.0)],
+    ids=["size", "length"],
+)
+def test_an_open_curve_has_a_bound_and_it_is_said_once_for_each_boundary(bound: GrowthSettings) -> None:
+    cones, labels = corridor(100.0)
+    log = exact_log(ahead(6.0, 12.0), cones, labels)
+    mapper, results = map_log(log, FixedLagMapper(replace(MapperSettings(), growth=bound)))
+    notices = sorted("; ".join(result.notice for result in results if result.notice).split("; "))
+    assert [notice.split(" boundary ")[0] for notice in notices] == ["the open left", "the open right"]
+    assert all("grows no further, with" in notice for notice in notices)
+    for boundary in mapper.boundaries.values():
+        assert 20.0 < boundary.confirmed_end < 40.0  # one extension is through several cones
+    assert max(results[-1].sizes) <= 14

@@ -16,6 +16,8 @@ from pathspace_graph.settings.mapper import MapperSettings
 UNLIMITED = {
     "gate.huber",
     "growth.forget_after",
+    "growth.max_size",
+    "growth.length_driven",
     "open_lap.max_cycles",
     "open_lap.max_cones",
     "odometry.doubt",

@@ -9,7 +9,7 @@ agree. Once one is clearly better than all others, and twice in a row, the windo
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -35,6 +35,7 @@ from .association import Gating, reassociate
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
 
 _POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])
 """These unit vectors choose the position of a pose."""
@@ -56,6 +57,8 @@ class Loop:
     """Each boundary has its parameters (n,) beside the points of the middle (m)."""
     curves: Mapping[int, KDTree]
     """Each boundary has densely sampled points."""
+    mapped: Mapping[int, BoolArray]
+    """These say of each point whether it lies between cones that were detected (see `is_mapped`)."""
 
     def at(self, stations: Array) -> Array:
         """Returns the points of the middle at stations of any shape, as complex numbers x + i y."""
@@ -71,9 +74,39 @@ class Loop:
             found[..., own] = np.minimum(distance, most)
         return found
 
+    def beside_gaps(self, labels: IntArray, points: Array) -> BoolArray:
+        """Returns which points (m, 2) are nearest to a gap of their curve (m,), where no cone is mapped."""
+        found = np.zeros(len(points), bool)
+        for label, curve in self.curves.items():
+            own = np.flatnonzero(labels == label)
+            if len(own):
+                found[own] = ~self.mapped[label][curve.query(points[own])[1]]
+        return found
 
-def lay_out_loop(state: State, settings: FindingSettings) -> Loop:
-    """Returns the loop between the two closed curves of a state."""
+
+def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) -> BoolArray:
+    """Returns which parameters (m,) of a closed curve lie between cones (k,) that are neighbours (m).
+
+    The others lie in a gap, which is longer than `gap` times the median distance of neighbours, and farther
+    than the margin (m) from its ends. Where the cones are not known, all of the curve counts as mapped.
+    """
+    if len(cones) < 2:
+        return np.ones(len(u), bool)
+    places = np.unique(np.mod(cones, length))
+    steps = np.diff(places, append=places[0] + length)
+    before = np.searchsorted(places, np.mod(u, length)) - 1
+    past = np.mod(u - places[before], length)
+    near_end = np.minimum(past, steps[before] - past) < margin
+    return np.asarray(near_end | (steps <= gap * np.median(steps))[before])
+
+
+def lay_out_loop(
+    state: State, settings: FindingSettings, is_mapped_on: Callable[[int, Array], BoolArray] | None = None
+) -> Loop:
+    """Returns the loop between the two closed curves of a state.
+
+    `is_mapped_on` says which parameters (m,) of a boundary lie between cones; without it, all of them do.
+    """
     u, points = {}, {}
     for label, boundary in state.boundaries.items():
         u[label] = np.arange(boundary.tables.low, boundary.tables.high, settings.sample)
@@ -86,7 +119,11 @@ def lay_out_loop(state: State, settings: FindingSettings) -> Loop:
     steps = np.hypot(*np.diff(middle, axis=0, append=middle[:1]).T)
     stations = np.concatenate([[0.0], steps.cumsum()[:-1]])
     beside = {LEFT: u[LEFT][::every], RIGHT: u[RIGHT][opposite]}
-    return Loop(middle, stations, float(steps.sum()), beside, curves)
+    mapped = {
+        label: is_mapped_on(label, own) if is_mapped_on else np.ones(len(own), bool)
+        for label, own in u.items()
+    }
+    return Loop(middle, stations, float(steps.sum()), beside, curves, mapped)
 
 
 class KnownLoop:
@@ -103,32 +140,65 @@ class KnownLoop:
         if self._laid_out is None or self._laid_out[0] != boundaries:
             values = state.variables.values.copy()
             self._smoother.refresh()
-            self._laid_out = boundaries, lay_out_loop(state, self._smoother.map.settings.finding)
+            settings = self._smoother.map.settings.finding
+            self._laid_out = boundaries, lay_out_loop(state, settings, self.is_mapped)
             state.variables.values[:] = values
         return self._laid_out[1]
+
+    @property
+    def is_whole(self) -> bool:
+        """Returns whether the loop has closed, with both boundaries."""
+        state = self._smoother.map.state
+        return state.closed and set(state.boundaries) == set(BOUNDARIES)
+
+    def with_gaps(self) -> list[int]:
+        """Returns the boundaries whose curves have gaps."""
+        return [label for label, mapped in self.get().mapped.items() if not mapped.all()]
+
+    def is_mapped(self, label: int, u: Array) -> BoolArray:
+        """Returns which parameters (m,) of a boundary lie between cones that were detected."""
+        track, settings = self._smoother.map, self._smoother.map.settings
+        cones, length = track.cones.get(label, np.zeros(0)), track.state.boundaries[label].length
+        return is_mapped(u, cones, length, settings.health.gap, settings.growth.merge_radius)
 
 
 def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop) -> Evidence:
     """Returns what the tested detections say about the newest pose, before the update.
 
     On a closed map every coloured detection should lie on a curve. If many are not in use, these are looked
-    for on the whole of their curve: they may be of a stretch across the infield.
+    for on the whole of their curve: they may be of a stretch across the infield. And where the map has a gap,
+    they say nothing about the vehicle.
     """
     detections, settings = smoother.map.detections, smoother.map.settings.health
     closed, used = smoother.map.state.closed, detections.used[tested.rows]
     offered = len(used) if closed else int(tested.in_view.sum())
-    in_use = explained = int(used.sum())
-    if closed and in_use < settings.share_degraded * offered:
-        others = tested.rows[~used]
-        poses = smoother.map.variables.poses_at(detections.cycle[others])
-        points = to_map(detections.point[others], poses)
-        away = known.get().distances(detections.label[others], points, settings.beside)
-        explained += int((away < settings.beside).sum())
+    labels, explained, unmapped = detections.label[tested.rows], used.copy(), np.zeros(len(used), bool)
+    if known.is_whole and used.sum() < settings.share_degraded * offered:
+        others = np.flatnonzero(~used)
+        rows = tested.rows[others]
+        points = to_map(detections.point[rows], smoother.map.variables.poses_at(detections.cycle[rows]))
+        away = known.get().distances(labels[others], points, settings.beside)
+        explained[others] = away < settings.beside
+        unmapped[others] = ~explained[others] & known.get().beside_gaps(labels[others], points)
     innovations = tested.innovation[used]
-    sigma = _sigma_of_position(smoother) if closed else np.nan
     return Evidence(
-        smoother.times[-1], offered, explained, in_use, float(innovations @ innovations), closed, sigma
+        t=smoother.times[-1],
+        offered=offered - int(unmapped.sum()),
+        explained=int(explained.sum()),
+        used=int(used.sum()),
+        innovations=float(innovations @ innovations),
+        closed=closed,
+        sigma=_sigma_of_position(smoother) if closed else np.nan,
+        offered_by=_by_boundary(labels[~unmapped]),
+        explained_by=_by_boundary(labels[explained]),
+        unmapped=_by_boundary(labels[unmapped]),
     )
+
+
+def _by_boundary(labels: IntArray) -> tuple[int, int]:
+    """Returns how many of the labels (m,) are of the left and of the right boundary."""
+    left, right = np.bincount(labels, minlength=len(BOUNDARIES)).tolist()
+    return left, right
 
 
 def _sigma_of_position(smoother: CurveSmoother) -> float:

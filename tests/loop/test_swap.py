@@ -15,10 +15,10 @@ from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
 from pathspace_graph.eval.metrics.table1 import lap_metrics
 from pathspace_graph.graph.gaussian import factorize, graph_of
 from pathspace_graph.io.log import Log
+from pathspace_graph.loop import drive_record
+from pathspace_graph.loop.drive_record import DriveRecord, LapBatch
 from pathspace_graph.mapping.detections import NOWHERE
-from pathspace_graph.online import open_lap
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.online.open_lap import LapBatch, OpenLapRecord
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings, PlaceSettings
 
@@ -167,7 +167,7 @@ def test_a_batch_that_does_not_converge_keeps_the_prior_and_says_so() -> None:
 
 
 def test_a_process_that_dies_keeps_the_prior_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(open_lap, "solve_lap", _exit)
+    monkeypatch.setattr(drive_record, "solve_lap", _exit)
     _, results = map_log(log())
     assert [result.notice for result in results if result.notice] == [
         "the map goes on from the window's own prior: the process of the batch has died"
@@ -193,18 +193,18 @@ def test_the_record_gives_the_poses_of_the_lap_in_the_closed_map() -> None:
     mapper, results = run()
     closes = closing_cycle(results)
     assert len(mapper.corrected_poses) == closes + 1
-    assert isinstance(mapper._open_lap, OpenLapRecord)
+    assert isinstance(mapper.loop.record, DriveRecord)
 
 
 def test_the_worker_solves_the_lap_as_this_process_does(monkeypatch: pytest.MonkeyPatch) -> None:
     laps: list[OpenLap] = []
-    record = OpenLapRecord.lap
+    record = DriveRecord.lap
 
-    def keep(self: OpenLapRecord, first_kept: int, start: ClosedMap, settings: MapperSettings) -> OpenLap:
+    def keep(self: DriveRecord, first_kept: int, start: ClosedMap, settings: MapperSettings) -> OpenLap:
         laps.append(record(self, first_kept, start, settings))
         return laps[-1]
 
-    monkeypatch.setattr(OpenLapRecord, "lap", keep)
+    monkeypatch.setattr(DriveRecord, "lap", keep)
     _, (marginal,) = caught(monkeypatch, log())
     here = solve_lap(laps[0])
     assert (here.mean == marginal.mean).all()

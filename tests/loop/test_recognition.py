@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_keys
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.loop.recognition import RecognizedPlace, find_place, may_tell_place
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.state import State
-from pathspace_graph.online.recognition import RecognizedPlace, find_place, may_tell_place
 from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.loop.association import associate
 from pathspace_graph.mapping.prediction import integrate_odometry, predict
-from pathspace_graph.online.association import associate
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 
 from ..scenes.drives import (

@@ -1,4 +1,4 @@
-"""The open lap is kept as it was measured, and is solved again as a batch when the loop closes."""
+"""The drive as it was measured, and its batch: when the loop closes, and where the closed map is mended."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ WORKER_IDLE = 600
 """The process that solves laps ends when it has had nothing to do for this time (s)."""
 
 
-class OpenLapRecord:
-    """Keeps the odometry, the detections and the poses of every cycle until the loop closes."""
+class DriveRecord:
+    """Keeps the odometry, the detections and the poses of every cycle, as long as a batch can solve them."""
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
         self.unsolvable: str | None = None
-        """This says why the lap cannot be solved as a batch; it is None if it can be."""
+        """This says why the drive cannot be solved as a batch; it is None if it can be."""
         self.poses: list[Array] = []
-        """Each cycle had this pose (3,), map frame, as it was estimated then."""
+        """Each cycle had this pose (3,), map frame, as it was estimated then or by the newest batch."""
         self._stamps: list[float] = []
         self._odometry: list[IntegratedOdometry] = []
         self._detections: list[Detections] = []
@@ -77,6 +77,15 @@ class OpenLapRecord:
             u = state.pose_u[label][-1:]
             (pose,) = curve_poses(boundary, state.control_points(label), u)
             self._places.setdefault(label, []).append(Place(cycle, float(u[0]), pose))
+
+    def followed(self, newest: Array) -> None:
+        """Adds the newest pose (3,) on a closed map."""
+        if self.unsolvable is None:
+            self.poses.append(newest.copy())
+
+    def replaced(self, earlier: Array, window: Array) -> None:
+        """Replaces all poses by those (k, 3) before the window and those (P, 3) in it, after a swap."""
+        self.poses = [*unwrap(np.concatenate([earlier, window]))]
 
     def recurrence(self) -> Recurrence | None:
         """Returns the recurrence of the path driven, if odometry alone says that the lap is over."""

@@ -33,7 +33,7 @@ def go_on_from(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
         points.append(spline.distinct_control_points)
     smoother.restart(first, removed, np.concatenate(added), np.concatenate(points))
     smoother.map.held_by_prior = True
-    smoother.map.scatter = marginal.scatter
+    smoother.map.scatter, smoother.map.cones = marginal.scatter, marginal.cones
     _move_poses(state.poses, marginal.poses[first:])
     state.variables.calibrations[:] = marginal.calibration
     smoother.map.correct()

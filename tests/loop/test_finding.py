@@ -17,8 +17,8 @@ from pathspace_graph.graph.variables import Layout
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.online.association import Gating
-from pathspace_graph.online.finding import FOUND, KnownLoop, Search, evidence_of, lay_out_loop
+from pathspace_graph.loop.association import Gating
+from pathspace_graph.loop.finding import FOUND, KnownLoop, Search, evidence_of, lay_out_loop
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.health import FindingSettings

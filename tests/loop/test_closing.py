@@ -16,9 +16,9 @@ from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
+from pathspace_graph.loop.closing import substitute
 from pathspace_graph.mapping.registration import Registration, near_start, register
 from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
-from pathspace_graph.online.closing import substitute
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.closing import ClosingSettings

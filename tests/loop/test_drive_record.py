@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.loop.drive_record import DriveRecord
+from pathspace_graph.loop.recognition import RecognizedPlace
 from pathspace_graph.mapping.prediction import integrate_odometry
 from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.state import State
-from pathspace_graph.online.open_lap import OpenLapRecord
-from pathspace_graph.online.recognition import RecognizedPlace
 from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
 
 from ..scenes.curves import boundary_through
@@ -31,9 +31,9 @@ def on_circle(angle: Array, side: float = 0.0) -> Array:
     return np.column_stack([r * np.sin(angle), RADIUS - r * np.cos(angle)])
 
 
-def driven(laps: float, drift: float) -> OpenLapRecord:
+def driven(laps: float, drift: float) -> DriveRecord:
     """Returns the record of a circle, driven for some laps; its odometry turns by `drift` rad/m too much."""
-    record, state, end = OpenLapRecord(MapperSettings()), State(), 2.0 * np.pi * laps
+    record, state, end = DriveRecord(MapperSettings()), State(), 2.0 * np.pi * laps
     state.variables.insert(np.array([CALIBRATION_KEY]), np.zeros(2))
     state.variables.insert(pose_keys(np.arange(1)), np.zeros(3))
     angles = np.arange(0.0, end + 0.3, 3.0 / RADIUS)

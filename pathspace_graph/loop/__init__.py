@@ -1,0 +1,1 @@
+"""What happens when the loop of the track closes, and afterwards."""

@@ -1,0 +1,260 @@
+"""The loop of the track: when it closes, what is done once, and what is done afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.batch.lap import ClosedMap, LapMarginal
+from pathspace_graph.batch.recurrence import Recurrence
+from pathspace_graph.factors.odometry import IntegratedOdometry
+from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.health import DEGRADED, GOOD, LOST, Evidence, Health, HealthMonitor
+from pathspace_graph.io.log import Detections
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.curve_map import CurveSmoother
+from pathspace_graph.mapping.path import DrivenPath
+from pathspace_graph.mapping.prediction import doubt_calibrations
+from pathspace_graph.mapping.registration import near_start
+from pathspace_graph.spline.bspline import BSpline
+
+from .association import Gating
+from .crossing import boundaries_cross
+from .drive_record import DriveRecord, LapBatch
+from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
+from .mending import Mending
+from .recognition import recognize
+from .swap import go_on_from
+
+Array = NDArray[np.float64]
+
+OWN_PRIOR = "the map goes on from the window's own prior"
+"""This begins the notice of a cycle in which the batch of the lap does not replace the prior."""
+
+
+class TrackLoop:
+    """Looks after the loop: the batch of the open lap when it closes, and a vehicle that is lost on it."""
+
+    def __init__(self, smoother: CurveSmoother, path: DrivenPath) -> None:
+        self.settings = smoother.map.settings
+        self.closed = False
+        """The flag is set when the loop has closed: the map has its final size."""
+        self.health = Health()
+        """This says how far the newest estimate can be trusted."""
+        self.corrected_poses: Array = np.zeros((0, 3))
+        """(k, 3) These are the poses of the first k cycles as the closing of the loop has corrected them."""
+        self.lap_seconds = float("nan")
+        """The batch of the lap took this wall time (s) in its own process, once it has replaced the prior."""
+        self.record = DriveRecord(self.settings)
+        """This is the drive as it was measured."""
+        self.mending = Mending(smoother)
+        """This mends the closed map where detections contradict it."""
+        self._smoother = smoother
+        self._path = path
+        self._monitor = HealthMonitor(self.settings.health)
+        self._known_loop = KnownLoop(smoother)
+        self._search: Search | None = None
+        self._lap_batch: LapBatch | None = None
+        self._boundaries_cross = False
+        self._believed = self.settings  # with the priors of the calibrations as they are now
+        self._closing_tried = 0.0
+        self._loop_tried, self._recognition_tried = 0.0, 0.0
+
+    @property
+    def is_searching(self) -> bool:
+        """Returns whether the vehicle is lost on a closed map, and is looked for."""
+        return self._search is not None
+
+    @property
+    def first_kept(self) -> int | None:
+        """Returns the cycle whose pose must stay in the window until the lap is solved, if there is one."""
+        return self._lap_batch.first_kept if self._lap_batch else None
+
+    def may_close(self) -> bool:
+        """Returns whether it is time to register the newest detections with the beginning of an open loop."""
+        settings, length = self.settings.closing, self._path.length
+        newest = self._smoother.variables.poses[-1]
+        if self.closed or not near_start(self._path, newest, settings):
+            return False
+        if length - self._closing_tried < settings.check_interval:
+            return False
+        self._closing_tried = length
+        return True
+
+    # --- what a cycle tells ------------------------------------------------------------------------------
+
+    def measured(self, t: float, odometry: IntegratedOdometry, detections: Detections) -> None:
+        """Records the odometry that leads to the pose at t (s), and the detections there."""
+        self.record.measured(t, odometry, detections)
+
+    def judge(self, tested: Gating | None, new: slice, reading: Reading) -> None:
+        """Judges the estimate by the detections that were tested, or remembers those of a lost vehicle.
+
+        The detections of the cycle are the rows `new` of the table.
+        """
+        smoother, detections = self._smoother, reading.detections
+        if self._search is not None:
+            corrected = smoother.map.detections.point[new].copy()
+            self._search.observe(smoother.variables.poses[-1], replace(detections, points_vehicle=corrected))
+            return
+        evidence = Evidence(detections.t)
+        if tested is not None:
+            evidence = evidence_of(smoother, tested, self._known_loop)
+        self.health = self._monitor.update(replace(evidence, odometry=reading.motion.fault))
+        if self._boundaries_cross and self.health.condition == GOOD:
+            self.health = Health(DEGRADED, "the two boundaries of the map cross")
+        if self._known_loop.is_whole and self.record.unsolvable is None:
+            self.mending.contradictions.observe(smoother, self._known_loop, new, detections.t)
+        self._begin_search()
+
+    def doubt_calibrations(self) -> None:
+        """Widens the priors of calibrations that the drive contradicts, while the loop is open."""
+        if not self.closed:
+            self._believed = doubt_calibrations(self._smoother, self._believed)
+
+    # --- the batch of the open lap -----------------------------------------------------------------------
+
+    def go_on(self, closes: bool) -> tuple[Array | None, str]:
+        """Records the open lap, has it solved when it closes, and goes on from the result when it is due.
+
+        Returns the jump (3,) of the newest pose if the map was replaced, and a notice.
+        """
+        if closes:
+            self._closes()
+            self._boundaries_cross = self._crosses()
+            return None, self._solve_lap()
+        if self.closed:
+            self.record.followed(self._smoother.variables.poses[-1])
+        else:
+            self._record_open_lap()
+        batch = self._lap_batch
+        if batch is None:
+            self._try_mending()
+        elif self._smoother.next_cycle - 1 >= batch.due:
+            self._lap_batch = None
+            return self._take(batch.marginal())
+        return None, ""
+
+    def _record_open_lap(self) -> None:
+        """Records the estimate of an open lap, and tries to close it where the drive says that it is over."""
+        self.record.estimated(self._smoother.map.state)
+        if self._path.length > self.settings.closing.min_path:
+            self.record.prepare()
+            if self._lap_batch is None:
+                self._try_loop()
+
+    def _take(self, marginal: LapMarginal | str) -> tuple[Array | None, str]:
+        """Goes on from the result of a batch, unless the present map is better."""
+        mends, smoother = self.mending.is_tried(), self._smoother
+        notice = self.mending.end(marginal) if mends else ""
+        if isinstance(marginal, str):
+            return None, f"{OWN_PRIOR}: {marginal}" if self.closed and not mends else ""
+        if mends and (not notice or self._crosses(marginal.splines) > self._boundaries_cross):
+            return None, ""
+        if not self.closed:
+            self._closes()
+        self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds
+        jump = go_on_from(smoother, marginal)
+        self.record.replaced(marginal.poses[: marginal.first_kept], smoother.variables.poses)
+        self._boundaries_cross = self._crosses()
+        return jump, notice
+
+    def _crosses(self, splines: Mapping[int, BSpline] | None = None) -> bool:
+        """Returns whether two boundaries cross, by default those of the present map."""
+        if splines is None:
+            self._smoother.refresh()
+            splines = self._smoother.map.state.splines
+        return set(splines) == set(BOUNDARIES) and boundaries_cross(splines, self.settings.finding.sample)
+
+    def _try_mending(self) -> None:
+        """Sends the drive to a batch that begins with other curves, where the closed map is contradicted."""
+        record = self.record
+        if not self._known_loop.is_whole or self._search is not None or record.unsolvable is not None:
+            return
+        if self.mending.is_due(self._known_loop, self._path.length):
+            self._begin_batch(self.mending.begin(np.array(record.poses)))
+
+    def _closes(self) -> None:
+        """Notes that the loop has closed; hardly anything moves from now on."""
+        self.closed, self._smoother.window.exact = True, False
+
+    def _solve_lap(self) -> str:
+        """Sends the lap to be solved as a batch in the cycle in which the loop has closed.
+
+        Returns a notice that says why it cannot be solved, or an empty one.
+        """
+        smoother, record = self._smoother, self.record
+        closed = record.closed_map(smoother)
+        self.corrected_poses = closed.poses
+        record.replaced(closed.poses, np.zeros((0, 3)))
+        cones = len(smoother.map.state.map_keys) / self.settings.spline.size_share
+        if cones > self.settings.open_lap.max_cones:
+            record.give_up("the lap has too many cones for a batch")
+        if record.unsolvable is not None:
+            return f"{OWN_PRIOR}: {record.unsolvable}"
+        self._begin_batch(closed)
+        return ""
+
+    def _begin_batch(self, start: ClosedMap | Recurrence) -> None:
+        """Sends the lap to its batch, which begins at a map that has just been closed, or at odometry."""
+        own, first, cycle = self.settings.open_lap, self._smoother.first_cycle, self._smoother.next_cycle - 1
+        wait = max(min(own.cycles, cycle - first), int(own.cycles_share * cycle))
+        first_kept = min(first + wait, cycle)
+        lap = self.record.lap(first_kept, start, self._believed)
+        self._lap_batch = LapBatch(lap, cycle + wait)
+
+    def _try_loop(self) -> None:
+        """Sends the lap to a batch from odometry where the drive says that it is over.
+
+        That happens where the registration keeps refusing to close the loop.
+        """
+        boundaries, length = self._smoother.map.state.boundaries, self._path.length
+        if length < self._loop_tried or set(boundaries) != set(BOUNDARIES):
+            return
+        self._loop_tried = length + self.settings.closing.check_interval
+        recurrence = self._recurrence()
+        if recurrence is not None:
+            self._loop_tried = length + self.settings.open_lap.retry
+            self._begin_batch(recurrence)
+
+    def _recurrence(self) -> Recurrence | None:
+        """Returns after which length the drive recurs, by its odometry or by the shape of the curves."""
+        record, settings = self.record, self.settings.closing.recognition
+        if record.unsolvable is not None:
+            return None
+        found = record.recurrence()
+        if found is not None or self._path.length < self._recognition_tried + settings.interval:
+            return found
+        self._recognition_tried = self._path.length
+        place = recognize(self._smoother)
+        return None if place is None else record.recurrence_since(place)
+
+    # --- a vehicle that is lost --------------------------------------------------------------------------
+
+    def _begin_search(self) -> None:
+        """Takes all detections of the window out of use, if the vehicle is lost on a map that is complete.
+
+        So the map stays as it was before. Nothing is done before the batch of the lap has replaced it.
+        """
+        ready = self._known_loop.is_whole and self._lap_batch is None
+        if self.health.condition == LOST and ready:
+            detections = self._smoother.map.detections
+            detections.release(np.arange(len(detections)))
+            self._search = Search(self._smoother)
+            self.mending.contradictions.clear()
+            self.record.give_up("the vehicle was lost")
+
+    def find_back(self) -> tuple[Array | None, str]:
+        """Starts the window anew where a lost vehicle is found; returns its jump (3,) and a notice."""
+        if self._search is None:
+            return None, ""
+        found = self._search.find()
+        if found is None:
+            return None, ""
+        first_cycle = max(self._search.first_cycle, self._smoother.first_cycle)
+        self._search, self.health = None, Health(DEGRADED, FOUND)
+        self._monitor.restart()
+        return start_anew(self._smoother, first_cycle, found), FOUND
