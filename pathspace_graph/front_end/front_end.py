@@ -17,6 +17,7 @@ from .motion import Motion, MotionCheck
 from .sides import SideJudge
 
 Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +28,8 @@ class Reading:
     """This motion leads to the cycle."""
     detections: Detections
     """These are the detections of the cycle."""
+    seen_again: BoolArray
+    """(m,) The flag is set when a detection lies where the cycles just before had one."""
 
 
 class FrontEnd:
@@ -40,7 +43,8 @@ class FrontEnd:
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Returns the judged readings of a cycle: the twists since the last one, and its detections."""
         motion = self._motion.update(odometry, detections)
-        return Reading(motion, self._sides.update(self._motion.pose, motion.twists, detections))
+        judged = self._sides.update(self._motion.pose, motion.twists, detections)
+        return Reading(motion, judged, self._motion.seen_again)
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from pathspace_graph.settings.front_end import MotionSettings
 from .scan_matching import Match, RecentDetections, match
 
 Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +56,8 @@ class MotionCheck:
         """Keeps the settings, and the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
         self.settings = settings
         self.sigma = sigma
+        self.seen_again: BoolArray = np.zeros(0, bool)
+        """(m,) The flag is set when a detection of the newest cycle lies where the cycles before had one."""
         self._recent = RecentDetections(settings)
         self.pose: Array = np.zeros(3)
         """(3,) This is the newest pose in the frame of the front end, in which the drive began at 0."""
@@ -73,7 +76,9 @@ class MotionCheck:
         motion = self._checked(motion, detections, variances)
         self.pose = compose(self.pose, motion.odometry.delta)
         poses = np.broadcast_to(self.pose, (len(variances), 3))
-        self._recent.add(t, to_map(detections.points_vehicle, poses))
+        points = to_map(detections.points_vehicle, poses)
+        self.seen_again = self._recent.has(points)
+        self._recent.add(t, points)
         if self._t is not None and t > self._t:
             self._velocity = motion.odometry.delta / (t - self._t)
             share = min((t - self._t) / (0.5 * self.settings.memory), 1.0)

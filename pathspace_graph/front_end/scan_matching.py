@@ -41,6 +41,11 @@ class RecentDetections:
         self.points = np.concatenate([self.points[kept], points])
         self._stamps = np.append(self._stamps[kept], np.full(len(points), t))
 
+    def has(self, points: Array) -> BoolArray:
+        """Returns whether each point (m, 2) lies where an earlier detection does."""
+        _, weights = _means(points, self.points, self.settings.reach_last)
+        return np.asarray(weights > self.settings.min_weight)
+
     def forget(self, t: float) -> None:
         """Drops the detections that are too old at t (s)."""
         self.add(t, np.zeros((0, 2)))

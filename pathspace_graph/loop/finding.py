@@ -162,34 +162,40 @@ class KnownLoop:
         return is_mapped(u, cones, length, settings.health.gap, settings.growth.merge_radius)
 
 
-def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop) -> Evidence:
+def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_again: BoolArray) -> Evidence:
     """Returns what the tested detections say about the newest pose, before the update.
 
     On a closed map every coloured detection should lie on a curve. If many are not in use, these are looked
-    for on the whole of their curve: they may be of a stretch across the infield. And where the map has a gap,
-    they say nothing about the vehicle.
+    for on the whole of their curve: they may be of a stretch across the infield. Three kinds of them say
+    nothing about the vehicle. Those that are not `seen_again` (m,), of all detections of the cycle, may be of
+    nothing at all. Those on the curve of the other colour have a wrong colour. And those beside a gap of the
+    map cannot lie on it.
     """
     detections, settings = smoother.map.detections, smoother.map.settings.health
     closed, used = smoother.map.state.closed, detections.used[tested.rows]
-    offered = len(used) if closed else int(tested.in_view.sum())
+    again = seen_again[tested.rows - (len(detections) - len(seen_again))]
+    judged = used | ((tested.in_view | closed) & again)
     labels, explained, unmapped = detections.label[tested.rows], used.copy(), np.zeros(len(used), bool)
-    if known.is_whole and used.sum() < settings.share_degraded * offered:
-        others = np.flatnonzero(~used)
+    if known.is_whole and used.sum() < settings.share_degraded * judged.sum():
+        others = np.flatnonzero(judged & ~used)
         rows = tested.rows[others]
         points = to_map(detections.point[rows], smoother.map.variables.poses_at(detections.cycle[rows]))
-        away = known.get().distances(labels[others], points, settings.beside)
-        explained[others] = away < settings.beside
-        unmapped[others] = ~explained[others] & known.get().beside_gaps(labels[others], points)
-    innovations = tested.innovation[used]
+        loop, own = known.get(), labels[others]
+        explained[others] = loop.distances(own, points, settings.beside) < settings.beside
+        unmapped[others] = ~explained[others] & loop.beside_gaps(own, points)
+        wrong = loop.distances(LEFT + RIGHT - own, points, settings.beside) < settings.beside
+        judged[others] &= explained[others] | ~wrong
+        unmapped &= judged
+    innovations, offered = tested.innovation[used], judged & ~unmapped
     return Evidence(
         t=smoother.times[-1],
-        offered=offered - int(unmapped.sum()),
+        offered=int(offered.sum()),
         explained=int(explained.sum()),
         used=int(used.sum()),
         innovations=float(innovations @ innovations),
         closed=closed,
         sigma=_sigma_of_position(smoother) if closed else np.nan,
-        offered_by=_by_boundary(labels[~unmapped]),
+        offered_by=_by_boundary(labels[offered]),
         explained_by=_by_boundary(labels[explained]),
         unmapped=_by_boundary(labels[unmapped]),
     )

@@ -102,7 +102,7 @@ class TrackLoop:
             return
         evidence = Evidence(detections.t)
         if tested is not None:
-            evidence = evidence_of(smoother, tested, self._known_loop)
+            evidence = evidence_of(smoother, tested, self._known_loop, reading.seen_again)
         self.health = self._monitor.update(replace(evidence, odometry=reading.motion.fault))
         if self._boundaries_cross and self.health.condition == GOOD:
             self.health = Health(DEGRADED, "the two boundaries of the map cross")

@@ -108,7 +108,7 @@ def test_the_uncertainty_of_the_position_is_that_of_the_last_step() -> None:
     assert smoother.last_step is not None
     newest = smoother.last_step.layout.keys[-1:]
     covariance = smoother.last_step.covariance(newest)[:2, :2]
-    sigma = evidence_of(smoother, NOTHING, KnownLoop(smoother)).sigma
+    sigma = evidence_of(smoother, NOTHING, KnownLoop(smoother), np.zeros(0, bool)).sigma
     np.testing.assert_allclose(sigma, np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
@@ -122,9 +122,25 @@ def test_detections_across_the_infield_are_explained_by_the_map_and_ghosts_are_n
     rows = table.append(detections(0.0, seen, np.full(4, LEFT)), smoother.next_cycle - 1)
     tested = Gating(np.arange(rows.start, rows.stop), np.zeros(4, bool), np.full(4, 9.0))
     before = smoother.variables.values.copy()
-    evidence = evidence_of(smoother, tested, KnownLoop(smoother))
+    evidence = evidence_of(smoother, tested, KnownLoop(smoother), np.ones(4, bool))
     assert (evidence.offered, evidence.explained, evidence.used) == (4, 2, 0)
     np.testing.assert_array_equal(smoother.variables.values, before)
+    once = evidence_of(smoother, tested, KnownLoop(smoother), np.array([True, True, True, False]))
+    assert (once.offered, once.explained) == (3, 2)
+
+
+def test_a_wrong_colour_says_nothing_about_the_vehicle() -> None:
+    """Detections on the right curve that are called left, and one on the left curve."""
+    log = clean()[0]
+    mapper = map_log(log, mapper_of(log))[0]
+    smoother, table = mapper.smoother, mapper.smoother.map.detections
+    right, left = (mapper.boundaries[b].spline(mapper.control_points(b)) for b in (RIGHT, LEFT))
+    points = np.concatenate([right.evaluate(np.array([10.0, 40.0])), left.evaluate(np.array([20.0]))])
+    seen = to_vehicle(points, np.tile(mapper.poses[-1], (3, 1)))
+    rows = table.append(detections(0.0, seen, np.full(3, LEFT)), smoother.next_cycle - 1)
+    tested = Gating(np.arange(rows.start, rows.stop), np.zeros(3, bool), np.full(3, 9.0))
+    evidence = evidence_of(smoother, tested, KnownLoop(smoother), np.ones(3, bool))
+    assert (evidence.offered, evidence.explained) == (1, 1)
 
 
 # --- the search alone ------------------------------------------------------------------------------------
