@@ -49,6 +49,8 @@ class Contradictions:
             own = rows[detections.boundary[new] == label]
             unexplained[own - new.start] |= ~known.is_mapped(label, detections.u[own])
         rows = rows[unexplained]
+        if len(rows) == 0:
+            return
         points = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
         variances = np.trace(detections.covariance[rows], axis1=1, axis2=2)
         for label, tracks in self._tracks.items():
@@ -69,6 +71,8 @@ class Contradictions:
         found, settings = list[Stretch](), self.settings
         for label, tracks in self._tracks.items():
             chosen = tracks.confirmed()
+            if len(chosen) < settings.cones:
+                continue
             chosen = chosen[_is_new(loop, label, tracks.points[chosen], settings.beside)]
             chosen = chosen[self._undisputed(label, chosen)]
             points, passed = tracks.points[chosen], tracks.last_t[chosen] < t - settings.settle

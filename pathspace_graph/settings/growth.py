@@ -30,7 +30,7 @@ class PathSettings(Positive):
 class GrowthSettings(Positive):
     """Describes how the open end of a curve grows."""
 
-    UNLIMITED = ("forget_after", "max_size", "length_driven")
+    UNLIMITED = ("forget_after",)
 
     reach: float = 7.0
     """A boundary is extended up to this far ahead of the vehicle (m along the predicted path)."""
