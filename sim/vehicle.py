@@ -54,6 +54,8 @@ class VehicleSettings:
     overrun: float = 10.0
     """The vehicle drives this far beyond the last lap's end (m), so that the lap is complete; where it is
     negative, the drive ends before the line, and the road stays open."""
+    rest: float = 0.0
+    """The vehicle stands at the start pose for this time (s) before it drives."""
     rate: float = 50.0
     """There are this many true poses per second (Hz), at the odometry's rate."""
 
@@ -67,7 +69,7 @@ class VehicleSettings:
             "rate",
         )
         check_numbers(self, "vehicle", positive, "a positive number")
-        at_least_0 = ("speed_start", "wander", "half_width", "margin")
+        at_least_0 = ("speed_start", "rest", "wander", "half_width", "margin")
         check_numbers(self, "vehicle", at_least_0, "a number of at least 0")
         if not np.isfinite(self.overrun):
             raise SettingsError(f"vehicle.overrun: expected a number, found {self.overrun}")
@@ -98,6 +100,9 @@ def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) ->
     headings = np.unwrap(np.arctan2(derivative[:, 1], derivative[:, 0]))
     sampled = np.column_stack([path(s), headings])
     twists = _twists(sampled, 1.0 / settings.rate)
+    still = round(settings.rest * settings.rate)
+    twists = np.concatenate([np.zeros((still, 3)), twists])
+    t = np.arange(len(twists)) / settings.rate
     return Drive(t, integrate(twists[:-1], 1.0 / settings.rate), twists)
 
 

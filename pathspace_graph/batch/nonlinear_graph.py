@@ -76,6 +76,9 @@ def _priors(chain: LogOdometry, heading: float) -> Iterator[gtsam.NonlinearFacto
     yield gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(*chain.first), noise)
     sigmas = gtsam.noiseModel.Diagonal.Sigmas(chain.calibration_sigma)
     yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, np.zeros(2), sigmas)
+    if chain.bias is not None:
+        noise = gtsam.noiseModel.Diagonal.Precisions(np.array([0.0, chain.bias.sigma**-2]))
+        yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, np.array([0.0, chain.bias.value]), noise)
 
 
 def _gauge(gauge: CurveGauge, control_points: Array) -> Iterator[gtsam.NonlinearFactor]:

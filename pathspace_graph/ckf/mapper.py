@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.front_end.front_end import FrontEnd
-from pathspace_graph.front_end.motion import Motion
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
+from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import odometry_noise
 from pathspace_graph.mapping.registration import near_start
@@ -69,9 +69,9 @@ class CkfMapper:
         used = sum(len(on.rows) for on in found.values())
         return self._result(detections.t, used, watch.laps)
 
-    def _predict(self, motion: Motion) -> None:
+    def _predict(self, motion: MeasuredMotion) -> None:
         """Predicts the pose by the motion since the last cycle, and locates it on the curves."""
-        self.state.belief.predict(motion.odometry)
+        self.state.belief.follow(motion)
         self.state.locate_vehicle()
         self.path.update(self.state.pose.copy())
         self.path.steer(motion.twists)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -103,9 +104,11 @@ def health_outline(result: RunResult) -> list[str]:
     """Returns how many cycles were not good, and why the vehicle is lost at the end, if any were."""
     number = counts([health_of(record) for record in result.cycles])
     total = max(len(result.cycles), 1)
+    reasons = Counter(record.reason for record in result.cycles if record.health == DEGRADED)
+    mostly = f" (mostly: {reasons.most_common(1)[0][0]})" if reasons else ""
     parts = [
-        f"{condition} in {number[condition] / total:.1%} of the cycles".replace("%", " %")
-        for condition in (DEGRADED, LOST)
+        f"{condition} in {number[condition] / total:.1%} of the cycles".replace("%", " %") + why
+        for condition, why in ((DEGRADED, mostly), (LOST, ""))
         if number[condition]
     ]
     last = stretches_of(result)[-1:]

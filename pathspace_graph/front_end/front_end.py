@@ -4,32 +4,43 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .log_odometry import LogOdometry, chained
-from .motion import Motion, MotionCheck
+from .motion import MotionCheck
 from .sides import SideJudge
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+SIDES_NOTICES: Final = {
+    (0, True): "the cones on the left have the colour of the right boundary: the colours are swapped",
+    (0, False): "the colours are as they were said to be",
+    (1, True): "most detections have no colour: the way driven tells their sides",
+    (1, False): "most detections have a colour again",
+}
+"""These are the notices that the colours are swapped (0) or mostly unknown (1), from now on or no longer."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
     """Holds the readings of a cycle after they were judged."""
 
-    motion: Motion
+    motion: MeasuredMotion
     """This motion leads to the cycle."""
     detections: Detections
     """These are the detections of the cycle."""
     seen_again: BoolArray
     """(m,) The flag is set when a detection lies where the cycles just before had one."""
+    notice: str = ""
+    """This says what the labels mean from now on, where that has changed."""
 
 
 class FrontEnd:
@@ -43,8 +54,14 @@ class FrontEnd:
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Returns the judged readings of a cycle: the twists since the last one, and its detections."""
         motion = self._motion.update(odometry, detections)
-        judged = self._sides.update(self._motion.pose, motion.twists, detections)
-        return Reading(motion, judged, self._motion.seen_again)
+        sides, before = self._sides, (self._sides.swapped, self._sides.colourless)
+        judged = sides.update(self._motion.pose, motion.twists, detections)
+        changed = [
+            SIDES_NOTICES[kind, now]
+            for kind, (was, now) in enumerate(zip(before, (sides.swapped, sides.colourless), strict=True))
+            if was != now
+        ]
+        return Reading(motion, judged, self._motion.seen_again, "; ".join(changed))
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +81,6 @@ def judge_log(log: Log, odometry_sigma: Array, settings: MapperSettings) -> Judg
     """
     front_end = FrontEnd(settings, odometry_sigma)
     readings = [front_end.update(odometry, cycle) for odometry, cycle in split_odometry(log)]
-    steps = [reading.motion.odometry for reading in readings]
-    chain = chained([cycle.t for cycle in log.cycles], steps, settings.odometry)
+    motions = [reading.motion for reading in readings]
+    chain = chained([cycle.t for cycle in log.cycles], motions, settings.odometry)
     return JudgedLog(chain, [reading.detections for reading in readings])

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.elimination import owners
 from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, pose_key
 from pathspace_graph.graph.odometry import OdometryChain, calibrated_delta, odometry_rows
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Variables
+from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import OdometrySettings
 
@@ -37,6 +38,8 @@ class LogOdometry:
     """(P, 3) These twists were in force at the cycles, in m/s, m/s and rad/s."""
     calibration_sigma: Array
     """(2,) The calibration (scale error [-], yaw-rate bias [rad/s]) has this prior standard deviation."""
+    bias: BiasMeasurement | None = None
+    """The vehicle has measured this bias of the yaw rate at rest, where it stood."""
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -58,7 +61,8 @@ class LogOdometry:
     def prior_cost(self, first: Array, calibration: Array) -> float:
         """Returns the cost of the priors on the first pose (3,) and on the calibration (2,)."""
         off, whitened = first - self.first, calibration / self.calibration_sigma
-        return 0.5 * float(off @ self.first_information @ off + whitened @ whitened)
+        cost = 0.5 * float(off @ self.first_information @ off + whitened @ whitened)
+        return cost + sum(0.5 * float((rows.residual**2).sum()) for rows in self._measured_bias(calibration))
 
     def rows(self, terms: tuple[Array, Array], first: Array, calibration: Array) -> list[Rows]:
         """Returns the rows of `terms`, and of both priors at a first pose (3,) and a calibration (2,)."""
@@ -68,18 +72,27 @@ class LogOdometry:
             odometry_rows(start, terms, owners(start)),
             _prior(pose_key(0), root, first - self.first),
             _prior(CALIBRATION_KEY, np.diag(1.0 / self.calibration_sigma), calibration),
+            *self._measured_bias(calibration),
         ]
+
+    def _measured_bias(self, calibration: Array) -> list[Rows]:
+        """Returns the row `(b - value) / sigma` of a bias that was measured at rest, or none."""
+        if self.bias is None:
+            return []
+        root = np.array([[0.0, 1.0 / self.bias.sigma]])
+        return [_prior(CALIBRATION_KEY, root, calibration - [0.0, self.bias.value])]
 
 
 def _prior(key: int, root: Array, off: Array) -> Rows:
     """Returns the rows `root off` on one variable; they belong to the first factor."""
-    return Rows(np.full((len(off), 1), key), root, root @ off, np.zeros(len(off), np.intp))
+    return Rows(np.full((len(root), 1), key), root, root @ off, np.zeros(len(root), np.intp))
 
 
 def chained(
-    stamps: Sequence[float], steps: Sequence[IntegratedOdometry], settings: OdometrySettings
+    stamps: Sequence[float], motions: Sequence[MeasuredMotion], settings: OdometrySettings
 ) -> LogOdometry:
-    """Returns the odometry of cycles with these stamps (s); each step leads to the pose of its cycle."""
+    """Returns the odometry of cycles with these stamps (s); each motion leads to the pose of its cycle."""
+    steps = [motion.odometry for motion in motions]
     return LogOdometry(
         stamps=np.array(stamps),
         first=compose(np.zeros(3), steps[0].delta),
@@ -87,7 +100,17 @@ def chained(
         odometry=OdometryChain(steps[1:]),
         twists=np.array([step.twist for step in steps]),
         calibration_sigma=np.array(settings.sigmas_calibration),
+        bias=mean_bias([motion.bias for motion in motions if motion.bias is not None]),
     )
+
+
+def mean_bias(measured: Sequence[BiasMeasurement]) -> BiasMeasurement | None:
+    """Returns the mean of independent measurements of the bias by their information; None without any."""
+    if not measured:
+        return None
+    information = np.array([one.sigma**-2 for one in measured])
+    values = np.array([one.value for one in measured])
+    return BiasMeasurement(float(information @ values / information.sum()), float(information.sum() ** -0.5))
 
 
 # --- calibrations ----------------------------------------------------------------------------------------

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,36 +15,17 @@ from pathspace_graph.factors.odometry import (
 )
 from pathspace_graph.factors.se2 import compose, relative, rotation, to_map
 from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.prediction import integrate_odometry
 from pathspace_graph.settings.front_end import MotionSettings
 
+from .rest import Rest
 from .scan_matching import Match, RecentDetections, match
 
 Array = NDArray[np.float64]
+NO_CALIBRATION: Final = np.zeros((3, CALIBRATION_SIZE))
+"""A motion that no odometry has measured does not depend on the calibration of the odometry."""
 BoolArray = NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """Holds the motion that leads to a cycle, and what was found out about the odometry."""
-
-    odometry: IntegratedOdometry
-    """This is the relative pose, with its covariance."""
-    twists: Array
-    """(k, 3) The vehicle moved with these twists since the last cycle, in m/s, m/s and rad/s."""
-    doubted: bool = False
-    """The flag is set where the detections contradict the odometry, and their own motion replaces it."""
-    missing: bool = False
-    """The flag is set where no twist was measured for long."""
-    stuck: bool = False
-    """The flag is set where the twist stays the same to the last digit."""
-
-    @property
-    def fault(self) -> str:
-        """Returns what is wrong with the odometry in plain words; it is empty where nothing is."""
-        if self.missing:
-            return "there is no odometry"
-        return "the detections contradict the odometry" if self.doubted else ""
 
 
 class MotionCheck:
@@ -65,15 +47,18 @@ class MotionCheck:
         self._rate = 0.0
         self._t: float | None = None
         self._reading: tuple[float, Array] = (-np.inf, np.full(3, np.nan))
+        self._rest = Rest(sigma, settings)
         self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
 
-    def update(self, odometry: Odometry, detections: Detections) -> Motion:
+    def update(self, odometry: Odometry, detections: Detections) -> MeasuredMotion:
         """Returns the motion since the last cycle."""
         t = detections.t
         motion = self._integrate(odometry, t)
         variances = 0.5 * np.trace(detections.covariances, axis1=1, axis2=2)
         self._recent.forget(t)
         motion = self._checked(motion, detections, variances)
+        if not motion.fault and self._rest.update(odometry, t):
+            motion = self._at_rest(motion, detections, variances)
         self.pose = compose(self.pose, motion.odometry.delta)
         poses = np.broadcast_to(self.pose, (len(variances), 3))
         points = to_map(detections.points_vehicle, poses)
@@ -88,10 +73,10 @@ class MotionCheck:
 
     # --- the odometry ------------------------------------------------------------------------------------
 
-    def _integrate(self, odometry: Odometry, t: float) -> Motion:
+    def _integrate(self, odometry: Odometry, t: float) -> MeasuredMotion:
         """Returns the motion by odometry, whose noise grows where a twist is held for long."""
         if len(odometry.t) == 0:
-            return Motion(integrate_odometry(odometry, t, self.sigma), odometry.twist)
+            return MeasuredMotion(integrate_odometry(odometry, t, self.sigma), odometry.twist)
         settings, (before, twist) = self.settings, self._reading
         same = (odometry.twist == np.concatenate([twist[None], odometry.twist[:-1]])).all(axis=1)
         measured = odometry.t.copy()
@@ -102,7 +87,7 @@ class MotionCheck:
         growth = settings.acceleration, settings.acceleration, settings.angular_acceleration
         sigma = np.hypot(self.sigma, held[:, None] * np.array(growth)) if held.any() else self.sigma
         integrated, stuck = integrate_odometry(odometry, t, sigma), same[1:].sum() >= settings.stuck
-        return Motion(integrated, odometry.twist, missing=bool(held[-1] > 0.0), stuck=bool(stuck))
+        return MeasuredMotion(integrated, odometry.twist, missing=bool(held[-1] > 0.0), stuck=bool(stuck))
 
     def _hold(self, measured: Array) -> float:
         """Returns how long a twist may be held, from the stamps of newly measured ones (k,)."""
@@ -112,9 +97,20 @@ class MotionCheck:
             self._interval = min(self._interval, shortest)
         return max(self.settings.hold, self.settings.hold_intervals * self._interval)
 
+    def _at_rest(self, motion: MeasuredMotion, detections: Detections, variances: Array) -> MeasuredMotion:
+        """Returns no motion at all, where the detections say so as well, or else the given one."""
+        settings = self.settings
+        found = self._match(detections, variances, self.pose, settings.iterations_first)
+        none = integrated_odometry(np.zeros(3), np.diag(settings.sigmas_rest) ** 2, NO_CALIBRATION)
+        rest = MeasuredMotion(none, np.zeros((1, 3)))
+        if found is None or self._is_contradicted(rest, self.pose, found):
+            self._rest.end()
+            return motion
+        return replace(rest, bias=self._rest.bias(detections.t))
+
     # --- the check ---------------------------------------------------------------------------------------
 
-    def _checked(self, motion: Motion, detections: Detections, variances: Array) -> Motion:
+    def _checked(self, motion: MeasuredMotion, detections: Detections, variances: Array) -> MeasuredMotion:
         """Returns the motion, or that of the detections where they contradict it, or where it is missing."""
         settings = self.settings
         if self._t is None or detections.t <= self._t:
@@ -155,7 +151,7 @@ class MotionCheck:
         fits = found.misfit < self.settings.max_misfit
         return fits and bool((change < self.settings.max_change * sigmas).all())
 
-    def _is_contradicted(self, motion: Motion, predicted: Array, found: Match) -> bool:
+    def _is_contradicted(self, motion: MeasuredMotion, predicted: Array, found: Match) -> bool:
         """Returns whether a match of detections, which begins at the predicted pose (3,), denies a motion."""
         off, covariance = self._contradiction(motion.odometry, predicted, found)
         enough = found.matched >= self.settings.min_doubting
@@ -189,7 +185,9 @@ class MotionCheck:
         covariance[2, 2] += (self.settings.sigma_latency * (odometry.twist[2] - self._rate)) ** 2
         return turn @ (found.pose - predicted), covariance
 
-    def _replaced(self, motion: Motion, best: Match | None, going_on: Array, dt: float) -> Motion:
+    def _replaced(
+        self, motion: MeasuredMotion, best: Match | None, going_on: Array, dt: float
+    ) -> MeasuredMotion:
         """Returns the motion by the detections together with going on (3,) as before."""
         settings, odometry = self.settings, motion.odometry
         mean, covariance = going_on.copy(), np.diag(self._sigmas_going_on(dt) ** 2)
@@ -209,9 +207,10 @@ class MotionCheck:
                 off = delta - odometry.delta
                 covariance += np.outer(off, off) * settings.before**2
             mean = delta
-        nothing = np.zeros((3, CALIBRATION_SIZE))
-        replaced = replace(integrated_odometry(mean, covariance, nothing), twist=mean / dt)
-        return Motion(replaced, replaced.twist[None], not motion.missing, motion.missing, motion.stuck)
+        replaced = replace(integrated_odometry(mean, covariance, NO_CALIBRATION), twist=mean / dt)
+        return MeasuredMotion(
+            replaced, replaced.twist[None], not motion.missing, motion.missing, motion.stuck
+        )
 
 
 def _to_vehicle(theta: float) -> Array:

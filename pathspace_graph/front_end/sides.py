@@ -35,6 +35,8 @@ class SideJudge:
         self.settings = settings
         self.swapped = False
         """The flag is set where the colours of the log so far are on the other sides."""
+        self.colourless = False
+        """The flag is set where most detections have no colour, so that the way driven tells their sides."""
         self._path = DrivenPath(path)
         self._cones = NearCones(settings)
         self._agreeing = self._opposing = 0  # cones on the side of their colour, and on the other one
@@ -47,14 +49,14 @@ class SideJudge:
         """
         self._path.update(pose)
         self._path.steer(twists)
-        labels, colourless = detections.labels, self._is_colourless(detections.labels)
-        if not colourless and self._agreeing + self._opposing >= self.settings.enough_votes:
+        labels, self.colourless = detections.labels, self._is_colourless(detections.labels)
+        if not self.colourless and self._agreeing + self._opposing >= self.settings.enough_votes:
             return self._relabelled(detections, np.full(len(labels), UNKNOWN))
         path = self._path.ahead(pose, self.settings.reach)
         points = to_map(detections.points_vehicle, np.broadcast_to(pose, (len(labels), 3)))
         cones = self._cones.add(detections.t, points, labels)
         self._judge_colours(path)
-        sides = self._sides(pose, path)[cones] if colourless else np.full(len(labels), UNKNOWN)
+        sides = self._sides(pose, path)[cones] if self.colourless else np.full(len(labels), UNKNOWN)
         return self._relabelled(detections, sides)
 
     def _relabelled(self, detections: Detections, sides: IntArray) -> Detections:

@@ -153,6 +153,15 @@ class FixedLagSmoother(Generic[M_co]):
         if self.submaps is not None:
             self.submaps.first = graph_of(self.submaps.first, after, before.negate())
 
+    def measure_bias(self, value: float, sigma: float) -> None:
+        """Adds a measurement of the yaw rate's bias (rad/s), which a vehicle at rest makes."""
+        keys, row = np.array([CALIBRATION_KEY]), np.array([[0.0, 1.0 / sigma]])
+        reference = self.variables.reference[self.variables.layout.entries(keys)]
+        measured = jacobian_factor(keys, row, row @ (np.array([0.0, value]) - reference))
+        self.prior, self.epoch = graph_of(self.prior, measured), self.epoch + 1
+        if self.submaps is not None:
+            self.submaps.first = graph_of(self.submaps.first, measured)
+
     def predict(
         self, t: float, odometry: IntegratedOdometry, sigmas_start: tuple[float, float, float]
     ) -> Array:

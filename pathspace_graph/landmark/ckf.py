@@ -62,7 +62,7 @@ class LandmarkCkf:
         """Processes one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
         reading = self.front_end.update(odometry, detections)
-        self.belief.predict(reading.motion.odometry)
+        self.belief.follow(reading.motion)
         detections = self.belief.corrected(reading.detections)
         watch.lap("predict")
         found = self._associate(detections)

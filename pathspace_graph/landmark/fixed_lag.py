@@ -67,10 +67,10 @@ class LandmarkFixedLag:
         """Processes one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
         reading = self.front_end.update(odometry, detections)
-        motion, detections = reading.motion.odometry, reading.detections
-        predict(self.smoother, self.path, motion, reading.motion.twists, detections.t, self.settings)
+        motion, detections = reading.motion, reading.detections
+        predict(self.smoother, self.path, motion, detections.t, self.settings)
         watch.lap("predict")
-        new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, motion.twist)
+        new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, motion.odometry.twist)
         associate_newest(self.smoother, new, self._eligible())
         watch.lap("associate")
         created = self._create(new, detections.t)

@@ -17,12 +17,12 @@ from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
 from pathspace_graph.batch.recurrence import Recurrence, find_recurrence, path_lengths
 from pathspace_graph.batch.start import unwrap
 from pathspace_graph.errors import SingularSystemError
-from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.front_end.log_odometry import chained
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -45,7 +45,7 @@ class DriveRecord:
         self.poses: list[Array] = []
         """Each cycle had this pose (3,), map frame, as it was estimated then or by the newest batch."""
         self._stamps: list[float] = []
-        self._odometry: list[IntegratedOdometry] = []
+        self._motions: list[MeasuredMotion] = []
         self._detections: list[Detections] = []
         self._places: dict[int, list[Place]] = {}
         self._reckoned: list[Array] = []
@@ -55,17 +55,17 @@ class DriveRecord:
         """Drops the measurements, since the lap cannot be solved for this reason."""
         if self.unsolvable is None:
             self.unsolvable = reason
-        self._stamps, self._odometry, self._detections = [], [], []
+        self._stamps, self._motions, self._detections = [], [], []
 
-    def measured(self, t: float, odometry: IntegratedOdometry, detections: Detections) -> None:
-        """Adds the odometry that leads to the pose at t (s), and the detections there."""
+    def measured(self, t: float, motion: MeasuredMotion, detections: Detections) -> None:
+        """Adds the motion that leads to the pose at t (s), and the detections there."""
         if self.unsolvable is not None:
             return
         self._stamps.append(t)
-        self._odometry.append(odometry)
+        self._motions.append(motion)
         self._detections.append(detections)
         last = self._reckoned[-1] if self._reckoned else np.zeros(3)
-        self._reckoned.append(compose(last, odometry.delta))
+        self._reckoned.append(compose(last, motion.odometry.delta))
         if len(self._stamps) > self.settings.open_lap.max_cycles:
             self.give_up("the lap is too long for a batch")
 
@@ -126,7 +126,7 @@ class DriveRecord:
 
         The priors of the calibrations are those of the settings, which may have become wide.
         """
-        chain = chained(self._stamps, self._odometry, settings.odometry)
+        chain = chained(self._stamps, self._motions, settings.odometry)
         return OpenLap(
             settings=settings,
             chain=chain,

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.recurrence import Recurrence
-from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Evidence, Health, HealthMonitor
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.curve_map import CurveSmoother
+from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import doubt_calibrations
 from pathspace_graph.mapping.registration import near_start
@@ -86,9 +86,9 @@ class TrackLoop:
 
     # --- what a cycle tells ------------------------------------------------------------------------------
 
-    def measured(self, t: float, odometry: IntegratedOdometry, detections: Detections) -> None:
-        """Records the odometry that leads to the pose at t (s), and the detections there."""
-        self.record.measured(t, odometry, detections)
+    def measured(self, t: float, motion: MeasuredMotion, detections: Detections) -> None:
+        """Records the motion that leads to the pose at t (s), and the detections there."""
+        self.record.measured(t, motion, detections)
 
     def judge(self, tested: Gating | None, new: slice, reading: Reading) -> None:
         """Judges the estimate by the detections that were tested, or remembers those of a lost vehicle.

@@ -20,6 +20,7 @@ from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import OdometrySettings
 
 from .cubature import Transformed, square_root, transform
+from .motion import MeasuredMotion
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -92,6 +93,13 @@ class Belief:
         """Returns a copy of the pose and the calibration, with their joint covariance."""
         covariance = self.covariance[:HEAD, :HEAD].copy()
         return VehicleState.split(self.pose, self.mean[POSE:HEAD], covariance)
+
+    def follow(self, motion: MeasuredMotion) -> None:
+        """Predicts the pose after a motion, and updates by a bias that was measured at rest."""
+        self.predict(motion.odometry)
+        if motion.bias is not None:
+            measured, noise = np.array([motion.bias.value]), np.array([[motion.bias.sigma**2]])
+            self.update(np.array([POSE + 1]), lambda x: x, measured, noise)
 
     def predict(self, odometry: IntegratedOdometry) -> None:
         """Predicts `pose <- pose * delta * (error - J calibration)`; the error is that of the odometry."""

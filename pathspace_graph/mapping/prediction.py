@@ -15,6 +15,7 @@ from pathspace_graph.io.log import Odometry
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
+from .motion import MeasuredMotion
 from .path import DrivenPath
 
 Array = NDArray[np.float64]
@@ -39,17 +40,15 @@ def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> Integr
 def predict(
     smoother: FixedLagSmoother[MapRows],
     path: DrivenPath,
-    odometry: IntegratedOdometry,
-    twists: Array,
+    motion: MeasuredMotion,
     t: float,
     settings: MapperSettings,
 ) -> None:
-    """Adds the pose at t (s) by the calibrated odometry since the newest one, and extends the driven path.
-
-    The vehicle moved with twists (k, 3) meanwhile, in m/s, m/s and rad/s.
-    """
-    path.update(smoother.predict(t, odometry, settings.odometry.sigmas_start))
-    path.steer(twists)
+    """Adds the pose at t (s) by the calibrated motion since the newest one, and extends the driven path."""
+    path.update(smoother.predict(t, motion.odometry, settings.odometry.sigmas_start))
+    path.steer(motion.twists)
+    if motion.bias is not None:
+        smoother.measure_bias(motion.bias.value, motion.bias.sigma)
 
 
 def doubted(mean: Array, variance: Array, settings: MapperSettings) -> MapperSettings:

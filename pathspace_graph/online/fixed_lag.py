@@ -127,7 +127,8 @@ class FixedLagMapper:
             self.growth.clear()
         self.smoother.marginalize(self.loop.first_kept)
         watch.lap("marginalize")
-        return self._result(detections.t, watch.laps, jump, notice or self.growth.notice)
+        notice = "; ".join(text for text in (notice, self.growth.notice, reading.notice) if text)
+        return self._result(detections.t, watch.laps, jump, notice)
 
     def _step(self) -> None:
         """Takes one Gauss-Newton step, relinearized at the current estimate, or the solver's step."""
@@ -145,8 +146,8 @@ class FixedLagMapper:
         """
         reading = self.front_end.update(odometry, detections)
         motion, t = reading.motion, detections.t
-        predict(self.smoother, self.path, motion.odometry, motion.twists, t, self.settings)
-        self.loop.measured(t, motion.odometry, reading.detections)
+        predict(self.smoother, self.path, motion, t, self.settings)
+        self.loop.measured(t, motion, reading.detections)
         if self.solver is not None:
             self.smoother.submaps = None  # another solver's loop closure relinearizes no submap
         return reading

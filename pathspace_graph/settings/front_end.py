@@ -78,6 +78,24 @@ class MotionSettings(Positive):
     """The speeds of a twist that is held longer are uncertain by this for each second more (m/s^2)."""
     angular_acceleration: float = 1.5
     """The yaw rate of a twist that is held longer is uncertain by this for each second more (rad/s^2)."""
+    rest: float = 1.0
+    """The vehicle is at rest once it has stood for this time (s). Its mean yaw rate over this time measures
+    the bias."""
+    rest_speed: float = 0.1
+    """The speed of a vehicle at rest is smaller than this (m/s), but for the noise of the odometry."""
+    rest_rate: float = 0.05
+    """The yaw rate of a vehicle at rest is smaller than this (rad/s), but for its noise; it is the bias."""
+    rest_sigmas: float = 3.0
+    """This number of standard deviations of the mean counts as noise."""
+    rest_sigma: float = 5e-4
+    """A vehicle at rest moves by this from cycle to cycle, as one standard deviation (m)."""
+    rest_sigma_heading: float = 5e-5
+    """A vehicle at rest turns by this from cycle to cycle, as one standard deviation (rad)."""
+
+    @property
+    def sigmas_rest(self) -> tuple[float, float, float]:
+        """Returns the standard deviations (m, m, rad) of a motion at rest."""
+        return self.rest_sigma, self.rest_sigma, self.rest_sigma_heading
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import relative
-from pathspace_graph.front_end.motion import Motion, MotionCheck
+from pathspace_graph.front_end.motion import MotionCheck
 from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.front_end import MotionSettings
 from pathspace_graph.sim.sensor import OdometryNoise
@@ -34,12 +35,12 @@ def log() -> Log:
     return simulate(bean_track(), settings, seed=3)
 
 
-def checked(log: Log, settings: MotionSettings | None = None) -> list[Motion]:
+def checked(log: Log, settings: MotionSettings | None = None) -> list[MeasuredMotion]:
     check = MotionCheck(log.odometry_sigma, settings or MotionSettings())
     return [check.update(odometry, cycle) for odometry, cycle in split_odometry(log)]
 
 
-def errors(log: Log, motions: list[Motion]) -> Array:
+def errors(log: Log, motions: list[MeasuredMotion]) -> Array:
     """The errors (k, 3) of the motions from cycle to cycle, in the frame of the earlier pose."""
     truth = log.truth
     assert truth is not None
@@ -63,7 +64,7 @@ def without_readings(log: Log) -> Log:
     return replace(log, odometry=Odometry(log.odometry.t[kept], log.odometry.twist[kept]))
 
 
-def told(log: Log, motions: list[Motion]) -> Array:
+def told(log: Log, motions: list[MeasuredMotion]) -> Array:
     """The stamps of the cycles where something is wrong with the odometry."""
     return np.array([cycle.t for cycle, m in zip(log.cycles, motions, strict=True) if m.fault])
 

@@ -12,6 +12,7 @@ from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.loop.association import associate
+from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.prediction import integrate_odometry, predict
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 
@@ -142,8 +143,8 @@ def test_older_detections_are_tested_again_only_where_a_curve_has_grown() -> Non
     labels = table.boundary[released].copy()
     table.release(released)
     odometry, cycle = next_cycle(mapper, at([]), [])
-    step = integrate_odometry(odometry, cycle.t, ODOMETRY_SIGMA)
-    predict(smoother, mapper.path, step, odometry.twist, cycle.t, mapper.settings)
+    motion = MeasuredMotion(integrate_odometry(odometry, cycle.t, ODOMETRY_SIGMA), odometry.twist)
+    predict(smoother, mapper.path, motion, cycle.t, mapper.settings)
     associate(smoother, frozenset())
     assert not table.used[released].any()
     for label in (LEFT, RIGHT):  # the newest pose's parameter was appended; it is found anew

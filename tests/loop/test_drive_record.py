@@ -11,6 +11,7 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.drive_record import DriveRecord
 from pathspace_graph.loop.recognition import RecognizedPlace
+from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.prediction import integrate_odometry
 from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.state import State
@@ -43,7 +44,7 @@ def driven(laps: float, drift: float) -> DriveRecord:
     for cycle in range(1, int(end * RADIUS / SPEED / CYCLE)):
         t, angle = CYCLE * cycle, SPEED * CYCLE * cycle / RADIUS
         step = integrate_odometry(Odometry(np.array([t - CYCLE]), twist), t, np.full(3, 0.01))
-        record.measured(t, step, Detections(t, *NOTHING))
+        record.measured(t, MeasuredMotion(step, twist), Detections(t, *NOTHING))
         state.poses[-1] = np.append(on_circle(np.array([angle]))[0], angle)
         state.pose_u = {LEFT: np.array([angle * (RADIUS - 2.0)]), RIGHT: np.array([angle * (RADIUS + 2.0)])}
         record.estimated(state)

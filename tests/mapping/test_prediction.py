@@ -11,6 +11,7 @@ from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import doubted, integrate_odometry, predict, smoother_settings
 from pathspace_graph.run import split_odometry
@@ -40,8 +41,8 @@ def test_every_cycle_adds_its_pose_and_extends_the_path(log: Log) -> None:
     settings = MapperSettings()
     smoother, path = FixedLagSmoother(smoother_settings(settings), CurveMap(settings)), DrivenPath()
     for odometry, cycle in split_odometry(log):
-        integrated = integrate_odometry(odometry, cycle.t, ODOMETRY_SIGMA)
-        predict(smoother, path, integrated, odometry.twist, cycle.t, settings)
+        motion = MeasuredMotion(integrate_odometry(odometry, cycle.t, ODOMETRY_SIGMA), odometry.twist)
+        predict(smoother, path, motion, cycle.t, settings)
     np.testing.assert_allclose(smoother.variables.poses, true_poses(log), atol=1e-9)
     assert smoother.times == [cycle.t for cycle in log.cycles]
     driven = np.hypot(*np.diff(true_poses(log)[:, :2], axis=0).T).sum()
