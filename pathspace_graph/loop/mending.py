@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from pathspace_graph.batch.knots import fit_through
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.recurrence import path_lengths
+from pathspace_graph.factors.se2 import to_map, to_vehicle
 from pathspace_graph.labels import NAMES
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import along_and_across
@@ -38,6 +39,7 @@ class Mending:
         """These are the detections that no curve explains."""
         self._smoother = smoother
         self._stretches: list[Stretch] = []
+        self._lap: Array = np.zeros((0, 3))  # the poses of the newest lap as the attempt began
         self._asked = -np.inf
         self._wait_until = 0.0
         self._attempts = 0
@@ -63,6 +65,8 @@ class Mending:
         """
         self._smoother.refresh()
         state = self._smoother.map.state
+        lengths = [boundary.length for boundary in state.boundaries.values()]
+        self._lap = poses[lap_begin(poses, max(lengths)) :]
         splines = {
             label: led_through(self._smoother.map, label, self._stretches, poses)
             for label in state.boundaries
@@ -79,6 +83,8 @@ class Mending:
         if isinstance(marginal, str):
             return ""
         label, cones = _cones(stretches)
+        end = len(marginal.poses)
+        cones = carried(cones, self._lap, marginal.poses[end - len(self._lap) :])
         distance = np.full(len(cones), np.inf)
         for own, spline in marginal.splines.items():
             curve = KDTree(sampled(spline, self.settings.sample))
@@ -96,6 +102,12 @@ def _cones(stretches: list[Stretch]) -> tuple[NDArray[np.intp], Array]:
     """Returns the label (k,) and the place (k, 2) of each cone of stretches."""
     labels = np.repeat([one.label for one in stretches], [len(one.cones) for one in stretches])
     return labels, np.concatenate([one.cones for one in stretches])
+
+
+def carried(points: Array, before: Array, after: Array) -> Array:
+    """Returns points (k, 2), each moved as the pose next to it has moved, from `before` to `after` (n, 3)."""
+    nearest = KDTree(before[:, :2]).query(points)[1]
+    return to_map(to_vehicle(points, before[nearest]), after[nearest])
 
 
 def led_through(track: CurveMap, label: int, stretches: list[Stretch], poses: Array) -> BSpline:
@@ -128,11 +140,17 @@ def newest_lap(poses: Array, length: float) -> tuple[Array, Array]:
     It begins at the place nearest to the newest pose about a lap of this length (m) before. The stations (n,)
     of the positions along it are returned, too.
     """
-    driven = path_lengths(poses)
-    before = np.flatnonzero(np.abs(driven[-1] - driven - length) < 0.5 * length)
-    first = before[np.hypot(*(poses[before, :2] - poses[-1, :2]).T).argmin()] if len(before) else 0
+    first = lap_begin(poses, length)
     lap = np.concatenate([poses[first:, :2], poses[first : first + 1, :2]])
     return lap, np.append(0.0, np.hypot(*np.diff(lap, axis=0).T).cumsum())
+
+
+def lap_begin(poses: Array, length: float) -> int:
+    """Returns the index of the pose (P, 3) nearest to the newest one, about a lap of a length (m) before."""
+    driven = path_lengths(poses)
+    before = np.flatnonzero(np.abs(driven[-1] - driven - length) < 0.5 * length)
+    away = np.hypot(*(poses[before, :2] - poses[-1, :2]).T)
+    return int(before[away.argmin()]) if len(before) else 0
 
 
 def _is_replaced(

@@ -16,7 +16,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.contradictions import Stretch
 from pathspace_graph.loop.crossing import sampled
 from pathspace_graph.loop.finding import KnownLoop
-from pathspace_graph.loop.mending import MENDED, led_through, newest_lap
+from pathspace_graph.loop.mending import MENDED, carried, led_through, newest_lap
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online
@@ -149,6 +149,13 @@ def test_the_newest_lap_begins_where_it_ends() -> None:
     assert stations[-1] == pytest.approx(40.0 * np.pi, rel=0.01)
     np.testing.assert_array_equal(lap[0], lap[-1])
     assert np.hypot(*(lap[0] - poses[-1, :2])) < 0.5
+
+
+def test_cones_are_carried_by_the_pose_next_to_them() -> None:
+    before = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
+    after = np.array([[1.0, 0.0, 0.0], [10.0, 2.0, 0.5 * np.pi]])
+    points = carried(np.array([[0.0, 3.0], [11.0, 1.0]]), before, after)
+    np.testing.assert_allclose(points, [[1.0, 3.0], [9.0, 3.0]], atol=1e-12)
 
 
 def test_known_gaps_are_gone_after_mending() -> None:
