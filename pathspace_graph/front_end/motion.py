@@ -47,6 +47,8 @@ class MotionCheck:
         self._rate = 0.0
         self._t: float | None = None
         self._reading: tuple[float, Array] = (-np.inf, np.full(3, np.nan))
+        self._limit = settings.doubt
+        self._doubted_at = -np.inf  # the odometry was contradicted last at this stamp (s)
         self._rest = Rest(sigma, settings)
         self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
 
@@ -56,7 +58,11 @@ class MotionCheck:
         motion = self._integrate(odometry, t)
         variances = 0.5 * np.trace(detections.covariances, axis1=1, axis2=2)
         self._recent.forget(t)
+        distrusted = t - self._doubted_at < self.settings.distrust
+        self._limit = self.settings.doubt_again if distrusted else self.settings.doubt
         motion = self._checked(motion, detections, variances)
+        if motion.doubted:
+            self._doubted_at = t
         if not motion.fault and self._rest.update(odometry, t):
             motion = self._at_rest(motion, detections, variances)
         self.pose = compose(self.pose, motion.odometry.delta)
@@ -155,7 +161,7 @@ class MotionCheck:
         """Returns whether a match of detections, which begins at the predicted pose (3,), denies a motion."""
         off, covariance = self._contradiction(motion.odometry, predicted, found)
         enough = found.matched >= self.settings.min_doubting
-        return enough and bool(off @ np.linalg.solve(covariance, off) > self.settings.doubt**2)
+        return enough and bool(off @ np.linalg.solve(covariance, off) > self._limit**2)
 
     def _has_jumped(self, odometry: IntegratedOdometry, going_on: Array, dt: float) -> bool:
         """Returns whether a motion differs from going on (3,) as before by more than a vehicle can do."""

@@ -17,9 +17,13 @@ class MotionSettings(Positive):
 
     UNLIMITED = ("doubt", "huber")
 
-    doubt: float = 4.5
+    doubt: float = 5.0
     """The detections contradict the odometry by this number of standard deviations. It is infinite where the
     odometry is always believed."""
+    doubt_again: float = 3.8
+    """An odometry that was contradicted not long ago is contradicted by this number of them."""
+    distrust: float = 12.0
+    """It is so for this time (s)."""
     doubt_rate: float = 2.0
     """The yaw rate of an odometry that is contradicted is still believed if the detections agree with it
     within this number of standard deviations."""
