@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -66,8 +67,7 @@ class MotionCheck:
         if not motion.fault and self._rest.update(odometry, t):
             motion = self._at_rest(motion, detections, variances)
         self.pose = compose(self.pose, motion.odometry.delta)
-        poses = np.broadcast_to(self.pose, (len(variances), 3))
-        points = to_map(detections.points_vehicle, poses)
+        points = to_map(detections.points_vehicle, self.pose[None])
         self.seen_again = self._recent.has(points)
         self._recent.add(t, points)
         if self._t is not None and t > self._t:
@@ -106,7 +106,7 @@ class MotionCheck:
     def _at_rest(self, motion: MeasuredMotion, detections: Detections, variances: Array) -> MeasuredMotion:
         """Returns no motion at all, where the detections say so as well, or else the given one."""
         settings = self.settings
-        found = self._match(detections, variances, self.pose, settings.iterations_first)
+        found = self._match(detections, variances, self.pose, settings.reaches_check)
         none = integrated_odometry(np.zeros(3), np.diag(settings.sigmas_rest) ** 2, NO_CALIBRATION)
         rest = MeasuredMotion(none, np.zeros((1, 3)))
         if found is None or self._is_contradicted(rest, self.pose, found):
@@ -124,7 +124,7 @@ class MotionCheck:
         dt = detections.t - self._t
         going_on = dt * (motion.odometry.twist if self._velocity is None else self._velocity)
         predicted = compose(self.pose, motion.odometry.delta)
-        found = self._match(detections, variances, predicted, settings.iterations_first)
+        found = self._match(detections, variances, predicted, settings.reaches_check)
         if found is not None and found.misfit > settings.max_misfit:
             found = None
         told = found is not None and found.matched >= settings.min_doubting
@@ -146,7 +146,7 @@ class MotionCheck:
         no vehicle can make. Nothing is told from them.
         """
         settings = self.settings
-        found = [self._match(detections, variances, start, settings.iterations) for start in starts]
+        found = [self._match(detections, variances, start, settings.reaches) for start in starts]
         possible = [one for one in found if one is not None and self._is_possible(one, starts[0], dt)]
         return max(possible, key=lambda one: one.matched - one.misfit, default=None)
 
@@ -172,10 +172,12 @@ class MotionCheck:
         settings = self.settings
         return np.array([settings.sigma_speed, settings.sigma_lateral, settings.sigma_rate]) * dt
 
-    def _match(self, detections: Detections, variances: Array, start: Array, iterations: int) -> Match | None:
+    def _match(
+        self, detections: Detections, variances: Array, start: Array, reaches: Sequence[float]
+    ) -> Match | None:
         """Returns the match of a cycle's detections that begins at a pose (3,), if it holds the pose."""
         points = detections.points_vehicle
-        found = match(self._recent, points, variances, start, self.settings, iterations)
+        found = match(self._recent, points, variances, start, self.settings, reaches)
         return found if found.matched >= self.settings.min_matched and found.is_certain else None
 
     def _contradiction(

@@ -7,6 +7,7 @@ from iteration to iteration (EM-ICP; Granger and Pennec 2002).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,19 +37,19 @@ class RecentDetections:
         self._stamps: Array = np.zeros(0)
 
     def add(self, t: float, points: Array) -> None:
-        """Adds the detections at points (m, 2) of a cycle at t (s), and drops those that are too old."""
-        kept = self._stamps > t - self.settings.memory
-        self.points = np.concatenate([self.points[kept], points])
-        self._stamps = np.append(self._stamps[kept], np.full(len(points), t))
+        """Adds the detections at points (m, 2) of a cycle at t (s)."""
+        self.points = np.concatenate([self.points, points])
+        self._stamps = np.concatenate([self._stamps, np.full(len(points), t)])
+
+    def forget(self, t: float) -> None:
+        """Drops the detections that are too old at t (s)."""
+        first = int(self._stamps.searchsorted(t - self.settings.memory, side="right"))
+        self.points, self._stamps = self.points[first:], self._stamps[first:]
 
     def has(self, points: Array) -> BoolArray:
         """Returns whether each point (m, 2) lies where an earlier detection does."""
         _, weights = _means(points, self.points, self.settings.reach_last)
         return np.asarray(weights > self.settings.min_weight)
-
-    def forget(self, t: float) -> None:
-        """Drops the detections that are too old at t (s)."""
-        self.add(t, np.zeros((0, 2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +60,15 @@ class Match:
     """(3,) This is the pose in the frame of the earlier detections, in m, m and rad."""
     information: Array
     """(3, 3) This is the information about the pose, in the same frame, from the matched detections."""
-    matched: int
-    """This number of detections lies on earlier ones."""
+    is_matched: BoolArray
+    """(m,) The flag is set when a detection lies on earlier ones."""
     misfit: float
     """This is the mean square of the matched detections' whitened distances."""
+
+    @property
+    def matched(self) -> int:
+        """Returns the number of detections that lie on earlier ones."""
+        return int(self.is_matched.sum())
 
     @property
     def is_certain(self) -> bool:
@@ -77,29 +83,30 @@ def match(
     variances: Array,
     start: Array,
     settings: MotionSettings,
-    iterations: int,
+    reaches: Sequence[float],
 ) -> Match:
     """Lays detections (m, 2), vehicle frame, on the recent ones by Gauss-Newton steps from a pose (3,).
 
     Each step minimizes `sum_i |R z_i + t - m_i|^2 / sigma_i^2` with m_i the weighted mean of the recent
     detections beside the point, and `sigma_i^2 = variance_i (1 + 1/n_i) + sigma_cone^2` with n_i the sum of
-    the weights. The variances (m,) are those of one coordinate (m^2).
+    the weights. There is a step for each of the reaches (m). The variances (m,) are those of one coordinate
+    (m^2).
     """
-    pose, shrink = start.copy(), (settings.reach_last / settings.reach) ** (1.0 / max(iterations - 1, 1))
-    for iteration in range(iterations):
-        points = to_map(points_vehicle, np.broadcast_to(pose, (len(points_vehicle), 3)))
-        means, weights = _means(points, recent.points, settings.reach * shrink**iteration)
+    pose, regular = start.copy(), np.eye(3) * np.finfo(float).eps
+    for reach in reaches:
+        points = to_map(points_vehicle, pose[None])
+        means, weights = _means(points, recent.points, reach)
         matched = weights > settings.min_weight
         off, arm = (points - means)[matched], (points - pose[:2])[matched]
         precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + settings.sigma_cone**2)
-        precision *= huber_weights(np.hypot(*off.T) * np.sqrt(precision), settings.huber)
+        square = (off * off).sum(axis=1)
+        precision *= huber_weights(np.sqrt(square * precision), settings.huber)
         information, gradient = _normal_equations(off, arm, precision)
         if matched.sum() < settings.min_matched:
             break
-        pose = pose - np.linalg.solve(information + np.eye(3) * np.finfo(float).eps, gradient)
+        pose = pose - np.linalg.solve(information + regular, gradient)
     count = int(matched.sum())
-    misfit = float((off**2).sum(axis=1) @ precision) / max(count, 1)
-    return Match(pose, information, count, misfit)
+    return Match(pose, information, matched, float(square @ precision) / max(count, 1))
 
 
 def _means(points: Array, recent: Array, reach: float) -> tuple[Array, Array]:

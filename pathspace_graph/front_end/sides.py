@@ -51,16 +51,16 @@ class SideJudge:
         self._path.steer(twists)
         labels, self.colourless = detections.labels, self._is_colourless(detections.labels)
         if not self.colourless and self._agreeing + self._opposing >= self.settings.enough_votes:
-            return self._relabelled(detections, np.full(len(labels), UNKNOWN))
+            return self._relabelled(detections, labels) if self.swapped else detections
         path = self._path.ahead(pose, self.settings.reach)
-        points = to_map(detections.points_vehicle, np.broadcast_to(pose, (len(labels), 3)))
+        points = to_map(detections.points_vehicle, pose[None])
         cones = self._cones.add(detections.t, points, labels)
         self._judge_colours(path)
         sides = self._sides(pose, path)[cones] if self.colourless else np.full(len(labels), UNKNOWN)
         return self._relabelled(detections, sides)
 
     def _relabelled(self, detections: Detections, sides: IntArray) -> Detections:
-        """Returns detections with the right colours, and with a side (m,) where they have none."""
+        """Returns detections with the right colours, and with sides (m,) for those that have none."""
         labels = detections.labels
         coloured = LEFT + RIGHT - labels if self.swapped else labels
         labels = np.where(labels == UNKNOWN, sides, coloured)

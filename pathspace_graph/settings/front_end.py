@@ -35,9 +35,8 @@ class MotionSettings(Positive):
     reach_last: float = 0.4
     """This is the reach in the last iteration (m)."""
     iterations: int = 6
-    """The detections are laid on the earlier ones in this number of iterations."""
-    iterations_first: int = 2
-    """The check of the odometry takes this number of iterations, since it begins near the solution."""
+    """The detections are laid on the earlier ones in this number of iterations. The check of the odometry
+    takes the first and the last one, since it begins near the solution."""
     min_weight: float = 0.7
     """A detection is matched if the weights of the remembered detections add up to this at least."""
     min_matched: int = 3
@@ -95,6 +94,17 @@ class MotionSettings(Positive):
     """A vehicle at rest moves by this from cycle to cycle, as one standard deviation (m)."""
     rest_sigma_heading: float = 5e-5
     """A vehicle at rest turns by this from cycle to cycle, as one standard deviation (rad)."""
+
+    @property
+    def reaches(self) -> list[float]:
+        """Returns the reach of each iteration (m), which shrinks by the same factor."""
+        shrink = (self.reach_last / self.reach) ** (1.0 / max(self.iterations - 1, 1))
+        return [self.reach * shrink**k for k in range(self.iterations)]
+
+    @property
+    def reaches_check(self) -> list[float]:
+        """Returns the reach of each iteration (m) in the check of the odometry."""
+        return [self.reach, self.reach_last]
 
     @property
     def sigmas_rest(self) -> tuple[float, float, float]:
