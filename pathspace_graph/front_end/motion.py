@@ -49,6 +49,7 @@ class MotionCheck:
         self._t: float | None = None
         self._reading: tuple[float, Array] = (-np.inf, np.full(3, np.nan))
         self._limit = settings.doubt
+        self._matched: BoolArray | None = None  # by the check of the newest cycle, where it agrees
         self._doubted_at = -np.inf  # the odometry was contradicted last at this stamp (s)
         self._rest = Rest(sigma, settings)
         self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
@@ -61,6 +62,7 @@ class MotionCheck:
         self._recent.forget(t)
         distrusted = t - self._doubted_at < self.settings.distrust
         self._limit = self.settings.doubt_again if distrusted else self.settings.doubt
+        self._matched = None
         motion = self._checked(motion, detections, variances)
         if motion.doubted:
             self._doubted_at = t
@@ -68,7 +70,7 @@ class MotionCheck:
             motion = self._at_rest(motion, detections, variances)
         self.pose = compose(self.pose, motion.odometry.delta)
         points = to_map(detections.points_vehicle, self.pose[None])
-        self.seen_again = self._recent.has(points)
+        self.seen_again = self._recent.has(points) if self._matched is None else self._matched
         self._recent.add(t, points)
         if self._t is not None and t > self._t:
             self._velocity = motion.odometry.delta / (t - self._t)
@@ -83,17 +85,28 @@ class MotionCheck:
         """Returns the motion by odometry, whose noise grows where a twist is held for long."""
         if len(odometry.t) == 0:
             return MeasuredMotion(integrate_odometry(odometry, t, self.sigma), odometry.twist)
-        settings, (before, twist) = self.settings, self._reading
-        same = (odometry.twist == np.concatenate([twist[None], odometry.twist[:-1]])).all(axis=1)
-        measured = odometry.t.copy()
-        if self._t is not None and odometry.t[0] <= self._t and same[0]:
-            measured[0] = before  # the row only goes on with the last twist
+        measured, (before, twist) = odometry.t, self._reading
+        if self._t is not None and measured[0] <= self._t and (odometry.twist[0] == twist).all():
+            measured = np.append(before, measured[1:])  # the first row only goes on with the last twist
         self._reading = float(measured[-1]), odometry.twist[-1]
-        held = np.maximum(np.append(odometry.t[1:], t) - measured - self._hold(measured), 0.0)
-        growth = settings.acceleration, settings.acceleration, settings.angular_acceleration
-        sigma = np.hypot(self.sigma, held[:, None] * np.array(growth)) if held.any() else self.sigma
-        integrated, stuck = integrate_odometry(odometry, t, sigma), same[1:].sum() >= settings.stuck
-        return MeasuredMotion(integrated, odometry.twist, missing=bool(held[-1] > 0.0), stuck=bool(stuck))
+        ages = np.append(odometry.t[1:], t) - measured
+        held = np.maximum(ages - self._hold(measured), 0.0)
+        sigma, missing = self.sigma, bool(held[-1] > 0.0)
+        if missing or held.any():
+            settings = self.settings
+            growth = settings.acceleration, settings.acceleration, settings.angular_acceleration
+            sigma = np.hypot(self.sigma, held[:, None] * np.array(growth))
+        integrated = integrate_odometry(odometry, t, sigma)
+        return MeasuredMotion(
+            integrated, odometry.twist, missing=missing, stuck=self._is_stuck(odometry.twist)
+        )
+
+    def _is_stuck(self, twists: Array) -> bool:
+        """Returns whether too many of the twists (k, 3) are equal to the one before, to the last digit."""
+        same = twists[1:, 0] == twists[:-1, 0]
+        if same.sum() < self.settings.stuck:
+            return False
+        return bool((twists[1:][same] == twists[:-1][same]).all(axis=1).sum() >= self.settings.stuck)
 
     def _hold(self, measured: Array) -> float:
         """Returns how long a twist may be held, from the stamps of newly measured ones (k,)."""
@@ -131,6 +144,7 @@ class MotionCheck:
         stuck = motion.stuck and not told and self._has_jumped(motion.odometry, going_on, dt)
         failed = motion.missing or (stuck and settings.doubt < np.inf)
         if found is not None and not failed and not self._is_contradicted(motion, predicted, found):
+            self._matched = found.is_matched
             return motion
         best = self._best(detections, variances, (compose(self.pose, going_on), predicted), dt)
         if failed or (best is not None and self._is_contradicted(motion, predicted, best)):

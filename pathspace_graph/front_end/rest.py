@@ -19,6 +19,7 @@ class Rest:
         """Keeps the settings, and the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
         self.settings = settings
         self.sigma = sigma
+        self._fastest = settings.rest_speed + settings.rest_sigmas * sigma[0]  # as one reading may be at rest
         self._since: float | None = None
         self._sum: Array = np.zeros(3)
         self._count = 0
@@ -31,7 +32,11 @@ class Rest:
         Its mean twist must be zero within its own noise, and within the limits of a vehicle that stands.
         """
         twists = odometry.twist[1:] if len(odometry.twist) > 1 else odometry.twist  # the first one is held
-        if len(twists) == 0 or not self._is_still(twists.mean(axis=0), len(twists)):
+        if (
+            len(twists) == 0
+            or twists[:, 0].min() > self._fastest
+            or not self._is_still(twists.mean(axis=0), len(twists))
+        ):
             self.end()
             return False
         if self._since is None:

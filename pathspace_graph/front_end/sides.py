@@ -37,7 +37,8 @@ class SideJudge:
         """The flag is set where the colours of the log so far are on the other sides."""
         self.colourless = False
         """The flag is set where most detections have no colour, so that the way driven tells their sides."""
-        self._path = DrivenPath(path)
+        self._path_settings = path
+        self._path: DrivenPath | None = None
         self._cones = NearCones(settings)
         self._agreeing = self._opposing = 0  # cones on the side of their colour, and on the other one
         self._known = self._unknown = 0.0  # newest detections with and without a colour
@@ -47,11 +48,13 @@ class SideJudge:
 
         The pose (3,) is in the frame of the front end, and the vehicle came there with twists (k, 3).
         """
-        self._path.update(pose)
-        self._path.steer(twists)
         labels, self.colourless = detections.labels, self._is_colourless(detections.labels)
         if not self.colourless and self._agreeing + self._opposing >= self.settings.enough_votes:
+            self._path = None  # it begins anew, if it is needed again
             return self._relabelled(detections, labels) if self.swapped else detections
+        self._path = self._path or DrivenPath(self._path_settings)
+        self._path.update(pose)
+        self._path.steer(twists)
         path = self._path.ahead(pose, self.settings.reach)
         points = to_map(detections.points_vehicle, pose[None])
         cones = self._cones.add(detections.t, points, labels)

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pathspace_graph.factors.se2 import to_map, to_vehicle
+from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.front_end.scan_matching import RecentDetections, match
 from pathspace_graph.settings.front_end import MotionSettings
 
 SETTINGS = MotionSettings()
 CONES = np.array([[2.0, 2.0], [6.0, 2.2], [10.0, 2.0], [2.5, -1.9], [7.0, -2.0], [11.0, -2.1]])
+
+
+def reaches(iterations: int) -> list[float]:
+    return replace(SETTINGS, iterations=iterations).reaches
 
 
 def seen_once(cones: np.ndarray = CONES) -> RecentDetections:
@@ -30,7 +36,7 @@ def detected(pose: np.ndarray, cones: np.ndarray = CONES) -> np.ndarray:
 def test_exact_detections_give_the_exact_motion(x: float, y: float, theta: float) -> None:
     pose = np.array([x, y, theta])
     start = np.array([x - 0.4, 0.0, 0.0])
-    found = match(seen_once(), detected(pose), np.full(6, 0.01), start, SETTINGS, 8)
+    found = match(seen_once(), detected(pose), np.full(6, 0.01), start, SETTINGS, reaches(8))
     np.testing.assert_allclose(found.pose, pose, atol=1e-3)
     assert found.matched == 6
     assert found.is_certain
@@ -38,7 +44,7 @@ def test_exact_detections_give_the_exact_motion(x: float, y: float, theta: float
 
 def test_the_information_is_that_of_two_detections_of_every_cone() -> None:
     """Each offset has the variance of two detections and of the cone: `2 * 0.01 + sigma_cone^2`."""
-    found = match(seen_once(), CONES, np.full(6, 0.01), np.zeros(3), SETTINGS, 1)
+    found = match(seen_once(), CONES, np.full(6, 0.01), np.zeros(3), SETTINGS, reaches(1))
     precision = 1.0 / (2 * 0.01 + SETTINGS.sigma_cone**2)
     assert found.information[0, 0] == pytest.approx(6 * precision)
     assert found.information[2, 2] == pytest.approx(precision * (CONES**2).sum())
@@ -54,7 +60,7 @@ def test_the_covariance_is_that_of_many_noisy_matches() -> None:
         recent = RecentDetections(settings)
         recent.add(0.0, CONES + sigma * rng.standard_normal(CONES.shape))
         points = CONES + sigma * rng.standard_normal(CONES.shape)
-        found = match(recent, points, np.full(6, sigma**2), np.zeros(3), settings, 4)
+        found = match(recent, points, np.full(6, sigma**2), np.zeros(3), settings, reaches(4))
         errors.append(found.pose)
     covariance = np.linalg.inv(found.information)
     np.testing.assert_allclose(
@@ -64,18 +70,29 @@ def test_the_covariance_is_that_of_many_noisy_matches() -> None:
 
 def test_a_detection_of_nothing_has_no_say() -> None:
     points = np.vstack([detected(np.array([0.5, 0.0, 0.0])), [[4.0, 0.0]]])
-    found = match(seen_once(), points, np.full(7, 0.01), np.array([0.3, 0.0, 0.0]), SETTINGS, 6)
+    found = match(seen_once(), points, np.full(7, 0.01), np.array([0.3, 0.0, 0.0]), SETTINGS, reaches(6))
     assert found.matched == 6
     np.testing.assert_allclose(found.pose, [0.5, 0.0, 0.0], atol=1e-3)
 
 
 def test_one_cone_holds_no_motion() -> None:
-    found = match(seen_once(CONES[:1]), CONES[:1], np.full(1, 0.01), np.zeros(3), SETTINGS, 3)
+    found = match(seen_once(CONES[:1]), CONES[:1], np.full(1, 0.01), np.zeros(3), SETTINGS, reaches(3))
     assert found.matched == 1
     assert not found.is_certain
 
 
 def test_old_detections_are_forgotten() -> None:
     recent = seen_once()
-    recent.add(SETTINGS.memory + 0.01, to_map(CONES[:2], np.zeros((2, 3))))
-    assert len(recent.points) == 2
+    recent.add(0.1, CONES[:2])
+    recent.forget(SETTINGS.memory + 0.01)
+    np.testing.assert_array_equal(recent.points, CONES[:2])
+
+
+def test_a_detection_is_seen_again_where_one_was() -> None:
+    seen = seen_once().has(np.array([[2.1, 2.0], [4.0, 0.0]]))
+    np.testing.assert_array_equal(seen, [True, False])
+
+
+def test_the_reaches_shrink_from_the_first_to_the_last() -> None:
+    np.testing.assert_allclose(reaches(3), [1.0, np.sqrt(0.4), 0.4])
+    assert SETTINGS.reaches_check == [SETTINGS.reach, SETTINGS.reach_last]
