@@ -12,7 +12,8 @@ from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, odometry_residuals
 from pathspace_graph.factors.se2 import compose, rotation
 
-from .keys import CALIBRATION_KEY, POSE, pose_key, pose_keys
+from .gaussian import FactoredSystem, half_solve
+from .keys import CALIBRATION_KEY, CALIBRATION_LETTER, POSE, pose_key, pose_keys
 from .rows import Rows
 from .variables import Variables
 
@@ -111,3 +112,30 @@ def through_odometry(by_pose: Array, poses: Array, odometry: OdometryChain) -> t
     local = by_pose.copy()
     local[:, :2] = by_pose[:, :2] @ rotation(poses[1, 2])
     return by_older, -local @ odometry.by_calibration[-1], local @ np.linalg.inv(odometry.whiteners[-1])
+
+
+def predicted_covariance(
+    step: FactoredSystem, rows: Rows, poses: Array, odometry: OdometryChain, newest: int, together: int
+) -> Array:
+    """Returns the predicted covariances `J Sigma J'` (m / k, k, k) of every k = `together` rows.
+
+    The pose is the first key of a row, and Sigma is the covariance of the last step. The pose of the cycle
+    `newest` was not in that step, so it is replaced by its prediction from the pose before: the odometry's
+    last interval leads from the first of `poses` (2, 3) to it. A map point that was not in the step
+    contributes nothing.
+    """
+    gradient, row = np.zeros((step.layout.size, len(rows)), order="F"), np.arange(len(rows))
+    columns = rows.columns(step.layout)
+    known = columns >= 0
+    gradient[columns[known], np.broadcast_to(row[:, None], columns.shape)[known]] = rows.jacobian[known]
+    noise, on_newest = np.zeros((len(rows), POSE)), columns[:, 0] < 0
+    if on_newest.any():
+        by_previous, by_calibration, noise[on_newest] = through_odometry(
+            rows.jacobian[on_newest, :POSE], poses, odometry
+        )
+        previous = pose_keys(np.array([newest - 1]))
+        gradient[step.layout.entries(previous)[:, None], row[on_newest]] += by_previous.T
+        gradient[step.layout.block(CALIBRATION_LETTER), row[on_newest]] += by_calibration.T
+    half = half_solve(step.factor, gradient).T.reshape(-1, together, step.layout.size)
+    own = noise.reshape(-1, together, POSE)
+    return np.asarray(half @ half.transpose(0, 2, 1) + own @ own.transpose(0, 2, 1))

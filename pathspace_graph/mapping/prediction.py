@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrate_twists
 from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, pose_key
-from pathspace_graph.graph.smoother import FixedLagSmoother, SmootherSettings
+from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.system import SmootherSettings
 from pathspace_graph.graph.window import MapRows
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.io.results import VehicleState

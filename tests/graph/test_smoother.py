@@ -13,7 +13,8 @@ from pathspace_graph.graph.gaussian import factorize, graph_of, keys_of, normal_
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
 from pathspace_graph.graph.odometry import calibrated_delta
 from pathspace_graph.graph.rows import LinearFactor, Rows
-from pathspace_graph.graph.smoother import FixedLagSmoother, SmootherSettings
+from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.system import SmootherSettings
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import split_odometry

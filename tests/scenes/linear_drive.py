@@ -13,7 +13,8 @@ from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
 from pathspace_graph.graph.odometry import OdometryChain
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.smoother import FixedLagSmoother, SmootherSettings
+from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.system import SmootherSettings
 from pathspace_graph.graph.variables import Variables
 
 from .graph import columns_of, dense_rows
