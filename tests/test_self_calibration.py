@@ -56,6 +56,15 @@ def test_every_estimator_finds_a_sensor_that_is_turned(estimator: str) -> None:
     assert mapper.vehicle_state().sensor[0] == pytest.approx(0.035, abs=0.012)  # type: ignore[attr-defined]
 
 
+def test_a_calibration_that_is_being_learned_is_said_in_the_open_lap() -> None:
+    log = driven("yaw", 0.035)
+    told = [
+        cycle for cycle in run_online(log, make_online("fixed-lag", SETTINGS, log)).cycles if cycle.reason
+    ]
+    assert any("calibration" in cycle.reason for cycle in told)
+    assert not any("calibration" in cycle.reason for cycle in told if cycle.closed)
+
+
 def test_a_sensor_that_is_what_it_was_said_to_be_is_not_doubted() -> None:
     mapper = make_online("fixed-lag", SETTINGS, driven())
     run_online(driven(), mapper)

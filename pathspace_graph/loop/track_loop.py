@@ -104,11 +104,19 @@ class TrackLoop:
         if tested is not None:
             evidence = evidence_of(smoother, tested, self._known_loop, reading.seen_again)
         self.health = self._monitor.update(replace(evidence, odometry=reading.motion.fault))
-        if self._boundaries_cross and self.health.condition == GOOD:
-            self.health = Health(DEGRADED, "the two boundaries of the map cross")
+        if self.health.condition == GOOD and self._caveat():
+            self.health = Health(DEGRADED, self._caveat())
         if self._known_loop.is_whole and self.record.unsolvable is None:
             self.mending.contradictions.observe(smoother, self._known_loop, new, detections.t)
         self._begin_search()
+
+    def _caveat(self) -> str:
+        """Returns why an estimate is not good though the detections agree with it, or an empty string."""
+        if self._boundaries_cross:
+            return "the two boundaries of the map cross"
+        if not self.closed and self._believed != self.settings:
+            return "the drive contradicts the calibration, which is being learned"
+        return ""
 
     def doubt_calibrations(self) -> None:
         """Widens the priors of calibrations that the drive contradicts, while the loop is open."""
