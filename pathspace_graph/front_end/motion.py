@@ -49,6 +49,7 @@ class MotionCheck:
         self._t: float | None = None
         self._reading: tuple[float, Array] = (-np.inf, np.full(3, np.nan))
         self._limit = settings.doubt
+        self._misfit = 1.0  # the mean of those of the matches that agreed, the newest counting most
         self._matched: BoolArray | None = None  # by the check of the newest cycle, where it agrees
         self._doubted_at = -np.inf  # the odometry was contradicted last at this stamp (s)
         self._rest = Rest(sigma, settings)
@@ -138,13 +139,14 @@ class MotionCheck:
         going_on = dt * (motion.odometry.twist if self._velocity is None else self._velocity)
         predicted = compose(self.pose, motion.odometry.delta)
         found = self._match(detections, variances, predicted, settings.reaches_check)
-        if found is not None and found.misfit > settings.max_misfit:
+        if found is not None and found.misfit > settings.max_misfit * self._excess:
             found = None
         told = found is not None and found.matched >= settings.min_doubting
         stuck = motion.stuck and not told and self._has_jumped(motion.odometry, going_on, dt)
         failed = motion.missing or (stuck and settings.doubt < np.inf)
         if found is not None and not failed and not self._is_contradicted(motion, predicted, found):
             self._matched = found.is_matched
+            self._misfit += settings.misfit_gain * (found.misfit - self._misfit)
             return motion
         best = self._best(detections, variances, (compose(self.pose, going_on), predicted), dt)
         if failed or (best is not None and self._is_contradicted(motion, predicted, best)):
@@ -168,7 +170,7 @@ class MotionCheck:
         """Returns whether a match is that of a vehicle which went on from pose to pose (3,)."""
         sigmas = self._sigmas_going_on(dt) + np.sqrt(np.diag(np.linalg.inv(found.information)))
         change = np.abs(relative(going_on, found.pose))
-        fits = found.misfit < self.settings.max_misfit
+        fits = found.misfit < self.settings.max_misfit * self._excess
         return fits and bool((change < self.settings.max_change * sigmas).all())
 
     def _is_contradicted(self, motion: MeasuredMotion, predicted: Array, found: Match) -> bool:
@@ -203,9 +205,15 @@ class MotionCheck:
         changes.
         """
         turn = _to_vehicle(predicted[2])
-        covariance = turn @ np.linalg.inv(found.information) @ turn.T + odometry.covariance
+        spread = np.linalg.inv(found.information) * self._excess
+        covariance = turn @ spread @ turn.T + odometry.covariance
         covariance[2, 2] += (self.settings.sigma_latency * (odometry.twist[2] - self._rate)) ** 2
         return turn @ (found.pose - predicted), covariance
+
+    @property
+    def _excess(self) -> float:
+        """Returns by which factor the variance of detections is larger than they claim; it is at least 1."""
+        return max(self._misfit / self.settings.misfit, 1.0)
 
     def _replaced(
         self, motion: MeasuredMotion, best: Match | None, going_on: Array, dt: float
@@ -221,7 +229,7 @@ class MotionCheck:
                 mean[2], covariance[2, 2] = odometry.delta[2], odometry.covariance[2, 2]
             own = relative(self.pose, best.pose)
             turn = _to_vehicle(best.pose[2])
-            information = turn @ best.information @ turn.T / settings.widening**2
+            information = turn @ best.information @ turn.T / (settings.widening**2 * self._excess)
             prior = np.linalg.inv(covariance)
             covariance = np.linalg.inv(information + prior)
             delta = covariance @ (information @ own + prior @ mean)

@@ -45,6 +45,11 @@ class MotionSettings(Positive):
     """A contradiction of the odometry rests on this number of matched detections at least."""
     huber: float = 2.5
     """Beyond this whitened distance, the Huber loss reduces the weight of a matched detection."""
+    misfit: float = 1.5
+    """Where the mean square of the whitened distances is larger than this for long, detections are worse than
+    they claim, and their covariances are multiplied by its excess."""
+    misfit_gain: float = 0.02
+    """The mean square takes over this share of each cycle's."""
     max_misfit: float = 3.0
     """No motion is told where the mean square of the whitened distances is larger than this. It is about 1
     where the vehicle has moved, and 4 and more where it was put down elsewhere."""

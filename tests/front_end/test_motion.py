@@ -77,6 +77,15 @@ def test_a_right_odometry_is_left_as_it_is(log: Log) -> None:
         np.testing.assert_array_equal(motion.odometry.covariance, own.odometry.covariance)
 
 
+def test_detections_that_are_worse_than_they_claim_do_not_deny_the_odometry(log: Log) -> None:
+    """They have three times the standard deviation that they claim."""
+    cycles = tuple(replace(c, covariances=c.covariances / 9.0) for c in log.cycles)
+    overconfident = replace(log, cycles=cycles)
+    faults = [motion.fault for motion in checked(overconfident)]
+    assert np.mean([bool(fault) for fault in faults]) < 0.2
+    assert np.abs(errors(log, checked(overconfident)).cumsum(axis=0)).max() < 0.7
+
+
 @pytest.mark.parametrize(
     "change",
     [lambda twist: 0.0 * twist, lambda twist: twist * [1.5, 1.5, 1.0], lambda twist: twist * [0.3, 0.3, 1.0]],
