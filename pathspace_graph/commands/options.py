@@ -40,7 +40,10 @@ def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
 def _set_help(settings: type[Any]) -> None:
     """Gives tyro the text of each field as one paragraph; it would break lines where the source does."""
     texts = {
-        text.arg_name: text.description or "" for text in docstring_parser.parse_from_object(settings).params
+        text.arg_name: text.description or ""
+        for home in reversed(settings.__mro__)
+        if is_dataclass(home)
+        for text in docstring_parser.parse_from_object(home).params
     }
     for entry in fields(settings):
         entry.metadata = MappingProxyType({"help": " ".join(texts.get(entry.name, "").split())})

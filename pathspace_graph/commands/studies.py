@@ -1,8 +1,9 @@
-"""What the commands that run a study share: its own tracks, seeds and laps replaced, and what failed."""
+"""What the commands that run a study share: their options, how a study is run, and what failed."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -10,12 +11,50 @@ import pandas as pd
 from rich.console import Console
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.harness.workers import check_jobs
+from pathspace_graph.eval.study.run import make_plan, run_plan
 from pathspace_graph.eval.study.study import Study
+from pathspace_graph.progress import progress
 
 CELLS_FAILED: Final = 3
 """This is the exit code of a study that is written, but some of whose cells failed."""
 LINES: Final = 20
 """A whole study writes about this many lines of progress where there is no terminal."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyCommand:
+    """Holds the options of every command that runs a study."""
+
+    out: Path
+    """Everything is written to this folder; a study that was begun there is continued."""
+    jobs: int = -1
+    """This number of processes runs at a time, -1 being one for each core."""
+    cluster: str | None = None
+    """The study runs on the workers of the Dask scheduler with this address (tcp://HOST:8786) instead."""
+    retry_failed: bool = False
+    """Runs that failed before are run again."""
+    tracks: tuple[str, ...] = ()
+    """These track files, and seeds of generated tracks, replace the study's own."""
+    seeds: tuple[int, ...] = ()
+    """These seeds replace the study's own."""
+    laps: int | None = None
+    """This number of laps replaces the study's own."""
+
+    def execute(self, study: Study, write: Callable[[Study, pd.DataFrame, Path], str]) -> None:
+        """Checks, runs, writes and reports a study; the exit code is 3 where cells failed.
+
+        `write` writes the results to the folder, and returns the text that is printed.
+        """
+        check_jobs(self.jobs)
+        study = with_drives(study, self.tracks, self.seeds, self.laps)
+        plan = make_plan(study)
+        with progress("runs", lines=LINES) as advance:
+            frame = run_plan(plan, self.out, self.jobs, self.cluster, self.retry_failed, advance)
+        say = Console(soft_wrap=True, highlight=False, markup=False)
+        say.print(write(study, frame, self.out).rstrip("\n"))
+        say.print(f"\nwritten to {self.out}")
+        report_failures(frame, len(plan.cells))
 
 
 def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], laps: int | None) -> Study:

@@ -300,6 +300,12 @@ def test_help_explains_the_command(command: str, capsys: pytest.CaptureFixture[s
     assert "--out" in capsys.readouterr().out
 
 
+def test_help_explains_the_options_that_commands_share(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ("ablate", "faults"):
+        assert main([command, "--help"]) == 0
+        assert "This number of processes runs at a time" in capsys.readouterr().out
+
+
 def test_help_shows_each_text_as_one_paragraph(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["online", "--help"]) == 0
     assert "Poses stay in the window for this time (s)." in capsys.readouterr().out
