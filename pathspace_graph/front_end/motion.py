@@ -24,9 +24,10 @@ from .rest import Rest
 from .scan_matching import Match, RecentDetections, match
 
 Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
 NO_CALIBRATION: Final = np.zeros((3, CALIBRATION_SIZE))
 """A motion that no odometry has measured does not depend on the calibration of the odometry."""
-BoolArray = NDArray[np.bool_]
 
 
 class MotionCheck:

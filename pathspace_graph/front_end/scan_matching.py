@@ -92,7 +92,7 @@ def match(
     the weights. There is a step for each of the reaches (m). The variances (m,) are those of one coordinate
     (m^2).
     """
-    pose, regular = start.copy(), np.eye(3) * np.finfo(float).eps
+    pose = start.copy()
     for reach in reaches:
         points = to_map(points_vehicle, pose[None])
         means, weights = _means(points, recent.points, reach)
@@ -104,7 +104,8 @@ def match(
         information, gradient = _normal_equations(off, arm, precision)
         if matched.sum() < settings.min_matched:
             break
-        pose = pose - np.linalg.solve(information + regular, gradient)
+        regular = information + np.diag(_LEAST_SHARE * information.diagonal())
+        pose = pose - np.linalg.solve(regular, gradient)
     count = int(matched.sum())
     return Match(pose, information, matched, float(square @ precision) / max(count, 1))
 

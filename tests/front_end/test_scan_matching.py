@@ -81,6 +81,15 @@ def test_one_cone_holds_no_motion() -> None:
     assert not found.is_certain
 
 
+def test_detections_of_one_cone_alone_hold_no_motion_however_many_they_are() -> None:
+    """All offsets have the same arm, so that the information is singular."""
+    points = np.tile(CONES[:1], (5, 1))
+    found = match(seen_once(CONES[:1]), points, np.full(5, 0.01), np.zeros(3), SETTINGS, reaches(6))
+    assert found.matched == 5
+    assert np.isfinite(found.pose).all()
+    assert not found.is_certain
+
+
 def test_old_detections_are_forgotten() -> None:
     recent = seen_once()
     recent.add(0.1, CONES[:2])
