@@ -13,6 +13,7 @@ from pathspace_graph.graph.keys import CALIBRATION_KEY, CONTROL_LETTERS, control
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import Layout, Variables
 from pathspace_graph.io.map import SplineBoundary
+from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.prediction import smoother_settings
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -220,6 +221,7 @@ def test_steps_of_the_active_variables_are_steps_of_the_whole_system() -> None:
     mapper = FixedLagMapper(EAGER, log.odometry_sigma)
     mapper.smoother = smoother = Checked(smoother_settings(EAGER), CurveMap(EAGER))
     smoother.followers = [smoother.map, mapper.path, mapper.growth]
+    mapper.loop = TrackLoop(smoother, mapper.path)
     map_log(log, mapper)
     assert mapper.closed
     assert smoother.checked > 0.3 * len(log.cycles)
