@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.labels import BOUNDARIES, UNKNOWN
+from pathspace_graph.mapping.tentative import nearest_within
 from pathspace_graph.settings.front_end import SidesSettings
 
 Array = NDArray[np.float64]
@@ -48,12 +49,9 @@ class NearCones:
 
     def _cones_of(self, points: Array) -> IntArray:
         """Returns the nearest cone (m,) of each point (m, 2), or the number of a new one."""
-        off = points[:, None] - self.points[None]
-        distance = np.hypot(off[..., 0], off[..., 1])
-        known = distance.min(axis=1, initial=np.inf) < self.settings.merge_radius
-        cones = distance.argmin(axis=1) if len(self.points) else np.zeros(len(points), np.intp)
+        cones, known = nearest_within(points, self.points, self.settings.merge_radius)
         cones[~known] = len(self.points) + np.arange(int((~known).sum()))
-        return np.asarray(cones, np.intp)
+        return cones
 
     def _forget(self, t: float) -> None:
         kept = self._last > t - self.settings.forget_after

@@ -20,13 +20,16 @@ from .sides import SideJudge
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-SIDES_NOTICES: Final = {
-    (0, True): "the cones on the left have the colour of the right boundary: the colours are swapped",
-    (0, False): "the colours are as they were said to be",
-    (1, True): "most detections have no colour: the way driven tells their sides",
-    (1, False): "most detections have a colour again",
+SWAPPED: Final = {
+    True: "the cones on the left have the colour of the right boundary: the colours are swapped",
+    False: "the colours are as they were said to be",
 }
-"""These are the notices that the colours are swapped (0) or mostly unknown (1), from now on or no longer."""
+"""These notices say that the colours are swapped from now on, or no longer."""
+COLOURLESS: Final = {
+    True: "most detections have no colour: the way driven tells their sides",
+    False: "most detections have a colour again",
+}
+"""These notices say that most colours are unknown from now on, or no longer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +57,12 @@ class FrontEnd:
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Returns the judged readings of a cycle: the twists since the last one, and its detections."""
         motion = self._motion.update(odometry, detections)
-        sides, before = self._sides, (self._sides.swapped, self._sides.colourless)
+        sides = self._sides
+        swapped, colourless = sides.swapped, sides.colourless
         judged = sides.update(self._motion.pose, motion.twists, detections)
-        changed = [
-            SIDES_NOTICES[kind, now]
-            for kind, (was, now) in enumerate(zip(before, (sides.swapped, sides.colourless), strict=True))
-            if was != now
-        ]
-        return Reading(motion, judged, self._motion.seen_again, "; ".join(changed))
+        notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
+        notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
+        return Reading(motion, judged, self._motion.seen_again, "; ".join(notices))
 
 
 @dataclass(frozen=True, eq=False)

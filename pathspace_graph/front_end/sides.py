@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
-from pathspace_graph.mapping.candidates import SIDES
+from pathspace_graph.mapping.candidates import SIDES, in_front_row
 from pathspace_graph.mapping.path import DrivenPath, PathAhead
 from pathspace_graph.settings.front_end import SidesSettings
 from pathspace_graph.settings.growth import PathSettings
@@ -133,11 +133,8 @@ class SideJudge:
         found = (side > settings.min_lateral) & (side < settings.max_lateral)
         found &= (stations > path.driven - settings.behind) & (stations < path.driven + settings.sure)
         order = np.flatnonzero(found)[np.argsort(stations[found])]
-        cones = []
-        for i in order.tolist():
-            beside = order[np.abs(stations[order] - stations[i]) < settings.beside]
-            if side[i] <= side[beside].min() + settings.lateral_gap:
-                cones.append(int(seen[i]))
+        in_front = in_front_row(stations[order], side[order], settings.beside, settings.lateral_gap)
+        cones = seen[order[in_front]].tolist()
         left = np.array([-np.sin(pose[2]), np.cos(pose[2])])
         row = Row([], pose[:2] + SIDES[label] * settings.half_width * left, float(pose[2]))
         for cone in cones[-2:]:

@@ -142,7 +142,7 @@ def newest_lap(poses: Array, length: float) -> tuple[Array, Array]:
     """
     first = lap_begin(poses, length)
     lap = np.concatenate([poses[first:, :2], poses[first : first + 1, :2]])
-    return lap, np.append(0.0, np.hypot(*np.diff(lap, axis=0).T).cumsum())
+    return lap, path_lengths(lap)
 
 
 def lap_begin(poses: Array, length: float) -> int:

@@ -12,10 +12,8 @@ from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.recurrence import Recurrence
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Evidence, Health, HealthMonitor
-from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.curve_map import CurveSmoother
-from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import doubt_calibrations
 from pathspace_graph.mapping.registration import near_start
@@ -86,10 +84,6 @@ class TrackLoop:
 
     # --- what a cycle tells ------------------------------------------------------------------------------
 
-    def measured(self, t: float, motion: MeasuredMotion, detections: Detections) -> None:
-        """Records the motion that leads to the pose at t (s), and the detections there."""
-        self.record.measured(t, motion, detections)
-
     def judge(self, tested: Gating | None, new: slice, reading: Reading) -> None:
         """Judges the estimate by the detections that were tested, or remembers those of a lost vehicle.
 
@@ -104,8 +98,8 @@ class TrackLoop:
         if tested is not None:
             evidence = evidence_of(smoother, tested, self._known_loop, reading.seen_again)
         self.health = self._monitor.update(replace(evidence, odometry=reading.motion.fault))
-        if self.health.condition == GOOD and self._caveat():
-            self.health = Health(DEGRADED, self._caveat())
+        if self.health.condition == GOOD and (caveat := self._caveat()):
+            self.health = Health(DEGRADED, caveat)
         if self._known_loop.is_whole and self.record.unsolvable is None:
             self.mending.contradictions.observe(smoother, self._known_loop, new, detections.t)
         self._begin_search()

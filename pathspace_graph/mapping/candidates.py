@@ -59,10 +59,9 @@ def chain(found: Candidates, settings: GrowthSettings, end: End | None) -> IntAr
     """
     chosen: list[int] = []
     last = None if end is None else (end.station, end.side)
-    for i, (station, side) in enumerate(zip(found.stations, found.sides, strict=True)):
-        beside = np.abs(found.stations - station) < settings.beside
-        if (found.sides[beside] < side - settings.lateral_gap).any():
-            continue
+    in_front = in_front_row(found.stations, found.sides, settings.beside, settings.lateral_gap)
+    for i in np.flatnonzero(in_front).tolist():
+        station, side = found.stations[i], found.sides[i]
         if last is not None:
             room = settings.lateral_change + settings.lateral_rate * (station - last[0])
             if side > last[1] + room:
@@ -70,3 +69,13 @@ def chain(found: Candidates, settings: GrowthSettings, end: End | None) -> IntAr
         chosen.append(i)
         last = (station, side)
     return np.array(chosen, dtype=np.intp)
+
+
+def in_front_row(stations: Array, sides: Array, beside: float, gap: float) -> NDArray[np.bool_]:
+    """Returns which points are in the row nearest to the path, from their stations and sides (n,), in m.
+
+    A point is behind that row if another one is less than `beside` (m) from it along the path, and nearer to
+    the path by more than `gap` (m).
+    """
+    near = np.abs(stations - stations[:, None]) < beside
+    return np.asarray(~(near & (sides < sides[:, None] - gap)).any(axis=1))

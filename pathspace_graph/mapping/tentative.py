@@ -34,7 +34,7 @@ class TentativeTracks:
         self._keep(self.last_t > t - self.settings.forget_after)
         if len(points) == 0:
             return
-        nearest, near = self._nearest(points)
+        nearest, near = nearest_within(points, self.points, self.settings.merge_radius)
         for row in np.flatnonzero(near):
             i, w = nearest[row], 1.0 / variances[row]
             self.weights[i] += w
@@ -76,16 +76,20 @@ class TentativeTracks:
         """Removes all tracks."""
         self._keep(np.zeros(len(self.counts), bool))
 
-    def _nearest(self, points: Array) -> tuple[IntArray, NDArray[np.bool_]]:
-        """Returns the nearest track of each point (m, 2), and whether it is within the merging radius."""
-        if len(self.points) == 0:
-            return np.zeros(len(points), np.intp), np.zeros(len(points), bool)
-        offset = points[:, None, :] - self.points[None, :, :]
-        distance = np.hypot(offset[:, :, 0], offset[:, :, 1])
-        nearest = distance.argmin(axis=1)
-        return nearest, distance[np.arange(len(points)), nearest] < self.settings.merge_radius
-
     def _keep(self, keep: NDArray[np.bool_]) -> None:
         if not keep.all():
             self.points, self.weights = self.points[keep], self.weights[keep]
             self.counts, self.last_t = self.counts[keep], self.last_t[keep]
+
+
+def nearest_within(points: Array, known: Array, radius: float) -> tuple[IntArray, NDArray[np.bool_]]:
+    """Returns the nearest of the known points (n, 2) to each point (m, 2), and whether it is within a radius.
+
+    The first result (m,) is an index, which means nothing where no point is known.
+    """
+    if len(known) == 0:
+        return np.zeros(len(points), np.intp), np.zeros(len(points), bool)
+    offset = points[:, None, :] - known[None, :, :]
+    distance = np.hypot(offset[:, :, 0], offset[:, :, 1])
+    nearest = distance.argmin(axis=1)
+    return nearest, distance[np.arange(len(points)), nearest] < radius

@@ -147,7 +147,7 @@ class FixedLagMapper:
         reading = self.front_end.update(odometry, detections)
         motion, t = reading.motion, detections.t
         predict(self.smoother, self.path, motion, t, self.settings)
-        self.loop.measured(t, motion, reading.detections)
+        self.loop.record.measured(t, motion, reading.detections)
         if self.solver is not None:
             self.smoother.submaps = None  # another solver's loop closure relinearizes no submap
         return reading

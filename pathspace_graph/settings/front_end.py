@@ -23,7 +23,7 @@ class MotionSettings(Positive):
     doubt_again: float = 3.8
     """An odometry that was contradicted not long ago is contradicted by this number of them."""
     distrust: float = 12.0
-    """It is so for this time (s)."""
+    """An odometry that was contradicted is distrusted for this time (s)."""
     doubt_rate: float = 2.0
     """The yaw rate of an odometry that is contradicted is still believed if the detections agree with it
     within this number of standard deviations."""
@@ -77,11 +77,11 @@ class MotionSettings(Positive):
     deviation (rad/s)."""
     hold: float = 0.15
     """A twist is held for this time (s) without a loss of certainty."""
+    hold_intervals: float = 3.0
+    """A twist may also be held for this number of times the shortest interval between two twists."""
     stuck: int = 3
     """Readings have stuck where this number of twists in one cycle is equal to the one before, to the last
     digit, and where the vehicle could not change its velocity so."""
-    hold_intervals: float = 3.0
-    """It may also be held for this number of the shortest interval between two twists."""
     acceleration: float = 5.0
     """The speeds of a twist that is held longer are uncertain by this for each second more (m/s^2)."""
     angular_acceleration: float = 1.5
@@ -129,10 +129,10 @@ class SidesSettings(Positive):
     """The path tells the side of a cone that is nearer to it than this (m)."""
     min_votes: int = 3
     """The colours are swapped after this number of cones on the side of the other colour."""
-    enough_votes: int = 30
-    """This number of cones settles what the colours mean."""
     majority: float = 2.5
     """These must be this number of times as many as those on the side of their own colour."""
+    enough_votes: int = 30
+    """This number of cones settles what the colours mean."""
     colourless: float = 0.7
     """Sides are told from the rows of cones where a larger share of the detections has no colour; at 1, they
     never are."""

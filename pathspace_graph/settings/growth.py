@@ -76,7 +76,7 @@ class GrowthSettings(Positive):
     """An open curve grows no further once it has this number of control points."""
     length_driven: float = 2.0
     """It grows no further, either, once it is longer than `length_free` plus this number of times the path
-    driven; on 11 tracks it is at most 1.44 times as long. A curve that zigzags between false cones is."""
+    driven. A curve that zigzags between false cones gets longer than that."""
     length_free: float = 50.0
     """This length of an open curve is not held against the path driven (m)."""
 
