@@ -40,6 +40,10 @@ class FaultyRun:
     """The trajectory is wrong by up to this (m)."""
     error_end: float
     """The trajectory is wrong by this in the last second, in the root mean square (m)."""
+    astray_time: float
+    """After the loop has closed, the vehicle is more than 1 m off for this time (s) at most."""
+    astray_way: float
+    """After the loop has closed, the vehicle is more than 1 m off for this way (m) at most."""
     said: str
     """These are the notices of the run; it is empty where nothing was said."""
     told_degraded: float
@@ -103,6 +107,8 @@ class Outcome:
             "lost": sum(run.lost for run in runs),
             "error_max": max((run.error_max for run in runs), default=np.nan),
             "error_end": max((run.error_end for run in runs), default=np.nan),
+            "astray_time": greatest([run.astray_time for run in runs]),
+            "astray_way": greatest([run.astray_way for run in runs]),
             "told": sum(run.is_told for run in runs),
             "told_degraded": mean([run.told_degraded for run in runs]),
             "told_lost": mean([run.told_lost for run in runs]),
@@ -116,6 +122,13 @@ def mean(values: Any) -> float:
     known = np.asarray(values, float)
     known = known[~np.isnan(known)]
     return float(known.mean()) if len(known) else float("nan")
+
+
+def greatest(values: Any) -> float:
+    """Returns the greatest of the values that are known, and NaN if there are none."""
+    known = np.asarray(values, float)
+    known = known[~np.isnan(known)]
+    return float(known.max()) if len(known) else float("nan")
 
 
 def outcomes(study: Study, frame: pd.DataFrame) -> list[Outcome]:
@@ -163,6 +176,8 @@ def _faulty_run(row: dict[str, Any], clean: dict[str, Any]) -> FaultyRun:
         lost=known("lost_at_end") == 1.0,
         error_max=known("error_max"),
         error_end=known("error_end"),
+        astray_time=known("astray_time"),
+        astray_way=known("astray_way"),
         said=row["said"],
         told_degraded=known("told_degraded"),
         told_lost=known("told_lost"),

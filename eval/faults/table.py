@@ -23,6 +23,7 @@ HEADER: Final = (
     "closed",
     "lost at the end",
     "largest error [m]",
+    "over 1 m off after closing [s, m]",
     "calibration by its prior's sigma",
     "called degraded, lost [% of cycles]",
     "said",
@@ -71,6 +72,7 @@ def _row(outcome: Outcome) -> tuple[str, ...]:
         f"{values['closed']} of {runs}{failed}",
         f"{values['lost']} of {runs}",
         _number(values["error_max"], 1),
+        _pair(values["astray_time"], values["astray_way"]),
         ", ".join(f"{name} {value:+.1f}" for name, value in values["calibration"].items()),
         _health(values),
         "; ".join(f"{n} of {runs}: {_short(text)}" for text, n in values["said"].items()) or NOTHING,
@@ -90,8 +92,11 @@ def _range(values: dict[str, Any]) -> str:
 
 
 def _health(values: dict[str, Any]) -> str:
-    degraded, lost = (100.0 * values[name] for name in ("told_degraded", "told_lost"))
-    return UNKNOWN if np.isnan(degraded) else f"{degraded:.1f}, {lost:.1f}"
+    return _pair(*(100.0 * values[name] for name in ("told_degraded", "told_lost")))
+
+
+def _pair(one: float, other: float) -> str:
+    return UNKNOWN if np.isnan(one) else f"{one:.1f}, {other:.1f}"
 
 
 def _number(value: float, digits: int) -> str:

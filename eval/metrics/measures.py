@@ -25,7 +25,13 @@ from .limit import limit
 from .reach import reach_values
 from .summary import has_cones, lap_times, vehicle_of
 from .table1 import capped_rmse, cone_distances, lap_metrics, missed_share, root_mean_square
-from .trajectory import end_of_trajectory, position_rms, trajectory_errors, vehicle_errors
+from .trajectory import (
+    end_of_trajectory,
+    longest_astray,
+    position_rms,
+    trajectory_errors,
+    vehicle_errors,
+)
 from .turn import turn_from_truth
 
 FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3, "°": float(np.rad2deg(1.0)), "mrad/s": 1e3}
@@ -152,6 +158,8 @@ _ALL: Final = (
     Metric("error_max", "largest trajectory error", "m", 2, scope="run"),
     Metric("error_end", "trajectory error in the last second", "m", 2, scope="run"),
     Metric("lost_at_end", "vehicle lost at the end", "%", 0, scope="run"),
+    Metric("astray_time", "longest time with an error of over 1 m, after closing", "s", 1, scope="run"),
+    Metric("astray_way", "longest way with an error of over 1 m, after closing", "m", 0, scope="run"),
     Metric("told_degraded", "cycles that the estimator calls degraded", "%", 1, scope="run"),
     Metric("told_lost", "cycles that the estimator calls lost", "%", 1, scope="run"),
     Metric("scale", "scale error of the speeds", "%", 2, scope="run"),
@@ -337,6 +345,7 @@ def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
     if len(truth.poses):
         values["false_closing"] = closes_falsely(run, truth)
         values |= end_of_trajectory(run.trajectory_t, run.trajectory, truth)
+        values |= longest_astray(run.trajectory_t, run.trajectory, truth, closing_stamp(run))
     jumps = [np.hypot(*record.jump[:2]) for record in run.cycles if record.jump is not None]
     return values | ({"jump": float(max(jumps))} if jumps else {})
 
@@ -361,14 +370,18 @@ def closes_falsely(run: RunResult, truth: Truth) -> bool:
     """
     if not run.map.closed:
         return False
-    closed = (record.t for record in run.cycles if record.closed)
-    t = float("inf") if isinstance(run, BatchRun) else next(closed, float("inf"))
-    ends = lap_end_indices(truth.poses)
+    t, ends = closing_stamp(run), lap_end_indices(truth.poses)
     if len(ends) == 0:
         return True
     steps = np.linalg.norm(np.diff(truth.poses[:, :2], axis=0), axis=1)
     driven = np.append(0.0, np.cumsum(steps))
     return bool(np.interp(t, truth.pose_t, driven) < driven[ends[0]] - EARLY)
+
+
+def closing_stamp(run: RunResult) -> float:
+    """Returns the stamp (s) at which an online run has closed the loop; it is infinite for any other run."""
+    closed = (record.t for record in run.cycles if record.closed)
+    return float("inf") if isinstance(run, BatchRun) else next(closed, float("inf"))
 
 
 def _drive_values(run: RunResult, truth: Truth | None, begin: float, end: float) -> dict[str, float]:

@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 
 LOST: Final = 5.0
 """A vehicle is lost where its position is wrong by more than this (m)."""
+ASTRAY: Final = 1.0
+"""A vehicle is astray where its position is wrong by more than this (m)."""
 END: Final = 1.0
 """The end of a log is this long (s)."""
 
@@ -66,6 +68,26 @@ def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
         "error_max": float(np.linalg.norm(errors[:, :2], axis=1).max()),
         "error_end": error_end,
         "lost_at_end": bool(error_end > LOST),
+    }
+
+
+def longest_astray(t: Array, poses: Array, truth: Truth, since: float) -> dict[str, float]:
+    """Returns the longest time (s) and way (m) for which a vehicle was astray, from a stamp (s) on.
+
+    From the first cycle that is wrong by more than a metre up to the next one that is right, or to the end.
+    """
+    after = (t >= max(since, truth.pose_t[0])) & (t <= truth.pose_t[-1])
+    if not after.any():
+        return {}
+    stamps, errors = t[after], np.linalg.norm(trajectory_errors(t[after], poses[after], truth)[:, :2], axis=1)
+    steps = np.linalg.norm(np.diff(truth.poses[:, :2], axis=0), axis=1)
+    driven = np.interp(stamps, truth.pose_t, np.append(0.0, np.cumsum(steps)))
+    astray = np.append(errors > ASTRAY, False).astype(int)
+    begins = np.flatnonzero(np.diff(astray, prepend=0) == 1)
+    ends = np.minimum(np.flatnonzero(np.diff(astray, prepend=0) == -1), len(stamps) - 1)
+    return {
+        "astray_time": float((stamps[ends] - stamps[begins]).max(initial=0.0)),
+        "astray_way": float((driven[ends] - driven[begins]).max(initial=0.0)),
     }
 
 

@@ -137,6 +137,7 @@ class BatchMapper:
     def _solve(self, log: Log, start: Start, on_round: Callable[[], None] | None) -> BatchResult:
         settings, batch, watch = own_settings(self.settings), self.settings.batch, Stopwatch()
         judged = judge_log(log, self.odometry_sigma, settings)
+        settings = judged.settings
         chain, detections = judged.chain, DetectionTable.of(judged.cycles, twists=judged.chain.twists)
         system = BatchSystem(detections, chain, settings, Biweight(batch.loose_gate))
         optimizer = Optimizer(system, batch)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -42,6 +42,8 @@ class Reading:
     """These are the detections of the cycle."""
     seen_again: BoolArray
     """(m,) The flag is set when a detection lies where the cycles just before had one."""
+    sensor_doubted: bool = False
+    """The flag is set once the readings so far contradict the prior of the sensor's yaw or latency."""
     notice: str = ""
     """This says what the labels mean from now on, where that has changed."""
 
@@ -52,6 +54,8 @@ class FrontEnd:
     def __init__(self, settings: MapperSettings, odometry_sigma: Array) -> None:
         """Keeps the settings, and the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
         self._motion = MotionCheck(odometry_sigma, settings.motion)
+        self._calibration = settings.calibration
+        self._sensor_doubted = False
         self._sides = SideJudge(settings.sides, settings.path)
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
@@ -62,7 +66,10 @@ class FrontEnd:
         judged = sides.update(self._motion.pose, motion.twists, detections)
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
-        return Reading(motion, judged, self._motion.seen_again, "; ".join(notices))
+        self._sensor_doubted |= self._motion.errors.contradict(self._calibration)
+        return Reading(
+            motion, judged, self._motion.seen_again, self._sensor_doubted, notice="; ".join(notices)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +80,8 @@ class JudgedLog:
     """This is the motion from each cycle to the next."""
     cycles: Sequence[Detections]
     """These are the detections of each cycle."""
+    settings: MapperSettings
+    """Here the priors of the sensor are wide, if the readings contradict them."""
 
 
 def judge_log(log: Log, odometry_sigma: Array, settings: MapperSettings) -> JudgedLog:
@@ -84,4 +93,6 @@ def judge_log(log: Log, odometry_sigma: Array, settings: MapperSettings) -> Judg
     readings = [front_end.update(odometry, cycle) for odometry, cycle in split_odometry(log)]
     motions = [reading.motion for reading in readings]
     chain = chained([cycle.t for cycle in log.cycles], motions, settings.odometry)
-    return JudgedLog(chain, [reading.detections for reading in readings])
+    if readings[-1].sensor_doubted:
+        settings = replace(settings, calibration=settings.calibration.widened())
+    return JudgedLog(chain, [reading.detections for reading in readings], settings)

@@ -22,6 +22,7 @@ from pathspace_graph.settings.front_end import MotionSettings
 
 from .rest import Rest
 from .scan_matching import Match, RecentDetections, match
+from .sensor_errors import SensorErrors, by_errors
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -46,7 +47,8 @@ class MotionCheck:
         self.pose: Array = np.zeros(3)
         """(3,) This is the newest pose in the frame of the front end, in which the drive began at 0."""
         self._velocity: Array | None = None
-        self._rate = 0.0
+        self.errors = SensorErrors(settings)
+        """This learns how much the sensor is turned, and how late its detections are."""
         self._t: float | None = None
         self._reading: tuple[float, Array] = (-np.inf, np.full(3, np.nan))
         self._limit = settings.doubt
@@ -58,10 +60,13 @@ class MotionCheck:
 
     def update(self, odometry: Odometry, detections: Detections) -> MeasuredMotion:
         """Returns the motion since the last cycle."""
-        t = detections.t
+        t, measured = detections.t, detections.points_vehicle
         motion = self._integrate(odometry, t)
+        columns = by_errors(measured, motion.odometry.twist)
+        detections = replace(detections, points_vehicle=measured + columns @ self.errors.mean)
         variances = 0.5 * np.trace(detections.covariances, axis1=1, axis2=2)
         self._recent.forget(t)
+        self._recent.correct(self.errors.mean)
         distrusted = t - self._doubted_at < self.settings.distrust
         self._limit = self.settings.doubt_again if distrusted else self.settings.doubt
         self._matched = None
@@ -73,11 +78,12 @@ class MotionCheck:
         self.pose = compose(self.pose, motion.odometry.delta)
         points = to_map(detections.points_vehicle, self.pose[None])
         self.seen_again = self._recent.has(points) if self._matched is None else self._matched
-        self._recent.add(t, points)
+        if motion.fault:
+            columns = by_errors(measured, motion.odometry.twist)  # by the twist that is believed
+        self._recent.add(t, measured, columns, self.pose)
         if self._t is not None and t > self._t:
             self._velocity = motion.odometry.delta / (t - self._t)
-            share = min((t - self._t) / (0.5 * self.settings.memory), 1.0)
-            self._rate += share * (float(self._velocity[2]) - self._rate)
+            self.errors.follow(self._velocity, t - self._t)
         self._t = t
         return motion
 
@@ -95,9 +101,7 @@ class MotionCheck:
         held = np.maximum(ages - self._hold(measured), 0.0)
         sigma, missing = self.sigma, bool(held[-1] > 0.0)
         if missing or held.any():
-            settings = self.settings
-            growth = settings.acceleration, settings.acceleration, settings.angular_acceleration
-            sigma = np.hypot(self.sigma, held[:, None] * np.array(growth))
+            sigma = np.hypot(self.sigma, held[:, None] * np.array(self.settings.accelerations))
         integrated = integrate_odometry(odometry, t, sigma)
         return MeasuredMotion(
             integrated, odometry.twist, missing=missing, stuck=self._is_stuck(odometry.twist)
@@ -148,6 +152,7 @@ class MotionCheck:
         if found is not None and not failed and not self._is_contradicted(motion, predicted, found):
             self._matched = found.is_matched
             self._misfit += settings.misfit_gain * (found.misfit - self._misfit)
+            self._learn(motion.odometry, predicted, found, dt)
             return motion
         best = self._best(detections, variances, (compose(self.pose, going_on), predicted), dt)
         if failed or (best is not None and self._is_contradicted(motion, predicted, best)):
@@ -202,14 +207,29 @@ class MotionCheck:
     ) -> tuple[Array, Array]:
         """Returns how far (3,) the detections are from the predicted pose, and its covariance (3, 3).
 
-        It is in the vehicle's frame. Detections may be late, which looks like another turn where the yaw rate
-        changes.
+        It is in the vehicle's frame. Detections may be late, or those of a sensor that is turned.
         """
+        off, covariance = self._difference(odometry, predicted, found)
+        shifts = self._shifts(odometry, predicted)
+        return off, covariance + shifts @ self.errors.covariance @ shifts.T
+
+    def _difference(
+        self, odometry: IntegratedOdometry, predicted: Array, found: Match
+    ) -> tuple[Array, Array]:
+        """Returns `_contradiction` for a sensor without errors."""
         turn = _to_vehicle(predicted[2])
         spread = np.linalg.inv(found.information) * self._excess
-        covariance = turn @ spread @ turn.T + odometry.covariance
-        covariance[2, 2] += (self.settings.sigma_latency * (odometry.twist[2] - self._rate)) ** 2
-        return turn @ (found.pose - predicted), covariance
+        return turn @ (found.pose - predicted), turn @ spread @ turn.T + odometry.covariance
+
+    def _shifts(self, odometry: IntegratedOdometry, predicted: Array) -> Array:
+        """Returns the derivatives (3, 2) of the difference by the errors of the sensor."""
+        way = rotation(predicted[2]).T @ (predicted[:2] - self._recent.seen_from)
+        return self.errors.shifts(way, odometry.twist)
+
+    def _learn(self, odometry: IntegratedOdometry, predicted: Array, found: Match, dt: float) -> None:
+        """Learns of the sensor from a match that agrees with the odometry."""
+        off, covariance = self._difference(odometry, predicted, found)
+        self.errors.update(off, covariance, self._shifts(odometry, predicted), dt)
 
     @property
     def _excess(self) -> float:

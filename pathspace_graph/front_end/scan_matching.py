@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.settings.front_end import MotionSettings
 
 Array = NDArray[np.float64]
@@ -28,23 +28,48 @@ _TINY = float(np.finfo(float).tiny)
 
 
 class RecentDetections:
-    """Holds the detections of the newest cycles in one frame."""
+    """Holds the detections of the newest cycles in one frame.
+
+    They are corrected by what is known now of the errors of the sensor, so that a cone stays where it is when
+    more is learned of them.
+    """
 
     def __init__(self, settings: MotionSettings) -> None:
         self.settings = settings
         self.points: Array = np.zeros((0, 2))
         """(n, 2) Each detection is at this point in m."""
+        self._measured: Array = np.zeros((0, 2))
+        self._columns: Array = np.zeros((0, 2, len(settings.sigmas_errors)))
+        self._places: Array = np.zeros((0, 2))
         self._stamps: Array = np.zeros(0)
 
-    def add(self, t: float, points: Array) -> None:
-        """Adds the detections at points (m, 2) of a cycle at t (s)."""
-        self.points = np.concatenate([self.points, points])
-        self._stamps = np.concatenate([self._stamps, np.full(len(points), t)])
+    def add(self, t: float, measured: Array, columns: Array, pose: Array) -> None:
+        """Adds the detections of a cycle at t (s), measured at (m, 2) in the frame of the pose (3,).
+
+        Their derivatives by e errors of the sensor are the columns (m, 2, e), in the same frame.
+        """
+        turned = np.einsum("ij,mje->mie", rotation(pose[2]), columns)
+        self._measured = np.concatenate([self._measured, to_map(measured, pose[None])])
+        self._columns = np.concatenate([self._columns, turned])
+        self._places = np.concatenate([self._places, np.broadcast_to(pose[:2], measured.shape)])
+        self._stamps = np.concatenate([self._stamps, np.full(len(measured), t)])
+        self.points = self._measured
+
+    def correct(self, errors: Array) -> None:
+        """Puts the detections where they are if the sensor has these errors (e,)."""
+        self.points = self._measured + self._columns @ errors
 
     def forget(self, t: float) -> None:
         """Drops the detections that are too old at t (s)."""
         first = int(self._stamps.searchsorted(t - self.settings.memory, side="right"))
-        self.points, self._stamps = self.points[first:], self._stamps[first:]
+        self._measured, self._columns = self._measured[first:], self._columns[first:]
+        self._places, self._stamps = self._places[first:], self._stamps[first:]
+        self.points = self._measured
+
+    @property
+    def seen_from(self) -> Array:
+        """Returns the mean place (2,) from which the detections were seen."""
+        return np.asarray(self._places.mean(axis=0))
 
     def has(self, points: Array) -> BoolArray:
         """Returns whether each point (m, 2) lies where an earlier detection does."""

@@ -78,7 +78,7 @@ class LandmarkFixedLag:
         for _ in range(self.settings.steps_grown if created else self.settings.steps):
             self.smoother.step()
         if not self.closed:
-            self.believed = doubt_calibrations(self.smoother, self.believed)
+            self.believed = doubt_calibrations(self.smoother, self.believed, reading.sensor_doubted)
         watch.lap("update")
         self._close()
         watch.lap("close")

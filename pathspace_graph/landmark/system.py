@@ -41,7 +41,7 @@ class LandmarkSystem:
         """Returns the problem of a log without any association; `odometry_sigma` (3,) is that of a twist."""
         judged = judge_log(log, odometry_sigma, settings)
         twists = judged.chain.twists
-        return cls(LandmarkDetections.of(judged.cycles, twists=twists), judged.chain, settings)
+        return cls(LandmarkDetections.of(judged.cycles, twists=twists), judged.chain, judged.settings)
 
     def believing(self, settings: MapperSettings) -> LandmarkSystem:
         """Returns the same problem with the priors of the calibrations that other settings have."""

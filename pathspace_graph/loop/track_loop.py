@@ -112,10 +112,10 @@ class TrackLoop:
             return "the drive contradicts the calibration, which is being learned"
         return ""
 
-    def doubt_calibrations(self) -> None:
+    def doubt_calibrations(self, reading: Reading) -> None:
         """Widens the priors of calibrations that the drive contradicts, while the loop is open."""
         if not self.closed:
-            self._believed = doubt_calibrations(self._smoother, self._believed)
+            self._believed = doubt_calibrations(self._smoother, self._believed, reading.sensor_doubted)
 
     # --- the batch of the open lap -----------------------------------------------------------------------
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,12 +75,19 @@ def doubted(mean: Array, variance: Array, settings: MapperSettings) -> MapperSet
     return replace(settings, calibration=settings.calibration.widened())
 
 
-def doubt_calibrations(smoother: FixedLagSmoother[MapRows], settings: MapperSettings) -> MapperSettings:
+def doubt_calibrations(
+    smoother: FixedLagSmoother[MapRows], settings: MapperSettings, sensor_doubted: bool
+) -> MapperSettings:
     """Widens the priors of calibrations where the drive so far contradicts them.
 
+    Where the front end says that the prior of the sensor is doubted, it becomes wide at once, before other
+    variables have taken the sensor's errors over.
     It returns the settings with the priors as they are then. It is for an open loop: the prior of a closed
     one is linearized where the calibration was then, and is surer of it than it may be.
     """
+    if sensor_doubted and settings.calibration.doubt < inf:
+        settings = replace(settings, calibration=settings.calibration.widened())
+        smoother.widen_calibrations(np.array(settings.sigmas_calibrations))
     if smoother.last_step is None or smoother.next_cycle % settings.odometry.doubt_cycles:
         return settings
     variables = smoother.variables

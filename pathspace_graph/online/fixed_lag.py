@@ -112,7 +112,7 @@ class FixedLagMapper:
         for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
             self._step()
         watch.lap("update")
-        self.loop.doubt_calibrations()
+        self.loop.doubt_calibrations(reading)
         closes = self._close()
         watch.lap("close")
         if closes:

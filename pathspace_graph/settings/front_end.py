@@ -59,7 +59,13 @@ class MotionSettings(Positive):
     sigma_cone: float = 0.05
     """This standard deviation (m) is added to that of a detection, since one side of a cone is seen."""
     sigma_latency: float = 0.05
-    """Detections are older than their stamps by this (s, one sigma), as far as the check is concerned."""
+    """Detections are older than their stamps by this (s, one sigma), before the check has learned more."""
+    sigma_latency_changes: float = 0.003
+    """The latency of detections changes by this standard deviation (s)."""
+    sigma_yaw: float = 0.02
+    """The sensor is turned by this (rad, one sigma), before the check has learned more."""
+    sigma_yaw_changes: float = 0.001
+    """The yaw of the sensor changes by this standard deviation (rad)."""
     before: float = 0.5
     """A contradiction may have begun a few cycles before it was noticed. So its size, times this, is added to
     the standard deviation of the motion."""
@@ -99,6 +105,21 @@ class MotionSettings(Positive):
     """A vehicle at rest moves by this from cycle to cycle, as one standard deviation (m)."""
     rest_sigma_heading: float = 5e-5
     """A vehicle at rest turns by this from cycle to cycle, as one standard deviation (rad)."""
+
+    @property
+    def accelerations(self) -> tuple[float, float, float]:
+        """Returns how fast the twist of a vehicle changes (m/s^2, m/s^2, rad/s^2)."""
+        return self.acceleration, self.acceleration, self.angular_acceleration
+
+    @property
+    def sigmas_errors(self) -> tuple[float, float]:
+        """Returns the standard deviations (rad, s) of the sensor's yaw and latency."""
+        return self.sigma_yaw, self.sigma_latency
+
+    @property
+    def sigmas_changes(self) -> tuple[float, float]:
+        """Returns the standard deviations (rad, s) by which the sensor's yaw and latency change."""
+        return self.sigma_yaw_changes, self.sigma_latency_changes
 
     @property
     def reaches(self) -> list[float]:

@@ -21,10 +21,15 @@ def reaches(iterations: int) -> list[float]:
     return replace(SETTINGS, iterations=iterations).reaches
 
 
+def remember(recent: RecentDetections, t: float, points: np.ndarray) -> None:
+    """Adds detections from the origin, by a sensor without errors."""
+    recent.add(t, points, np.zeros((len(points), 2, len(SETTINGS.sigmas_errors))), np.zeros(3))
+
+
 def seen_once(cones: np.ndarray = CONES) -> RecentDetections:
     """The cones as they were detected once, without noise, from the origin."""
     recent = RecentDetections(SETTINGS)
-    recent.add(0.0, cones)
+    remember(recent, 0.0, cones)
     return recent
 
 
@@ -58,7 +63,7 @@ def test_the_covariance_is_that_of_many_noisy_matches() -> None:
     errors = []
     for _ in range(400):
         recent = RecentDetections(settings)
-        recent.add(0.0, CONES + sigma * rng.standard_normal(CONES.shape))
+        remember(recent, 0.0, CONES + sigma * rng.standard_normal(CONES.shape))
         points = CONES + sigma * rng.standard_normal(CONES.shape)
         found = match(recent, points, np.full(6, sigma**2), np.zeros(3), settings, reaches(4))
         errors.append(found.pose)
@@ -92,9 +97,20 @@ def test_detections_of_one_cone_alone_hold_no_motion_however_many_they_are() -> 
 
 def test_old_detections_are_forgotten() -> None:
     recent = seen_once()
-    recent.add(0.1, CONES[:2])
+    remember(recent, 0.1, CONES[:2])
     recent.forget(SETTINGS.memory + 0.01)
     np.testing.assert_array_equal(recent.points, CONES[:2])
+
+
+def test_remembered_detections_follow_what_is_learned_of_the_sensor() -> None:
+    """A detection at (4, 0) from (1, 2), which looks to the left, moves by its derivative, turned as well."""
+    recent = RecentDetections(SETTINGS)
+    columns = np.array([[[0.0, -3.0], [4.0, 0.0]]])  # a turned sensor moves it to the left
+    recent.add(0.0, np.array([[4.0, 0.0]]), columns, np.array([1.0, 2.0, np.pi / 2]))
+    np.testing.assert_allclose(recent.points, [[1.0, 6.0]], atol=1e-12)
+    np.testing.assert_allclose(recent.seen_from, [1.0, 2.0])
+    recent.correct(np.array([0.01, 0.1]))
+    np.testing.assert_allclose(recent.points, [[1.0 - 0.04, 6.0 - 0.3]], atol=1e-12)
 
 
 def test_a_detection_is_seen_again_where_one_was() -> None:

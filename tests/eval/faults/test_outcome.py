@@ -86,9 +86,18 @@ def test_what_a_run_calls_itself_is_told_where_it_judges_its_health(frame: pd.Da
     assert table.rows[1][table.header.index("called degraded, lost [% of cycles]")] == "10.0, 20.0"
 
 
+def test_the_longest_way_astray_is_that_of_the_worst_run(frame: pd.DataFrame) -> None:
+    frame["astray_time"], frame["astray_way"] = np.arange(7.0), 10.0 * np.arange(7.0)
+    clean, mild, _ = outcomes(STUDY, frame)
+    table = fault_table(STUDY, [clean, mild])
+    column = table.header.index("over 1 m off after closing [s, m]")
+    assert [row[column] for row in table.rows] == ["2.0, 20.0", "4.0, 40.0"]
+
+
 def test_the_table_has_the_columns_that_something_is_known_of(frame: pd.DataFrame) -> None:
     table = fault_table(STUDY, outcomes(STUDY, frame))
-    assert table.header == tuple(name for name in HEADER if not name.startswith("called"))
+    unknown = "called", "over 1 m off"
+    assert table.header == tuple(name for name in HEADER if not name.startswith(unknown))
     assert table.rows[0][:7] == ("clean", "", "1.00", "1.0 to 1.0", "1.00", "0.0", "2 of 2")
     assert table.rows[1][2:8] == ("2.50", "1.5 to 3.5", "1.25", "5.0", "2 of 2", "1 of 2")
     assert table.rows[1][-1] == "1 of 2: a notice"

@@ -9,6 +9,7 @@ from pathspace_graph.eval.metrics.trajectory import (
     ate,
     end_of_trajectory,
     interpolate_poses,
+    longest_astray,
     trajectory_errors,
     vehicle_errors,
 )
@@ -47,6 +48,21 @@ def test_a_vehicle_is_lost_that_is_5_m_off_in_the_last_second() -> None:
             "lost_at_end": lost,
         }
     assert end_of_trajectory(t + 100.0, path, true) == {}
+
+
+def test_a_vehicle_is_astray_until_it_is_within_a_metre_again() -> None:
+    """At 2 m/s: 1 s off before it counts, then 0.5 s, then 2 s, and 0.3 s at the end."""
+    t = np.linspace(0.0, 20.0, 201)
+    path = np.column_stack([2.0 * t, np.zeros((201, 2))])
+    true = Truth(t, path, np.zeros((0, 2)), np.zeros(0, dtype=int))
+    poses = path.copy()
+    for begin, end in ((10, 20), (50, 55), (100, 120), (198, 201)):
+        poses[begin:end, 1] = 1.1
+    poses[70:90, 1] = 0.9
+    assert longest_astray(t, poses, true, 3.0) == pytest.approx({"astray_time": 2.0, "astray_way": 4.0})
+    assert longest_astray(t, poses, true, 12.0) == pytest.approx({"astray_time": 0.2, "astray_way": 0.4})
+    assert longest_astray(t, path, true, 0.0) == {"astray_time": 0.0, "astray_way": 0.0}
+    assert longest_astray(t, poses, true, np.inf) == {}
 
 
 def test_the_vehicle_at_the_end_is_compared_with_the_truth() -> None:

@@ -1,0 +1,118 @@
+"""What the check of the odometry learns of the sensor's yaw and latency."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.se2 import relative, to_vehicle
+from pathspace_graph.front_end.front_end import judge_log
+from pathspace_graph.front_end.motion import MotionCheck
+from pathspace_graph.front_end.scan_matching import RecentDetections, match
+from pathspace_graph.front_end.sensor_errors import SensorErrors, by_errors
+from pathspace_graph.io.log import Log
+from pathspace_graph.run import split_odometry
+from pathspace_graph.settings.calibration import CalibrationSettings
+from pathspace_graph.settings.front_end import MotionSettings
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.faults import Faults, SensorFaults
+from pathspace_graph.sim.sensor import OdometryNoise
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+
+from ..scenes.drives import bean_track
+
+Array = NDArray[np.float64]
+SETTINGS = MotionSettings()
+CONES = np.array([[4.0, 2.0], [8.0, 2.2], [12.0, 2.0], [4.5, -1.9], [9.0, -2.0], [13.0, -2.1]])
+
+
+def test_the_shifts_are_those_of_a_match_of_late_detections_of_a_turned_sensor() -> None:
+    """The vehicle goes 2 m ahead while it brakes from 10 to 8 m/s; the sensor has small errors."""
+    errors = np.array([0.004, 0.003])
+    begin, end = np.zeros(3), np.array([2.0, 0.0, 0.1])
+    before, now = np.array([10.0, 0.0, 0.2]), np.array([8.0, 0.0, 0.6])
+    seen = []
+    for pose, twist in ((begin, before), (end, now)):
+        exact = to_vehicle(CONES, np.tile(pose, (len(CONES), 1)))
+        seen.append(exact - by_errors(exact, twist) @ errors)
+    recent = RecentDetections(SETTINGS)
+    recent.add(0.0, seen[0], by_errors(seen[0], before), begin)
+    found = match(recent, seen[1], np.full(6, 0.01), end, SETTINGS, [0.4] * 6)
+    known = SensorErrors(SETTINGS)
+    known.follow(before, 10.0)
+    off = relative(end, found.pose)
+    way = to_vehicle(end[:2][None], np.array([[0.0, 0.0, end[2]]]))[0]
+    np.testing.assert_allclose(known.shifts(way, now) @ errors, off, atol=2e-3)
+    assert abs(off[0]) > 5e-3  # there is something to be seen
+    assert abs(off[1]) > 5e-3
+    recent.correct(errors)
+    corrected = seen[1] + by_errors(seen[1], now) @ errors
+    found = match(recent, corrected, np.full(6, 0.01), end, SETTINGS, [0.4] * 6)
+    np.testing.assert_allclose(found.pose, end, atol=5e-4)
+
+
+def test_a_drive_at_one_speed_straight_ahead_says_nothing_of_the_latency() -> None:
+    known, velocity = SensorErrors(SETTINGS), np.array([10.0, 0.0, 0.0])
+    known.follow(velocity, 10.0)
+    before = known.covariance[1, 1]
+    known.update(
+        np.array([0.1, -0.2, 0.0]), 0.01 * np.eye(3), known.shifts(np.array([3.0, 0.0]), velocity), 0.1
+    )
+    assert known.covariance[1, 1] == pytest.approx(before)
+    assert known.mean[1] == pytest.approx(0.0)
+    assert (
+        known.mean[0] > 0.0
+    )  # but to be drawn to the right is what a sensor does that is turned to the left
+
+
+def test_many_independent_matches_give_the_errors_with_the_claimed_covariance() -> None:
+    rng, spread, off = np.random.default_rng(0), np.diag([0.05, 0.05, 0.005]) ** 2, []
+    for _ in range(300):
+        truth = rng.normal(scale=SETTINGS.sigmas_errors)
+        known, left = SensorErrors(SETTINGS), np.zeros(2)
+        for _ in range(20):
+            shifts = known.shifts(np.array([3.0, 0.1]), np.array([*rng.normal(scale=1.0, size=2), 0.1]))
+            left = truth - known.mean
+            known.update(shifts @ left + rng.multivariate_normal(np.zeros(3), spread), spread, shifts, 10.0)
+        off.append(truth - known.mean)
+    claimed = known.covariance - np.diag(np.square(SETTINGS.sigmas_changes))
+    np.testing.assert_allclose(np.sqrt(np.diag(np.cov(np.array(off).T))), np.sqrt(np.diag(claimed)), rtol=0.2)
+
+
+# --- whole drives ----------------------------------------------------------------------------------------
+
+
+def drive(**faults: float) -> Log:
+    odometry = OdometryNoise(scale=0.0, gyro_bias=0.0)
+    settings = SimulationSettings(laps=2, odometry=odometry, faults=Faults(sensor=SensorFaults(**faults)))
+    return simulate(bean_track(), settings, seed=1)
+
+
+@pytest.mark.parametrize(
+    ("faults", "expected"),
+    [({}, (0.0, 0.0)), ({"yaw": -0.03}, (-0.03, 0.0)), ({"latency": 0.06}, (0.0, 0.06))],
+    ids=["none", "yaw", "latency"],
+)
+def test_a_drive_shows_the_errors_of_its_sensor(
+    faults: dict[str, float], expected: tuple[float, float]
+) -> None:
+    log = drive(**faults)
+    check = MotionCheck(log.odometry_sigma, SETTINGS)
+    for odometry, cycle in split_odometry(log):
+        check.update(odometry, cycle)
+    sigmas = np.sqrt(np.diag(check.errors.covariance))
+    assert (np.abs(check.errors.mean - expected) < 3.0 * sigmas).all()
+    assert check.errors.contradict(CalibrationSettings()) == bool(faults)
+
+
+def test_the_prior_of_a_sensor_becomes_wide_for_a_batch_where_the_drive_contradicts_it() -> None:
+    turned, settings = drive(yaw=-0.03), MapperSettings()
+    judged = judge_log(turned, turned.odometry_sigma, settings)
+    assert judged.settings.calibration == settings.calibration.widened()
+    sure = replace(settings, calibration=CalibrationSettings(doubt=np.inf))
+    assert judge_log(turned, turned.odometry_sigma, sure).settings == sure
+    none = replace(settings, calibration=CalibrationSettings(sensor=False))
+    assert judge_log(turned, turned.odometry_sigma, none).settings == none
