@@ -46,6 +46,8 @@ from .window import M_co
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
+STIFFNESS = 1e4
+"""A gauge that is held has this number of times its information."""
 TIME_TOLERANCE = 1e-9
 """A pose leaves once it is older than the lag by more than this time (s), since stamps have round-off."""
 
@@ -237,6 +239,19 @@ class FixedLagSmoother(WindowSystem[M_co]):
         self.variables.remove(removed)
         self.window.clear()
 
+    def hold_gauge(self, keys: IntArray, across: Array) -> None:
+        """Holds where a closed map as a whole is, by its points (k,) in ascending order.
+
+        The rows C `across` (3, 2k) give the rigid motion (x, y, theta) by `C dx`, for moves dx of the points.
+        It is held at the present estimate, and its covariance counts in `covariance` from now on.
+        """
+        self.reactivate()
+        own = across @ self.covariance(keys) @ across.T
+        root = np.linalg.cholesky(STIFFNESS * np.linalg.inv(own)).T @ across
+        now = self.variables.change(self.variables.layout.entries(keys))
+        self.prior = graph_of(self.prior, jacobian_factor(keys, root, root @ now))
+        self.gauge_covariance, self.epoch = STIFFNESS / (STIFFNESS + 1.0) * own, self.epoch + 1
+
     def restart(self, first_cycle: int, removed: IntArray, added: IntArray, points: Array) -> None:
         """Replaces map points `removed` (n,) by `added` (k,) at `points` (k, 2), and drops the prior.
 
@@ -244,6 +259,7 @@ class FixedLagSmoother(WindowSystem[M_co]):
         keeps its later poses with their odometry. A new prior must be set, on all that remains.
         """
         self.epoch, self.submaps, self.inactive = self.epoch + 1, None, InactiveMap()
+        self.gauge_covariance = np.zeros((POSE, POSE))
         self.prior, keyframes = gtsam.GaussianFactorGraph(), self.variables.keyframes
         leaving = np.arange(self.first_cycle, first_cycle)
         for cycle in leaving.tolist():

@@ -27,6 +27,7 @@ from .gaussian import (
 )
 from .inactive import InactiveMap
 from .keys import (
+    POSE,
     POSE_LETTER,
     SENSOR_LETTER,
 )
@@ -89,6 +90,8 @@ class WindowSystem(Generic[M_co]):
         """The last Gauss-Newton step solved this damped system; it is None before the first step."""
         self.calibration_sigma: Array = np.array([*settings.sigma_calibration, *settings.sigma_sensor])
         """The priors of the calibrations have these standard deviations, (2,) or (7,)."""
+        self.gauge_covariance: Array = np.zeros((POSE, POSE))
+        """This is the covariance (3, 3) of a rigid motion of everything, once the gauge is held."""
         self.epoch = 0
         """This counts the changes of the prior other than the marginalization of a pose."""
 
@@ -276,6 +279,12 @@ class WindowSystem(Generic[M_co]):
 
         It is in the order of the keys, with poses as (x, y, theta) in the map frame (m, m, rad).
         """
+        own = self._covariance(keys)
+        motions = Layout(keys).rigid_motions(self.variables.of(keys))
+        return own + motions @ self.gauge_covariance @ motions.T
+
+    def _covariance(self, keys: IntArray) -> Array:
+        """Returns the joint covariance (q, q) of variables (k,), without that of a gauge that is held."""
         whole = bool(np.isin(keys, self.inactive.keys).any())
         if whole or self.chain is not None:
             self.refresh()

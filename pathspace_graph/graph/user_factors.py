@@ -44,6 +44,8 @@ class UserFactors:
     def __init__(self) -> None:
         self._active: list[_UserFactor] = []
         self._inactive: list[_UserFactor] = []
+        self.given = False
+        """The flag is set once the user has given any factor, which may be absolute."""
 
     def add(
         self, factors: Sequence[gtsam.NonlinearFactor], known: Callable[[int], bool], expected: str
@@ -59,6 +61,7 @@ class UserFactors:
                 if not known(key):
                     raise SettingsError(f"factor on {name(key)}: expected keys of {expected}")
         self._active += new
+        self.given |= len(new) > 0
         return any(one.holds_pose for one in new)
 
     @property

@@ -23,6 +23,7 @@ from .association import Gating
 from .crossing import boundaries_cross
 from .drive_record import DriveRecord, LapBatch
 from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
+from .gauge import hold_gauge
 from .mending import Mending
 from .recognition import recognize
 from .swap import go_on_from
@@ -58,6 +59,7 @@ class TrackLoop:
         self._lap_batch: LapBatch | None = None
         self._boundaries_cross = False
         self._believed = self.settings  # with the priors of the calibrations as they are now
+        self._settled: float | None = None  # path driven (m) when the closed map was last replaced
         self._closing_tried = 0.0
         self._loop_tried, self._recognition_tried = 0.0, 0.0
 
@@ -134,6 +136,7 @@ class TrackLoop:
             self._record_open_lap()
         batch = self._lap_batch
         if batch is None:
+            self._hold_gauge()
             self._try_mending()
         elif self._smoother.next_cycle - 1 >= batch.due:
             self._lap_batch = None
@@ -159,7 +162,7 @@ class TrackLoop:
         if not self.closed:
             self._closes()
         self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds
-        jump = go_on_from(smoother, marginal)
+        jump, self._settled = go_on_from(smoother, marginal), self._path.length
         self.record.replaced(marginal.poses[: marginal.first_kept], smoother.variables.poses)
         self._boundaries_cross = self._crosses()
         return jump, notice
@@ -178,6 +181,21 @@ class TrackLoop:
             return
         if self.mending.is_due(self._known_loop, self._path.length):
             self._begin_batch(self.mending.begin(np.array(record.poses)))
+
+    def _hold_gauge(self) -> None:
+        """Holds the position and heading of the closed map as a whole, once enough laps were driven on it.
+
+        They are not held where the user has given factors, since these may tell them.
+        """
+        smoother, boundaries = self._smoother, self._smoother.map.state.boundaries
+        if not self.closed or self._search is not None or smoother.user_factors.given:
+            return
+        if self._settled is None:
+            self._settled = self._path.length
+        lap = max(boundary.length for boundary in boundaries.values())
+        held = smoother.gauge_covariance.any()
+        if not held and self._path.length > self._settled + self.settings.closing.gauge_laps * lap:
+            hold_gauge(smoother)
 
     def _closes(self) -> None:
         """Notes that the loop has closed; hardly anything moves from now on."""

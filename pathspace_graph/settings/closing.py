@@ -29,6 +29,8 @@ class RecognitionSettings(Positive, group="closing.recognition"):
 class ClosingSettings(Positive):
     """Describes loop closing."""
 
+    UNLIMITED = ("gauge_laps",)
+
     min_path: float = 60.0
     """A lap is at least this long (m)."""
     check_interval: float = 2.0
@@ -105,5 +107,8 @@ class ClosingSettings(Positive):
     seam_margin: float = 0.5
     """A cone nearer to the seam than this (m) was also detected at the beginning, and is not counted
     twice."""
+    gauge_laps: float = 2.0
+    """After this number of laps on the closed map, its position and heading as a whole are held. It is
+    infinite where they never are."""
     recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
     """These settings find the place of a vehicle that is lost after a long lap."""

@@ -176,6 +176,7 @@ def test_the_studies_listed_are_the_files_on_disk_and_are_shipped() -> None:
         "covariance",
         "degree",
         "density",
+        "endurance",
         "estimators",
         "false_closings",
         "faults",

@@ -1,0 +1,43 @@
+"""The gauge of a closed map: where the whole of it lies in the map frame.
+
+Only the beginning of the drive is known in the map frame, and every later reading is relative. So what later
+laps tell of the gauge comes through the shape of the map alone: the better the curves beside the start are
+known, the better is the heading of all the rest. This is true of the noise of readings, which is new in every
+lap. But cones lie off a curve with few control points by the same distance in each lap. The readings of many
+laps bend the curve to it, and a bend of centimetres beside the start turns the whole map. So the gauge is
+held after a few laps, where the shape goes on to be estimated. The covariance that it had is kept.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.mapping.curve_map import CurveSmoother
+
+Array = NDArray[np.float64]
+
+
+def hold_gauge(smoother: CurveSmoother) -> None:
+    """Holds where the closed map as a whole is, across its curves."""
+    state = smoother.map.state
+    tangents = [state.spline(label).tangent_unit(b.abscissae) for label, b in state.boundaries.items()]
+    tangent = np.concatenate(tangents)
+    order, normals = np.argsort(state.map_keys), np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    points = state.map_points[order]
+    smoother.hold_gauge(state.map_keys[order], motion_across(points, normals[order]))
+
+
+def motion_across(points: Array, normals: Array) -> Array:
+    """Returns the rows C (3, 2k) by which `C dx` is the rigid motion that fits small moves dx (2k,) best.
+
+    Points (k, 2) of a curve may slide along it, so their moves count along the normals (k, 2) only. With the
+    rows N (k, 2k) of the normals and the rigid motions G it is the least squares solution `(N G)^+ N`.
+    """
+    count = len(points)
+    across = np.zeros((count, 2 * count))
+    across[np.arange(count), 2 * np.arange(count)] = normals[:, 0]
+    across[np.arange(count), 2 * np.arange(count) + 1] = normals[:, 1]
+    turn = normals[:, 1] * points[:, 0] - normals[:, 0] * points[:, 1]
+    motions = np.column_stack([normals, turn])
+    return np.asarray(np.linalg.pinv(motions) @ across)

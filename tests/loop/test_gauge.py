@@ -1,0 +1,136 @@
+"""The gauge of a closed map is held: shape goes on to be estimated, and the covariance stays what it was."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import gtsam
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pathspace_graph.io.log import Log
+from pathspace_graph.loop.gauge import hold_gauge, motion_across
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.run import split_odometry
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+
+from ..scenes.drives import bean_track
+
+Array = NDArray[np.float64]
+
+
+def ring(count: int = 40) -> tuple[Array, Array]:
+    """Points of an ellipse, and its normals there."""
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    points = np.column_stack([20.0 * np.cos(angle) + 5.0, 9.0 * np.sin(angle) - 3.0])
+    normals = np.column_stack([9.0 * np.cos(angle), 20.0 * np.sin(angle)])
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+@given(x=st.floats(-1.0, 1.0), y=st.floats(-1.0, 1.0), theta=st.floats(-0.01, 0.01))
+def test_a_rigid_motion_is_found_though_points_slide_along(x: float, y: float, theta: float) -> None:
+    points, normals = ring()
+    moved = np.array([x, y]) + theta * np.column_stack([-points[:, 1], points[:, 0]])
+    tangents = np.column_stack([-normals[:, 1], normals[:, 0]])
+    slid = moved + np.linspace(-2.0, 3.0, len(points))[:, None] * tangents
+    np.testing.assert_allclose(motion_across(points, normals) @ slid.ravel(), [x, y, theta], atol=1e-9)
+
+
+# --- a closed map ----------------------------------------------------------------------------------------
+
+
+@cache
+def log() -> Log:
+    return simulate(bean_track(), SimulationSettings(laps=5), seed=2)
+
+
+def with_laps(laps: float) -> MapperSettings:
+    settings = MapperSettings()
+    return replace(settings, closing=replace(settings.closing, gauge_laps=laps))
+
+
+def run(laps: float, until: float) -> FixedLagMapper:
+    mapper = FixedLagMapper(with_laps(laps))
+    for odometry, detections in split_odometry(log()):
+        if detections.t > until:
+            break
+        mapper.update(odometry, detections)
+    return mapper
+
+
+def across(mapper: FixedLagMapper) -> tuple[Array, Array]:
+    """The keys of the control points, and the rows that give the motion across the curves."""
+    state = mapper.smoother.map.state
+    order = np.argsort(state.map_keys)
+    tangent = np.concatenate([state.spline(b).tangent_unit(c.abscissae) for b, c in state.boundaries.items()])
+    normals = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    return state.map_keys[order], motion_across(state.map_points[order], normals[order])
+
+
+@cache
+def mid() -> float:
+    return float(log().cycles[len(log().cycles) // 2].t)
+
+
+def test_holding_moves_nothing_and_keeps_what_is_known_of_the_motion() -> None:
+    mapper = run(np.inf, mid())
+    smoother = mapper.smoother
+    assert mapper.closed and not smoother.gauge_covariance.any()
+    keys, rows = across(mapper)
+    before = smoother.covariance(keys)
+    hold_gauge(smoother)
+    after = smoother.covariance(keys)
+    np.testing.assert_allclose(rows @ after @ rows.T, rows @ before @ rows.T, rtol=1e-6)
+    held = rows @ (after - shared(mapper, keys)) @ rows.T
+    assert np.trace(held) < 1e-3 * np.trace(rows @ before @ rows.T)
+    free = run(np.inf, mid()).smoother
+    for one in (smoother, free):
+        one.step()
+    np.testing.assert_allclose(smoother.variables.of(keys), free.variables.of(keys), atol=1e-3)
+
+
+def shared(mapper: FixedLagMapper, keys: Array) -> Array:
+    """The part of the covariance that all points share once the gauge is held."""
+    layout = mapper.smoother.variables.layout
+    motions = layout.rigid_motions(mapper.smoother.variables.values)[layout.entries(keys)]
+    return np.asarray(motions @ mapper.smoother.gauge_covariance @ motions.T)
+
+
+def test_the_map_is_held_after_the_laps_that_were_set_and_its_shape_is_not() -> None:
+    held, free = run(1.0, np.inf), run(np.inf, np.inf)
+    assert held.smoother.gauge_covariance.any() and not free.smoother.gauge_covariance.any()
+    early = run(1.0, held_since(held))
+    keys, rows = across(early)
+    moved = held.smoother.variables.of(keys) - early.smoother.variables.of(keys)
+    sigma = np.sqrt(np.diag(held.smoother.gauge_covariance))
+    assert (np.abs(rows @ moved) < 0.1 * sigma).all()
+    assert np.abs(moved).max() > 5e-3
+    for label, boundary in held.map().boundaries.items():
+        sigmas = [np.trace(one.covariance) for one in (boundary, free.map().boundaries[label])]
+        assert sigmas[0] > 0.9 * sigmas[1]
+
+
+def held_since(mapper: FixedLagMapper) -> float:
+    """The stamp by which the gauge was held: one more lap after the swap, and a little more."""
+    return 0.7 * mapper.smoother.times[-1]
+
+
+def test_factors_of_the_user_may_tell_the_gauge_so_that_it_is_not_held() -> None:
+    mapper = FixedLagMapper(with_laps(0.1))
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
+    for cycle, (odometry, detections) in enumerate(split_odometry(log())):
+        own = [gtsam.PriorFactorPose2(mapper.next_pose_key, gtsam.Pose2(), noise)] if cycle == 5 else []
+        mapper.update(odometry, detections, own)
+    assert mapper.closed and not mapper.smoother.gauge_covariance.any()
+
+
+def test_a_map_that_replaces_another_has_a_gauge_of_its_own() -> None:
+    smoother = run(0.1, mid()).smoother
+    assert smoother.gauge_covariance.any()
+    keys = smoother.map.state.map_keys
+    smoother.restart(smoother.first_cycle, keys, keys, smoother.variables.of(keys).reshape(-1, 2))
+    assert not smoother.gauge_covariance.any()
