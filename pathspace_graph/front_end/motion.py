@@ -20,6 +20,7 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.prediction import integrate_odometry
 from pathspace_graph.settings.front_end import MotionSettings
 
+from .gate import Newest
 from .rest import Rest
 from .scan_matching import Match, RecentDetections, match
 
@@ -80,6 +81,12 @@ class MotionCheck:
             self._rate += share * (float(self._velocity[2]) - self._rate)
         self._t = t
         return motion
+
+    @property
+    def newest(self) -> Newest:
+        """Returns what the readings of the next cycle go on from."""
+        t, twist = self._reading
+        return Newest(self._t, twist if t > -np.inf else None)
 
     # --- the odometry ------------------------------------------------------------------------------------
 

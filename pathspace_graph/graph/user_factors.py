@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import ReadingError
 
 from .gaussian import graph_of, jacobian_factor, normal_equations, square_root_form
 from .keys import POSE, are_poses, name, sizes
@@ -45,19 +45,9 @@ class UserFactors:
         self._active: list[_UserFactor] = []
         self._inactive: list[_UserFactor] = []
 
-    def add(
-        self, factors: Sequence[gtsam.NonlinearFactor], known: Callable[[int], bool], expected: str
-    ) -> bool:
-        """Adds factors, and returns whether any of them holds a pose.
-
-        SettingsError where a factor has a key that is not known; no factor is added then. `expected` is part
-        of the message.
-        """
+    def add(self, factors: Sequence[gtsam.NonlinearFactor]) -> bool:
+        """Adds factors that `check_factors` lets pass, and returns whether any of them holds a pose."""
         new = [_UserFactor(factor, np.array(list(factor.keys()), np.intp)) for factor in factors]
-        for one in new:
-            for key in one.keys.tolist():
-                if not known(key):
-                    raise SettingsError(f"factor on {name(key)}: expected keys of {expected}")
         self._active += new
         return any(one.holds_pose for one in new)
 
@@ -95,6 +85,32 @@ class UserFactors:
         meets = [condition(one) for one in self._active]
         chosen = [one for one, met in zip(self._active, meets, strict=True) if met]
         return chosen, [one for one, met in zip(self._active, meets, strict=True) if not met]
+
+
+def check_factors(
+    factors: Sequence[gtsam.NonlinearFactor],
+    known: Callable[[int], bool],
+    expected: str,
+    values: Callable[[IntArray], gtsam.Values],
+) -> None:
+    """Raises a ReadingError for the first factor that is not one, or whose keys or numbers cannot be used.
+
+    Each key must be known; `expected` is part of the message. Each factor is linearized at the values of its
+    keys, and must give finite numbers.
+    """
+    for row, factor in enumerate(factors):
+        if not isinstance(factor, gtsam.NonlinearFactor):
+            raise ReadingError("factors", "a gtsam.NonlinearFactor", type(factor).__name__, row)
+        keys = list(factor.keys())
+        unknown = [key for key in keys if not known(key)]
+        if unknown:
+            raise ReadingError("factors", f"keys of {expected}", name(unknown[0]), row)
+        try:
+            linear = factor.linearize(values(np.array(keys, np.intp)))
+        except Exception as error:  # whatever a user's own function raises, or GTSAM where types differ
+            raise ReadingError("factors", "a factor that can be linearized", error, row) from error
+        if linear is not None and not all(np.isfinite(part).all() for part in linear.jacobian()):
+            raise ReadingError("factors", "finite numbers", "others where it is linearized", row)
 
 
 def _linear(factors: Sequence[_UserFactor], variables: Variables) -> list[gtsam.GaussianFactor]:

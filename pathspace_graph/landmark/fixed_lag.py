@@ -66,7 +66,8 @@ class LandmarkFixedLag:
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """Processes one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
-        reading = self.front_end.update(odometry, detections)
+        cycle = self.front_end.admit(odometry, detections)
+        reading = self.front_end.update(cycle.odometry, cycle.detections)
         motion, detections = reading.motion, reading.detections
         predict(self.smoother, self.path, motion, detections.t, self.settings)
         watch.lap("predict")
@@ -84,7 +85,7 @@ class LandmarkFixedLag:
         watch.lap("close")
         self.smoother.marginalize()
         watch.lap("marginalize")
-        return self._result(detections.t, watch.laps)
+        return cycle.counted(self._result(detections.t, watch.laps))
 
     def _create(self, new: slice, t: float) -> bool:
         """Adds detections without a landmark to the tentative tracks, and makes confirmed ones landmarks.

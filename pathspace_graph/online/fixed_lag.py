@@ -9,8 +9,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import ReadingError, SettingsError
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
+from pathspace_graph.front_end.gate import Admitted
 from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
@@ -98,10 +99,12 @@ class FixedLagMapper:
         variable of the graph, SettingsError is raised and nothing is changed.
         """
         watch = Stopwatch()
+        factors = tuple(factors)
+        cycle = self._admit(odometry, detections, factors)
         self.smoother.add_factors(factors)
         if factors:
             self.loop.record.give_up("the batch of the lap does not know the user's factors")
-        reading = self._predict(odometry, detections)
+        reading = self._predict(cycle.odometry, cycle.detections)
         watch.lap("predict")
         self._classify(reading)  # detections that no curve explains may expand one
         watch.lap("classify")
@@ -128,7 +131,7 @@ class FixedLagMapper:
         self.smoother.marginalize(self.loop.first_kept)
         watch.lap("marginalize")
         notice = "; ".join(text for text in (notice, self.growth.notice, reading.notice) if text)
-        return self._result(detections.t, watch.laps, jump, notice)
+        return cycle.counted(self._result(cycle.detections.t, watch.laps, jump, notice))
 
     def _step(self) -> None:
         """Takes one Gauss-Newton step, relinearized at the current estimate, or the solver's step."""
@@ -136,6 +139,17 @@ class FixedLagMapper:
             self.smoother.step(self.settings.sigma_step)
         else:
             self.solver.step(self.smoother, self.settings.sigma_step)
+
+    def _admit(
+        self, odometry: Odometry, detections: Detections, factors: Sequence[gtsam.NonlinearFactor]
+    ) -> Admitted:
+        """Returns a cycle that may be used, or raises a ReadingError; nothing but a count changes."""
+        try:
+            self.smoother.check_factors(factors)
+        except ReadingError:
+            self.front_end.gate.refused += 1
+            raise
+        return self.front_end.admit(odometry, detections)
 
     # --- the steps of the paper --------------------------------------------------------------------------
 
