@@ -65,8 +65,12 @@ class FrontEnd:
         """
         return self.gate.admit(odometry, detections, self._motion.newest, window)
 
-    def late(self, detections: Detections) -> Detections:
-        """Returns the detections of a late cycle with the labels of their sides; unknown ones stay so."""
+    def use_late(self, detections: Detections, window: Sequence[float]) -> Detections:
+        """Returns the detections of a late cycle with the labels of their sides; unknown ones stay so.
+
+        Its stamp is not admitted again as long as it lies in the window, whose poses have these stamps (s).
+        """
+        self.gate.use_late(detections.t, window)
         return self._sides.relabelled(detections, np.full(len(detections.labels), UNKNOWN))
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:

@@ -31,7 +31,7 @@ TWIST: Final = ("vx", "vy", "wz")
 MIN_DETERMINANT: Final = 1e-12
 """A covariance with det <= this * xx * yy is singular to double precision, so not positive definite."""
 MAX_ASYMMETRY: Final = 1e-6
-"""The entries xy and yx of a covariance differ by at most this share of its trace."""
+"""The entries xy and yx of a covariance differ by at most this share of its larger eigenvalue."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,6 +182,8 @@ def _check_order(stamps: Array, t: float, newest: Newest, limits: LimitSettings)
     if len(stamps) and stamps[-1] > t:
         row = int(stamps.searchsorted(t, side="right"))
         raise ReadingError("odometry.t", "none later than the cycle", float(stamps[row]), row)
+    if newest.t is not None and t < newest.t + limits.interval:
+        raise ReadingError("detections.t", f"at least {limits.interval:g} s after the newest cycle", t)
     before = [] if newest.t is None else [newest.t]
     known = np.concatenate([before, stamps, [t]])
     steps = known[1:] - known[:-1]
@@ -274,15 +276,15 @@ def _has_range(points: Array, limits: LimitSettings) -> BoolArray:
 def _has_covariance(covariances: Array, limits: LimitSettings) -> BoolArray:
     """Returns whether covariances (m, 2, 2) are symmetric and positive definite, and of a possible size.
 
-    The eigenvalues e <= f have `e f = det` and `e + f = trace`. So `det >= sigma^2 trace` gives
-    `e >= sigma^2`.
+    The smaller eigenvalue is the determinant by the larger one.
     """
     xx, xy, yx, yy = covariances.reshape(-1, 4).T
     with np.errstate(over="ignore", invalid="ignore"):
-        trace, det = xx + yy, xx * yy - xy * yx
-        good = (xx > 0.0) & (yy > 0.0) & (np.abs(xy - yx) <= MAX_ASYMMETRY * trace)
-        good &= (det > MIN_DETERMINANT * xx * yy) & (det >= limits.sigma_min**2 * trace)
-        good &= trace <= limits.sigma_max**2
+        det = xx * yy - xy * yx
+        largest = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
+        good = (xx > 0.0) & (yy > 0.0) & (np.abs(xy - yx) <= MAX_ASYMMETRY * largest)
+        good &= (det > MIN_DETERMINANT * xx * yy) & (det >= limits.sigma_min**2 * largest)
+        good &= largest <= limits.sigma_max**2
     return np.asarray(good)
 
 

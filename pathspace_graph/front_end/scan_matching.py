@@ -38,8 +38,9 @@ class RecentDetections:
 
     def add(self, t: float, points: Array) -> None:
         """Adds the detections at points (m, 2) of a cycle at t (s)."""
-        self.points = np.concatenate([self.points, points])
-        self._stamps = np.concatenate([self._stamps, np.full(len(points), t)])
+        most = self.settings.max_remembered
+        self.points = np.concatenate([self.points, points])[-most:]
+        self._stamps = np.concatenate([self._stamps, np.full(len(points), t)])[-most:]
 
     def forget(self, t: float) -> None:
         """Drops the detections that are too old at t (s)."""

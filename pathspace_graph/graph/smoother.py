@@ -172,8 +172,12 @@ class FixedLagSmoother(WindowSystem[M_co]):
     # --- marginalization ---------------------------------------------------------------------------------
 
     def marginalize(self, held_from: int | None = None) -> None:
-        """Marginalizes poses that are older than the lag, but none of the cycles from `held_from` on."""
-        while len(self.times) > 1 and self.times[-1] - self.times[0] > self.settings.lag + TIME_TOLERANCE:
+        """Marginalizes poses that are older than the lag, or too many.
+
+        The cycles from `held_from` on stay.
+        """
+        lag, most = self.settings.lag + TIME_TOLERANCE, self.settings.max_poses
+        while len(self.times) > 1 and (self.times[-1] - self.times[0] > lag or len(self.times) > most):
             if self.first_cycle == held_from:
                 return
             self._marginalize_oldest()

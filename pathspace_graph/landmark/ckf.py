@@ -59,7 +59,11 @@ class LandmarkCkf:
         """These tracks by label are not landmarks yet."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Processes one perception cycle: the twists since the last one, and the detections of now."""
+        """Processes one perception cycle: the twists since the last one, and the detections of now.
+
+        A cycle that cannot be used is a ReadingError and changes nothing. So is one that is late, since a
+        filter has no earlier pose that could take its detections.
+        """
         watch = Stopwatch()
         cycle = self.front_end.admit(odometry, detections)
         reading = self.front_end.update(cycle.odometry, cycle.detections)

@@ -106,6 +106,7 @@ def smoother_settings(settings: MapperSettings) -> SmootherSettings:
     """Returns the engine's part of an estimator's settings."""
     return SmootherSettings(
         lag=settings.lag,
+        max_poses=settings.max_poses,
         tolerances=(settings.relinearize.point, settings.relinearize.heading),
         keyframe_interval=settings.closing.keyframe_interval,
         sigma_calibration=settings.odometry.sigmas_calibration,

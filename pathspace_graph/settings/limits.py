@@ -8,7 +8,7 @@ from .checked import Positive
 
 
 @dataclass(frozen=True)
-class LimitSettings(Positive):
+class LimitSettings(Positive, group="limits"):
     """Describes what a vehicle and its sensors can do at most; a cycle beyond that is refused.
 
     A single detection beyond what a sensor can see is dropped instead.
@@ -20,12 +20,15 @@ class LimitSettings(Positive):
     """No vehicle turns faster than this (rad/s)."""
     stamp: float = 1e11
     """No stamp is larger than this (s), which is some three thousand years. Stamps in nanoseconds are."""
+    interval: float = 4e-3
+    """A cycle is at least this much later than the one before (s). Between cycles that are nearer, the
+    odometry is so certain that the system loses its digits."""
     silence: float = 30.0
     """There is a twist or a cycle at least once in this time (s). A vehicle may be anywhere after a longer
     one."""
     twists: int = 100_000
     """A cycle has at most this number of twists."""
-    detections: int = 1_000
+    detections: int = 500
     """A cycle has at most this number of detections."""
     range_min: float = 0.01
     """A detection is at least this far from the vehicle (m)."""

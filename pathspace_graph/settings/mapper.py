@@ -220,6 +220,8 @@ class MapperSettings(Positive):
 
     lag: float = 3.0
     """Poses stay in the window for this time (s)."""
+    max_poses: int = 400
+    """The window holds at most this number of poses, however fast the cycles follow each other."""
     steps: int = 1
     """Each cycle takes this number of Gauss-Newton steps, each relinearized at the current estimate."""
     steps_grown: int = 1

@@ -129,6 +129,12 @@ REFUSED: dict[str, Bad] = {
     "milliseconds": (lambda: through(cycle=detections(1100.0)), "detections.t", None, "are in seconds"),
     "a minute ahead": (lambda: through(cycle=detections(61.2)), "detections.t", None, "at most 30 s after"),
     "backwards": (lambda: through(cycle=detections(0.9)), "detections.t", None, "later than the newest"),
+    "at once": (
+        lambda: through(odometry(np.zeros(0), np.zeros((0, 3))), detections(1.003)),
+        "detections.t",
+        None,
+        "at least 0.004 s after the newest cycle",
+    ),
     "twice": (lambda: through(cycle=detections(1.0)), "detections.t", None, "later than the newest"),
     "a twist after the cycle": (
         lambda: through(odometry(STAMPS + 0.05)),
@@ -231,11 +237,11 @@ REFUSED: dict[str, Bad] = {
     ),
     "too many detections": (
         lambda: through(
-            cycle=Detections(1.1, np.ones((1001, 2)), np.tile(np.eye(2), (1001, 1, 1)), np.zeros(1001, int))
+            cycle=Detections(1.1, np.ones((501, 2)), np.tile(np.eye(2), (501, 1, 1)), np.zeros(501, int))
         ),
         "detections.points_vehicle",
         None,
-        "at most 1000 rows",
+        "at most 500 rows",
     ),
 }
 
