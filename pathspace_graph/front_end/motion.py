@@ -93,7 +93,8 @@ class MotionCheck:
     def _integrate(self, odometry: Odometry, t: float) -> MeasuredMotion:
         """Returns the motion by odometry, whose noise grows where a twist is held for long."""
         if len(odometry.t) == 0:
-            return MeasuredMotion(integrate_odometry(odometry, t, self.sigma), odometry.twist)
+            none = integrate_odometry(odometry, t, self.sigma)  # which is certain that nothing moves
+            return MeasuredMotion(none, odometry.twist, missing=self._t is not None)
         measured, (before, twist) = odometry.t, self._reading
         if self._t is not None and measured[0] <= self._t and (odometry.twist[0] == twist).all():
             measured = np.append(before, measured[1:])  # the first row only goes on with the last twist
