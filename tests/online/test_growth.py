@@ -328,7 +328,9 @@ def test_one_cycle_that_leads_very_far_does_not_take_the_curve_along() -> None:
     mapper, results = map_log(log)
     t, before = results[-1].t, results[-1].sizes
     nothing = detections(t + 29.0, np.zeros((0, 2)), np.zeros(0, np.intp))
-    result = mapper.update(Odometry(np.array([t]), np.array([[100.0, 0.0, 0.0]])), nothing)
+    stamps = np.arange(t, t + 29.0, DT)
+    twists = np.column_stack([99.0 + 1e-4 * np.arange(len(stamps)), np.zeros((len(stamps), 2))])
+    result = mapper.update(Odometry(stamps, twists), nothing)
     assert result.pose[0] > 2000.0
     assert result.sizes == before
 
