@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pathspace_graph.settings.mapper import MapperSettings
     from pathspace_graph.spline.bspline import BSpline
 
-    from .errors import InputError, OutputError, PathspaceError, SettingsError
+    from .errors import InputError, OutputError, PathspaceError, ReadingError, SettingsError
     from .run import run_online
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "OutputError",
     "PathspaceError",
     "PointBoundary",
+    "ReadingError",
     "RunResult",
     "SettingsError",
     "SplineBoundary",
@@ -41,7 +42,7 @@ __all__ = [
 
 # imported when first asked for: the command line's help, and sim, need no estimator
 _HOMES = {
-    "errors": ("InputError", "OutputError", "PathspaceError", "SettingsError"),
+    "errors": ("InputError", "OutputError", "PathspaceError", "ReadingError", "SettingsError"),
     "io.log": ("Detections", "Log", "Odometry", "read_log", "write_log"),
     "io.map": ("Map", "PointBoundary", "SplineBoundary", "read_map"),
     "io.results": ("CycleRecord", "RunResult", "write_result"),

@@ -29,6 +29,32 @@ class InputError(PathspaceError):
         super().__init__(f"{where}: {message}")
 
 
+class ReadingError(PathspaceError):
+    """A perception cycle was handed over that no estimator can use; the estimator is as it was before.
+
+    The text names the field, the row (0 is the first one), what was expected and what was found.
+    """
+
+    def __init__(
+        self, field: str, expected: str, found: object, row: int | None = None, t: float | None = None
+    ) -> None:
+        self.field, self.expected, self.found, self.row = field, expected, found, row
+        self.t = t
+        """This is the stamp of the cycle (s), where it has one."""
+        when = "" if t is None else f"cycle at {t:.12g} s: "
+        where = field if row is None else f"{field}, row {row}"
+        value = f"{found:g}" if isinstance(found, float) else str(found)
+        super().__init__(f"{when}{where}: expected {expected}, found {value}")
+
+    def at(self, t: float) -> ReadingError:
+        """Returns the same error of the cycle with this stamp (s)."""
+        return type(self)(self.field, self.expected, self.found, self.row, t)
+
+    def __reduce__(self) -> tuple[type[ReadingError], tuple[object, ...]]:
+        """Returns how to make the error again: it comes back from worker processes."""
+        return type(self), (self.field, self.expected, self.found, self.row, self.t)
+
+
 class OutputError(PathspaceError):
     """An output path cannot be written without losing something that is there already."""
 

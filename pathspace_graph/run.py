@@ -45,6 +45,12 @@ class CycleResult:
     """This says what a user should know of the cycle; it is empty if there is nothing."""
     health: Health = field(default_factory=Health)
     """This says how far the estimate can be trusted; it is empty for an estimator without a monitor."""
+    dropped: int = 0
+    """This is the number of the cycle's detections that were dropped, since they are impossible."""
+    late: bool = False
+    """The flag is set where the cycle was handed over after a newer one, and was used at its own time."""
+    refused: int = 0
+    """This number of cycles was refused since the last one that was used."""
 
 
 class OnlineEstimator(Protocol):
@@ -199,6 +205,9 @@ class _Run:
                 offered=len(detections.labels),
                 health=result.health.condition,
                 reason=result.health.reason,
+                dropped=result.dropped,
+                late=result.late,
+                refused=result.refused,
             )
         )
         if self._observer is not None:

@@ -17,8 +17,10 @@ from pathspace_graph.eval.harness.workers import check_jobs, outcomes, workers
 from pathspace_graph.eval.metrics.cost import StageTime, stage_times
 from pathspace_graph.eval.metrics.ghosts import GhostSettings
 from pathspace_graph.eval.metrics.measures import measure, online_cycles
-from pathspace_graph.io.log import LOG_FILE, Log, read_log
+from pathspace_graph.front_end.gate import read_usable_log
+from pathspace_graph.io.log import LOG_FILE, Log
 from pathspace_graph.io.results import BatchRun, RunResult
+from pathspace_graph.settings.limits import LimitSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 Row = dict[str, float | int | str | bool]
@@ -113,15 +115,16 @@ class Comparison:
         return [outcome for outcome in self.outcomes if outcome.failure]
 
 
-def read_logs(folder: Path) -> tuple[NamedLog, ...]:
+def read_logs(folder: Path, limits: LimitSettings | None = None) -> tuple[NamedLog, ...]:
     """Returns the log of a log folder, or those of a folder of log folders by name; InputError if there
-    are none."""
+    are none, or if a cycle of one cannot be used."""
+    limits = limits or LimitSettings()
     if (folder / LOG_FILE).exists() or not folder.is_dir():
-        return (NamedLog(folder.resolve().name, read_log(folder)),)
+        return (NamedLog(folder.resolve().name, read_usable_log(folder, limits)),)
     inside = sorted(entry for entry in folder.iterdir() if (entry / LOG_FILE).is_file())
     if not inside:
         raise InputError(folder, f"expected a log ({LOG_FILE}) or folders that are logs, found neither")
-    return tuple(NamedLog(entry.name, read_log(entry)) for entry in inside)
+    return tuple(NamedLog(entry.name, read_usable_log(entry, limits)) for entry in inside)
 
 
 def choose(names: Sequence[str]) -> tuple[str, ...]:

@@ -40,6 +40,11 @@ def summarize(result: RunResult, log: Log) -> dict[str, Any]:
         "size": result.map.size,
         "not_mapped": not_mapped(result.map, log),
         "seconds": _timing(result),
+        "gate": {
+            "dropped": sum(record.dropped for record in result.cycles),
+            "late": sum(record.late for record in result.cycles),
+            "refused": sum(record.refused for record in result.cycles),
+        },
     }
     events = _events(result)
     if events:

@@ -41,6 +41,7 @@ class Expansion:
         """These are the tracks of all recent detections, by label."""
         self.observed: dict[int, list[Array]] = {label: [] for label in BOUNDARIES}
         """These are all distinct cones that were confirmed, as points (2,) in m, map frame, by label."""
+        self._carried = dict.fromkeys(BOUNDARIES, 0.0)  # lengths (m) since the last cone
 
     def observe(self, state: CurveState, detections: Detections) -> None:
         """Adds all detections of a cycle to the tracks, and newly confirmed ones to the observed cones."""
@@ -67,7 +68,10 @@ class Expansion:
             found = self._candidates(state, label, detections, rows, path_ahead)
             if label not in state.curves:
                 self._begin(state, label, detections, found)
-            elif self._extend(state, label, detections, found) or self._carry_on(state, label, path_ahead):
+            elif self._extend(state, label, detections, found):
+                extended.add(label)
+                self._carried[label] = 0.0
+            elif self._carry_on(state, label, path_ahead):
                 extended.add(label)
         return extended
 
@@ -141,7 +145,7 @@ class Expansion:
     def _carry_on(self, state: CurveState, label: int, path_ahead: PathAhead) -> bool:
         """Extends a curve whose end the vehicle has passed beside the path, nearly as far as the vehicle.
 
-        Returns whether the curve was extended.
+        It is carried on by at most `growth.max_unseen`. Returns whether the curve was extended.
         """
         settings = self.settings.growth
         end = _end(state, label, path_ahead, settings.end_behind)
@@ -149,8 +153,10 @@ class Expansion:
             return False
         side = SIDES[label] * max(end.side, settings.min_lateral)
         point = path_ahead.beside(path_ahead.driven - settings.stranded_left * settings.stranded, side)
-        if np.hypot(*(point - end.position)) < settings.min_carry:
+        distance = float(np.hypot(*(point - end.position)))
+        if not settings.min_carry <= distance <= settings.max_unseen - self._carried[label]:
             return False
+        self._carried[label] += distance
         point_vehicle = (point - state.pose[:2]) @ rotation(state.pose[2])
         state.extend(label, point_vehicle, self.settings.ckf.sigma_carry**2 * np.eye(2))
         return True

@@ -52,9 +52,14 @@ class CkfMapper:
         self._last_check = 0.0
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Processes one perception cycle: the twists since the last one, and the detections of now."""
+        """Processes one perception cycle: the twists since the last one, and the detections of now.
+
+        A cycle that cannot be used is a ReadingError and changes nothing. So is one that is late, since a
+        filter has no earlier pose that could take its detections.
+        """
         watch = Stopwatch()
-        reading = self.front_end.update(odometry, detections)
+        cycle = self.front_end.admit(odometry, detections)
+        reading = self.front_end.update(cycle.odometry, cycle.detections)
         self._predict(reading.motion)
         detections = self.state.belief.corrected(reading.detections)
         watch.lap("predict")
@@ -67,7 +72,7 @@ class CkfMapper:
         self._close(detections)
         watch.lap("close")
         used = sum(len(on.rows) for on in found.values())
-        return self._result(detections.t, used, watch.laps)
+        return cycle.counted(self._result(detections.t, used, watch.laps))
 
     def _predict(self, motion: MeasuredMotion) -> None:
         """Predicts the pose by the motion since the last cycle, and locates it on the curves."""

@@ -14,8 +14,9 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT_BATCH, check_batch, make_batch
 from pathspace_graph.eval.metrics.gap import gap
 from pathspace_graph.eval.metrics.summary import summarize
+from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.io.files import check_target
-from pathspace_graph.io.log import Log, read_log
+from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.results import BatchRun, write_result
 from pathspace_graph.progress import progress
@@ -49,7 +50,7 @@ class Batch:
         if self.start == "odometry" and self.estimator != DEFAULT_BATCH:
             raise SettingsError(f"--start: expected online for {self.estimator}, found {self.start}")
         check_target(self.out, MAP_FILE)
-        log = read_log(self.log)
+        log = read_usable_log(self.log, self.settings.limits)
         with progress("optimizing") as advance:
             estimator = make_batch(self.estimator, self.settings, log)
             if isinstance(estimator, BatchMapper):

@@ -56,7 +56,7 @@ class Compare:
         reference = choose_reference(self.reference, estimators)
         check_jobs(self.jobs)
         check_target(self.out, MARKER)
-        logs = read_logs(self.log)
+        logs = read_logs(self.log, self.settings.limits)
         with progress("comparing", len(logs) * len(estimators)) as advance:
             comparison = compare(
                 logs,

@@ -23,9 +23,10 @@ from pathspace_graph.eval.metrics.summary import (
     vehicle_of,
 )
 from pathspace_graph.eval.metrics.table1 import LapMetrics
+from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_target
-from pathspace_graph.io.log import Log, read_log
+from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.labels import NAMES
@@ -51,7 +52,7 @@ class Online:
         """Reads, maps, writes and reports."""
         check_online(self.estimator)
         check_target(self.out, MAP_FILE)
-        log = read_log(self.log)
+        log = read_usable_log(self.log, self.settings.limits)
         result = map_online(log, self.settings, self.estimator)
         write_result(self.out, result, summarize(result, log))
         report(result, log)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.labels import BOUNDARIES, UNKNOWN
-from pathspace_graph.mapping.tentative import nearest_within
+from pathspace_graph.mapping.tentative import nearest_within, newest_of
 from pathspace_graph.settings.front_end import SidesSettings
 
 Array = NDArray[np.float64]
@@ -54,7 +54,7 @@ class NearCones:
         return cones
 
     def _forget(self, t: float) -> None:
-        kept = self._last > t - self.settings.forget_after
+        kept = newest_of(self._last, self.settings.max_cones) & (self._last > t - self.settings.forget_after)
         self.points, self.counts = self.points[kept], self.counts[kept]
         self.votes, self.judged = self.votes[kept], self.judged[kept]
         self._last = self._last[kept]

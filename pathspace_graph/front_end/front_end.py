@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
+from .gate import Admitted, Gate
 from .log_odometry import LogOdometry, chained
 from .motion import MotionCheck
 from .sides import SideJudge
@@ -53,10 +55,27 @@ class FrontEnd:
 
     def __init__(self, settings: MapperSettings, odometry_sigma: Array) -> None:
         """Keeps the settings, and the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
+        self.gate = Gate(settings.limits)
+        """It refuses cycles that no estimator can use."""
         self._motion = MotionCheck(odometry_sigma, settings.motion)
         self._calibration = settings.calibration
         self._sensor_doubted = False
         self._sides = SideJudge(settings.sides, settings.path)
+
+    def admit(self, odometry: Odometry, detections: Detections, window: Sequence[float] = ()) -> Admitted:
+        """Returns a cycle that may be used, or raises a ReadingError; nothing but a count changes.
+
+        A late cycle is admitted between the stamps (s) of the `window`.
+        """
+        return self.gate.admit(odometry, detections, self._motion.newest, window)
+
+    def use_late(self, detections: Detections, window: Sequence[float]) -> Detections:
+        """Returns the detections of a late cycle with the labels of their sides; unknown ones stay so.
+
+        Its stamp is not admitted again as long as it lies in the window, whose poses have these stamps (s).
+        """
+        self.gate.use_late(detections.t, window)
+        return self._sides.relabelled(detections, np.full(len(detections.labels), UNKNOWN))
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Returns the judged readings of a cycle: the twists since the last one, and its detections."""
@@ -87,10 +106,12 @@ class JudgedLog:
 def judge_log(log: Log, odometry_sigma: Array, settings: MapperSettings) -> JudgedLog:
     """Returns a log as the front end gives it to an estimator of whole logs.
 
-    odometry_sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s).
+    odometry_sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s). A cycle that an
+    online estimator would refuse is a ReadingError.
     """
     front_end = FrontEnd(settings, odometry_sigma)
-    readings = [front_end.update(odometry, cycle) for odometry, cycle in split_odometry(log)]
+    admitted = (front_end.admit(odometry, cycle) for odometry, cycle in split_odometry(log))
+    readings = [front_end.update(cycle.odometry, cycle.detections) for cycle in admitted]
     motions = [reading.motion for reading in readings]
     chain = chained([cycle.t for cycle in log.cycles], motions, settings.odometry)
     if readings[-1].sensor_doubted:

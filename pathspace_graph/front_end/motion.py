@@ -20,6 +20,7 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.prediction import integrate_odometry
 from pathspace_graph.settings.front_end import MotionSettings
 
+from .gate import Newest
 from .rest import Rest
 from .scan_matching import Match, RecentDetections, match
 from .sensor_errors import SensorErrors, by_errors
@@ -87,12 +88,19 @@ class MotionCheck:
         self._t = t
         return motion
 
+    @property
+    def newest(self) -> Newest:
+        """Returns what the readings of the next cycle go on from."""
+        t, twist = self._reading
+        return Newest(self._t, twist if t > -np.inf else None)
+
     # --- the odometry ------------------------------------------------------------------------------------
 
     def _integrate(self, odometry: Odometry, t: float) -> MeasuredMotion:
         """Returns the motion by odometry, whose noise grows where a twist is held for long."""
         if len(odometry.t) == 0:
-            return MeasuredMotion(integrate_odometry(odometry, t, self.sigma), odometry.twist)
+            none = integrate_odometry(odometry, t, self.sigma)  # which is certain that nothing moves
+            return MeasuredMotion(none, odometry.twist, missing=self._t is not None)
         measured, (before, twist) = odometry.t, self._reading
         if self._t is not None and measured[0] <= self._t and (odometry.twist[0] == twist).all():
             measured = np.append(before, measured[1:])  # the first row only goes on with the last twist

@@ -49,10 +49,11 @@ class RecentDetections:
         Their derivatives by e errors of the sensor are the columns (m, 2, e), in the same frame.
         """
         turned = np.einsum("ij,mje->mie", rotation(pose[2]), columns)
-        self._measured = np.concatenate([self._measured, to_map(measured, pose[None])])
-        self._columns = np.concatenate([self._columns, turned])
-        self._places = np.concatenate([self._places, np.broadcast_to(pose[:2], measured.shape)])
-        self._stamps = np.concatenate([self._stamps, np.full(len(measured), t)])
+        places, most = np.broadcast_to(pose[:2], measured.shape), self.settings.max_remembered
+        self._measured = np.concatenate([self._measured, to_map(measured, pose[None])])[-most:]
+        self._columns = np.concatenate([self._columns, turned])[-most:]
+        self._places = np.concatenate([self._places, places])[-most:]
+        self._stamps = np.concatenate([self._stamps, np.full(len(measured), t)])[-most:]
         self.points = self._measured
 
     def correct(self, errors: Array) -> None:

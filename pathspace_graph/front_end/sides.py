@@ -51,7 +51,7 @@ class SideJudge:
         labels, self.colourless = detections.labels, self._is_colourless(detections.labels)
         if not self.colourless and self._agreeing + self._opposing >= self.settings.enough_votes:
             self._path = None  # it begins anew, if it is needed again
-            return self._relabelled(detections, labels) if self.swapped else detections
+            return self.relabelled(detections, labels) if self.swapped else detections
         self._path = self._path or DrivenPath(self._path_settings)
         self._path.update(pose)
         self._path.steer(twists)
@@ -60,9 +60,9 @@ class SideJudge:
         cones = self._cones.add(detections.t, points, labels)
         self._judge_colours(path)
         sides = self._sides(pose, path)[cones] if self.colourless else np.full(len(labels), UNKNOWN)
-        return self._relabelled(detections, sides)
+        return self.relabelled(detections, sides)
 
-    def _relabelled(self, detections: Detections, sides: IntArray) -> Detections:
+    def relabelled(self, detections: Detections, sides: IntArray) -> Detections:
         """Returns detections with the right colours, and with sides (m,) for those that have none."""
         labels = detections.labels
         coloured = LEFT + RIGHT - labels if self.swapped else labels

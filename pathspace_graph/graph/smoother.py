@@ -40,6 +40,7 @@ from .keys import (
 from .odometry import calibrated_delta
 from .submaps import Submaps
 from .system import SmootherSettings, WindowSystem
+from .user_factors import check_factors
 from .variables import Layout
 from .window import M_co
 
@@ -126,20 +127,30 @@ class FixedLagSmoother(WindowSystem[M_co]):
         self.times.append(t)
         self.window.odometry.append(odometry)
 
+    def check_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
+        """Raises a SettingsError for the first of a user's factors that cannot be used; nothing changes."""
+        if factors:
+            window = f"{name(pose_key(self.first_cycle))} to {name(pose_key(self.next_cycle))}"
+            expected = f"poses in the window, {window}, of control points and of the calibration"
+            check_factors(factors, self._is_known, expected, self._values_of)
+
+    def _values_of(self, keys: IntArray) -> gtsam.Values:
+        """Returns the values of known keys; the pose of the next cycle is where the newest one is."""
+        next_key = pose_key(self.next_cycle)
+        values = self.variables.gtsam_values(keys[keys != next_key])
+        if next_key in keys:
+            values.insert(next_key, gtsam.Pose2(*self.variables.poses[-1]) if self.times else gtsam.Pose2())
+        return values
+
     def add_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
-        """Adds the user's factors on any variables, and on the pose of the next cycle.
+        """Adds the user's factors on any variables, and on the pose of the next cycle, after their check.
 
         Factors on poses may be absolute, which a submap cannot be. So submaps are dropped then, and the prior
         keeps its linearization point when the loop closes. Inactive variables of a factor become active.
-        SettingsError where a key is not known.
         """
         if not factors:
             return
-        window = (
-            f"poses in the window, {name(pose_key(self.first_cycle))} to {name(pose_key(self.next_cycle))}"
-        )
-        expected = f"{window}, of control points and of the calibration"
-        if self.user_factors.add(factors, self._is_known, expected):
+        if self.user_factors.add(factors):
             self.submaps = None
         if self.chain is not None or np.isin(self.user_factors.keys, self.inactive.keys).any():
             self.reactivate()
@@ -163,8 +174,12 @@ class FixedLagSmoother(WindowSystem[M_co]):
     # --- marginalization ---------------------------------------------------------------------------------
 
     def marginalize(self, held_from: int | None = None) -> None:
-        """Marginalizes poses that are older than the lag, but none of the cycles from `held_from` on."""
-        while len(self.times) > 1 and self.times[-1] - self.times[0] > self.settings.lag + TIME_TOLERANCE:
+        """Marginalizes poses that are older than the lag, or too many.
+
+        The cycles from `held_from` on stay.
+        """
+        lag, most = self.settings.lag + TIME_TOLERANCE, self.settings.max_poses
+        while len(self.times) > 1 and (self.times[-1] - self.times[0] > lag or len(self.times) > most):
             if self.first_cycle == held_from:
                 return
             self._marginalize_oldest()

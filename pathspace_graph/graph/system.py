@@ -55,6 +55,8 @@ class SmootherSettings:
     """The keyframes of the submaps are this length of path (m) apart."""
     sigma_calibration: tuple[float, float]
     """These are the prior sigmas of the calibration: scale error (-) and bias of the yaw rate (rad/s)."""
+    max_poses: int = 400
+    """The window holds at most this number of poses."""
     sigma_sensor: tuple[float, ...] = ()
     """These are the prior sigmas of the sensor's calibration, none where it is not estimated."""
     relative: bool = False

@@ -47,19 +47,9 @@ class UserFactors:
         self.given = False
         """The flag is set once the user has given any factor, which may be absolute."""
 
-    def add(
-        self, factors: Sequence[gtsam.NonlinearFactor], known: Callable[[int], bool], expected: str
-    ) -> bool:
-        """Adds factors, and returns whether any of them holds a pose.
-
-        SettingsError where a factor has a key that is not known; no factor is added then. `expected` is part
-        of the message.
-        """
+    def add(self, factors: Sequence[gtsam.NonlinearFactor]) -> bool:
+        """Adds factors that `check_factors` lets pass, and returns whether any of them holds a pose."""
         new = [_UserFactor(factor, np.array(list(factor.keys()), np.intp)) for factor in factors]
-        for one in new:
-            for key in one.keys.tolist():
-                if not known(key):
-                    raise SettingsError(f"factor on {name(key)}: expected keys of {expected}")
         self._active += new
         self.given |= len(new) > 0
         return any(one.holds_pose for one in new)
@@ -98,6 +88,36 @@ class UserFactors:
         meets = [condition(one) for one in self._active]
         chosen = [one for one, met in zip(self._active, meets, strict=True) if met]
         return chosen, [one for one, met in zip(self._active, meets, strict=True) if not met]
+
+
+def check_factors(
+    factors: Sequence[gtsam.NonlinearFactor],
+    known: Callable[[int], bool],
+    expected: str,
+    values: Callable[[IntArray], gtsam.Values],
+) -> None:
+    """Raises a SettingsError for the first factor that is not one, or whose keys or numbers cannot be used.
+
+    Each key must be known; `expected` is part of the message. Each factor is linearized at the values of its
+    keys, and must give finite numbers.
+    """
+    for row, factor in enumerate(factors):
+        if not isinstance(factor, gtsam.NonlinearFactor):
+            raise _unusable(row, "a gtsam.NonlinearFactor", type(factor).__name__)
+        keys = list(factor.keys())
+        unknown = [key for key in keys if not known(key)]
+        if unknown:
+            raise _unusable(row, f"keys of {expected}", name(unknown[0]))
+        try:
+            linear = factor.linearize(values(np.array(keys, np.intp)))
+        except Exception as error:  # whatever a user's own function raises, or GTSAM where types differ
+            raise _unusable(row, "a factor that can be linearized", error) from error
+        if linear is not None and not all(np.isfinite(part).all() for part in linear.jacobian()):
+            raise _unusable(row, "finite numbers", "others where it is linearized")
+
+
+def _unusable(row: int, expected: str, found: object) -> SettingsError:
+    return SettingsError(f"factors, row {row}: expected {expected}, found {found}")
 
 
 def _linear(factors: Sequence[_UserFactor], variables: Variables) -> list[gtsam.GaussianFactor]:

@@ -37,6 +37,7 @@ _CYCLE_COLUMNS: Final = (
     "offered",
     "health",
     "reason",
+    "dropped",
 )
 
 
@@ -72,6 +73,12 @@ class CycleRecord:
     """The estimate is good, degraded or lost; this is empty where the estimator does not say it."""
     reason: str = ""
     """This says why the estimate is not good."""
+    dropped: int = 0
+    """This is the number of the cycle's detections that were dropped, since they are impossible."""
+    late: bool = False
+    """The cycle was handed over after a newer one, and was used at its own time, where this is true."""
+    refused: int = 0
+    """This number of cycles was refused just before this one."""
 
 
 @dataclass(frozen=True, eq=False)

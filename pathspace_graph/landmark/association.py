@@ -121,8 +121,12 @@ def compatible(labels: IntArray, landmark_labels: IntArray) -> BoolArray:
 # --- online ----------------------------------------------------------------------------------------------
 
 
-def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray) -> None:
+def associate_newest(
+    smoother: LandmarkSmoother, new: slice, eligible: BoolArray, cycle: int | None = None
+) -> None:
     """Associates the rows `new` of the newest pose with landmarks, and puts the associated ones to use.
+
+    Late rows are of the pose of an earlier `cycle`.
 
     Only landmarks whose entry in `eligible` (n,) is set take part. A detection between the gates becomes
     AMBIGUOUS. So does one in the match gate of a landmark with another label, since it must not create a
@@ -131,7 +135,7 @@ def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray
     detections, state, settings = smoother.map.detections, smoother.map.state, smoother.map.settings.landmark
     rows = np.arange(new.start, new.stop)
     candidates = nearby(smoother, rows, settings.rough)
-    prediction = predict(smoother, candidates[eligible[candidates]])
+    prediction = predict(smoother, candidates[eligible[candidates]], cycle)
     gates, numbers = Gates.of(settings), state.numbers[prediction.landmarks]
     any_label = pair_costs(
         detections.point[rows], detections.covariance[rows], prediction.points_vehicle, prediction.covariances
@@ -154,21 +158,24 @@ def nearby(smoother: LandmarkSmoother, rows: IntArray, radius: float) -> IntArra
     return np.flatnonzero((np.hypot(offset[..., 0], offset[..., 1]) < radius).any(axis=0))
 
 
-def predict(smoother: LandmarkSmoother, landmarks: IntArray) -> Prediction:
-    """Predicts the detections of landmarks (k,), given by position, from the newest pose.
+def predict(smoother: LandmarkSmoother, landmarks: IntArray, cycle: int | None = None) -> Prediction:
+    """Predicts the detections of landmarks (k,), given by position, from the pose of a cycle.
+
+    It is the newest pose by default.
 
     The covariance is `H_j Sigma H_j'`, where Sigma is the joint covariance of pose and landmark in the last
     step. It is zero before the first step.
     """
     state, k = smoother.map.state, len(landmarks)
-    poses, zero = np.tile(smoother.variables.poses[-1], (k, 1)), np.zeros((k, POINT))
+    cycles = np.full(k, smoother.next_cycle - 1 if cycle is None else cycle)
+    poses, zero = smoother.variables.poses_at(cycles), np.zeros((k, POINT))
     expected = landmark_residuals(poses, state.landmarks[landmarks], zero)
     if smoother.last_step is None or k == 0:
         return Prediction(landmarks, expected.residual, np.zeros((k, POINT, POINT)))
     columns = len(smoother.variables.sensor)
     sensor = by_sensor(expected.residual, np.tile(smoother.map.twist, (k, 1)))[:, :, :columns]
     jacobian = np.concatenate([expected.by_pose, -sensor, expected.by_landmark], axis=2)
-    rows = two_rows(np.full(k, smoother.next_cycle - 1), state.numbers[landmarks], jacobian, zero)
+    rows = two_rows(cycles, state.numbers[landmarks], jacobian, zero)
     return Prediction(landmarks, expected.residual, smoother.predicted_covariance(rows, together=POINT))
 
 

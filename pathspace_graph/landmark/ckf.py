@@ -59,9 +59,14 @@ class LandmarkCkf:
         """These tracks by label are not landmarks yet."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Processes one perception cycle: the twists since the last one, and the detections of now."""
+        """Processes one perception cycle: the twists since the last one, and the detections of now.
+
+        A cycle that cannot be used is a ReadingError and changes nothing. So is one that is late, since a
+        filter has no earlier pose that could take its detections.
+        """
         watch = Stopwatch()
-        reading = self.front_end.update(odometry, detections)
+        cycle = self.front_end.admit(odometry, detections)
+        reading = self.front_end.update(cycle.odometry, cycle.detections)
         self.belief.follow(reading.motion)
         detections = self.belief.corrected(reading.detections)
         watch.lap("predict")
@@ -72,7 +77,9 @@ class LandmarkCkf:
         self._create(detections, found.new)
         watch.lap("create")
         used, sizes = int((found.landmark != UNASSOCIATED).sum()), landmark_counts(self.labels)
-        return CycleResult(detections.t, self.belief.pose.copy(), sizes, used, False, watch.laps)
+        return cycle.counted(
+            CycleResult(detections.t, self.belief.pose.copy(), sizes, used, False, watch.laps)
+        )
 
     def _associate(self, detections: Detections) -> Association:
         """Assigns the detections to the nearby landmarks, by the joint covariance of pose and landmarks."""

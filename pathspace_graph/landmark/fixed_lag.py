@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.front_end import FrontEnd
+from pathspace_graph.front_end.late import at_nearest_pose
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
@@ -64,9 +67,16 @@ class LandmarkFixedLag:
         self._last_check = 0.0
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Processes one perception cycle: the twists since the last one, and the detections of now."""
+        """Processes one perception cycle: the twists since the last one, and the detections of now.
+
+        A cycle that cannot be used is a ReadingError and changes nothing. One that is late is used as
+        `FixedLagMapper.update` says.
+        """
         watch = Stopwatch()
-        reading = self.front_end.update(odometry, detections)
+        cycle = self.front_end.admit(odometry, detections, self.smoother.times)
+        if cycle.late:
+            return cycle.counted(self._use_late(cycle.detections, watch))
+        reading = self.front_end.update(cycle.odometry, cycle.detections)
         motion, detections = reading.motion, reading.detections
         predict(self.smoother, self.path, motion, detections.t, self.settings)
         watch.lap("predict")
@@ -84,7 +94,22 @@ class LandmarkFixedLag:
         watch.lap("close")
         self.smoother.marginalize()
         watch.lap("marginalize")
-        return self._result(detections.t, watch.laps)
+        return cycle.counted(self._result(detections.t, watch.laps))
+
+    def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
+        """Uses the detections of a late cycle at its time, without a pose of their own."""
+        detections = self.front_end.use_late(detections, self.smoother.times)
+        late = at_nearest_pose(self.smoother, detections, self.settings.motion)
+        new = self.smoother.map.add_late(late)
+        associate_newest(self.smoother, new, self._eligible(), late.cycle)
+        watch.lap("associate")
+        created = self._create(new, detections.t)
+        watch.lap("create")
+        for _ in range(self.settings.steps_grown if created else self.settings.steps):
+            self.smoother.step()
+        watch.lap("update")
+        used = int(self.smoother.map.detections.used[new].sum())
+        return replace(self._result(detections.t, watch.laps), readings=used)
 
     def _create(self, new: slice, t: float) -> bool:
         """Adds detections without a landmark to the tentative tracks, and makes confirmed ones landmarks.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.landmark import landmark_residuals
 from pathspace_graph.factors.noise import huber_weights, whiteners
 from pathspace_graph.factors.sensor import restored
+from pathspace_graph.front_end.late import LateDetections
 from pathspace_graph.graph.keys import POINT, POSE, SENSOR_KEY, landmark_keys, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
@@ -51,6 +52,12 @@ class LandmarkMap:
         """
         self.twist = twist
         rows = self.detections.append(detections, cycle, twist)
+        self.correct()
+        return rows
+
+    def add_late(self, late: LateDetections) -> slice:
+        """Adds late detections to those of their pose, corrected by the sensor's calibration."""
+        rows = self.detections.insert(late.detections, late.cycle, late.twist)
         self.correct()
         return rows
 

@@ -55,6 +55,23 @@ def associate(smoother: CurveSmoother, retest: frozenset[int], use: bool = True)
     return Gating(rows[judged], foot.interior[judged], innovation[judged])
 
 
+def associate_late(smoother: CurveSmoother, new: slice) -> None:
+    """Puts those of the late detections, which are the rows `new`, into use that lie on a curve.
+
+    They are gated as the newest ones are in `associate`.
+    """
+    detections, state = smoother.map.detections, smoother.map.state
+    if smoother.last_step is None:
+        return
+    own = [detections.open_to(label, new.start) for label in state.curves.labels.tolist()]
+    own = [rows[rows < new.stop] for rows in own]
+    rows, curve = np.concatenate(own), np.repeat(np.arange(len(own)), [len(one) for one in own])
+    points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
+    pose_u = np.array([state.pose_u[label] for label in state.boundaries])
+    low, high = _view(smoother, rows, curve, pose_u)
+    _accept(smoother, rows, curve, points, state.curves.find(state.map_points, points, curve, low, high))
+
+
 def reassociate(smoother: CurveSmoother) -> None:
     """Associates all detections of the window anew, after the curves were replaced.
 

@@ -69,6 +69,17 @@ class DriveRecord:
         if len(self._stamps) > self.settings.open_lap.max_cycles:
             self.give_up("the lap is too long for a batch")
 
+    def measured_late(self, cycle: int, detections: Detections) -> None:
+        """Adds detections to those of an earlier cycle, as they would be seen from its pose."""
+        if self.unsolvable is None:
+            known = self._detections[cycle]
+            self._detections[cycle] = Detections(
+                known.t,
+                np.concatenate([known.points_vehicle, detections.points_vehicle]),
+                np.concatenate([known.covariances, detections.covariances]),
+                np.concatenate([known.labels, detections.labels]),
+            )
+
     def estimated(self, state: State) -> None:
         """Adds the newest pose, and its place along each of the curves."""
         cycle = len(self.poses)

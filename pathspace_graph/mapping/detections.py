@@ -75,12 +75,17 @@ class DetectionColumns:
 
         The vehicle moved with this twist (3,), in m/s, m/s and rad/s; by default it stood still.
         """
+        return self.insert(detections, cycle, twist)
+
+    def insert(self, detections: Detections, cycle: int, twist: Array | None = None) -> slice:
+        """Adds detections behind those of their cycle and before those of later ones, as `append` does."""
         twists = None if twist is None else twist[None]
-        start, new = len(self), type(self).of([detections], cycle, twists)
+        start = int(self.cycle.searchsorted(cycle, side="right"))
+        new = type(self).of([detections], cycle, twists)
         for column in fields(self):
-            both = [getattr(self, column.name), getattr(new, column.name)]
-            setattr(self, column.name, np.concatenate(both))
-        return slice(start, len(self))
+            known, own = getattr(self, column.name), getattr(new, column.name)
+            setattr(self, column.name, np.concatenate([known[:start], own, known[start:]]))
+        return slice(start, start + len(new))
 
     def corrected(self, rows: IntArray | slice, sensor: Array) -> Array:
         """Returns positions (m, 2) corrected by the sensor's calibration (5,), which may be empty."""

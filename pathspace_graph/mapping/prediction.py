@@ -8,8 +8,9 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrate_twists
-from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, pose_key
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, SENSOR_KEY, pose_key
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.system import SmootherSettings
 from pathspace_graph.graph.window import MapRows
@@ -26,9 +27,12 @@ Array = NDArray[np.float64]
 def odometry_noise(sigma: Array | None) -> Array:
     """Returns the standard deviations (3,) of a twist as a copy; without any, those of the simulator.
 
-    They are in m/s, m/s and rad/s.
+    They are in m/s, m/s and rad/s. Anything but three positive numbers is a SettingsError.
     """
-    return np.array(ODOMETRY_SIGMA if sigma is None else sigma, float)
+    noise = np.array(ODOMETRY_SIGMA if sigma is None else sigma, float)
+    if noise.shape != (POSE,) or not ((noise > 0.0) & (noise < np.inf)).all():
+        raise SettingsError(f"odometry_sigma: expected {POSE} positive numbers, found {noise.tolist()}")
+    return noise
 
 
 def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:
@@ -110,6 +114,7 @@ def smoother_settings(settings: MapperSettings) -> SmootherSettings:
     """Returns the engine's part of an estimator's settings."""
     return SmootherSettings(
         lag=settings.lag,
+        max_poses=settings.max_poses,
         tolerances=(settings.relinearize.point, settings.relinearize.heading),
         keyframe_interval=settings.closing.keyframe_interval,
         sigma_calibration=settings.odometry.sigmas_calibration,

@@ -40,12 +40,13 @@ class TentativeTracks:
             self.weights[i] += w
             self.points[i] += (points[row] - self.points[i]) * w / self.weights[i]
             self.counts[i] += 1
-            self.last_t[i] = t
+            self.last_t[i] = max(self.last_t[i], t)  # a late detection makes no track older
         new = ~near
         self.points = np.concatenate([self.points, points[new]])
         self.weights = np.concatenate([self.weights, 1.0 / variances[new]])
         self.counts = np.concatenate([self.counts, np.ones(int(new.sum()), np.intp)])
         self.last_t = np.concatenate([self.last_t, np.full(int(new.sum()), t)])
+        self._keep(newest_of(self.last_t, self.settings.max_tracks))
 
     def confirmed(self) -> IntArray:
         """Returns the indices of the tracks with enough detections."""
@@ -80,6 +81,14 @@ class TentativeTracks:
         if not keep.all():
             self.points, self.weights = self.points[keep], self.weights[keep]
             self.counts, self.last_t = self.counts[keep], self.last_t[keep]
+
+
+def newest_of(stamps: Array, most: int) -> NDArray[np.bool_]:
+    """Returns which (n,) of the stamps (n,) are among the newest ones, of which there are at most `most`."""
+    keep = np.ones(len(stamps), bool)
+    if len(stamps) > most:
+        keep[np.argsort(stamps, kind="stable")[:-most]] = False
+    return keep
 
 
 def nearest_within(points: Array, known: Array, radius: float) -> tuple[IntArray, NDArray[np.bool_]]:

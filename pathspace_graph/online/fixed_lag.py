@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import ReadingError, SettingsError
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
+from pathspace_graph.front_end.gate import Admitted
+from pathspace_graph.front_end.late import at_nearest_pose
 from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
@@ -18,7 +21,7 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.association import associate
+from pathspace_graph.loop.association import associate, associate_late
 from pathspace_graph.loop.closing import apply_correspondences, optimize_loop, simplify
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
@@ -91,17 +94,32 @@ class FixedLagMapper:
     ) -> CycleResult:
         """Processes one perception cycle: the twists since the last cycle, and its detections.
 
+        The call is refused as a ReadingError, and nothing has changed, where it holds anything that cannot be
+        used (`front_end.gate`, `settings.limits`). Impossible detections are dropped and counted in the
+        result. The next call goes on from the newest cycle that was used. The twists are a stream: each is
+        held until the next one, and those in force before the newest cycle are left out. So a caller hands
+        over the twists since the last call in order, and where some are lost, the last one is held.
+
+        A late cycle, with a stamp before the newest one's, is used at its time if that is inside the window,
+        and is refused otherwise. It brings no twists that are newer than the newest cycle, and no factors.
+        Its detections are moved to the pose that is nearest in time (`front_end.late`), and may make the
+        curves grow in the next cycle in order. The pose in the result is still the newest one.
+
         `factors` are GTSAM factors of your own on poses in the window (`pose_key`, `next_pose_key`: `Pose2`),
         on control points (`control_keys`: `Point2`) and on the calibration. Each is relinearized at every
         step until one of its poses leaves the window; then it is part of the prior. A factor on control
         points alone is kept until the loop closes, which replaces the control points. If a key is not a
-        variable of the graph, SettingsError is raised and nothing is changed.
+        variable of the graph, or a number not finite, SettingsError is raised and nothing is changed.
         """
         watch = Stopwatch()
+        factors = tuple(factors)
+        cycle = self._admit(odometry, detections, factors)
+        if cycle.late:
+            return cycle.counted(self._use_late(cycle.detections, watch))
         self.smoother.add_factors(factors)
         if factors:
             self.loop.record.give_up("the batch of the lap does not know the user's factors")
-        reading = self._predict(odometry, detections)
+        reading = self._predict(cycle.odometry, cycle.detections)
         watch.lap("predict")
         self._classify(reading)  # detections that no curve explains may expand one
         watch.lap("classify")
@@ -128,7 +146,7 @@ class FixedLagMapper:
         self.smoother.marginalize(self.loop.first_kept)
         watch.lap("marginalize")
         notice = "; ".join(text for text in (notice, self.growth.notice, reading.notice) if text)
-        return self._result(detections.t, watch.laps, jump, notice)
+        return cycle.counted(self._result(cycle.detections.t, watch.laps, jump, notice))
 
     def _step(self) -> None:
         """Takes one Gauss-Newton step, relinearized at the current estimate, or the solver's step."""
@@ -136,6 +154,41 @@ class FixedLagMapper:
             self.smoother.step(self.settings.sigma_step)
         else:
             self.solver.step(self.smoother, self.settings.sigma_step)
+
+    def _admit(
+        self, odometry: Odometry, detections: Detections, factors: Sequence[gtsam.NonlinearFactor]
+    ) -> Admitted:
+        """Returns a cycle that may be used, or raises; nothing but a count changes."""
+        try:
+            self.smoother.check_factors(factors)
+        except SettingsError:
+            self.front_end.gate.refused += 1
+            raise
+        cycle = self.front_end.admit(odometry, detections, self.smoother.times)
+        if cycle.late and factors:
+            self.front_end.gate.refused += 1
+            raise ReadingError("factors", "none with a late cycle", len(factors), t=cycle.detections.t)
+        return cycle
+
+    def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
+        """Uses the detections of a late cycle at its time, without a pose of their own."""
+        detections = self.front_end.use_late(detections, self.smoother.times)
+        late = at_nearest_pose(self.smoother, detections, self.settings.motion)
+        track = self.smoother.map
+        new = track.detections.insert(late.detections, late.cycle, late.twist)
+        track.correct()
+        self.loop.record.measured_late(late.cycle, late.detections)
+        if self.boundaries and not self.loop.is_searching:
+            associate_late(self.smoother, new)
+            track.place_detections(new.start)
+        if not self.closed:
+            self.growth.observe(self.smoother, new, detections.t)
+        watch.lap("classify")
+        for _ in range(self.settings.steps):
+            self._step()
+        watch.lap("update")
+        used = int(track.detections.used[new].sum())
+        return replace(self._result(detections.t, watch.laps, None, ""), readings=used)
 
     # --- the steps of the paper --------------------------------------------------------------------------
 

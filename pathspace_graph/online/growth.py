@@ -56,12 +56,16 @@ class Growth:
         longest = settings.length_free + settings.length_driven * path_ahead.driven
         if boundary.size < settings.max_size and boundary.confirmed_end < longest:
             return False
+        self._say_full(boundary, label)
+        return True
+
+    def _say_full(self, boundary: Boundary, label: int) -> None:
+        """Notes once that an open curve grows no further."""
         if label not in self._full:
             self._full.add(label)
             size = f"{boundary.size} control points on {boundary.confirmed_end:.0f} m"
             notice = f"the open {NAMES[label]} boundary grows no further, with {size}"
             self.notice = f"{self.notice}; {notice}" if self.notice else notice
-        return True
 
     def move(self, motion: Array) -> None:
         """Moves all tentative tracks by a rigid motion (3,) of the map frame."""
@@ -129,13 +133,33 @@ class Growth:
         settings = self.settings
         end = _end(smoother, label, path_ahead.since(path_ahead.driven - behind))
         found = self._candidates(smoother, label, path_ahead, end)
-        if len(found.points):
+        room = settings.max_unseen - smoother.map.state.boundaries[label].unseen
+        if len(found.points) and np.hypot(*(found.points[0] - end.position)) < room:
             u = _extend_through(smoother, label, end.position, found.points)
             self._consume(smoother, label, found, u)
             return True
         if end.station < path_ahead.driven - settings.stranded:
-            return _follow_path(smoother, label, path_ahead, end)
+            return self._follow_path(smoother, label, path_ahead, end, room)
         return False
+
+    def _follow_path(
+        self, smoother: CurveSmoother, label: int, path_ahead: PathAhead, end: End, room: float
+    ) -> bool:
+        """Extrapolates an end that the vehicle has passed: the curve follows the path at the end's distance.
+
+        It does not where that is farther than `room` (m). Returns whether the curve has grown.
+        """
+        settings = self.settings
+        side = max(end.side, settings.min_lateral)
+        station = path_ahead.driven - settings.stranded_left * settings.stranded
+        point = path_ahead.beside(station, SIDES[label] * side)
+        distance = float(np.hypot(*(point - end.position)))
+        if distance > room:
+            self._say_full(smoother.map.state.boundaries[label], label)
+        if not settings.min_carry <= distance <= room:
+            return False
+        _extend_through(smoother, label, end.position, point[None])
+        return True
 
     def _take_back(self, smoother: CurveSmoother, label: int, kept: int) -> None:
         """Shortens a curve to its first `kept` cones; the other cones are tentative tracks again."""
@@ -211,18 +235,6 @@ def _extend_through(smoother: CurveSmoother, label: int, end: Array, points: Arr
     if len(control_points) > len(known):
         smoother.map.state.extend(label, control_points[len(known) :])
     return np.asarray(u)
-
-
-def _follow_path(smoother: CurveSmoother, label: int, path_ahead: PathAhead, end: End) -> bool:
-    """Extrapolates an end that the vehicle has passed: the curve follows the path at the end's distance."""
-    settings = smoother.map.settings.growth
-    side = max(end.side, settings.min_lateral)
-    station = path_ahead.driven - settings.stranded_left * settings.stranded
-    point = path_ahead.beside(station, SIDES[label] * side)
-    if np.hypot(*(point - end.position)) < settings.min_carry:
-        return False
-    _extend_through(smoother, label, end.position, point[None])
-    return True
 
 
 def _relocate_poses(smoother: CurveSmoother, label: int, from_u: float) -> None:

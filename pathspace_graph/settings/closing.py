@@ -107,7 +107,7 @@ class ClosingSettings(Positive):
     seam_margin: float = 0.5
     """A cone nearer to the seam than this (m) was also detected at the beginning, and is not counted
     twice."""
-    gauge_laps: float = 2.0
+    gauge_laps: float = 4.0
     """After this number of laps on the closed map, its position and heading as a whole are held. It is
     infinite where they never are."""
     recognition: RecognitionSettings = field(default_factory=RecognitionSettings)

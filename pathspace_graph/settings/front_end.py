@@ -29,6 +29,8 @@ class MotionSettings(Positive):
     within this number of standard deviations."""
     memory: float = 0.65
     """Detections are remembered for this time (s)."""
+    max_remembered: int = 2000
+    """At most this number of detections is remembered, the newest ones."""
     reach: float = 1.0
     """A remembered detection at distance d counts as the same cone with the weight `exp(-d^2 / 2 reach^2)`
     (m), in the first iteration."""
@@ -165,6 +167,8 @@ class SidesSettings(Positive):
     """Detections that are nearer to each other than this (m) are of one cone."""
     forget_after: float = 3.0
     """A cone is forgotten when it was not detected for this time (s)."""
+    max_cones: int = 2000
+    """At most this number of cones is remembered, the ones that were seen last."""
     sightings: int = 2
     """A cone has a side once it was detected this number of times."""
     behind: float = 8.0

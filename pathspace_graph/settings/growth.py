@@ -77,6 +77,11 @@ class GrowthSettings(Positive):
     length_driven: float = 2.0
     """It grows no further, either, once it is longer than `length_free` plus this number of times the path
     driven. A curve that zigzags between false cones gets longer than that."""
+    max_unseen: float = 500.0
+    """An open curve goes on without any cone for at most this length (m): it is not carried on any farther
+    behind the vehicle, and not led on to a cone beyond that."""
+    max_tracks: int = 1000
+    """At most this number of tentative tracks of each label is kept, the ones that were seen last."""
     length_free: float = 50.0
     """This length of an open curve is not held against the path driven (m)."""
 

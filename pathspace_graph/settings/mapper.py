@@ -15,6 +15,7 @@ from .front_end import MotionSettings, SidesSettings
 from .growth import GrowthSettings, PathSettings, TentativeSettings
 from .health import FindingSettings, HealthSettings, MendingSettings
 from .knots import Knots
+from .limits import LimitSettings
 
 
 @dataclass(frozen=True)
@@ -219,6 +220,8 @@ class MapperSettings(Positive):
 
     lag: float = 3.0
     """Poses stay in the window for this time (s)."""
+    max_poses: int = 400
+    """The window holds at most this number of poses, however fast the cycles follow each other."""
     steps: int = 1
     """Each cycle takes this number of Gauss-Newton steps, each relinearized at the current estimate."""
     steps_grown: int = 1
@@ -226,6 +229,8 @@ class MapperSettings(Positive):
     sigma_step: float = 0.5
     """A control point moves this far freely in a step (m): this damps sliding along the curve, and leaves the
     optimum where it is."""
+    limits: LimitSettings = field(default_factory=LimitSettings)
+    """These settings say what a perception cycle may hold."""
     spline: SplineSettings = field(default_factory=SplineSettings)
     """These settings describe the two boundary curves."""
     gauge: GaugeSettings = field(default_factory=GaugeSettings)

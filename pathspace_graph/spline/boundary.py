@@ -185,6 +185,11 @@ class Boundary:
         """Returns the parameter up to which foot points are allowed: an open curve's end is extrapolated."""
         return np.inf if self.periodic else self.confirmed_end + self.settings.confirmed_margin
 
+    @property
+    def unseen(self) -> float:
+        """Returns the length (m) of the curve's end, up to where it is confirmed, without any cone."""
+        return self.confirmed_end - (self.cone_parameters[-1] if self.cone_parameters else 0.0)
+
     def believed(self, high: Array) -> Array:
         """Returns upper limits (m,) of stretches, clipped so that they exclude the extrapolated end."""
         return np.minimum(high, self.trusted)

@@ -192,3 +192,17 @@ def test_a_bad_map_folder(
     assert str(tmp_path / name) in line
     assert says in line
     assert not (tmp_path / "map.png").exists()
+
+
+@pytest.mark.parametrize(("command", "out"), [("online", "map"), ("batch", "map"), ("compare", "table")])
+@pytest.mark.parametrize(("column", "value"), [("vx", "1e5"), ("vy", "-101"), ("wz", "10.5")])
+def test_a_motion_that_no_vehicle_can_make(
+    command: str, out: str, column: str, value: str, log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (log / "odometry.csv").write_text(with_cell(GOOD["odometry.csv"], 2, column, value))
+    assert main([command, str(log), "--out", str(log.parent / out)]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert f"{log / 'odometry.csv'}, row 2: cycle at 0.1 s: " in line
+    assert f"expected {column} from -" in line
+    assert [path.name for path in log.parent.iterdir()] == ["log"]

@@ -128,7 +128,7 @@ def test_a_map_keeps_the_formats_contract(log_folder: Path, map_folder: Path) ->
 def test_a_row_for_every_cycle(log_folder: Path, map_folder: Path) -> None:
     log = read_log(log_folder)
     rows = (map_folder / "cycles.csv").read_text().splitlines()
-    assert rows[0] == "cycle,t,seconds,size_left,size_right,readings,lap,offered,health,reason"
+    assert rows[0] == "cycle,t,seconds,size_left,size_right,readings,lap,offered,health,reason,dropped"
     assert len(rows) == len(log.cycles) + 1
     trajectory = np.loadtxt(map_folder / "trajectory.tum")
     assert trajectory.shape == (len(log.cycles), 8)

@@ -100,3 +100,14 @@ def test_landmarks_that_are_merged_give_their_detections() -> None:
     table.merge(np.array([8]), np.array([7]))
     assert table.landmark[[0, 4, 5]].tolist() == [7, 7, 9]
     assert np.flatnonzero(table.used).tolist() == [0, 4, 5]
+
+
+@pytest.mark.parametrize("kind", TABLES)
+def test_late_detections_stand_behind_those_of_their_cycle(kind: type[DetectionColumns]) -> None:
+    """The table is that of the log in which the cycle had them from the first."""
+    table = kind.of(CYCLES)
+    assert table.insert(cycle(UNKNOWN, LEFT), 2) == slice(4, 6)
+    assert table.cycle.tolist() == [0, 0, 0, 2, 2, 2, 3, 3]
+    assert table.label.tolist() == [LEFT, RIGHT, UNKNOWN, RIGHT, UNKNOWN, LEFT, LEFT, LEFT]
+    assert table.insert(cycle(RIGHT), 1) == slice(3, 4)
+    assert table.cycle.tolist() == [0, 0, 0, 1, 2, 2, 2, 3, 3]

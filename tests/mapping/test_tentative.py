@@ -85,3 +85,17 @@ def test_a_rigid_motion_moves_every_track() -> None:
     found.move(np.array([1.0, 1.0, np.pi]))
     np.testing.assert_allclose(found.points, [[0.0, 1.0], [-3.0, -1.0]], atol=1e-12)
     assert found.weights.tolist() == [1.0, 2.0] and found.counts.tolist() == [1, 1]
+
+
+def test_of_too_many_tracks_those_stay_that_were_seen_last() -> None:
+    found = TentativeTracks(GrowthSettings(max_tracks=3))
+    for k, t in enumerate([0.4, 0.1, 0.3, 0.2, 0.5]):
+        found.add(np.array([[3.0 * k, 0.0]]), np.ones(1), t)
+    assert found.points[:, 0].tolist() == [0.0, 6.0, 12.0]
+    assert found.last_t.tolist() == [0.4, 0.3, 0.5]
+
+
+def test_a_late_detection_makes_no_track_older() -> None:
+    found = tentative((0.0, 0.0, 1.0, 2.0), (0.0, 0.0, 1.0, 1.5))
+    assert found.last_t.tolist() == [2.0]
+    assert found.counts.tolist() == [2]

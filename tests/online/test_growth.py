@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from pathspace_graph.eval.metrics.curves import mapped_points, true_curve
-from pathspace_graph.io.log import Detections, Log
+from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.path import PathAhead
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -299,3 +299,43 @@ def test_an_open_curve_has_a_bound_and_it_is_said_once_for_each_boundary(bound: 
     for boundary in mapper.boundaries.values():
         assert 20.0 < boundary.confirmed_end < 40.0  # one extension is through several cones
     assert max(results[-1].sizes) <= 14
+
+
+# --- no end is carried on for ever -----------------------------------------------------------------------
+
+
+def blind_after(seconds: float, length: float) -> Log:
+    """A drive of some length (m) beside a corridor, whose cones are not seen any more after a time (s)."""
+    log = exact_log(ahead(20.0, length / 20.0), *corridor(length))
+    nothing = detections(0.0, np.zeros((0, 2)), np.zeros(0, np.intp))
+    cycles = tuple(c if c.t < seconds else replace(nothing, t=c.t) for c in log.cycles)
+    return replace(log, cycles=cycles)
+
+
+def test_a_stranded_end_is_carried_on_a_bounded_way_and_that_is_said_once() -> None:
+    settings = MapperSettings(growth=GrowthSettings(max_unseen=60.0))
+    mapper, results = map_log(blind_after(2.0, 200.0), FixedLagMapper(settings))
+    for boundary in mapper.boundaries.values():
+        assert 50.0 < boundary.unseen <= 60.0
+    notices = [result.notice for result in results if result.notice]
+    assert len([text for text in notices if "left boundary grows no further" in text]) == 1
+    assert len([text for text in notices if "right boundary grows no further" in text]) == 1
+
+
+def test_one_cycle_that_leads_very_far_does_not_take_the_curve_along() -> None:
+    """Half a minute at 100 m/s is within the limits of a vehicle."""
+    log = exact_log(ahead(8.0, 4.0), *corridor(60.0))
+    mapper, results = map_log(log)
+    t, before = results[-1].t, results[-1].sizes
+    nothing = detections(t + 29.0, np.zeros((0, 2)), np.zeros(0, np.intp))
+    stamps = np.arange(t, t + 29.0, DT)
+    twists = np.column_stack([99.0 + 1e-4 * np.arange(len(stamps)), np.zeros((len(stamps), 2))])
+    result = mapper.update(Odometry(stamps, twists), nothing)
+    assert result.pose[0] > 2000.0
+    assert result.sizes == before
+
+
+def test_the_window_holds_a_bounded_number_of_poses() -> None:
+    log = exact_log(ahead(8.0, 3.0), *corridor(40.0))
+    mapper, _ = map_log(log, FixedLagMapper(MapperSettings(max_poses=7)))
+    assert len(mapper.poses) == 7

@@ -1,0 +1,350 @@
+"""The gate of the online estimators: a perception cycle is checked before anything is touched.
+
+A cycle that no estimator can use is a ReadingError, and changes nothing. A single detection that is
+impossible is dropped, and the others are used: a detector may fail for one cone, while a wrong stamp, shape,
+label or twist makes the whole cycle useless.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import inf
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import InputError, ReadingError
+from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, read_log
+from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.run import CycleResult, split_odometry
+from pathspace_graph.settings.limits import LimitSettings
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+UNITS: Final = "stamps are in seconds"
+"""This hint follows where a stamp looks like one in milliseconds or nanoseconds."""
+TWIST: Final = ("vx", "vy", "wz")
+"""These are the columns of a twist."""
+MIN_DETERMINANT: Final = 1e-12
+"""A covariance with det <= this * xx * yy is singular to double precision, so not positive definite."""
+MAX_ASYMMETRY: Final = 1e-6
+"""The entries xy and yx of a covariance differ by at most this share of its larger eigenvalue."""
+
+
+@dataclass(frozen=True, eq=False)
+class Newest:
+    """Holds what a cycle goes on from."""
+
+    t: float | None = None
+    """This is the stamp of the newest cycle in order (s); it is None before the first one."""
+    twist: Array | None = None
+    """(3,) This twist was measured last, in m/s, m/s and rad/s; it is None before the first one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Admitted:
+    """Holds a perception cycle that may be used, in arrays of its own."""
+
+    odometry: Odometry
+    """These twists are in force from the newest cycle in order to this one; a late cycle has none."""
+    detections: Detections
+    """These are the detections of the cycle that are possible."""
+    dropped: int = 0
+    """This number of detections was dropped."""
+    late: bool = False
+    """The flag is set where the cycle is older than the newest one, and is used at its own time."""
+    refused: int = 0
+    """This number of cycles was refused since the last one that was used."""
+    notice: str = ""
+    """This says what was dropped, in the first of the cycles in which that happens."""
+
+    def counted(self, result: CycleResult) -> CycleResult:
+        """Returns the result of the cycle with what was counted at the gate."""
+        if not (self.dropped or self.late or self.refused):
+            return result
+        notice = "; ".join(text for text in (self.notice, result.notice) if text)
+        return replace(result, notice=notice, dropped=self.dropped, late=self.late, refused=self.refused)
+
+
+def admit(
+    odometry: Odometry,
+    detections: Detections,
+    limits: LimitSettings,
+    newest: Newest,
+    window: Sequence[float] = (),
+    used: Sequence[float] = (),
+) -> Admitted:
+    """Returns a cycle as an estimator may use it, or raises a ReadingError.
+
+    A cycle that is older than the newest one is late. It is admitted where it lies between the stamps (s) of
+    the `window`, whose poses can still take detections, unless its stamp is among those `used`. The twists
+    are a stream, and need not begin at the newest cycle: each is held until the next one, and what was in
+    force before the newest cycle is left out.
+    """
+    t = _stamp(_of_type(Detections, detections, "detections").t, limits)
+    try:
+        possible, notice = possible_detections(detections, t, limits)
+        stamps, twists = _checked_twists(_of_type(Odometry, odometry, "odometry"), limits)
+        late = newest.t is not None and t <= newest.t
+        if late:
+            _check_late(stamps, t, window, used)
+            stamps, twists = stamps[:0], twists[:0]
+        else:
+            _check_order(stamps, t, newest, limits)
+            stamps, twists = _since(stamps, twists, newest)
+    except ReadingError as error:
+        raise error.at(t) from None
+    dropped = len(detections.labels) - len(possible.labels)
+    return Admitted(Odometry(stamps, twists), possible, dropped, late, notice=notice)
+
+
+class Gate:
+    """Holds what a cycle must go on from, and counts what was refused."""
+
+    def __init__(self, limits: LimitSettings) -> None:
+        self.limits = limits
+        self.refused = 0
+        """This number of cycles was refused since the last one that was used."""
+        self._after_silence: float | None = None  # a cycle at this stamp (s) was refused, as it came too late
+        self._late: list[float] = []  # the stamps (s) of late cycles in the window that were used
+        self._dropping = False
+
+    def admit(
+        self, odometry: Odometry, detections: Detections, newest: Newest, window: Sequence[float] = ()
+    ) -> Admitted:
+        """Returns `admit` with the cycles that were refused meanwhile, or raises and counts one more."""
+        limits = replace(self.limits, silence=inf) if self._goes_on(detections) else self.limits
+        try:
+            admitted = admit(odometry, detections, limits, newest, window, self._late)
+        except ReadingError:
+            self.refused += 1
+            self._after_silence = _stamp_or_none(detections)
+            raise
+        admitted = replace(admitted, refused=self.refused, notice="" if self._dropping else admitted.notice)
+        self.refused, self._dropping, self._after_silence = 0, admitted.dropped > 0, None
+        return admitted
+
+    def _goes_on(self, detections: Detections) -> bool:
+        """Returns whether a cycle goes on from the one that has just been refused.
+
+        One stamp far ahead is an error. Two that agree are of a vehicle that was silent for long, which must
+        not be refused for ever.
+        """
+        t, before = _stamp_or_none(detections), self._after_silence
+        return t is not None and before is not None and 0.0 < t - before <= self.limits.silence
+
+    def use_late(self, t: float, window: Sequence[float]) -> None:
+        """Notes that the late cycle at t (s) is used, so that it is not used again."""
+        self._late = [stamp for stamp in self._late if stamp >= window[0]] + [t]
+
+
+def read_usable_log(folder: Path, limits: LimitSettings) -> Log:
+    """Reads a log whose cycles may all be used; otherwise raises an InputError with file, row and stamp."""
+    log, newest = read_log(folder), Newest()
+    for odometry, detections in split_odometry(log):
+        try:
+            admitted = admit(odometry, detections, limits, newest)
+        except ReadingError as error:
+            raise _of_file(error, folder, log, odometry) from error
+        newest = Newest(detections.t, admitted.odometry.twist[-1] if len(admitted.odometry.t) else None)
+    return log
+
+
+def _of_file(error: ReadingError, folder: Path, log: Log, odometry: Odometry) -> InputError:
+    """Returns an error of a cycle with these twists as one of the log's file, whose header is row 1."""
+    of_odometry, row = error.field.startswith("odometry"), None
+    if of_odometry and error.row is not None:
+        row = int(log.odometry.t.searchsorted(odometry.t[error.row], side="right")) + 1
+    text = str(ReadingError(error.field, error.expected, error.found, t=error.t))
+    return InputError(folder / (ODOMETRY_FILE if of_odometry else DETECTIONS_FILE), text, row)
+
+
+def _stamp_or_none(detections: Any) -> float | None:
+    """Returns the stamp of a cycle (s), or None where it has none."""
+    t = getattr(detections, "t", None)
+    return float(t) if isinstance(t, int | float) and abs(t) < inf else None
+
+
+# --- stamps ----------------------------------------------------------------------------------------------
+
+
+def _stamp(value: Any, limits: LimitSettings) -> float:
+    """Returns the stamp of a cycle (s)."""
+    try:
+        t = float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ReadingError("detections.t", "a number", type(value).__name__) from None
+    if not abs(t) <= limits.stamp:
+        raise ReadingError("detections.t", f"at most {limits.stamp:g} s ({UNITS})", t)
+    return t
+
+
+def _check_late(stamps: Array, t: float, window: Sequence[float], used: Sequence[float]) -> None:
+    """Refuses a late cycle at t (s) that is not inside the window, or was used, or brings newer twists."""
+    if not window:
+        raise ReadingError("detections.t", "a stamp later than the newest cycle", t)
+    if t < window[0]:
+        raise ReadingError("detections.t", f"a stamp inside the window, from {window[0]:.12g} s on", t)
+    if t in window or t in used:
+        raise ReadingError("detections.t", "a cycle that was not used before", t)
+    if len(stamps) and stamps[-1] > window[-1]:
+        expected = f"none later than the newest cycle at {window[-1]:.12g} s with a late cycle"
+        raise ReadingError("odometry.t", expected, float(stamps[-1]), len(stamps) - 1)
+
+
+def _check_order(stamps: Array, t: float, newest: Newest, limits: LimitSettings) -> None:
+    """Refuses twists (k,) that are later than their cycle at t (s), and a long time without any reading."""
+    if len(stamps) and stamps[-1] > t:
+        row = int(stamps.searchsorted(t, side="right"))
+        raise ReadingError("odometry.t", "none later than the cycle", float(stamps[row]), row)
+    if newest.t is not None and t < newest.t + limits.interval:
+        raise ReadingError("detections.t", f"at least {limits.interval:g} s after the newest cycle", t)
+    before = [] if newest.t is None else [newest.t]
+    known = np.concatenate([before, stamps, [t]])
+    steps = known[1:] - known[:-1]
+    if len(steps) == 0 or steps.max() <= limits.silence:
+        return
+    at = int(steps.argmax()) + 1
+    expected = f"at most {limits.silence:g} s after the reading at {known[at - 1]:.12g} s ({UNITS})"
+    if at == len(known) - 1:
+        raise ReadingError("detections.t", expected, t)
+    raise ReadingError("odometry.t", expected, float(known[at]), at - len(before))
+
+
+# --- twists ----------------------------------------------------------------------------------------------
+
+
+def _checked_twists(odometry: Odometry, limits: LimitSettings) -> tuple[Array, Array]:
+    """Returns the stamps (k,) and the twists (k, 3), all of them finite, possible and in order of time."""
+    stamps = _numbers(odometry.t, "odometry.t", (-1,))
+    twists = _numbers(odometry.twist, "odometry.twist", (len(stamps), len(TWIST)))
+    if len(stamps) > limits.twists:
+        raise ReadingError("odometry.t", f"at most {limits.twists} twists", len(stamps))
+    good = np.abs(stamps) <= limits.stamp
+    if not good.all():
+        row = int(good.argmin())
+        expected = f"at most {limits.stamp:g} s ({UNITS})"
+        raise ReadingError("odometry.t", expected, float(stamps[row]), row)
+    good = stamps[1:] > stamps[:-1]
+    if not good.all():
+        row = int(good.argmin()) + 1
+        raise ReadingError("odometry.t", "a stamp later than the one before", float(stamps[row]), row)
+    most = limits.speed, limits.speed, limits.yaw_rate
+    good = np.abs(twists) <= most
+    if not good.all():
+        row, column = divmod(int(good.argmin()), len(TWIST))
+        unit = "rad/s" if column == len(TWIST) - 1 else "m/s"
+        expected = f"{TWIST[column]} from -{most[column]:g} to {most[column]:g} {unit}"
+        raise ReadingError("odometry.twist", expected, float(twists[row, column]), row)
+    return stamps, twists
+
+
+def _since(stamps: Array, twists: Array, newest: Newest) -> tuple[Array, Array]:
+    """Returns the stamps (k,) and twists (k, 3) in force since the newest cycle, the first from there on."""
+    if newest.t is None:
+        return stamps, twists
+    first = int(stamps.searchsorted(newest.t, side="right")) - 1
+    if first >= 0:
+        stamps, twists = stamps[first:], twists[first:]
+        stamps[0] = newest.t
+    elif newest.twist is not None:
+        stamps, twists = np.append(newest.t, stamps), np.concatenate([newest.twist[None], twists])
+    return stamps, twists
+
+
+# --- detections ------------------------------------------------------------------------------------------
+
+
+def possible_detections(detections: Detections, t: float, limits: LimitSettings) -> tuple[Detections, str]:
+    """Returns the possible detections of a cycle at t (s), and a notice about the others.
+
+    A detection is possible if it is finite, within the ranges and the uncertainties of any sensor, and if its
+    covariance is symmetric and positive definite. Wrong shapes, types or labels are a ReadingError.
+    """
+    points = _numbers(detections.points_vehicle, "detections.points_vehicle", (-1, 2))
+    count = len(points)
+    covariances = _numbers(detections.covariances, "detections.covariances", (count, 2, 2))
+    labels = _labels(detections.labels, count)
+    if count > limits.detections:
+        raise ReadingError("detections.points_vehicle", f"at most {limits.detections} rows", count)
+    near, definite = _has_range(points, limits), _has_covariance(covariances, limits)
+    good = near & definite
+    if good.all():
+        return Detections(t, points, covariances, labels), ""
+    row = int(good.argmin())
+    expected = f"a distance from {limits.range_min:g} to {limits.range_max:g} m"
+    found: object = points[row].tolist()
+    if near[row]:
+        expected = f"a covariance with sigmas from {limits.sigma_min:g} to {limits.sigma_max:g} m"
+        found = covariances[row].tolist()
+    many = f"{count - int(good.sum())} of {count} detections dropped"
+    notice = f"{many}: expected {expected}, found {found} in row {row}"
+    return Detections(t, points[good], covariances[good], labels[good]), notice
+
+
+def _has_range(points: Array, limits: LimitSettings) -> BoolArray:
+    """Returns whether points (m, 2), vehicle frame, are where a sensor can see; those not finite are not."""
+    distance = np.hypot(points[:, 0], points[:, 1])
+    return np.asarray((distance >= limits.range_min) & (distance <= limits.range_max))
+
+
+def _has_covariance(covariances: Array, limits: LimitSettings) -> BoolArray:
+    """Returns whether covariances (m, 2, 2) are symmetric and positive definite, and of a possible size.
+
+    The smaller eigenvalue is the determinant by the larger one.
+    """
+    xx, xy, yx, yy = covariances.reshape(-1, 4).T
+    with np.errstate(over="ignore", invalid="ignore"):
+        det = xx * yy - xy * yx
+        largest = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
+        good = (xx > 0.0) & (yy > 0.0) & (np.abs(xy - yx) <= MAX_ASYMMETRY * largest)
+        good &= (det > MIN_DETERMINANT * xx * yy) & (det >= limits.sigma_min**2 * largest)
+        good &= largest <= limits.sigma_max**2
+    return np.asarray(good)
+
+
+def _labels(values: Any, count: int) -> NDArray[np.int_]:
+    """Returns the labels (m,) of detections as integers."""
+    field = "detections.labels"
+    labels = _array(values, field, (count,))
+    if count and labels.dtype.kind not in "iu":
+        raise ReadingError(field, "integers", labels.dtype)
+    good = (labels >= LEFT) & (labels <= UNKNOWN)
+    if not good.all():
+        row = int(good.argmin())
+        raise ReadingError(field, f"{LEFT} (left), {RIGHT} (right) or {UNKNOWN} (unknown)", labels[row], row)
+    return labels.astype(np.int_)
+
+
+# --- arrays ----------------------------------------------------------------------------------------------
+
+
+def _numbers(values: Any, field: str, shape: tuple[int, ...]) -> Array:
+    """Returns a copy of numbers with a shape, in which -1 stands for any length."""
+    array = _array(values, field, shape)
+    if array.dtype.kind not in "fiu":
+        raise ReadingError(field, "numbers", array.dtype)
+    return array.astype(np.float64)
+
+
+def _array(values: Any, field: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Returns values as an array with a shape, in which -1 stands for any length."""
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise ReadingError(field, "an array", "rows of different lengths") from None
+    fits = array.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, array.shape, strict=True))
+    if not fits:
+        raise ReadingError(field, f"the shape {shape}".replace("-1", "m"), f"the shape {array.shape}")
+    return array
+
+
+def _of_type(kind: type[Any], value: Any, field: str) -> Any:
+    """Returns a value of a type, or raises a ReadingError."""
+    if not isinstance(value, kind):
+        raise ReadingError(field, kind.__name__, type(value).__name__)
+    return value

@@ -1,0 +1,389 @@
+"""The gate: what is refused, what is dropped, and what is left of the stream of twists."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pathspace_graph import ReadingError
+from pathspace_graph.errors import InputError, PathspaceError
+from pathspace_graph.front_end.gate import Admitted, Gate, Newest, admit, read_usable_log
+from pathspace_graph.io.log import Detections, Odometry, write_log
+from pathspace_graph.settings.limits import LimitSettings
+
+from ..scenes.drives import ahead, corridor, exact_log
+
+LIMITS = LimitSettings()
+NEWEST = Newest(1.0, np.array([4.0, 0.1, 0.2]))
+STAMPS = np.array([1.0, 1.02, 1.06])
+TWISTS = np.array([[5.0, 0.0, 0.1], [6.0, 0.0, 0.2], [7.0, 0.0, 0.3]])
+
+
+def odometry(stamps: Any = STAMPS, twists: Any = TWISTS) -> Odometry:
+    return Odometry(stamps, twists)
+
+
+def detections(t: Any = 1.1, **changes: Any) -> Detections:
+    good = Detections(
+        t,
+        np.array([[5.0, 2.0], [6.0, -2.0], [9.0, 2.0]]),
+        np.tile(0.01 * np.eye(2), (3, 1, 1)),
+        np.array([0, 1, 2]),
+    )
+    return replace(good, **changes)
+
+
+def with_entry(array: np.ndarray[Any, Any], index: Any, value: float) -> np.ndarray[Any, Any]:
+    changed = array.copy()
+    changed[index] = value
+    return changed
+
+
+def through(
+    twists: Any = None, cycle: Any = None, newest: Newest = NEWEST, window: tuple[float, ...] = ()
+) -> Admitted:
+    return admit(twists or odometry(), cycle or detections(), LIMITS, newest, window)
+
+
+# --- what is used ----------------------------------------------------------------------------------------
+
+
+def test_a_good_cycle_goes_through_as_it_is_in_arrays_of_its_own() -> None:
+    handed, cycle = odometry(), detections()
+    admitted = admit(handed, cycle, LIMITS, NEWEST)
+    np.testing.assert_array_equal(admitted.odometry.t, STAMPS)
+    np.testing.assert_array_equal(admitted.odometry.twist, TWISTS)
+    for name in ("t", "points_vehicle", "covariances", "labels"):
+        np.testing.assert_array_equal(getattr(admitted.detections, name), getattr(cycle, name))
+    for mine, theirs in (
+        (admitted.odometry.t, handed.t),
+        (admitted.odometry.twist, handed.twist),
+        (admitted.detections.points_vehicle, cycle.points_vehicle),
+        (admitted.detections.covariances, cycle.covariances),
+        (admitted.detections.labels, cycle.labels),
+    ):
+        assert not np.shares_memory(mine, theirs)
+    assert (admitted.dropped, admitted.late, admitted.refused, admitted.notice) == (0, False, 0, "")
+
+
+def test_the_first_cycle_may_have_any_stamp_and_no_twist() -> None:
+    empty = odometry(np.zeros(0), np.zeros((0, 3)))
+    for t in (-5.0, 0.0, 1.7e9):
+        assert len(through(empty, detections(t), Newest()).odometry.t) == 0
+
+
+def test_plain_lists_and_whole_numbers_are_numbers() -> None:
+    admitted = through(odometry([1, 1.05], [[5, 0, 0], [6, 0, 0]]), detections(labels=[0, 1, 2]))
+    assert admitted.odometry.twist.dtype == np.float64
+    assert admitted.detections.labels.tolist() == [0, 1, 2]
+
+
+# --- the stream of twists --------------------------------------------------------------------------------
+
+
+def test_the_twist_measured_last_is_held_until_the_first_one_handed_over() -> None:
+    admitted = through(odometry(STAMPS[1:], TWISTS[1:]))
+    assert NEWEST.twist is not None
+    np.testing.assert_array_equal(admitted.odometry.t, STAMPS)
+    np.testing.assert_array_equal(admitted.odometry.twist, [NEWEST.twist, *TWISTS[1:]])
+
+
+def test_without_any_twist_the_one_measured_last_is_held() -> None:
+    admitted = through(odometry(np.zeros(0), np.zeros((0, 3))))
+    assert NEWEST.twist is not None
+    np.testing.assert_array_equal(admitted.odometry.t, [1.0])
+    np.testing.assert_array_equal(admitted.odometry.twist, [NEWEST.twist])
+
+
+def test_what_was_in_force_before_the_newest_cycle_is_left_out() -> None:
+    stamps = np.array([0.9, 0.95, 0.98, 1.05])
+    twists = np.arange(12.0).reshape(4, 3) / 10.0
+    admitted = through(odometry(stamps, twists))
+    np.testing.assert_array_equal(admitted.odometry.t, [1.0, 1.05])
+    np.testing.assert_array_equal(admitted.odometry.twist, twists[2:])
+    np.testing.assert_array_equal(stamps, [0.9, 0.95, 0.98, 1.05])
+
+
+# --- what is refused -------------------------------------------------------------------------------------
+
+Bad = tuple[Callable[[], Admitted], str, int | None, str]
+REFUSED: dict[str, Bad] = {
+    "no odometry": (lambda: admit(None, detections(), LIMITS, NEWEST), "odometry", None, "Odometry"),  # type: ignore[arg-type]
+    "no detections": (lambda: admit(odometry(), None, LIMITS, NEWEST), "detections", None, "Detections"),  # type: ignore[arg-type]
+    "a stamp that is none": (lambda: through(cycle=detections(None)), "detections.t", None, "number"),
+    "NaN as a stamp": (lambda: through(cycle=detections(np.nan)), "detections.t", None, "found nan"),
+    "infinity as a stamp": (lambda: through(cycle=detections(-np.inf)), "detections.t", None, "-inf"),
+    "nanoseconds": (lambda: through(cycle=detections(1e18)), "detections.t", None, "are in seconds"),
+    "nanoseconds at first": (
+        lambda: through(cycle=detections(1.7e18), newest=Newest()),
+        "detections.t",
+        None,
+        "are in seconds",
+    ),
+    "milliseconds": (lambda: through(cycle=detections(1100.0)), "detections.t", None, "are in seconds"),
+    "a minute ahead": (lambda: through(cycle=detections(61.2)), "detections.t", None, "at most 30 s after"),
+    "backwards": (lambda: through(cycle=detections(0.9)), "detections.t", None, "later than the newest"),
+    "at once": (
+        lambda: through(odometry(np.zeros(0), np.zeros((0, 3))), detections(1.0005)),
+        "detections.t",
+        None,
+        "at least 0.001 s after the newest cycle",
+    ),
+    "twice": (lambda: through(cycle=detections(1.0)), "detections.t", None, "later than the newest"),
+    "a twist after the cycle": (
+        lambda: through(odometry(STAMPS + 0.05)),
+        "odometry.t",
+        2,
+        "none later than the cycle",
+    ),
+    "twists out of order": (
+        lambda: through(odometry(STAMPS[[0, 2, 1]])),
+        "odometry.t",
+        2,
+        "later than the one before",
+    ),
+    "a twist twice": (lambda: through(odometry(STAMPS[[0, 1, 1]])), "odometry.t", 2, "later than the one"),
+    "NaN as a twist's stamp": (
+        lambda: through(odometry(with_entry(STAMPS, 1, np.nan))),
+        "odometry.t",
+        1,
+        "found nan",
+    ),
+    "a minute without twists": (
+        lambda: through(odometry(STAMPS + np.array([0.0, 60.0, 60.0])), detections(61.1)),
+        "odometry.t",
+        1,
+        "at most 30 s after the reading at 1 s",
+    ),
+    "NaN as a speed": (
+        lambda: through(odometry(twists=with_entry(TWISTS, (1, 0), np.nan))),
+        "odometry.twist",
+        1,
+        "vx from -100 to 100 m/s, found nan",
+    ),
+    "infinite speed": (
+        lambda: through(odometry(twists=with_entry(TWISTS, (0, 1), np.inf))),
+        "odometry.twist",
+        0,
+        "vy from -100 to 100 m/s, found inf",
+    ),
+    "no vehicle's speed": (
+        lambda: through(odometry(twists=with_entry(TWISTS, (2, 0), -1e5))),
+        "odometry.twist",
+        2,
+        "vx from -100 to 100 m/s, found -100000",
+    ),
+    "no vehicle's turn": (
+        lambda: through(odometry(twists=with_entry(TWISTS, (2, 2), 11.0))),
+        "odometry.twist",
+        2,
+        "wz from -10 to 10 rad/s, found 11",
+    ),
+    "fewer twists than stamps": (
+        lambda: through(odometry(twists=TWISTS[:2])),
+        "odometry.twist",
+        None,
+        r"the shape \(3, 3\), found the shape \(2, 3\)",
+    ),
+    "twists of two numbers": (
+        lambda: through(odometry(twists=TWISTS[:, :2])),
+        "odometry.twist",
+        None,
+        "shape",
+    ),
+    "words as twists": (lambda: through(odometry(twists=[["a"] * 3] * 3)), "odometry.twist", None, "numbers"),
+    "ragged twists": (
+        lambda: through(odometry(twists=[[1.0], [1.0, 2.0], []])),
+        "odometry.twist",
+        None,
+        "different lengths",
+    ),
+    "points of three numbers": (
+        lambda: through(cycle=detections(points_vehicle=np.zeros((3, 3)))),
+        "detections.points_vehicle",
+        None,
+        r"the shape \(m, 2\)",
+    ),
+    "too few covariances": (
+        lambda: through(cycle=detections(covariances=np.zeros((2, 2, 2)))),
+        "detections.covariances",
+        None,
+        "shape",
+    ),
+    "too few labels": (lambda: through(cycle=detections(labels=[0])), "detections.labels", None, "shape"),
+    "labels as words": (
+        lambda: through(cycle=detections(labels=["left", "right", "left"])),
+        "detections.labels",
+        None,
+        "integers",
+    ),
+    "labels as numbers": (
+        lambda: through(cycle=detections(labels=np.array([0.0, 1.0, 1.0]))),
+        "detections.labels",
+        None,
+        "integers",
+    ),
+    "no such label": (
+        lambda: through(cycle=detections(labels=np.array([0, 7, 1]))),
+        "detections.labels",
+        1,
+        "found 7",
+    ),
+    "too many detections": (
+        lambda: through(
+            cycle=Detections(1.1, np.ones((501, 2)), np.tile(np.eye(2), (501, 1, 1)), np.zeros(501, int))
+        ),
+        "detections.points_vehicle",
+        None,
+        "at most 500 rows",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_used_is_named_with_field_row_and_what_was_expected(name: str) -> None:
+    call, field, row, text = REFUSED[name]
+    with pytest.raises(ReadingError, match=text) as caught:
+        call()
+    assert (caught.value.field, caught.value.row) == (field, row)
+    assert field in str(caught.value)
+    assert isinstance(caught.value, PathspaceError)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_error_survives_the_way_from_a_worker() -> None:
+    error = ReadingError("odometry.twist", "less", 3.0, 2, 1.5)
+    again = pickle.loads(pickle.dumps(error))
+    assert str(again) == str(error) == "cycle at 1.5 s: odometry.twist, row 2: expected less, found 3"
+    assert vars(again) == vars(error)
+
+
+def test_what_is_refused_is_a_setting() -> None:
+    wide = LimitSettings(speed=2e5, silence=100.0)
+    fast = odometry(twists=with_entry(TWISTS, (2, 0), 1e5))
+    assert admit(fast, detections(61.2), wide, NEWEST).odometry.twist[2, 0] == 1e5
+
+
+def test_one_stamp_far_ahead_is_an_error_and_two_that_agree_are_a_vehicle_that_was_silent() -> None:
+    gate = Gate(LimitSettings())
+    for late in (61.0, 500.0, 961.0):
+        with pytest.raises(ReadingError, match="at most 30 s after"):
+            gate.admit(odometry(), detections(late), NEWEST)
+    admitted = gate.admit(odometry(), detections(961.1), NEWEST)
+    assert (admitted.detections.t, admitted.refused) == (961.1, 3)
+    assert admitted.odometry.t[0] == NEWEST.t  # the last twist is held meanwhile
+    with pytest.raises(ReadingError):
+        gate.admit(odometry(), detections(2000.0), Newest(961.1))
+    assert gate.admit(odometry(), detections(NEWEST.t + 0.1), NEWEST).refused == 1
+
+
+# --- what is dropped -------------------------------------------------------------------------------------
+
+COVARIANCES = detections().covariances
+POINTS = detections().points_vehicle
+DROPPED = {
+    "NaN": {"points_vehicle": with_entry(POINTS, (1, 0), np.nan)},
+    "infinity": {"points_vehicle": with_entry(POINTS, (1, 1), -np.inf)},
+    "far beyond the sensor": {"points_vehicle": with_entry(POINTS, (1, 0), 1e200)},
+    "at the vehicle": {"points_vehicle": with_entry(POINTS, 1, 0.0)},
+    "NaN as a covariance": {"covariances": with_entry(COVARIANCES, (1, 0, 0), np.nan)},
+    "infinite covariance": {"covariances": with_entry(COVARIANCES, 1, np.inf)},
+    "no covariance": {"covariances": with_entry(COVARIANCES, 1, 0.0)},
+    "negative covariance": {"covariances": with_entry(COVARIANCES, 1, -0.01)},
+    "indefinite covariance": {"covariances": with_entry(COVARIANCES, (1, slice(None), slice(None)), 0.02)},
+    "asymmetric covariance": {"covariances": with_entry(COVARIANCES, (1, 0, 1), 0.005)},
+    "huge covariance": {"covariances": with_entry(COVARIANCES, (1, 0, 0), 1e308)},
+    "tiny covariance": {"covariances": with_entry(COVARIANCES, (1, 0, 0), 1e-300)},
+}
+
+
+@pytest.mark.parametrize("name", DROPPED)
+def test_a_single_impossible_detection_is_dropped(name: str) -> None:
+    admitted = through(cycle=detections(**DROPPED[name]))
+    assert admitted.dropped == 1
+    np.testing.assert_array_equal(admitted.detections.points_vehicle, POINTS[[0, 2]])
+    np.testing.assert_array_equal(admitted.detections.covariances, COVARIANCES[[0, 2]])
+    np.testing.assert_array_equal(admitted.detections.labels, [0, 2])
+    assert admitted.notice.startswith("1 of 3 detections dropped: expected a ")
+    assert admitted.notice.endswith("in row 1")
+
+
+def test_correlated_and_long_covariances_are_possible() -> None:
+    covariances = np.array([[[4.0, 1.999], [1.999, 1.0]], [[25.0, 0.0], [0.0, 1e-6]], [[1e-8, 0], [0, 1e-8]]])
+    assert through(cycle=detections(covariances=covariances)).dropped == 0
+
+
+def test_the_notice_comes_once_in_a_row() -> None:
+    gate, bad = Gate(LIMITS), DROPPED["NaN"]
+    told = []
+    for k, spoilt in enumerate([True, True, False, True]):
+        cycle = detections(1.1 + k, **(bad if spoilt else {}))
+        told.append(bool(gate.admit(odometry(STAMPS + k), cycle, Newest(1.0 + k)).notice))
+    assert told == [True, False, False, True]
+
+
+def test_refused_cycles_are_counted_until_one_is_used() -> None:
+    gate = Gate(LIMITS)
+    for _ in range(3):
+        with pytest.raises(ReadingError):
+            gate.admit(odometry(), detections(np.nan), NEWEST)
+    assert gate.admit(odometry(), detections(), NEWEST).refused == 3
+    assert gate.admit(odometry(STAMPS + 1), detections(2.1), Newest(2.0)).refused == 0
+
+
+# --- late cycles -----------------------------------------------------------------------------------------
+
+WINDOW = (0.5, 0.7, 1.0)
+NONE = Odometry(np.zeros(0), np.zeros((0, 3)))
+
+
+def test_a_late_cycle_inside_the_window_is_used_without_its_twists() -> None:
+    admitted = through(odometry(STAMPS - 0.3), detections(0.8), window=WINDOW)
+    assert admitted.late
+    assert len(admitted.odometry.t) == 0
+
+
+@pytest.mark.parametrize(
+    ("t", "twists", "text"),
+    [
+        (0.4, NONE, "inside the window, from 0.5 s on"),
+        (0.7, NONE, "was not used before"),
+        (1.0, NONE, "was not used before"),
+        (0.8, odometry(), "none later than the newest cycle at 1 s with a late cycle"),
+    ],
+)
+def test_other_late_cycles_are_refused(t: float, twists: Odometry, text: str) -> None:
+    with pytest.raises(ReadingError, match=text):
+        through(twists, detections(t), window=WINDOW)
+
+
+def test_a_late_cycle_is_used_once() -> None:
+    gate = Gate(LIMITS)
+    assert gate.admit(NONE, detections(0.8), NEWEST, WINDOW).late
+    gate.use_late(0.8, WINDOW)
+    with pytest.raises(ReadingError, match="was not used before"):
+        gate.admit(NONE, detections(0.8), NEWEST, WINDOW)
+
+
+# --- logs ------------------------------------------------------------------------------------------------
+
+
+def test_a_log_that_cannot_be_used_is_named_with_the_row_and_the_stamp(tmp_path: Path) -> None:
+    log = exact_log(ahead(8.0, 2.0), *corridor(40.0))
+    write_log(log, tmp_path / "good")
+    assert len(read_usable_log(tmp_path / "good", LIMITS).cycles) == len(log.cycles)
+    twists = with_entry(log.odometry.twist, (37, 2), 1e3)
+    write_log(replace(log, odometry=Odometry(log.odometry.t, twists)), tmp_path / "bad")
+    with pytest.raises(InputError, match=r"odometry\.csv, row 39: cycle at 0\.8 s: .* found 1000"):
+        read_usable_log(tmp_path / "bad", LIMITS)
+    late = tuple(replace(cycle, t=cycle.t + 100.0 * (cycle.t > 0.95)) for cycle in log.cycles)
+    stamps = log.odometry.t + 100.0 * (log.odometry.t > 0.95)
+    write_log(replace(log, cycles=late, odometry=Odometry(stamps, log.odometry.twist)), tmp_path / "gap")
+    with pytest.raises(InputError, match=r"odometry\.csv, row 50: .* at most 30 s after"):
+        read_usable_log(tmp_path / "gap", LIMITS)

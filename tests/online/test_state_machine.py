@@ -1,0 +1,321 @@
+"""A state machine: whatever is handed over and in whichever order, the next good cycle works.
+
+Good cycles come from a drive on a straight track. Between them come cycles that an estimator must refuse, and
+odd ones that it must bear. Nothing that is refused may change a bit of the estimator.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
+from numpy.typing import NDArray
+
+from pathspace_graph import FixedLagMapper, ReadingError, SettingsError
+from pathspace_graph.ckf.mapper import CkfMapper
+from pathspace_graph.factors.se2 import compose, se2_exp
+from pathspace_graph.front_end.gate import Gate
+from pathspace_graph.graph.keys import pose_key, pose_keys
+from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.landmark.ckf import LandmarkCkf
+from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
+from pathspace_graph.run import CycleResult
+
+from ..scenes.drives import ODOMETRY_SIGMA, corridor, see
+
+Array = NDArray[np.float64]
+Estimator = FixedLagMapper | LandmarkFixedLag | CkfMapper | LandmarkCkf
+
+CONES, LABELS = corridor(120.0, gap=5.0)
+DT = 0.02
+NO_TWISTS = Odometry(np.zeros(0), np.zeros((0, 3)))
+MOST_VARIABLES = 3000
+"""No sequence of the steps below makes a state with more entries."""
+
+TWISTS = st.tuples(
+    st.sampled_from([0.0, 6.0, 8.0, 8.0, -3.0, 100.0]),
+    st.sampled_from([0.0, 0.0, 0.3]),
+    st.sampled_from([0.0, 0.0, 0.05, -0.05, 10.0]),
+)
+GAPS = st.sampled_from([0.005, 0.05, 0.1, 0.1, 0.1, 0.1, 0.5, 4.0])
+STRANGE = st.sampled_from([np.nan, np.inf, -np.inf, 1e308, -1e308, 1e18, 1e5, -1e5])
+
+
+def digest(estimator: Estimator) -> str:
+    """Identifies everything that an estimator holds, but for the counts of the gate."""
+    found = hashlib.sha256()
+    for part in _parts(estimator, set()):
+        found.update(part)
+    return found.hexdigest()
+
+
+def _parts(value: Any, seen: set[int]) -> Iterator[bytes]:
+    """The contents of an object, each object once."""
+    if isinstance(value, np.ndarray):
+        yield f"{value.dtype}{value.shape}".encode() + value.tobytes()
+    elif isinstance(value, dict):
+        for key in sorted(value, key=repr):
+            yield repr(key).encode()
+            yield from _parts(value[key], seen)
+    elif isinstance(value, list | tuple | deque):
+        for entry in value:
+            yield from _parts(entry, seen)
+    elif type(value).__module__.startswith("pathspace_graph") and not isinstance(value, Gate):
+        if id(value) not in seen:
+            seen.add(id(value))
+            yield from _parts(vars(value), seen)
+    elif isinstance(value, gtsam.GaussianFactorGraph | gtsam.GaussianBayesNet):
+        for k in range(value.size()):
+            yield from _parts(value.at(k), seen)
+    elif isinstance(value, gtsam.GaussianFactor):
+        yield repr(list(value.keys())).encode() + value.augmentedInformation().tobytes()
+    elif not isinstance(value, Gate):
+        yield repr(value).encode()
+
+
+def state_of(estimator: Estimator) -> tuple[Array, Array]:
+    """The values of all variables, and the covariance of the newest pose or of the whole filter."""
+    if isinstance(estimator, CkfMapper):
+        return estimator.state.belief.mean, estimator.state.belief.covariance
+    if isinstance(estimator, LandmarkCkf):
+        return estimator.belief.mean, estimator.belief.covariance
+    smoother = estimator.smoother
+    if smoother.last_step is None:
+        return smoother.variables.values, np.eye(3)
+    newest = pose_keys(np.array([smoother.next_cycle - 1]))
+    return smoother.variables.values, smoother.last_covariance(newest)
+
+
+class Cycles(RuleBasedStateMachine):
+    """Hands cycles to one estimator in any order."""
+
+    make: Callable[[], Estimator]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.estimator = type(self).make()
+        self.t = 0.0
+        self.pose: Array = np.zeros(3)
+        self.refused = 0
+        self.late: list[float] = []
+
+    # --- what is handed over ---------------------------------------------------------------------------
+
+    def drive(self, gap: float, twist: tuple[float, float, float]) -> tuple[Odometry, Detections]:
+        """Moves the vehicle, and returns the twists since the newest cycle and what is seen then."""
+        stamps = np.arange(self.t, self.t + gap - 1e-9, DT)
+        self.pose = compose(self.pose, se2_exp(gap * np.array([twist]))[0])
+        self.t = float(self.t + gap)
+        return Odometry(stamps, np.tile(twist, (len(stamps), 1))), see(self.t, self.pose, CONES, LABELS)
+
+    def accept(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        """Hands over a cycle that must be used."""
+        result = self.estimator.update(odometry, detections)
+        assert result.refused == self.refused
+        assert np.isfinite(result.pose).all()
+        self.refused = 0
+        return result
+
+    def refuse(self, odometry: Odometry, detections: Detections, *factors: Any) -> None:
+        """Hands over a cycle that must be refused, and then the next good one."""
+        before = digest(self.estimator)
+        with pytest.raises(SettingsError if factors else ReadingError):
+            self.estimator.update(odometry, detections, *factors)
+        assert digest(self.estimator) == before
+        self.refused += 1
+
+    # --- cycles that are used --------------------------------------------------------------------------
+
+    @rule(gap=GAPS, twist=TWISTS)
+    def good(self, gap: float, twist: tuple[float, float, float]) -> None:
+        self.accept(*self.drive(gap, twist))
+
+    @rule(gap=GAPS, count=st.integers(3, 8))
+    def good_ones(self, gap: float, count: int) -> None:
+        for _ in range(count):
+            self.accept(*self.drive(min(gap, 0.1), (8.0, 0.0, 0.0)))
+
+    @rule(twist=TWISTS)
+    def nothing_detected(self, twist: tuple[float, float, float]) -> None:
+        odometry, seen = self.drive(0.1, twist)
+        self.accept(
+            odometry,
+            replace(
+                seen,
+                points_vehicle=np.zeros((0, 2)),
+                covariances=np.zeros((0, 2, 2)),
+                labels=np.zeros(0, int),
+            ),
+        )
+
+    @rule(gap=GAPS)
+    def no_twists(self, gap: float) -> None:
+        _, seen = self.drive(gap, (8.0, 0.0, 0.0))
+        self.accept(NO_TWISTS, seen)
+
+    @rule()
+    def twists_of_the_last_second(self) -> None:
+        odometry, seen = self.drive(0.1, (8.0, 0.0, 0.0))
+        stamps = np.arange(self.t - 1.0, self.t - 1e-9, DT)
+        self.accept(Odometry(stamps, np.tile(odometry.twist[:1], (len(stamps), 1))), seen)
+
+    @rule(value=STRANGE, entry=st.integers(0, 5))
+    def a_strange_detection(self, value: float, entry: int) -> None:
+        odometry, seen = self.drive(0.1, (8.0, 0.0, 0.0))
+        points = np.concatenate([[[6.0, 1.0]], seen.points_vehicle])
+        covariances = np.concatenate([0.01 * np.eye(2)[None], seen.covariances])
+        if entry < 2:
+            points[0, entry] = value
+        else:
+            covariances[0].flat[entry - 2] = value
+        strange = Detections(self.t, points, covariances, np.append(0, seen.labels))
+        assert self.accept(odometry, strange).dropped == 1
+
+    @rule(sigma=st.sampled_from([0.0, 1e-5, 1e-3, 10.0, 99.0]))
+    def another_sigma(self, sigma: float) -> None:
+        odometry, seen = self.drive(0.1, (8.0, 0.0, 0.0))
+        covariances = np.tile(sigma**2 * np.eye(2), (len(seen.labels), 1, 1))
+        result = self.accept(odometry, replace(seen, covariances=covariances))
+        assert result.dropped == (len(seen.labels) if sigma == 0.0 else 0)
+
+    @rule(number=st.integers(1, 60), seed=st.integers(0, 3))
+    def false_detections(self, number: int, seed: int) -> None:
+        odometry, _ = self.drive(0.1, (8.0, 0.0, 0.0))
+        rng = np.random.default_rng(seed)
+        points = rng.uniform(-200.0, 200.0, (number, 2))
+        covariances = np.tile(0.01 * np.eye(2), (number, 1, 1))
+        self.accept(odometry, Detections(self.t, points, covariances, rng.integers(0, 3, number)))
+
+    @rule(share=st.sampled_from([0.1, 0.5, 0.9]), back=st.integers(1, 6))
+    def a_late_cycle(self, share: float, back: int) -> None:
+        """Windows take it at its time, once; filters refuse it."""
+        if isinstance(self.estimator, CkfMapper | LandmarkCkf):
+            if not self.estimator_is_new:
+                self.refuse(NO_TWISTS, see(self.t - 0.1 * back, self.pose, CONES, LABELS))
+            return
+        times = self.estimator.smoother.times
+        if len(times) > back:
+            t = (1.0 - share) * times[-back - 1] + share * times[-back]
+            late = see(t, self.pose, CONES, LABELS)
+            if t not in self.late:
+                self.late.append(t)
+                values = len(self.estimator.smoother.variables.values)
+                assert self.accept(NO_TWISTS, late).late
+                assert isinstance(self.estimator, LandmarkFixedLag) or values == len(
+                    self.estimator.smoother.variables.values
+                )
+            self.refuse(NO_TWISTS, late)
+
+    @rule()
+    def a_cycle_that_is_too_late(self) -> None:
+        if not self.estimator_is_new:
+            self.refuse(NO_TWISTS, see(self.t - 100.0, self.pose, CONES, LABELS))
+
+    # --- cycles that are refused -----------------------------------------------------------------------
+
+    @rule(value=STRANGE, column=st.integers(0, 2), row=st.integers(0, 4))
+    def a_strange_twist(self, value: float, column: int, row: int) -> None:
+        odometry, seen = self.ahead()
+        odometry.twist[row, column] = value
+        self.refuse(odometry, seen)
+
+    @rule(value=st.sampled_from([np.nan, np.inf, 1e18, 1e308, -1e3, 1e5, None, "now"]))
+    def a_strange_stamp(self, value: Any) -> None:
+        _, seen = self.ahead()
+        if self.estimator_is_new and value in (-1e3, 1e5):
+            return
+        self.refuse(NO_TWISTS, replace(seen, t=value))
+
+    @rule(value=STRANGE, row=st.integers(0, 4))
+    def a_strange_stamp_of_a_twist(self, value: float, row: int) -> None:
+        odometry, seen = self.ahead()
+        odometry.t[row] = value
+        if not (row == 0 and value in (-1e5,)):
+            self.refuse(odometry, seen)
+
+    @rule(kind=st.sampled_from(["points", "covariances", "labels", "label", "words", "twists", "none"]))
+    def a_wrong_shape(self, kind: str) -> None:
+        odometry, seen = self.ahead()
+        two = Detections(seen.t, np.ones((2, 2)), np.tile(np.eye(2), (2, 1, 1)), np.array([0, 1]))
+        wrong: dict[str, tuple[Any, Any]] = {
+            "points": (odometry, replace(two, points_vehicle=np.ones((2, 3)))),
+            "covariances": (odometry, replace(two, covariances=np.ones((2, 2)))),
+            "labels": (odometry, replace(two, labels=np.array([0, 1, 1]))),
+            "label": (odometry, replace(two, labels=np.array([0, 3]))),
+            "words": (odometry, replace(two, labels=np.array(["left", "right"]))),
+            "twists": (replace(odometry, twist=odometry.twist[:, :2]), two),
+            "none": (None, two),
+        }
+        self.refuse(*wrong[kind])
+
+    @rule()
+    def twists_later_than_the_cycle(self) -> None:
+        odometry, seen = self.ahead()
+        self.refuse(replace(odometry, t=odometry.t + 0.05), seen)
+
+    @rule()
+    def the_same_cycle_again(self) -> None:
+        if not self.estimator_is_new:
+            self.refuse(NO_TWISTS, see(self.t, self.pose, CONES, LABELS))
+
+    @rule()
+    def a_bad_factor(self) -> None:
+        if isinstance(self.estimator, FixedLagMapper):
+            noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
+            unknown = gtsam.PriorFactorPose2(pose_key(10**6), gtsam.Pose2(), noise)
+            infinite = gtsam.PriorFactorPose2(self.estimator.next_pose_key, gtsam.Pose2(np.nan, 0, 0), noise)
+            for factor in (unknown, infinite, "factor"):
+                self.refuse(*self.ahead(), [factor])
+
+    def ahead(self) -> tuple[Odometry, Detections]:
+        """The next cycle, before the vehicle has moved there."""
+        stamps = self.t + DT * np.arange(5)
+        return Odometry(stamps, np.tile([8.0, 0.0, 0.0], (5, 1))), see(self.t + 0.1, self.pose, CONES, LABELS)
+
+    @property
+    def estimator_is_new(self) -> bool:
+        return self.estimator.front_end._motion.newest.t is None
+
+    # --- what always holds -----------------------------------------------------------------------------
+
+    @invariant()
+    def the_state_is_finite_and_bounded(self) -> None:
+        values, covariance = state_of(self.estimator)
+        assert np.isfinite(values).all()
+        assert len(values) < MOST_VARIABLES
+        assert np.isfinite(covariance).all()
+        scale = np.abs(covariance).max()
+        np.testing.assert_allclose(covariance, covariance.T, atol=1e-9 * scale)
+        assert np.linalg.eigvalsh(covariance).min() > -1e-9 * scale
+
+    def teardown(self) -> None:
+        """Whatever has happened, the next cycles work."""
+        for _ in range(2):
+            self.accept(*self.drive(0.1, (8.0, 0.0, 0.0)))
+        self.the_state_is_finite_and_bounded()
+        self.estimator.map()
+        self.estimator.vehicle_state()
+
+
+@pytest.mark.parametrize("kind", [FixedLagMapper, LandmarkFixedLag, CkfMapper, LandmarkCkf])
+def test_no_order_of_cycles_breaks_an_estimator(kind: type[Estimator]) -> None:
+    machine = type(kind.__name__, (Cycles,), {"make": staticmethod(lambda: kind(None, ODOMETRY_SIGMA))})
+    run_state_machine_as_test(
+        machine,
+        settings=settings(
+            max_examples=12,
+            stateful_step_count=25,
+            deadline=None,
+            derandomize=True,
+            suppress_health_check=list(HealthCheck),
+        ),
+    )
