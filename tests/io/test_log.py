@@ -12,10 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pathspace_graph.errors import InputError, OutputError
+from pathspace_graph.io.limits import MAX_RANGE, MAX_SPEED
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth, read_log, write_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
-FINITE = st.floats(-1e6, 1e6, allow_nan=False)
+
+def numbers_up_to(largest: float) -> st.SearchStrategy[float]:
+    return st.floats(-largest, largest, allow_nan=False)
 
 
 def small_log() -> Log:
@@ -69,7 +72,11 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(twist=arrays(float, (4, 3), elements=FINITE), point=arrays(float, (2,), elements=FINITE), t0=FINITE)
+@given(
+    twist=arrays(float, (4, 3), elements=numbers_up_to(MAX_SPEED)),
+    point=arrays(float, (2,), elements=numbers_up_to(MAX_RANGE)),
+    t0=numbers_up_to(1e6),
+)
 def test_round_trip_is_exact_for_any_numbers(
     twist: np.ndarray, point: np.ndarray, t0: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
