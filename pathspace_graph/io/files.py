@@ -13,7 +13,7 @@ from pathspace_graph.errors import OutputError
 
 from . import disk
 from .manifest import MANIFEST_FILE, manifest_of
-from .temporary import beside
+from .temporary import beside, is_temporary
 
 
 @contextmanager
@@ -29,7 +29,7 @@ def atomic_folder(target: Path | str, marker: str) -> Iterator[Path]:
     with _parents(final), beside(final, _mkdir) as temporary:
         yield temporary
         check_target(final, marker)
-        write_manifest(temporary)
+        (temporary / MANIFEST_FILE).write_text(manifest_of(temporary), encoding="utf-8", newline="\n")
         disk.sync_tree(temporary)
         _put_in_place(temporary, final)
 
@@ -85,7 +85,8 @@ def check_target(target: Path | str, marker: str) -> None:
     if not target.is_dir():
         raise OutputError(f"{target}: expected a folder to write, found a file")
     try:
-        foreign = any(target.iterdir()) and not (target / marker).is_file()
+        names = [entry.name for entry in target.iterdir() if not is_temporary(entry.name)]
+        foreign = bool(names) and not (target / marker).is_file()
     except OSError as error:
         raise OutputError(f"{target}: expected a readable folder: {error.strerror}") from error
     if foreign:

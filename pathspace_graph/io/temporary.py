@@ -17,6 +17,14 @@ _TOKEN_BYTES: Final = 4
 """The names of temporary files differ by this number of random bytes."""
 
 
+_TOKEN: Final = f"[0-9a-f]{{{2 * _TOKEN_BYTES}}}"
+
+
+def is_temporary(name: str) -> bool:
+    """Returns whether a file has the name of a temporary one."""
+    return re.fullmatch(rf"\..*\.{_TOKEN}\.tmp(\.[^.]*)?", name) is not None
+
+
 @contextmanager
 def beside(final: Path, make: Callable[[Path], None]) -> Iterator[Path]:
     """Yields a new path beside `final`, made by `make`, and removes it if it is still there at the end.
@@ -47,8 +55,7 @@ def _make_locked(final: Path, make: Callable[[Path], None]) -> tuple[Path, int |
 
 def remove_leftovers(final: Path) -> None:
     """Removes the temporary files of `final` that no living process has locked."""
-    token = f"[0-9a-f]{{{2 * _TOKEN_BYTES}}}"
-    name = re.compile(re.escape(f".{final.stem}.") + token + re.escape(f".tmp{final.suffix}"))
+    name = re.compile(re.escape(f".{final.stem}.") + _TOKEN + re.escape(f".tmp{final.suffix}"))
     try:
         found = [entry.name for entry in os.scandir(final.parent) if name.fullmatch(entry.name)]
     except OSError:

@@ -219,7 +219,7 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
     monkeypatch.setattr("pathspace_graph.commands.demo.simulate", lambda *_: read_log(log_folder))
     monkeypatch.chdir(tmp_path)
     assert main(["demo"]) == 0
-    assert names(tmp_path / "pathspace-demo") == {"log", "map", "track.png"}
+    assert names(tmp_path / "pathspace-demo") == {"log", "map", "track.png", "manifest.json"}
     assert read_map(tmp_path / "pathspace-demo" / "map").boundaries
     printed = capsys.readouterr().out
     assert "rmse" in printed
