@@ -71,7 +71,7 @@ def shown(value: Any) -> str:
 def check_content(content: Any, file: Path) -> None:
     """Raises an InputError where the content of a file is nested too deep or has too large a whole number."""
     level, seen = [content], set[int]()
-    for _ in range(MAX_DEPTH + 1):
+    for _ in range(MAX_DEPTH):
         values = list(chain.from_iterable(map(_children, level)))
         for value in values:
             if isinstance(value, int) and abs(value) > MAX_INTEGER:

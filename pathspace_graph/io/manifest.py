@@ -129,16 +129,17 @@ def _is_as_written(file: Path, entry: Any) -> bool:
 def verified(folder: Path, *names: str) -> Iterator[None]:
     """Verifies these files after they were read without an error.
 
-    An error of their content comes first, since it names the row; it says if the file has changed as well.
+    An error of the content of a file that has changed comes first, since it names the row.
     """
     try:
         yield
     except InputError as error:
         try:
-            verify(folder, [error.file.name] if error.file.parent == folder else [])
+            verify(folder, names)
         except InputError as damage:
-            raise InputError(
-                error.file, f"{error.message}; the file is not as it was written ({MANIFEST_FILE})", error.row
-            ) from damage
+            if damage.file != error.file:
+                raise damage from error
+            message = f"{error.message}; the file is not as it was written ({MANIFEST_FILE})"
+            raise InputError(error.file, message, error.row) from damage
         raise
     verify(folder, names)

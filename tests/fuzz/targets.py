@@ -32,6 +32,11 @@ class Target:
 
     def run(self, data: bytes, folder: Path) -> None:
         """Writes the input's files to the folder, and reads it."""
+        self.write(data, folder)
+        self.read(folder)
+
+    def write(self, data: bytes, folder: Path) -> None:
+        """Writes the input's files to the folder."""
         names = iter(SECTION.split(data))
         contents = {next(iter(self.files)): next(names)}
         contents |= {name.decode(): content for name, content in zip(names, names, strict=True)}
@@ -41,7 +46,6 @@ class Target:
                 (folder / name).write_bytes(content)
             else:
                 (folder / name).unlink(missing_ok=True)
-        self.read(folder)
 
 
 def read_tracks(folder: Path) -> None:
