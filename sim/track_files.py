@@ -245,8 +245,8 @@ def _eufs(path: Path, _: Table) -> Track:
     table = read_table(path, ("tag", "x", "y"))
     tags = np.array([tag.strip().lower() for tag in table.columns["tag"]])
     points = table.stack(("x", "y"))
-    if len(points) > MAX_CONES:
-        raise InputError(path, f"expected at most {MAX_CONES} cones, found {len(points)}")
+    if len(points) > 2 * MAX_CONES:
+        raise InputError(path, f"expected at most {2 * MAX_CONES} cones, found {len(points)}")
     left, right = (_without_duplicates(points[tags == tag]) for tag in ("blue", "yellow"))
     other, gate = points[np.isin(tags, EUFS_OTHER)], points[tags == "big_orange"]
     for tag, cones in (("blue", left), ("yellow", right)):

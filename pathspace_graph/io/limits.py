@@ -44,10 +44,10 @@ MAX_ANGLE: Final = 1e6
 """A heading that was not wrapped is at most this (rad)."""
 MAX_NOISE: Final = 1e6
 """A standard deviation, a range or a rate in a log's header is at most this, in its own unit."""
-MAX_TRACK_LENGTH: Final = 2e5
-"""A track is at most this long (m)."""
-MAX_CONES: Final = 20_000
-"""A track has at most this number of cones."""
+MAX_TRACK_LENGTH: Final = 3e4
+"""A track is at most this long (m); its rows are matched in a time that grows with the square of it."""
+MAX_CONES: Final = 6_000
+"""Each boundary of a track has at most this number of cones."""
 
 SHOWN_CHARACTERS: Final = 120
 """A message shows at most this number of characters of what was found."""

@@ -18,7 +18,14 @@ from importlib.util import find_spec
 from pathlib import Path
 
 CORPUS = Path(__file__).with_name("corpus")
-LIMITS = ("-timeout=10", "-rss_limit_mb=2048", "-max_len=8192", "-print_final_stats=1", "-verbosity=1")
+LIMITS = (
+    "-timeout=10",
+    "-rss_limit_mb=2048",
+    "-max_len=8192",
+    "-len_control=0",
+    "-print_final_stats=1",
+    "-verbosity=1",
+)
 """An input may take ten seconds and two gigabytes."""
 INSTRUMENTED = [
     "tomllib",
@@ -63,13 +70,13 @@ def main() -> int:
     parser.add_argument(
         "--finds", type=Path, default=Path("build/fuzz"), help="folder of new inputs and finds"
     )
-    parser.add_argument("--one", help=argparse.SUPPRESS)
+    parser.add_argument("--one", help=argparse.SUPPRESS)  # with options and folders of libFuzzer
     options, rest = parser.parse_known_args()
     if find_spec("atheris") is None:
         print(f"nothing is fuzzed: there is no atheris for this Python {sys.version.split()[0]}")
         return 0
     if options.one:
-        fuzz_one(options.one, rest)
+        fuzz_one(options.one, [*rest, *options.targets])
         return 0
     names = options.targets or sorted(folder.name for folder in CORPUS.iterdir())
     return max(_campaign(name, options.seconds, options.finds) for name in names)
