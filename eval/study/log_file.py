@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 import zipfile
 import zlib
@@ -16,12 +18,13 @@ from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth
 
 _TRUTH: Final = ("pose_t", "poses", "cones", "cone_labels", "associations", "calibration")
 _SENSOR: Final = ("range_max", "fov", "rate")
-_ERRORS: Final = (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile, zlib.error)
-"""Damaged archives, and arrays that do not fit each other, raise these."""
+_DIGEST_BYTES: Final = hashlib.sha256().digest_size
+_ERRORS: Final = (OSError, ValueError, LookupError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""Archives of something else, and arrays that do not fit each other, raise these."""
 
 
 def write_log_file(file: Path, log: Log) -> None:
-    """Writes the log as a numpy archive."""
+    """Writes the log as a numpy archive behind its SHA-256."""
     cycles, sensor = log.cycles, [getattr(log.sensor, name) for name in _SENSOR]
     arrays: dict[str, Any] = {
         "odometry_t": log.odometry.t,
@@ -38,17 +41,23 @@ def write_log_file(file: Path, log: Log) -> None:
     if log.truth is not None:
         known = {name: getattr(log.truth, name) for name in _TRUTH}
         arrays |= {name: value for name, value in known.items() if value is not None}
-    with file.open("wb") as out:
-        np.savez(out, allow_pickle=False, **arrays)
+    archive = io.BytesIO()
+    np.savez(archive, **arrays)
+    content = archive.getvalue()
+    file.write_bytes(hashlib.sha256(content).digest() + content)
 
 
 def read_log_file(file: Path) -> Log:
     """Returns the log of an archive; an InputError says that it is none, or damaged."""
     try:
-        with np.load(file, allow_pickle=False) as archive:
+        data = file.read_bytes()
+        digest, content = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
+        if digest != hashlib.sha256(content).digest():
+            raise ValueError("it is not as it was written")
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         return _log(arrays)
-    except _ERRORS as error:
+    except (*_ERRORS, EOFError) as error:
         raise InputError(file, f"expected the log of a study: {error}") from error
 
 

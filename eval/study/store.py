@@ -68,7 +68,7 @@ class Store:
 
     def drop_logs(self) -> None:
         """Removes the logs, since they can be simulated again."""
-        for file in self.logs.glob("*.npz"):
+        for file in self.logs.glob("*.log"):
             file.unlink()
         with suppress(OSError):  # there is none, or it holds something else
             self.logs.rmdir()
@@ -77,7 +77,7 @@ class Store:
         return self.folder / "cells" / f"{cell.id}.json"
 
     def _log(self, drive: Drive) -> Path:
-        return self.logs / f"{drive.id}.npz"
+        return self.logs / f"{drive.id}.log"
 
 
 def _is_record(record: Any) -> bool:
