@@ -34,7 +34,10 @@ _UNSUPPORTED: Final = frozenset({errno.ENOSYS, errno.EINVAL, errno.ENOTSUP})
 def sync(path: Path) -> None:
     """Waits until the content of a file, or the names in a folder, are on the disk."""
     sys.audit(SYNC, str(path))
-    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except PermissionError:  # what may be written need not be readable
+        return
     try:
         os.fsync(descriptor)
     except OSError as error:

@@ -15,9 +15,8 @@ from . import disk
 
 _TOKEN_BYTES: Final = 4
 """The names of temporary files differ by this number of random bytes."""
-
-
 _TOKEN: Final = f"[0-9a-f]{{{2 * _TOKEN_BYTES}}}"
+"""These bytes match this pattern in the names."""
 
 
 def is_temporary(name: str) -> bool:

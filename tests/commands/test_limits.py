@@ -20,6 +20,16 @@ COMMANDS = {
 STRANGE = [file for file in INPUTS if file.parent.name in COMMANDS and file.name not in READ]
 
 
+@pytest.mark.parametrize("digits", [20, 400, 5000])
+def test_a_number_of_many_digits_is_refused(
+    digits: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = str(tmp_path / "out")
+    assert main(["simulate", "--generate", "0", "--laps", "1" + digits * "0", "--out", out]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1 and "expected whole numbers" in line and len(line) < 300
+
+
 @pytest.mark.parametrize("file", STRANGE, ids=lambda file: f"{file.parent.name}-{file.name}")
 def test_a_strange_file_ends_in_one_line(
     file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
