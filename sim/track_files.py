@@ -17,9 +17,9 @@ from pathspace_graph.io.csv_table import Table, read_table
 from pathspace_graph.io.limits import (
     MAX_CONES,
     MAX_COORDINATE,
-    MAX_RANGE,
     MAX_TRACK_BYTES,
     MAX_TRACK_LENGTH,
+    MAX_TRACK_WIDTH,
     shown,
 )
 from pathspace_graph.io.parsing import parse_yaml, read_text
@@ -314,8 +314,8 @@ def _tum_circuit(path: Path) -> FloatArray:
     table = read_table(path, TUM_COLUMNS, comment="#")
     circuit = table.stack(TUM_COLUMNS)
     table.require(np.asarray(circuit[:, 2:].min(axis=1) > 0), "expected widths above 0")
-    widths = f"expected widths of at most {MAX_RANGE:g} m"
-    table.require(np.asarray(circuit[:, 2:].max(axis=1) <= MAX_RANGE), widths)
+    widths = f"expected widths of at most {MAX_TRACK_WIDTH:g} m"
+    table.require(np.asarray(circuit[:, 2:].max(axis=1) <= MAX_TRACK_WIDTH), widths)
     _check_size(path, circuit[:, :2], "the middle of the track")
     moved = np.asarray(np.diff(arc_lengths(circuit[:, :2])) > REPEAT_DISTANCE)
     table.require(np.append(True, moved)[: len(circuit)], "expected a point other than the one before")

@@ -46,6 +46,8 @@ MAX_NOISE: Final = 1e6
 """A standard deviation, a range or a rate in a log's header is at most this, in its own unit."""
 MAX_TRACK_LENGTH: Final = 3e4
 """A track is at most this long (m); its rows are matched in a time that grows with the square of it."""
+MAX_TRACK_WIDTH: Final = 100.0
+"""A boundary is at most this far from the middle of a track (m)."""
 MAX_CONES: Final = 6_000
 """Each boundary of a track has at most this number of cones."""
 

@@ -9,17 +9,22 @@ The exit code is 1 where anything was found. Where atheris is missing, a line sa
 from __future__ import annotations
 
 import argparse
+import os
 import re
-import subprocess
 import sys
 import tempfile
 import warnings
+from contextlib import redirect_stderr
 from importlib.util import find_spec
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
 CORPUS = Path(__file__).with_name("corpus")
 LIMITS = ("-timeout=60", "-rss_limit_mb=3072", "-max_len=8192", "-len_control=0", "-print_final_stats=1")
-"""An input may take a minute and three gigabytes: a track of 30 km takes a third of both."""
+"""An input may take a minute and three gigabytes."""
+TRACK_LENGTH = 2e3
+"""Tracks are at most this long (m) here: one of 30 km takes the time of thousands of short ones."""
 INSTRUMENTED = [
     "tomllib",
     *(f"pathspace_graph.{room}" for room in ("io", "sim", "spline", "eval.study", "settings")),
@@ -27,27 +32,58 @@ INSTRUMENTED = [
 """Branches of these modules guide the fuzzer."""
 
 
-def fuzz_one(name: str, arguments: list[str]) -> None:
-    """Fuzzes one target in this process, until the time is up or something is found."""
-    import atheris  # noqa: PLC0415 - an extra
+class Fuzzer:
+    """Runs each target in a child of this process, which has imported and instrumented everything once."""
 
-    with atheris.instrument_imports(include=INSTRUMENTED):
-        from targets import TARGETS  # noqa: PLC0415 - what is imported here is watched
+    def __init__(self, finds: Path) -> None:
+        import atheris  # noqa: PLC0415 - an extra
 
-        from pathspace_graph.errors import PathspaceError  # noqa: PLC0415 - the same
+        quiet = redirect_stderr(StringIO())
+        with quiet, atheris.instrument_imports(include=INSTRUMENTED):
+            from targets import TARGETS  # noqa: PLC0415 - what is imported here is instrumented
 
-    warnings.simplefilter("error")
-    target = TARGETS[name]
-    with tempfile.TemporaryDirectory(dir=_memory()) as folder:
+            from pathspace_graph.errors import PathspaceError  # noqa: PLC0415 - the same
+            from pathspace_graph.sim import track_files  # noqa: PLC0415 - the same
+        track_files.MAX_TRACK_LENGTH = TRACK_LENGTH  # type: ignore[misc]
+        self._atheris, self._targets, self._refusal = atheris, TARGETS, PathspaceError
+        self._finds = finds
+
+    def run(self, name: str, seconds: int) -> bool:
+        """Fuzzes a target and reports; returns whether anything was found."""
+        (self._finds / name).mkdir(parents=True, exist_ok=True)
+        log = self._finds / f"{name}.log"
+        with tempfile.TemporaryDirectory(dir=_memory()) as folder:
+            child = os.fork()
+            if child == 0:
+                self._fuzz(name, seconds, Path(folder), log)
+            found = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0
+        told = log.read_text(errors="replace")
+        count = re.search(r"stat::number_of_executed_units: *(\d+)", told)
+        verdict = f"found something, see {self._finds}/{name}-*" if found else "nothing found"
+        print(f"{name}: {count[1] if count else 'unknown'} executions in {seconds} s, {verdict}", flush=True)
+        if found:
+            print(told[-4000:], flush=True)
+        return found
+
+    def _fuzz(self, name: str, seconds: int, folder: Path, log: Path) -> None:
+        """Fuzzes in the child until the time is up or something is found, and ends the process."""
+        with log.open("w") as out:
+            os.dup2(out.fileno(), 1)
+            os.dup2(out.fileno(), 2)
+        warnings.simplefilter("error")
+        target: Any = self._targets[name]
 
         def once(data: bytes) -> None:
             try:
-                target.run(data, Path(folder))
-            except PathspaceError as error:
+                target.run(data, folder)
+            except self._refusal as error:
                 assert "\n" not in str(error), "expected a message of one line"
 
-        atheris.Setup([sys.argv[0], *arguments], once)
-        atheris.Fuzz()
+        options = [*LIMITS, f"-max_total_time={seconds}", f"-artifact_prefix={self._finds / name}-"]
+        folders = [str(self._finds / name), str(CORPUS / name)]
+        self._atheris.Setup([sys.argv[0], *options, *folders], once)
+        self._atheris.Fuzz()
+        os._exit(0)
 
 
 def _memory() -> str | None:
@@ -56,38 +92,18 @@ def _memory() -> str | None:
 
 
 def main() -> int:
-    """Fuzzes the targets one after the other, each in a process of its own."""
+    """Fuzzes the targets one after the other."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("targets", nargs="*", metavar="TARGET", help="these readers, all of them by default")
     parser.add_argument("--seconds", type=int, default=600, help="time for each target")
-    parser.add_argument(
-        "--finds", type=Path, default=Path("build/fuzz"), help="folder of new inputs and finds"
-    )
-    parser.add_argument("--one", help=argparse.SUPPRESS)  # with options and folders of libFuzzer
-    options, rest = parser.parse_known_args()
+    parser.add_argument("--finds", type=Path, default=Path("build/fuzz"), help="folder of finds")
+    options = parser.parse_args()
     if find_spec("atheris") is None:
         print(f"nothing is fuzzed: there is no atheris for this Python {sys.version.split()[0]}")
         return 0
-    if options.one:
-        fuzz_one(options.one, [*rest, *options.targets])
-        return 0
+    fuzzer = Fuzzer(options.finds)
     names = options.targets or sorted(folder.name for folder in CORPUS.iterdir())
-    return max(_campaign(name, options.seconds, options.finds) for name in names)
-
-
-def _campaign(name: str, seconds: int, finds: Path) -> int:
-    grown = finds / name
-    grown.mkdir(parents=True, exist_ok=True)
-    limits = [*LIMITS, f"-max_total_time={seconds}", f"-artifact_prefix={finds / name}-"]
-    command = [sys.executable, __file__, f"--one={name}", *limits, str(grown), str(CORPUS / name)]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, errors="replace")
-    count = re.search(r"stat::number_of_executed_units: *(\d+)", done.stderr)
-    found = done.returncode != 0
-    verdict = f"found something, see {finds}/{name}-*" if found else "nothing found"
-    print(f"{name}: {count[1] if count else 'an unknown number of'} executions in {seconds} s, {verdict}")
-    if found:
-        print(done.stderr[-4000:])
-    return int(found)
+    return max(int(fuzzer.run(name, options.seconds)) for name in names)
 
 
 if __name__ == "__main__":
