@@ -68,7 +68,7 @@ class Store:
 
     def drop_logs(self) -> None:
         """Removes the logs, since they can be simulated again."""
-        for file in self.logs.glob("*.log"):
+        for file in (*self.logs.glob("*.log"), *self.logs.glob("*.pickle")):  # pickles of older versions
             file.unlink()
         with suppress(OSError):  # there is none, or it holds something else
             self.logs.rmdir()
