@@ -32,6 +32,10 @@ MAX_SPEED: Final = 1e3
 """A measured speed is at most this (m/s)."""
 MAX_YAW_RATE: Final = 1e3
 """A measured yaw rate is at most this (rad/s)."""
+MAX_HELD: Final = 1e3
+"""A twist that is held until the next row moves the vehicle by at most this (m)."""
+MAX_DRIVE: Final = 1e6
+"""A drive is at most this long (m)."""
 MAX_RANGE: Final = 1e4
 """Each coordinate of a detection is at most this (m), vehicle frame."""
 MAX_DETECTIONS: Final = 10_000

@@ -19,7 +19,9 @@ from .files import atomic_folder
 from .limits import (
     MAX_ANGLE,
     MAX_DETECTIONS,
+    MAX_DRIVE,
     MAX_HEADER_BYTES,
+    MAX_HELD,
     MAX_NOISE,
     MAX_RANGE,
     MAX_SPEED,
@@ -244,6 +246,11 @@ def _read_odometry(file: Path) -> Odometry:
     if not len(table):
         raise InputError(file, "expected at least one row, found a header only", 2)
     t, speeds = _increasing_times(table), table.stack(("vx", "vy"), MAX_SPEED)
+    held = np.abs(speeds[:-1]).max(axis=1) * np.diff(t)
+    held_far = f"expected a twist that moves the vehicle by at most {MAX_HELD:g} m until the next row"
+    table.require(np.append(held <= MAX_HELD, True), held_far)
+    too_long = f"expected a drive of at most {MAX_DRIVE:g} m up to the next row"
+    table.require(np.append(np.cumsum(held) <= MAX_DRIVE, True), too_long)
     return Odometry(t, np.column_stack([speeds, table.numbers("wz", MAX_YAW_RATE)]))
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pathspace_graph.errors import InputError, OutputError
-from pathspace_graph.io.limits import MAX_RANGE, MAX_SPEED
+from pathspace_graph.io.limits import MAX_HELD, MAX_RANGE
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth, read_log, write_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
@@ -73,7 +73,7 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    twist=arrays(float, (4, 3), elements=numbers_up_to(MAX_SPEED)),
+    twist=arrays(float, (4, 3), elements=numbers_up_to(MAX_HELD)),
     point=arrays(float, (2,), elements=numbers_up_to(MAX_RANGE)),
     t0=numbers_up_to(1e6),
 )
@@ -171,6 +171,13 @@ BAD_ROWS = [
     ),
     ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.1,1,0,-1e9\n", 3, "at most 1000 in size in column 'wz'"),
     ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1000000000000000000,1,0,0\n", 3, "1e+10 in size in column 't'"),
+    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1,5,0,0\n1e9,5,0,0\n", 3, "at most 1000 m until the next row"),
+    (
+        "odometry.csv",
+        "t,vx,vy,wz\n" + "".join(f"{k},-999,0,0\n" for k in range(1003)),
+        1003,
+        "at most 1e+06 m",
+    ),
     ("odometry.csv", "t,vx,vy,wz\n0,1_0,0,0\n", 2, "number in column 'vx', found '1_0'"),
     ("odometry.csv", "t,vx,vy,wz\n0,\u0661,0,0\n", 2, "number in column 'vx'"),
     (
