@@ -25,6 +25,7 @@ class InputError(PathspaceError):
     def __init__(self, file: Path | str, message: str, row: int | None = None) -> None:
         self.file = Path(file)
         self.row = row
+        self.message = message
         where = str(file) if row is None else f"{file}, row {row}"
         super().__init__(f"{where}: {message}")
 

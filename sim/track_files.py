@@ -9,12 +9,20 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.io.csv_table import Table, read_table
+from pathspace_graph.io.limits import (
+    MAX_CONES,
+    MAX_COORDINATE,
+    MAX_TRACK_BYTES,
+    MAX_TRACK_LENGTH,
+    MAX_TRACK_WIDTH,
+    shown,
+)
+from pathspace_graph.io.parsing import parse_yaml, read_text
 
 from .driving_order import driving_order
 from .geometry import along_polyline, arc_lengths, direction, left_normals, ring, unit
@@ -84,6 +92,7 @@ def _check_exists(path: Path) -> None:
 
 def _check(path: Path, track: Track) -> None:
     for name, row in (("left", track.left), ("right", track.right)):
+        _check_size(path, row, f"the {name} boundary")
         if len(row) < MIN_CONES:
             raise InputError(
                 path, f"expected at least {MIN_CONES} cones of the {name} boundary, found {len(row)}"
@@ -102,19 +111,22 @@ def _check(path: Path, track: Track) -> None:
         )
 
 
+def _check_size(path: Path, row: FloatArray, name: str) -> None:
+    """Raises an InputError where a row of points (n, 2) has too many or is too long."""
+    length = float(arc_lengths(row)[-1]) if len(row) else 0.0
+    if len(row) > MAX_CONES or length > MAX_TRACK_LENGTH:
+        raise InputError(
+            path,
+            f"expected at most {MAX_CONES} cones over {MAX_TRACK_LENGTH:g} m as {name}, "
+            f"found {len(row)} over {length:g} m",
+        )
+
+
 # YAML: PacSim and fssim
 
 
 def _parse_yaml(path: Path) -> Any:
-    try:
-        return yaml.load(
-            path.read_text(encoding="utf-8-sig"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-        )
-    except yaml.MarkedYAMLError as error:
-        row = error.problem_mark.line + 1 if error.problem_mark else None
-        raise InputError(path, f"expected YAML: {error.problem}", row) from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(path, f"expected YAML: {' '.join(str(error).split())}") from error
+    return parse_yaml(read_text(path, "YAML", MAX_TRACK_BYTES), path)
 
 
 def _is_pacsim(data: Any) -> bool:
@@ -130,7 +142,7 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
     closed = _get(path, data, "lanesFirstWithLastConnected", "track.")
     if not isinstance(closed, bool):
         raise InputError(
-            path, f"expected true or false at track.lanesFirstWithLastConnected, found {closed!r}"
+            path, f"expected true or false at track.lanesFirstWithLastConnected, found {shown(closed)}"
         )
     start = _get(path, data, "start", "track.")
     position = _vector(path, _get(path, start, "position", "track.start."), 2, "track.start.position")
@@ -180,21 +192,26 @@ def _list(path: Path, value: object, key: str) -> list[Any]:
     if value is None:
         return []
     if not isinstance(value, list):
-        raise InputError(path, f"expected a list at {key}, found {value!r}")
+        raise InputError(path, f"expected a list at {key}, found {shown(value)}")
+    if len(value) > MAX_CONES:
+        raise InputError(path, f"expected at most {MAX_CONES} cones at {key}, found {len(value)}")
     return value
 
 
 def _vector(path: Path, value: object, size: int, key: str) -> FloatArray:
-    """Returns the first `size` numbers of a list, all finite."""
+    """Returns the first `size` numbers of a list, all within the limit of coordinates."""
     try:
         if not isinstance(value, list) or len(value) < size:
             raise ValueError
         # YAML 1.1 takes 1e-5 for a word, so words are given a chance to be numbers
         vector = np.array([float(number) for number in value[:size]])
     except (TypeError, ValueError):
-        raise InputError(path, f"expected {size} numbers at {key}, found {value!r}") from None
+        raise InputError(path, f"expected {size} numbers at {key}, found {shown(value)}") from None
     if not np.isfinite(vector).all():
-        raise InputError(path, f"expected finite numbers at {key}, found {value!r}")
+        raise InputError(path, f"expected finite numbers at {key}, found {shown(value)}")
+    if np.abs(vector).max() > MAX_COORDINATE:
+        expected = f"expected numbers of at most {MAX_COORDINATE:g} in size at {key}"
+        raise InputError(path, f"{expected}, found {shown(value)}")
     return vector
 
 
@@ -213,7 +230,7 @@ def _without_repeats(row: FloatArray, closed: bool) -> FloatArray:
 
 
 def _parse_csv(path: Path) -> Table:
-    return read_table(path, (), comment="#")
+    return read_table(path, (), comment="#", most=MAX_TRACK_BYTES)
 
 
 def _is_tum(table: Table) -> bool:
@@ -228,6 +245,8 @@ def _eufs(path: Path, _: Table) -> Track:
     table = read_table(path, ("tag", "x", "y"))
     tags = np.array([tag.strip().lower() for tag in table.columns["tag"]])
     points = table.stack(("x", "y"))
+    if len(points) > 2 * MAX_CONES:
+        raise InputError(path, f"expected at most {2 * MAX_CONES} cones, found {len(points)}")
     left, right = (_without_duplicates(points[tags == tag]) for tag in ("blue", "yellow"))
     other, gate = points[np.isin(tags, EUFS_OTHER)], points[tags == "big_orange"]
     for tag, cones in (("blue", left), ("yellow", right)):
@@ -269,11 +288,12 @@ def _eufs_start(
 
 def _without_duplicates(cones: FloatArray) -> FloatArray:
     """Returns the cones (n, 2) that are not within the duplicate distance of one kept before."""
-    kept: list[FloatArray] = []
+    kept, count = np.empty_like(cones), 0
     for cone in cones:
-        if not kept or np.linalg.norm(np.array(kept) - cone, axis=1).min() >= DUPLICATE_DISTANCE:
-            kept.append(cone)
-    return np.array(kept).reshape(-1, 2)
+        if (np.linalg.norm(kept[:count] - cone, axis=1) >= DUPLICATE_DISTANCE).all():
+            kept[count] = cone
+            count += 1
+    return kept[:count]
 
 
 def _tum(path: Path, _: Table) -> Track:
@@ -294,6 +314,9 @@ def _tum_circuit(path: Path) -> FloatArray:
     table = read_table(path, TUM_COLUMNS, comment="#")
     circuit = table.stack(TUM_COLUMNS)
     table.require(np.asarray(circuit[:, 2:].min(axis=1) > 0), "expected widths above 0")
+    widths = f"expected widths of at most {MAX_TRACK_WIDTH:g} m"
+    table.require(np.asarray(circuit[:, 2:].max(axis=1) <= MAX_TRACK_WIDTH), widths)
+    _check_size(path, circuit[:, :2], "the middle of the track")
     moved = np.asarray(np.diff(arc_lengths(circuit[:, :2])) > REPEAT_DISTANCE)
     table.require(np.append(True, moved)[: len(circuit)], "expected a point other than the one before")
     if len(circuit) > 1 and np.linalg.norm(circuit[-1, :2] - circuit[0, :2]) <= REPEAT_DISTANCE:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from rich.table import Table
 
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.files import atomic_file
-from pathspace_graph.io.json_file import write_json
+from pathspace_graph.io.json_file import read_json, write_json
 
 from .metric import Metric
 
@@ -73,12 +72,7 @@ def write_baseline(file: Path, figures: Iterable[Metric]) -> None:
 
 def read_baseline(file: Path) -> dict[str, float]:
     """Returns the ratios by name; raises InputError where the file isn't a baseline."""
-    try:
-        content: Any = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(file, "expected a baseline, found no file (--write-baseline makes one)") from error
-    except (OSError, ValueError) as error:
-        raise InputError(file, f"expected a baseline: {error}") from error
+    content = read_json(file, "a baseline (--write-baseline makes one)")
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(file, f'expected "format": "{FORMAT}"')
     entries = content.get("ratios")

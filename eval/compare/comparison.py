@@ -20,6 +20,7 @@ from pathspace_graph.eval.metrics.measures import measure, online_cycles
 from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.io.log import LOG_FILE, Log
 from pathspace_graph.io.results import BatchRun, RunResult
+from pathspace_graph.io.temporary import is_temporary
 from pathspace_graph.settings.limits import LimitSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -121,7 +122,8 @@ def read_logs(folder: Path, limits: LimitSettings | None = None) -> tuple[NamedL
     limits = limits or LimitSettings()
     if (folder / LOG_FILE).exists() or not folder.is_dir():
         return (NamedLog(folder.resolve().name, read_usable_log(folder, limits)),)
-    inside = sorted(entry for entry in folder.iterdir() if (entry / LOG_FILE).is_file())
+    entries = (entry for entry in folder.iterdir() if not is_temporary(entry.name))
+    inside = sorted(entry for entry in entries if (entry / LOG_FILE).is_file())
     if not inside:
         raise InputError(folder, f"expected a log ({LOG_FILE}) or folders that are logs, found neither")
     return tuple(NamedLog(entry.name, read_usable_log(entry, limits)) for entry in inside)

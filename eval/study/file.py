@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError, check_name
+from pathspace_graph.io.limits import MAX_HEADER_BYTES, shown
+from pathspace_graph.io.parsing import parse_toml, read_text
 
 from .overrides import flatten
 from .study import ALL, Baseline, Study
@@ -37,12 +38,7 @@ def find_study(name: Path) -> Path:
 def read_study(file: Path | str) -> Study:
     """Returns the study of a TOML file, with track files relative to it; InputError says what is wrong."""
     file = Path(file)
-    try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(file, f"expected a readable file: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(file, f"expected TOML: {error}") from error
+    content = parse_toml(read_text(file, "a study", MAX_HEADER_BYTES), file)
     try:
         return study_from(content, file.parent, file.stem)
     except PathspaceError as error:
@@ -83,16 +79,16 @@ def _baseline(table: Mapping[str, Any]) -> Baseline:
 
 def _list(key: str, value: Any) -> list[Any]:
     if not isinstance(value, list):
-        raise SettingsError(f"{key}: expected a list, found {value!r}")
+        raise SettingsError(f"{key}: expected a list, found {shown(value)}")
     return value
 
 
 def _table(key: str, value: Any) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
-        raise SettingsError(f"{key}: expected a table, found {value!r}")
+        raise SettingsError(f"{key}: expected a table, found {shown(value)}")
     return value
 
 
 def _check_text(key: str, value: Any) -> None:
     if not isinstance(value, str):
-        raise SettingsError(f"{key}: expected text, found {value!r}")
+        raise SettingsError(f"{key}: expected text, found {shown(value)}")

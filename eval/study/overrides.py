@@ -8,6 +8,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pathspace_graph.errors import SettingsError, check_name
+from pathspace_graph.io.limits import shown
 
 T = TypeVar("T")
 Overrides = Mapping[str, Any]
@@ -72,4 +73,4 @@ def as_type(value: Any, hint: Any, where: str) -> Any:
     if isinstance(hint, type) and type(value) is hint:
         return value
     name = hint.__name__ if isinstance(hint, type) else str(hint)
-    raise SettingsError(f"{where}: expected a value of type {name}, found {value!r}")
+    raise SettingsError(f"{where}: expected a value of type {name}, found {shown(value)}")

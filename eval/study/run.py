@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -10,12 +9,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from pathspace_graph.errors import OutputError
+from pathspace_graph.errors import InputError, OutputError
 from pathspace_graph.eval.harness.drives import Drive, NamedTrack, load_tracks, try_drive
 from pathspace_graph.eval.harness.workers import check_jobs, outcomes, workers
-from pathspace_graph.io.files import check_target
-from pathspace_graph.io.json_file import to_plain, write_json
+from pathspace_graph.io.files import check_target, remove_manifest
+from pathspace_graph.io.json_file import read_json, to_plain, write_json
 from pathspace_graph.io.log import Log
+from pathspace_graph.io.manifest import verified
 
 from .cells import Cell, Record, failed, run_cell
 from .frame import frame_of
@@ -113,6 +113,7 @@ def run_plan(
 ) -> pd.DataFrame:
     """Does the same for a plan."""
     check_folder(out, plan)
+    remove_manifest(out)  # of a study that goes on; the last step writes it again
     store = Store(out)
     remaining = [cell for cell in plan.cells if _is_missing(store.read(cell), retry_failed)]
     with workers(jobs, cluster) if remaining else nullcontext():
@@ -130,9 +131,10 @@ def check_folder(out: Path, plan: Plan) -> None:
     if not file.is_file():
         return
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise OutputError(f"{file}: expected a study: {error}") from error
+        with verified(out, STUDY_FILE):
+            found = read_json(file, "a study")
+    except InputError as error:
+        raise OutputError(str(error)) from error
     if not isinstance(found, dict):
         raise OutputError(f"{file}: expected a study, found {type(found).__name__}")
     expected, other = (

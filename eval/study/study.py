@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -12,6 +13,7 @@ from pathspace_graph import estimators as registry
 from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.eval.harness.attempts import known_estimators
 from pathspace_graph.eval.metrics.measures import METRICS
+from pathspace_graph.io.limits import MAX_VARIANTS, shown
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings
 
@@ -82,7 +84,7 @@ class Study:
         for column in self.columns:
             column_of(column)
         if not isinstance(self.yardsticks, bool):
-            raise SettingsError(f"yardsticks: expected true or false, found {self.yardsticks!r}")
+            raise SettingsError(f"yardsticks: expected true or false, found {shown(self.yardsticks)}")
         self._check_settings()
         self._check_baseline()
 
@@ -98,7 +100,7 @@ class Study:
 
     def _check_settings(self) -> None:
         if isinstance(self.laps, bool) or not isinstance(self.laps, int):
-            raise SettingsError(f"laps: expected a whole number, found {self.laps!r}")
+            raise SettingsError(f"laps: expected a whole number, found {shown(self.laps)}")
         if DEFAULT in self.variants:
             raise SettingsError(f"variants.{DEFAULT}: that name is kept for the settings as they are")
         for name in self.noise:
@@ -159,7 +161,10 @@ def _grid(grid: Mapping[str, Sequence[Any]]) -> dict[str, Overrides]:
     """Returns every combination of the values by its name."""
     for name, values in grid.items():
         if not isinstance(values, list | tuple) or not values:
-            raise SettingsError(f"grid.{name}: expected a list of values, found {values!r}")
+            raise SettingsError(f"grid.{name}: expected a list of values, found {shown(values)}")
+    combinations = math.prod(map(len, grid.values()))
+    if combinations > MAX_VARIANTS:
+        raise SettingsError(f"grid: expected at most {MAX_VARIANTS} combinations, found {combinations}")
     points = [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
     return {", ".join(f"{name}={_short(value)}" for name, value in point.items()): point for point in points}
 
@@ -172,10 +177,10 @@ def _short(value: Any) -> str:
 
 def _check_list(name: str, values: Any) -> None:
     if len(values) == 0 or len({repr(value) for value in values}) != len(values):
-        raise SettingsError(f"{name}: expected at least one, and none twice, found {list(values)}")
+        raise SettingsError(f"{name}: expected at least one, and none twice, found {shown(list(values))}")
 
 
 def _check_integers(name: str, values: Sequence[Any]) -> None:
     for value in values:
         if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-            raise SettingsError(f"{name}: expected whole numbers from 0 on, found {value!r}")
+            raise SettingsError(f"{name}: expected whole numbers from 0 on, found {shown(value)}")

@@ -13,6 +13,7 @@ import docstring_parser
 import tyro
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.io.limits import MAX_INTEGER, shown
 
 _HELP: Final = ("-h", "--help")
 _ANSI: Final = re.compile(r"\x1b\[[0-9;]*m")
@@ -25,6 +26,9 @@ def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
 
     It raises a SettingsError on bad usage.
     """
+    for word in arguments:
+        if word.lstrip("+-").isdecimal() and len(word) > len(str(MAX_INTEGER)) + 1:
+            raise SettingsError(f"{program}: expected whole numbers up to {MAX_INTEGER}, found {shown(word)}")
     if not set(_HELP).isdisjoint(arguments):
         _set_help(command)
     complaint = io.StringIO()

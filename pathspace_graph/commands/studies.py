@@ -14,6 +14,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.harness.workers import check_jobs
 from pathspace_graph.eval.study.run import make_plan, run_plan
 from pathspace_graph.eval.study.study import Study
+from pathspace_graph.io.files import write_manifest
 from pathspace_graph.progress import progress
 
 CELLS_FAILED: Final = 3
@@ -52,7 +53,9 @@ class StudyCommand:
         with progress("runs", lines=LINES) as advance:
             frame = run_plan(plan, self.out, self.jobs, self.cluster, self.retry_failed, advance)
         say = Console(soft_wrap=True, highlight=False, markup=False)
-        say.print(write(study, frame, self.out).rstrip("\n"))
+        text = write(study, frame, self.out)
+        write_manifest(self.out)
+        say.print(text.rstrip("\n"))
         say.print(f"\nwritten to {self.out}")
         report_failures(frame, len(plan.cells))
 

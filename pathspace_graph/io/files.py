@@ -2,35 +2,36 @@
 
 from __future__ import annotations
 
-import secrets
-import shutil
+import errno
+import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 
 from pathspace_graph.errors import OutputError
+
+from . import disk
+from .manifest import MANIFEST_FILE, manifest_of
+from .temporary import beside, is_temporary
 
 
 @contextmanager
 def atomic_folder(target: Path | str, marker: str) -> Iterator[Path]:
     """Yields a temporary folder beside `target` that takes its place on success and is removed on failure.
 
-    An empty folder at `target` is used. An earlier result, known by the file `marker` in it, is kept as a
-    numbered backup `NAME.~1~`. Anything else there is an OutputError.
+    It is given a manifest. An empty folder at `target` is used. An earlier result, known by the file `marker`
+    in it, is kept as a numbered backup `NAME.~1~`. Anything else there is an OutputError. At each moment the
+    target is the old or the new, also where the process is killed or the power is cut.
     """
     final = Path(target).absolute()
     check_target(final, marker)
-    made = _make_parents(final)
-    temporary = _temporary_sibling(final)
-    try:
-        _mkdir(temporary)
+    with _parents(final), beside(final, _mkdir) as temporary:
         yield temporary
         check_target(final, marker)
+        (temporary / MANIFEST_FILE).write_text(manifest_of(temporary), encoding="utf-8", newline="\n")
+        disk.sync_tree(temporary)
         _put_in_place(temporary, final)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        _remove_empty(made)
-        raise
 
 
 @contextmanager
@@ -41,35 +42,38 @@ def atomic_file(path: Path | str) -> Iterator[Path]:
     """
     final = Path(path).absolute()
     check_file_target(final)
-    made = _make_parents(final)
-    temporary = _temporary_sibling(final)
-    try:
+    with _parents(final), beside(final, _touch) as temporary:
         yield temporary
         check_file_target(final)
+        disk.sync(temporary)
         _put_in_place(temporary, final)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        _remove_empty(made)
-        raise
 
 
 @contextmanager
 def replacing(file: Path) -> Iterator[Path]:
     """Yields a temporary path beside `file` that takes its place on success; no backup is kept."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    temporary = _temporary_sibling(file)
-    try:
+    with beside(file, _touch) as temporary:
         yield temporary
+        disk.sync(temporary)
         temporary.replace(file)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+        disk.sync(file.parent)
 
 
 def write_text(file: Path, text: str) -> None:
     """Writes text in UTF-8, whole or not at all; an earlier file is replaced."""
     with replacing(file) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def write_manifest(folder: Path) -> None:
+    """Writes the manifest of what a folder holds now."""
+    write_text(folder / MANIFEST_FILE, manifest_of(folder))
+
+
+def remove_manifest(folder: Path) -> None:
+    """Removes the manifest of a folder that is about to change, where there is one."""
+    (folder / MANIFEST_FILE).unlink(missing_ok=True)
 
 
 def check_target(target: Path | str, marker: str) -> None:
@@ -81,7 +85,8 @@ def check_target(target: Path | str, marker: str) -> None:
     if not target.is_dir():
         raise OutputError(f"{target}: expected a folder to write, found a file")
     try:
-        foreign = any(target.iterdir()) and not (target / marker).is_file()
+        names = [entry.name for entry in target.iterdir() if not is_temporary(entry.name)]
+        foreign = bool(names) and not (target / marker).is_file()
     except OSError as error:
         raise OutputError(f"{target}: expected a readable folder: {error.strerror}") from error
     if foreign:
@@ -107,43 +112,90 @@ def _check_parents(target: Path) -> None:
 
 
 def _put_in_place(temporary: Path, final: Path) -> None:
-    backup: Path | None = None
+    """Moves what was written to its place, and what was there to a numbered backup."""
     try:
-        if final.is_dir() and not final.is_symlink() and not any(final.iterdir()):
-            final.rmdir()
-        elif final.exists() or final.is_symlink():
-            backup = final.rename(_free_backup(final))
-        temporary.rename(final)
+        while not disk.rename_new(temporary, final):
+            # what is there may go meanwhile, or a folder be filled; then it is tried again
+            with suppress(FileNotFoundError):
+                if _take_empty_folder(temporary, final) or _swap(temporary, final):
+                    break
+        disk.sync(final.parent)
     except OSError as error:
-        if backup is not None:
-            backup.rename(final)
         raise OutputError(f"{final}: can't be written: {error.strerror}") from error
 
 
-def _free_backup(path: Path) -> Path:
-    number = 1
-    while (backup := path.with_name(f"{path.name}.~{number}~")).exists() or backup.is_symlink():
-        number += 1
-    return backup
+def _take_empty_folder(temporary: Path, final: Path) -> bool:
+    """Replaces an empty folder in one step; it returns False where something else is there."""
+    if final.is_symlink() or not final.is_dir() or any(final.iterdir()):
+        return False
+    try:
+        temporary.rename(final)
+    except OSError as error:
+        if error.errno != errno.ENOTEMPTY:
+            raise
+        return False
+    return True
 
 
-def _temporary_sibling(final: Path) -> Path:
-    # the suffix stays last, as writers choose the format by it
-    return final.with_name(f".{final.stem}.{secrets.token_hex(4)}.tmp{final.suffix}")
+def _swap(temporary: Path, final: Path) -> bool:
+    """Exchanges the old result for the new one in one step, after which the old one has its backup's name.
+
+    Where the system has no such step there are two, and only the backup is there between them. It returns
+    True, since it is done then.
+    """
+    backup = _rename_to_backup(temporary, final)
+    try:
+        if disk.exchange(backup, final):
+            return True
+    except OSError:
+        backup.rename(temporary)
+        raise
+    backup.rename(temporary)
+    backup = _rename_to_backup(final, final)
+    try:
+        temporary.rename(final)
+    except OSError:
+        backup.rename(final)
+        raise
+    return True
 
 
-def _make_parents(final: Path) -> list[Path]:
+def _rename_to_backup(path: Path, final: Path) -> Path:
+    """Renames to the first free name of a backup of `final`, and returns it."""
+    for number in count(1):
+        backup = final.with_name(f"{final.name}.~{number}~")
+        if not os.path.lexists(backup) and disk.rename_new(path, backup):
+            return backup
+    raise AssertionError("numbers don't end")
+
+
+@contextmanager
+def _parents(final: Path) -> Iterator[None]:
+    """Makes the folders above a path, and on failure removes those that it made and that are still empty."""
     missing = [parent for parent in final.parents if not parent.exists()]
     for parent in reversed(missing):
-        _mkdir(parent)
-    return missing
-
-
-def _mkdir(folder: Path) -> None:
+        _mkdir(parent, exist_ok=True)
     try:
-        folder.mkdir(exist_ok=True)
+        yield
+        for parent in missing:
+            disk.sync(parent.parent)
+    except BaseException:
+        _remove_empty(missing)
+        raise
+
+
+def _mkdir(folder: Path, exist_ok: bool = False) -> None:
+    try:
+        folder.mkdir(exist_ok=exist_ok)
     except OSError as error:
         raise OutputError(f"{folder}: can't be made: {error.strerror}") from error
+
+
+def _touch(file: Path) -> None:
+    try:
+        file.touch(exist_ok=False)
+    except OSError as error:
+        raise OutputError(f"{file}: can't be made: {error.strerror}") from error
 
 
 def _remove_empty(folders: list[Path]) -> None:

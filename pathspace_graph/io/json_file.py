@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from pathspace_graph.errors import InputError
-
 from .files import write_text
+from .parsing import parse_json, read_text
 
 
 def to_plain(value: Any) -> Any:
@@ -39,11 +38,4 @@ def write_json(file: Path, content: Any, indent: int | None = 2) -> None:
 
 def read_json(file: Path, expected: str) -> Any:
     """Returns the content of a JSON file; an InputError says that `expected` was expected where it fails."""
-    try:
-        return json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(file, f"expected {expected}, can't be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputError(file, "expected text in UTF-8") from None
-    except json.JSONDecodeError as error:
-        raise InputError(file, f"expected JSON ({error.msg})", row=error.lineno) from None
+    return parse_json(read_text(file, expected), file)

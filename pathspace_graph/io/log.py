@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
-import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +16,21 @@ from pathspace_graph.labels import NAMES, label_from_name
 
 from .csv_table import FloatArray, Table, read_table
 from .files import atomic_folder
+from .limits import (
+    MAX_ANGLE,
+    MAX_DETECTIONS,
+    MAX_DRIVE,
+    MAX_HEADER_BYTES,
+    MAX_HELD,
+    MAX_NOISE,
+    MAX_RANGE,
+    MAX_SPEED,
+    MAX_STAMP,
+    MAX_YAW_RATE,
+    shown,
+)
+from .manifest import verified
+from .parsing import parse_toml, read_text
 
 IntArray = NDArray[np.int_]
 
@@ -29,6 +41,15 @@ DETECTIONS_FILE: Final = "detections.csv"
 TRUTH_POSES_FILE: Final = "truth_poses.csv"
 TRUTH_CONES_FILE: Final = "truth_cones.csv"
 TRUTH_ASSOCIATIONS_FILE: Final = "truth_associations.csv"
+FILES: Final = (
+    LOG_FILE,
+    ODOMETRY_FILE,
+    DETECTIONS_FILE,
+    TRUTH_POSES_FILE,
+    TRUTH_CONES_FILE,
+    TRUTH_ASSOCIATIONS_FILE,
+)
+"""A log has these files, those of the truth only where it is known."""
 
 CALIBRATION: Final = ("scale", "bias")
 """The true calibration of the odometry has these names in the log's header."""
@@ -133,6 +154,11 @@ def read_log(folder: Path | str) -> Log:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "expected a log folder, found " + ("a file" if folder.exists() else "none"))
+    with verified(folder, *FILES):
+        return _read_log(folder)
+
+
+def _read_log(folder: Path) -> Log:
     header = _read_toml(folder / LOG_FILE)
     odometry = _read_odometry(folder / ODOMETRY_FILE)
     table = read_table(folder / DETECTIONS_FILE, ("t", "x", "y", "label", "xx", "xy", "yy"))
@@ -163,26 +189,16 @@ def write_log(log: Log, folder: Path | str) -> None:
 
 
 def _read_toml(file: Path) -> dict[str, Any]:
-    try:
-        header = tomllib.loads(file.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise InputError(file, "expected a file, found none") from None
-    except OSError as error:
-        raise InputError(file, f"expected a readable file: {error.strerror}") from error
-    except UnicodeDecodeError:
-        raise InputError(file, "expected text in UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        line = re.search(r"at line (\d+)", str(error))
-        raise InputError(file, f"expected TOML: {error}", int(line[1]) if line else None) from error
+    header = parse_toml(read_text(file, most=MAX_HEADER_BYTES), file)
     if header.get("format") != FORMAT:
-        raise InputError(file, f'expected format = "{FORMAT}", found {header.get("format")!r}')
+        raise InputError(file, f'expected format = "{FORMAT}", found {shown(header.get("format"))}')
     return header
 
 
 def _section(file: Path, header: dict[str, Any], name: str) -> dict[str, Any]:
     section = header.get(name, {})
     if not isinstance(section, dict):
-        raise InputError(file, f"expected a section [{name}], found {section!r}")
+        raise InputError(file, f"expected a section [{name}], found {shown(section)}")
     return section
 
 
@@ -190,7 +206,7 @@ def _odometry_sigma(file: Path, header: dict[str, Any]) -> FloatArray:
     sigma = _section(file, header, "odometry").get("sigma")
     good = isinstance(sigma, list) and len(sigma) == 3 and all(_is_positive(value) for value in sigma)
     if not good:
-        raise InputError(file, f"expected three positive numbers as [odometry] sigma, found {sigma!r}")
+        raise InputError(file, f"expected three positive numbers as [odometry] sigma, found {shown(sigma)}")
     return np.array(sigma, dtype=float)
 
 
@@ -200,7 +216,7 @@ def _sensor_info(file: Path, header: dict[str, Any]) -> SensorInfo:
     for name in ("range_max", "fov", "rate"):
         value = section.get(name)
         if value is not None and not _is_positive(value):
-            raise InputError(file, f"expected a positive number as [sensor] {name}, found {value!r}")
+            raise InputError(file, f"expected a positive number as [sensor] {name}, found {shown(value)}")
         values[name] = None if value is None else float(value)
     return SensorInfo(**values)
 
@@ -211,27 +227,35 @@ def _true_calibration(file: Path, header: dict[str, Any]) -> FloatArray | None:
         return None
     values = [section.get(name) for name in CALIBRATION]
     if not all(_is_number(value) for value in values):
-        raise InputError(file, f"expected numbers as [truth] {' and '.join(CALIBRATION)}, found {values}")
+        raise InputError(
+            file, f"expected numbers as [truth] {' and '.join(CALIBRATION)}, found {shown(values)}"
+        )
     return np.array(values, dtype=float)
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_NOISE
 
 
 def _is_positive(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
+    return isinstance(value, int | float) and _is_number(value) and value > 0
 
 
 def _read_odometry(file: Path) -> Odometry:
     table = read_table(file, ("t", "vx", "vy", "wz"))
     if not len(table):
         raise InputError(file, "expected at least one row, found a header only", 2)
-    return Odometry(_increasing_times(table), table.stack(("vx", "vy", "wz")))
+    t, speeds = _increasing_times(table), table.stack(("vx", "vy"), MAX_SPEED)
+    held = np.abs(speeds[:-1]).max(axis=1) * np.diff(t)
+    held_far = f"expected a twist that moves the vehicle by at most {MAX_HELD:g} m until the next row"
+    table.require(np.append(held <= MAX_HELD, True), held_far)
+    too_long = f"expected a drive of at most {MAX_DRIVE:g} m up to the next row"
+    table.require(np.append(np.cumsum(held) <= MAX_DRIVE, True), too_long)
+    return Odometry(t, np.column_stack([speeds, table.numbers("wz", MAX_YAW_RATE)]))
 
 
 def _increasing_times(table: Table) -> FloatArray:
-    t = table.numbers("t")
+    t = table.numbers("t", MAX_STAMP)
     good = np.append(True, np.diff(t) > 0) if len(t) else np.ones(0, dtype=bool)
     table.require(good, "expected a time later than the row before")
     return t
@@ -240,22 +264,25 @@ def _increasing_times(table: Table) -> FloatArray:
 def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ...]:
     if not len(table):
         return ()
-    t = table.numbers("t")
+    t = table.numbers("t", MAX_STAMP)
     table.require(np.append(True, np.diff(t) >= 0), "expected a time not earlier than the row before")
     table.require(t >= t_first, f"expected a time not before the first odometry row ({t_first:g} s)")
     late = f"expected a time at most {MAX_HOLD:g} s after the last odometry row ({t_last:g} s)"
     table.require(t <= t_last + MAX_HOLD, late)
-    points = table.stack(("x", "y"))
+    points = table.stack(("x", "y"), MAX_RANGE)
     covariances = _covariances(table)
     labels = _labels(table)
     starts = np.flatnonzero(np.diff(t, prepend=-np.inf))
     stops = np.append(starts[1:], len(t))
+    if (stops - starts).max() > MAX_DETECTIONS:
+        first = int(starts[np.argmax(stops - starts)])
+        table.fail(first, f"expected at most {MAX_DETECTIONS} detections in a cycle, found more")
     spans = [slice(a, b) for a, b in zip(starts, stops, strict=True)]
     return tuple(Detections(float(t[s.start]), points[s], covariances[s], labels[s]) for s in spans)
 
 
 def _covariances(table: Table) -> FloatArray:
-    xx, xy, yy = (table.numbers(name) for name in ("xx", "xy", "yy"))
+    xx, xy, yy = (table.numbers(name, MAX_RANGE**2) for name in ("xx", "xy", "yy"))
     with np.errstate(over="ignore", invalid="ignore"):
         good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
     table.require(good, "expected a positive definite covariance (xx > 0, xx yy > xy^2)")
@@ -280,7 +307,8 @@ def _read_truth_poses(file: Path) -> tuple[FloatArray, FloatArray]:
     if not file.exists():
         return np.zeros(0), np.zeros((0, 3))
     table = read_table(file, ("t", "x", "y", "theta"))
-    return _increasing_times(table), table.stack(("x", "y", "theta"))
+    points, theta = table.stack(("x", "y")), table.numbers("theta", MAX_ANGLE)
+    return _increasing_times(table), np.column_stack([points, theta])
 
 
 def _read_truth_cones(file: Path) -> tuple[FloatArray, IntArray]:

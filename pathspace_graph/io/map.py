@@ -16,6 +16,8 @@ from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.spline.bspline import BSpline
 
 from .json_file import read_json
+from .limits import MAX_COORDINATE, MAX_DEGREE, shown
+from .manifest import verified
 
 Array = NDArray[np.float64]
 
@@ -134,11 +136,11 @@ def map_from_json(content: Any, file: Path | str = MAP_FILE) -> Map:
     reader = _Reader(Path(file))
     top = reader.object(content, "the file")
     if top.get("format") != FORMAT:
-        raise reader.error(f'expected format = "{FORMAT}", found {top.get("format")!r}')
+        raise reader.error(f'expected format = "{FORMAT}", found {shown(top.get("format"))}')
     boundaries = reader.object(reader.get(top, "boundaries", ""), "boundaries")
     unknown = sorted(set(boundaries) - {NAMES[label] for label in BOUNDARIES})
     if unknown:
-        raise reader.error(f"boundaries: expected left and right, found {unknown[0]!r}")
+        raise reader.error(f"boundaries: expected left and right, found {shown(unknown[0])}")
     return Map(
         closed=reader.boolean(reader.get(top, "closed", ""), "closed"),
         boundaries={
@@ -170,26 +172,36 @@ class _Reader:
 
     def boolean(self, value: Any, where: str) -> bool:
         if not isinstance(value, bool):
-            raise self.error(f"{where}: expected true or false, found {value!r}")
+            raise self.error(f"{where}: expected true or false, found {shown(value)}")
         return value
 
     def integer(self, value: Any, where: str, least: int) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise self.error(f"{where}: expected a whole number of at least {least}, found {value!r}")
+            raise self.error(f"{where}: expected a whole number of at least {least}, found {shown(value)}")
         return value
 
-    def array(self, value: Any, where: str, columns: int | None = None) -> Array:
-        """Returns finite numbers: a list where `columns` is None, or rows of `columns` values."""
+    def array(
+        self, value: Any, where: str, columns: int | None = None, largest: float = MAX_COORDINATE
+    ) -> Array:
+        """Returns finite numbers: a list where `columns` is None, or rows of `columns` values.
+
+        Each is at most `largest` in size.
+        """
         expected = "a list of finite numbers" if columns is None else f"rows of {columns} finite numbers"
         try:
-            array = np.asarray(value, dtype=float)
+            array = np.asarray(value)
         except (TypeError, ValueError):
             raise self.error(f"{where}: expected {expected}") from None
+        if array.dtype.kind not in "iuf":  # texts and null would be turned into numbers
+            raise self.error(f"{where}: expected {expected}")
+        array = array.astype(float)
         if columns is not None and array.size == 0:
             array = array.reshape(0, columns)
         shaped = array.ndim == 1 if columns is None else array.ndim == 2 and array.shape[1] == columns
         if not isinstance(value, list) or not shaped or not np.isfinite(array).all():
             raise self.error(f"{where}: expected {expected}")
+        if array.size and np.abs(array).max() > largest:
+            raise self.error(f"{where}: expected numbers of at most {largest:g} in size, found larger ones")
         return array
 
     def boundary(self, value: Any, where: str) -> MapBoundary:
@@ -212,6 +224,8 @@ class _Reader:
 
     def spline(self, fields: dict[str, Any], where: str) -> BSpline:
         degree = self.integer(self.get(fields, "degree", where), f"{where}.degree", least=1)
+        if degree > MAX_DEGREE:
+            raise self.error(f"{where}.degree: expected at most {MAX_DEGREE}, found {degree}")
         periodic = self.boolean(self.get(fields, "periodic", where), f"{where}.periodic")
         knots = self.array(self.get(fields, "knots", where), f"{where}.knots")
         points = self.array(self.get(fields, "control_points", where), f"{where}.control_points", columns=2)
@@ -225,7 +239,7 @@ class _Reader:
         if stated != size:
             raise self.error(f"{where}.size: expected {size} (what is listed), found {stated}")
         listed = self.get(fields, "covariance", where)
-        covariance = self.array(listed, f"{where}.covariance", columns=2 * size)
+        covariance = self.array(listed, f"{where}.covariance", 2 * size, MAX_COORDINATE**2)
         if len(covariance) != 2 * size:
             raise self.error(f"{where}.covariance: expected {2 * size} rows, found {len(covariance)}")
         if not _is_covariance(covariance):
@@ -248,4 +262,5 @@ def _is_covariance(P: Array) -> bool:
 def read_map(folder: Path | str) -> Map:
     """Returns the map of a folder that follows FORMATS, as those of `write_result` do."""
     file = Path(folder) / MAP_FILE
-    return map_from_json(read_json(file, "a map"), file)
+    with verified(Path(folder), MAP_FILE):
+        return map_from_json(read_json(file, "a map"), file)

@@ -19,6 +19,7 @@ from .csv_table import read_table
 from .files import atomic_folder
 from .json_file import write_json
 from .log import CALIBRATION
+from .manifest import verified
 from .map import MAP_FILE, Map, map_to_json
 from .trajectory import TRAJECTORY_FILE, write_trajectory
 
@@ -195,4 +196,5 @@ def _cycle_row(record: CycleRecord) -> list[float | int | str]:
 
 def read_health(file: Path) -> list[str]:
     """Returns the health of each cycle by the file of cycles; the list is empty if it does not say it."""
-    return list(read_table(file, ("cycle",)).columns.get("health", []))
+    with verified(file.parent, file.name):
+        return list(read_table(file, ("cycle",)).columns.get("health", []))

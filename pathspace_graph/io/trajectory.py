@@ -10,6 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from pathspace_graph.errors import InputError
 
+from .csv_table import is_plain
+from .limits import MAX_COORDINATE, MAX_STAMP, shown
+from .manifest import verified
+from .parsing import read_text
+
 Array = NDArray[np.float64]
 
 TRAJECTORY_FILE: Final = "trajectory.tum"
@@ -32,15 +37,13 @@ def read_trajectory(file: Path) -> tuple[Array, Array]:
 
     Empty lines and lines that begin with # are left out. An InputError names the row that is wrong.
     """
-    try:
-        lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise InputError(file, f"expected a trajectory, can't be read ({error.strerror})") from None
-    rows = [
-        _values(file, line, number)
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.startswith("#")
-    ]
+    with verified(file.parent, file.name):
+        lines = read_text(file, "a trajectory").split("\n")
+        rows = [
+            _values(file, line, number)
+            for number, line in enumerate(lines, start=1)
+            if line.strip() and not line.startswith("#")
+        ]
     values = np.array(rows).reshape(-1, _COLUMNS)
     theta = 2 * np.arctan2(values[:, 6], values[:, 7])
     return values[:, 0], np.column_stack([values[:, 1:3], theta])
@@ -48,9 +51,12 @@ def read_trajectory(file: Path) -> tuple[Array, Array]:
 
 def _values(file: Path, line: str, number: int) -> list[float]:
     try:
-        values = [float(word) for word in line.split()]
+        values = [float(word) for word in line.split()] if is_plain(line) else []
     except ValueError:
         values = []
     if len(values) != _COLUMNS or not np.isfinite(values).all():
         raise InputError(file, f"expected {_COLUMNS} finite numbers (t tx ty tz qx qy qz qw)", number)
+    if abs(values[0]) > MAX_STAMP or max(map(abs, values[1:])) > MAX_COORDINATE:
+        limits = f"a stamp of at most {MAX_STAMP:g} s and coordinates of at most {MAX_COORDINATE:g} m"
+        raise InputError(file, f"expected {limits}, found {shown(line.strip())}", number)
     return values

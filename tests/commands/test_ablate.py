@@ -51,7 +51,15 @@ def test_the_command_leaves_tables_and_figures(
     assert "left" in printed.err
     files = set(contents(out)) - {f"cells/{name.name}" for name in (out / "cells").iterdir()}
     assert files == {
-        *("study.json", "results.csv", "times.csv", "summary.txt", "summary.md", "summary.tex"),
+        *(
+            "study.json",
+            "results.csv",
+            "times.csv",
+            "summary.txt",
+            "summary.md",
+            "summary.tex",
+            "manifest.json",
+        ),
         *(
             f"figures/{name}.{suffix}"
             for name in ("differences", "accuracy_size", "accuracy_time")

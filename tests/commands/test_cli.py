@@ -109,7 +109,8 @@ def test_a_track_file_wins_over_a_generated_one(tmp_path: Path) -> None:
 
 
 def test_a_map_keeps_the_formats_contract(log_folder: Path, map_folder: Path) -> None:
-    assert names(map_folder) == {"map.json", "trajectory.tum", "cycles.csv", "summary.json"}
+    files = {"map.json", "trajectory.tum", "cycles.csv", "summary.json", "manifest.json"}
+    assert names(map_folder) == files
     content = json.loads((map_folder / "map.json").read_text())
     assert content["format"] == "pathspace-map/1"
     cones = read_log(log_folder).truth
@@ -219,7 +220,7 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
     monkeypatch.setattr("pathspace_graph.commands.demo.simulate", lambda *_: read_log(log_folder))
     monkeypatch.chdir(tmp_path)
     assert main(["demo"]) == 0
-    assert names(tmp_path / "pathspace-demo") == {"log", "map", "track.png"}
+    assert names(tmp_path / "pathspace-demo") == {"log", "map", "track.png", "manifest.json"}
     assert read_map(tmp_path / "pathspace-demo" / "map").boundaries
     printed = capsys.readouterr().out
     assert "rmse" in printed
@@ -297,7 +298,9 @@ def test_an_interrupt_leaves_nothing_half_written(
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_explains_the_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--help"]) == 0
-    assert "--out" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "--out" in shown or command == "verify"
+    assert "usage" in shown
 
 
 def test_help_explains_the_options_that_commands_share(capsys: pytest.CaptureFixture[str]) -> None:

@@ -59,6 +59,7 @@ def test_the_command_writes_tables_figures_and_maps(
     assert {path.name for path in out.iterdir()} == files | figures | {
         "times.csv",
         "comparison.json",
+        "manifest.json",
         *NAMES,
     }
     assert read_map(out / "gaps").size == 36

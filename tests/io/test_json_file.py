@@ -45,7 +45,7 @@ def test_what_cannot_be_written_leaves_the_earlier_file(tmp_path: Path) -> None:
 
 
 def test_an_error_of_reading_names_what_was_expected_and_the_row(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"f\.json: expected a list, can't be read"):
+    with pytest.raises(InputError, match=r"f\.json: expected a list, found none"):
         read_json(tmp_path / "f.json", "a list")
     (tmp_path / "f.json").write_text('[1,\n2,\n"')
     with pytest.raises(InputError, match=r"f\.json, row 3: expected JSON"):

@@ -12,10 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pathspace_graph.errors import InputError, OutputError
+from pathspace_graph.io.limits import MAX_HELD, MAX_RANGE
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth, read_log, write_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
-FINITE = st.floats(-1e6, 1e6, allow_nan=False)
+
+def numbers_up_to(largest: float) -> st.SearchStrategy[float]:
+    return st.floats(-largest, largest, allow_nan=False)
 
 
 def small_log() -> Log:
@@ -69,7 +72,11 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(twist=arrays(float, (4, 3), elements=FINITE), point=arrays(float, (2,), elements=FINITE), t0=FINITE)
+@given(
+    twist=arrays(float, (4, 3), elements=numbers_up_to(MAX_HELD)),
+    point=arrays(float, (2,), elements=numbers_up_to(MAX_RANGE)),
+    t0=numbers_up_to(1e6),
+)
 def test_round_trip_is_exact_for_any_numbers(
     twist: np.ndarray, point: np.ndarray, t0: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -156,6 +163,44 @@ BAD_ROWS = [
     ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n\n1,1,0\n", 4, "expected 4 fields, found 3"),
     ("odometry.csv", "t,vx,vy,wz\n0,1,,0\n", 2, "number in column 'vy', found ''"),
     ("odometry.csv", "t,vx,vy,wz,t\n0,1,0,0,0\n", 1, "more than one"),
+    (
+        "odometry.csv",
+        "t,vx,vy,wz\n0,1,0,0\n0.1,1e5,0,0\n",
+        3,
+        "1000 in size in column 'vx', found '1e5'",
+    ),
+    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.1,1,0,-1e9\n", 3, "at most 1000 in size in column 'wz'"),
+    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1000000000000000000,1,0,0\n", 3, "1e+10 in size in column 't'"),
+    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1,5,0,0\n1e9,5,0,0\n", 3, "at most 1000 m until the next row"),
+    (
+        "odometry.csv",
+        "t,vx,vy,wz\n" + "".join(f"{k},-999,0,0\n" for k in range(1003)),
+        1003,
+        "at most 1e+06 m",
+    ),
+    ("odometry.csv", "t,vx,vy,wz\n0,1_0,0,0\n", 2, "number in column 'vx', found '1_0'"),
+    ("odometry.csv", "t,vx,vy,wz\n0,\u0661,0,0\n", 2, "number in column 'vx'"),
+    (
+        "detections.csv",
+        "t,x,y,label,xx,xy,yy\n0,3,-1e5,left,1,0,1\n",
+        2,
+        "10000 in size in column 'y'",
+    ),
+    (
+        "detections.csv",
+        "t,x,y,label,xx,xy,yy\n0,3,1,left,1e9,0,1\n",
+        2,
+        "1e+08 in size in column 'xx'",
+    ),
+    (
+        "detections.csv",
+        "t,x,y,label,xx,xy,yy\n" + 10001 * "0,3,1,left,1,0,1\n",
+        2,
+        "10000 detections",
+    ),
+    ("truth_poses.csv", "t,x,y,theta\n0,1e9,0,0\n", 2, "at most 1e+08 in size in column 'x'"),
+    ("truth_poses.csv", "t,x,y,theta\n0,0,0,1e9\n", 2, "at most 1e+06 in size in column 'theta'"),
+    ("truth_cones.csv", "x,y,label\n0,9.2e18,left\n", 2, "at most 1e+08 in size in column 'y'"),
     ("detections.csv", "t,x,y,label,xx,xy\n", 1, "column 'yy'"),
     ("detections.csv", "t,x,y,label,xx,xy,yy\n0,?,1,left,1,0,1\n", 2, "number in column 'x'"),
     ("detections.csv", "t,x,y,label,xx,xy,yy\n0,3,1,left,1,0,1\n0,3,inf,left,1,0,1\n", 3, "finite"),

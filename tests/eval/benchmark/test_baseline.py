@@ -67,7 +67,7 @@ def test_what_is_no_baseline_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "bad.json").write_text(text)
     with pytest.raises(InputError, match="expected"):
         read_baseline(tmp_path / "bad.json")
-    with pytest.raises(InputError, match="no file"):
+    with pytest.raises(InputError, match="--write-baseline makes one"):
         read_baseline(tmp_path / "none.json")
 
 

@@ -133,7 +133,7 @@ def test_a_damaged_cell_or_log_is_made_again(study: Study, tmp_path: Path) -> No
     calls = Pretender.calls + Fragile.calls
     drive = make_plan(study).cells[0].drive
     (tmp_path / "logs").mkdir()
-    (tmp_path / "logs" / f"{drive.id}.pickle").write_bytes(b"not a log")
+    (tmp_path / "logs" / f"{drive.id}.log").write_bytes(b"not a log")
     again = run_study(study, tmp_path)
     assert Pretender.calls + Fragile.calls == calls + 1
     pd.testing.assert_frame_equal(without_times(first), without_times(again))

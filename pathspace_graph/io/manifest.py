@@ -1,0 +1,145 @@
+"""The manifest of a folder: size and SHA-256 of each file as it was written, verified when a file is read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from pathspace_graph.errors import InputError
+
+from .limits import shown
+from .parsing import parse_json, read_text
+
+FORMAT: Final = "pathspace-manifest/1"
+MANIFEST_FILE: Final = "manifest.json"
+"""A folder holds its manifest in this file."""
+_MARK: Final = "pathspace"
+"""A manifest holds this word more than once, so that a damaged one is not taken for another program's."""
+_DIGEST: Final = "pathspace_digest"
+"""The manifest's own SHA-256, without this key, stands under it."""
+
+
+def manifest_of(folder: Path) -> str:
+    """Returns the text of the manifest of all files in a folder and in its subfolders.
+
+    Of a subfolder with a manifest of its own, only that is listed. Hidden files are left out.
+    """
+    files = {}
+    for file in sorted(_files(folder)):
+        with file.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        files[file.relative_to(folder).as_posix()] = {"size": file.stat().st_size, "sha256": digest}
+    return _text(files)
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    for entry in os.scandir(folder):
+        path = Path(entry.path)
+        if entry.name.startswith(".") or path == folder / MANIFEST_FILE or entry.is_symlink():
+            continue
+        if entry.is_dir():
+            own = path / MANIFEST_FILE
+            yield from [own] if own.is_file() else _files(path)
+        elif entry.is_file():
+            yield path
+
+
+def _text(files: Any) -> str:
+    content = {"format": FORMAT, "files": files}
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return json.dumps(content | {_DIGEST: digest}, indent=1) + "\n"
+
+
+def read_manifest(folder: Path) -> dict[str, dict[str, Any]] | None:
+    """Returns size and SHA-256 of each listed file by its path, or None where the folder has no manifest.
+
+    A file of the same name that another program wrote is none. An InputError says where one is damaged.
+    """
+    file = folder / MANIFEST_FILE
+    if not file.is_file():
+        return None
+    text = read_text(file, "a manifest")
+    content = parse_json(text, file)
+    if _MARK not in text:
+        return None
+    files = content.get("files") if isinstance(content, dict) else None
+    # any other byte makes another text
+    if not isinstance(files, dict) or text != _text(files):
+        raise InputError(file, "expected the manifest as it was written, found another content" + _ACCEPT)
+    return files
+
+
+_ACCEPT: Final = f" (removing {MANIFEST_FILE} accepts the files as they are)"
+
+
+def verify(folder: Path, names: Iterable[str]) -> None:
+    """Raises an InputError for the first of these files that is not as the folder's manifest says.
+
+    A file that is missing or not listed, and a folder without a manifest, are accepted.
+    """
+    listed = read_manifest(folder)
+    for name in names if listed else ():
+        if listed and name in listed and (folder / name).is_file():
+            _verify_file(folder / name, listed[name])
+
+
+def verify_all(folder: Path) -> int:
+    """Verifies every listed file, also by the manifests of subfolders, and returns their number.
+
+    An InputError names the first file that is missing or differs, or the folder where it has no manifest.
+    """
+    listed = read_manifest(folder)
+    if listed is None:
+        raise InputError(folder, f"expected a folder with a manifest ({MANIFEST_FILE}), found none")
+    count = len(listed)
+    for name, entry in listed.items():
+        file = folder / name
+        if not file.is_file():
+            raise InputError(file, "expected a file that the manifest lists, found none" + _ACCEPT)
+        _verify_file(file, entry)
+        if file.name == MANIFEST_FILE:
+            count += verify_all(file.parent)
+    return count
+
+
+def _verify_file(file: Path, entry: Any) -> None:
+    if not _is_as_written(file, entry):
+        message = f"expected the file as it was written ({MANIFEST_FILE}), found another content"
+        raise InputError(file, message + _ACCEPT)
+
+
+def _is_as_written(file: Path, entry: Any) -> bool:
+    try:
+        if entry["size"] != file.stat().st_size:
+            return False
+        with file.open("rb") as stream:
+            return bool(entry["sha256"] == hashlib.file_digest(stream, "sha256").hexdigest())
+    except (LookupError, TypeError) as error:
+        raise InputError(file, f"expected size and sha256 in the manifest, found {shown(entry)}") from error
+    except OSError as error:
+        raise InputError(file, f"expected a readable file: {error.strerror}") from error
+
+
+@contextmanager
+def verified(folder: Path, *names: str) -> Iterator[None]:
+    """Verifies these files after they were read without an error.
+
+    An error of the content of a file that has changed comes first, since it names the row.
+    """
+    try:
+        yield
+    except InputError as error:
+        try:
+            verify(folder, names)
+        except InputError as damage:
+            if damage.file != error.file:
+                raise damage from error
+            message = f"{error.message}; the file is not as it was written ({MANIFEST_FILE})"
+            raise InputError(error.file, message, error.row) from damage
+        raise
+    verify(folder, names)

@@ -1,0 +1,247 @@
+"""A command that is killed at any of its steps on the disk leaves the old result or the new, whole.
+
+What is computed is recorded, since the writers are what is tested.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+from matplotlib.figure import Figure
+
+from pathspace_graph import estimators as registry
+from pathspace_graph.cli import parse_command
+from pathspace_graph.eval.compare.comparison import Comparison, compare, read_logs
+from pathspace_graph.eval.figures.isolated import IsolatedFigure
+from pathspace_graph.eval.harness.attempts import run_estimator
+from pathspace_graph.eval.metrics.text_table import TextTable
+from pathspace_graph.eval.scaling.points import CONES, LAPS, READINGS, Point, Scaling, fit_slope
+from pathspace_graph.eval.scaling.settings import ScalingSettings
+from pathspace_graph.io.log import Log, read_log, write_log
+from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
+from pathspace_graph.io.results import RunResult, write_result
+from pathspace_graph.settings.mapper import MapperSettings
+
+from ..scenes import rings
+from ..scenes.kills import Contents, content_of, dies, leftovers, results
+from ..scenes.pretenders import write_round_track
+
+MOST_STEPS = 400
+"""No command here takes as many steps."""
+LEAST_STEPS = 4
+"""Every command takes more steps than this."""
+
+
+def slow(name: str) -> object:
+    return pytest.param(name, marks=pytest.mark.slow)
+
+
+LONG = ("compare", "demo")
+"""These commands take many steps, so that the next run is done after every third kill only."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A short log, and what an estimator has made of it."""
+
+    folder: Path
+    log: Log
+    result: RunResult
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    folder = tmp_path_factory.mktemp("recorded")
+    with pytest.MonkeyPatch.context() as patch:
+        rings.register(patch)
+        log = read_log(rings.write_logs(folder / "drives") / "a")
+        truth = replace(log.truth, associations=None) if log.truth else None
+        short = replace(log, cycles=log.cycles[:3], truth=truth)
+        write_log(short, folder / "log")
+        result = run_estimator("rings", MapperSettings(), short)
+    write_result(folder / "map", result, {"estimator": "rings"})
+    return Recorded(folder, short, result)
+
+
+@pytest.fixture(scope="module")
+def comparison(recorded: Recorded) -> Comparison:
+    with pytest.MonkeyPatch.context() as patch:
+        rings.register(patch)
+        return compare(read_logs(recorded.folder / "log"), ["rings"], MapperSettings())
+
+
+@pytest.fixture(autouse=True)
+def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is computed is taken from the record, a picture is a few bytes, and nothing is printed."""
+    rings.register(monkeypatch)
+    monkeypatch.setitem(registry.ONLINE, "fixed-lag", rings.Rings)  # the shipped studies name it
+    monkeypatch.setattr("os.fsync", lambda _: None)  # the killer loses what was not flushed
+    picture = Figure()
+    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: Path(file).write_bytes(b"picture"))
+    figures = tuple(IsolatedFigure(name, lambda: (picture, "It shows.")) for name in ("fit", "expansion"))
+    answers = {
+        "commands.simulate.simulate": recorded.log,
+        "commands.demo.simulate": recorded.log,
+        "commands.demo.map_with_both": (recorded.result, recorded.result),
+        "commands.demo.plot_map": picture,
+        "commands.demo.side_by_side": TextTable("", (), ()),
+        "commands.online.map_online": recorded.result,
+        "commands.online.report": None,
+        "commands.batch.report": None,
+        "commands.plot.plot_map": picture,
+        "commands.compare.read_logs": [],
+        "commands.compare.compare": comparison,
+        "commands.compare.Compare._report": None,
+        "commands.scale.make_drives": Roads(),
+        "commands.scale.measure_scaling": scaling(),
+        "eval.compare.output.plot_maps": picture,
+        "eval.compare.output.tables": {"table": TextTable("", ("a",), (("1",),))},
+        "eval.scaling.output.plot_laps": picture,
+        "eval.scaling.output.plot_scaling": picture,
+        "eval.scaling.output._process_megabytes": 1.0,
+    }
+    answers |= {f"commands.{command}.read_log": recorded.log for command in ("online", "batch", "plot")}
+    answers |= {f"{room}.summarize": {} for room in ("commands.demo", "commands.online", "commands.batch")}
+    answers |= {"eval.compare.output.summarize": {}, "commands.compare.with_gaps": comparison}
+    for name, answer in answers.items():
+        monkeypatch.setattr(f"pathspace_graph.{name}", lambda *_, _answer=answer, **__: _answer)
+    monkeypatch.setattr("pathspace_graph.eval.figures.isolated.FIGURES", figures)
+    monkeypatch.setattr("pathspace_graph.eval.figures.files.SUFFIXES", (".png",))
+
+
+@dataclass(frozen=True)
+class Roads:
+    cycles: int = 1
+
+
+def scaling() -> Scaling:
+    points = tuple(Point(CONES, "rings", at, 0.002, 9, 50.0) for at in (100.0, 200.0, 300.0))
+    slopes = tuple(fit_slope(sweep, "rings", points) for sweep in (CONES, READINGS, LAPS))
+    return Scaling(ScalingSettings(), {}, points, slopes, {"rings": 1.0})
+
+
+def commands(recorded: Recorded) -> dict[str, list[str]]:
+    """Every command that writes at once, but for its target, by the name of its target."""
+    log, track = str(recorded.folder / "log"), str(recorded.folder / "map")
+    return {
+        "simulate": ["--generate", "0"],
+        "online": [log, "--estimator", "rings"],
+        "batch": [log, "--estimator", "rings-batch"],
+        "compare": [log, "--estimators", "rings", "gaps"],
+        "scale": ["--estimators", "rings"],
+        "figures": [],
+        "demo": [],
+        "plot": [track],
+    }
+
+
+def work_of(name: str, options: list[str], out: Path) -> Callable[[], None]:
+    command = parse_command(name, [*options, "--out", str(out)])
+
+    def work() -> None:
+        try:
+            command.run()
+        except SystemExit as end:  # a batch that did not converge is written all the same
+            assert end.code == 3
+
+    return work
+
+
+def check(target: Path, expected: list[Contents]) -> None:
+    """The target is one of these, and every folder with a manifest in it is as that says."""
+    assert content_of(target) in expected
+    for manifest in target.rglob(MANIFEST_FILE) if target.is_dir() else ():
+        verify_all(manifest.parent)
+
+
+def place(target: Path, like: Contents) -> None:
+    """An old result: the new one with other bytes, but for its manifests, which are left out."""
+    for name, data in like.items():
+        if Path(name).name != MANIFEST_FILE:
+            file = target / name if name else target
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(b"old " + data)
+
+
+@pytest.mark.parametrize("old", [False, True], ids=["first", "again"])
+@pytest.mark.parametrize(
+    "name", ["simulate", "online", "batch", "scale", "figures", "plot", *map(slow, LONG)]
+)
+def test_a_kill_at_any_step_leaves_the_old_or_the_new(
+    name: str, old: bool, recorded: Recorded, tmp_path: Path
+) -> None:
+    out = "out.png" if name == "plot" else "out"
+    folder = tmp_path / "folder"
+    target = folder / out
+    work = work_of(name, commands(recorded)[name], target)
+    work()
+    new = content_of(target)
+    every = 3 if name in LONG else 1
+    died, step = True, 0
+    while died:
+        step += 1
+        shutil.rmtree(folder)
+        folder.mkdir()
+        if old:
+            place(target, new)
+        before = [content_of(target)] if old else []
+        died = dies(work, folder, step)
+        if old or target.exists():
+            check(target, [*before, new])
+        if old and step % every == 0:
+            work()
+            check(target, [new])
+            assert leftovers(folder) == []
+        assert all(content in results(folder, out) for content in before), "the old result is kept"
+        assert step < MOST_STEPS
+    assert check(target, [new]) is None
+    assert step > LEAST_STEPS
+
+
+STUDY = """
+tracks = ["{track}"]
+seeds = [0, 1]
+laps = 1
+estimators = ["rings"]
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ablate", "faults"])
+def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
+    name: str, recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study, rows = "pathspace_graph.eval.study", [{"lap": 1, "rmse": 0.5}]
+    monkeypatch.setattr(f"{study}.run.try_drive", lambda _: recorded.log)
+    monkeypatch.setattr(f"{study}.cells.lap_rows", lambda *_, **__: rows)
+    monkeypatch.setattr(f"{study}.output.figures", lambda *_: {"rmse": Figure()})
+    monkeypatch.setattr("pathspace_graph.eval.faults.output.plot_faults", lambda *_: Figure())
+    track = write_round_track(tmp_path)
+    (tmp_path / "small.toml").write_text(STUDY.format(track=track))
+    folder = tmp_path / "folder"
+    options = [str(tmp_path / "small.toml"), "--jobs", "1"]
+    if name == "faults":
+        drives = ["--tracks", str(track), "--seeds", "0", "--laps", "1", "--jobs", "1"]
+        options = [*drives, "--only", "no colours", "--quick", "--estimator", "rings"]
+    work = work_of(name, options, folder / "out")
+    work()
+    new = content_of(folder / "out")
+    shutil.rmtree(folder)
+    died, step = True, 0
+    while died:
+        step += 1
+        folder.mkdir(exist_ok=True)
+        died = dies(work, folder, step)
+        for file, data in content_of(folder / "out").items() if (folder / "out").exists() else ():
+            assert file.startswith("logs/") or "/." in f"/{file}" or data == new[file], file
+        if died and step % 4 == 0:  # it goes on in the folder of the run that died
+            work()
+            assert content_of(folder / "out") == new
+            assert leftovers(folder) == []
+        shutil.rmtree(folder)
+        assert step < MOST_STEPS
+    assert step > LEAST_STEPS

@@ -1,0 +1,109 @@
+"""A flipped byte in any file that is written is refused, with the name of the file.
+
+`FLIPS=3000 pytest tests/io/test_flipped_bytes.py` does it more often.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pathspace_graph.errors import InputError, PathspaceError
+from pathspace_graph.eval.harness.drives import Drive, NamedTrack
+from pathspace_graph.eval.study.cells import Cell, failed
+from pathspace_graph.eval.study.store import Store
+from pathspace_graph.io.log import FILES, read_log, write_log
+from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
+from pathspace_graph.io.map import read_map
+from pathspace_graph.io.results import read_health, write_result
+from pathspace_graph.io.trajectory import read_trajectory
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings
+from pathspace_graph.sim.track_files import read_track
+
+from ..scenes.pretenders import write_round_track
+from .test_log import small_log
+from .test_results import result
+
+FLIPS = int(os.environ.get("FLIPS", "300"))
+"""Each file has this number of flipped bytes, one at a time."""
+
+READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
+    **dict.fromkeys(FILES, ("log", read_log)),
+    "map.json": ("map", read_map),
+    "trajectory.tum": ("map", lambda folder: read_trajectory(folder / "trajectory.tum")),
+    "cycles.csv": ("map", lambda folder: read_health(folder / "cycles.csv")),
+    "summary.json": ("map", verify_all),
+}
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("written")
+    write_log(small_log(), folder / "log")
+    write_result(folder / "map", result(), {"estimator": "fixed-lag", "laps": [{"lap": 1, "rmse": 0.5}]})
+    return folder
+
+
+def flipped(data: bytes, rng: np.random.Generator) -> bytes:
+    """The same bytes but one."""
+    at, mask = int(rng.integers(len(data))), int(rng.integers(1, 256))
+    return data[:at] + bytes([data[at] ^ mask]) + data[at + 1 :]
+
+
+def refused(file: Path, read: Callable[[Path], object]) -> int:
+    """How many of the flips are refused with the file's name."""
+    good, rng, count = file.read_bytes(), np.random.default_rng(0), 0
+    for _ in range(FLIPS):
+        file.write_bytes(flipped(good, rng))
+        try:
+            read(file.parent)
+        except InputError as error:
+            count += error.file == file
+            assert "\n" not in str(error)
+    file.write_bytes(good)
+    read(file.parent)
+    return count
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_in_a_file_of_a_log_or_a_map(name: str, written: Path) -> None:
+    folder, read = READERS[name]
+    assert refused(written / folder / name, read) == FLIPS
+
+
+@pytest.mark.parametrize(("folder", "read"), [("log", read_log), ("map", read_map), ("map", verify_all)])
+def test_in_a_manifest(folder: str, read: Callable[[Path], object], written: Path) -> None:
+    assert refused(written / folder / MANIFEST_FILE, read) == FLIPS
+
+
+def test_in_a_cell_of_a_study(tmp_path: Path) -> None:
+    """A damaged cell is run again."""
+    track = NamedTrack("round", read_track(write_round_track(tmp_path)))
+    cell = Cell(Drive(track, 0, "nominal", SimulationSettings()), "fixed-lag", "default", MapperSettings())
+    store = Store(tmp_path)
+    record = failed(cell, ValueError("lost")) | {"laps": [{"lap": 1, "rmse": 0.123456}]}
+    store.write(cell, record)
+    assert store.read(cell) == record
+    (file,) = (tmp_path / "cells").iterdir()
+    good, rng = file.read_bytes(), np.random.default_rng(0)
+    for _ in range(FLIPS):
+        file.write_bytes(flipped(good, rng))
+        found = store.read(cell)
+        assert found is None or found == record  # another blank between two values is no other content
+    file.write_text("[]")
+    assert store.read(cell) is None
+
+
+def test_a_file_that_a_user_has_edited_is_accepted_without_the_manifest(tmp_path: Path) -> None:
+    write_log(small_log(), tmp_path / "log")
+    file = tmp_path / "log" / "odometry.csv"
+    file.write_text(file.read_text().replace("\n", "\r\n"))
+    with pytest.raises(PathspaceError, match=r"odometry\.csv.*removing manifest\.json accepts"):
+        read_log(tmp_path / "log")
+    (tmp_path / "log" / MANIFEST_FILE).unlink()
+    read_log(tmp_path / "log")
