@@ -85,7 +85,7 @@ class FrontEnd:
         judged = sides.update(self._motion.pose, motion.twists, detections)
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
-        self._sensor_doubted |= self._motion.errors.contradict(self._calibration)
+        self._sensor_doubted = self._sensor_doubted or self._motion.errors.contradict(self._calibration)
         return Reading(
             motion, judged, self._motion.seen_again, self._sensor_doubted, notice="; ".join(notices)
         )

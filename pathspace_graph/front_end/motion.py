@@ -23,7 +23,7 @@ from pathspace_graph.settings.front_end import MotionSettings
 from .gate import Newest
 from .rest import Rest
 from .scan_matching import Match, RecentDetections, match
-from .sensor_errors import SensorErrors, by_errors
+from .sensor_errors import Difference, SensorErrors, by_errors
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -157,11 +157,13 @@ class MotionCheck:
         told = found is not None and found.matched >= settings.min_doubting
         stuck = motion.stuck and not told and self._has_jumped(motion.odometry, going_on, dt)
         failed = motion.missing or (stuck and settings.doubt < np.inf)
-        if found is not None and not failed and not self._is_contradicted(motion, predicted, found):
-            self._matched = found.is_matched
-            self._misfit += settings.misfit_gain * (found.misfit - self._misfit)
-            self._learn(motion.odometry, predicted, found, dt)
-            return motion
+        if found is not None and not failed:
+            difference = self._difference(motion.odometry, predicted, found)
+            if not self._denies(found, difference):
+                self._matched = found.is_matched
+                self._misfit += settings.misfit_gain * (found.misfit - self._misfit)
+                self.errors.update(difference, dt)
+                return motion
         best = self._best(detections, variances, (compose(self.pose, going_on), predicted), dt)
         if failed or (best is not None and self._is_contradicted(motion, predicted, best)):
             return self._replaced(motion, best, going_on, dt)
@@ -189,7 +191,11 @@ class MotionCheck:
 
     def _is_contradicted(self, motion: MeasuredMotion, predicted: Array, found: Match) -> bool:
         """Returns whether a match of detections, which begins at the predicted pose (3,), denies a motion."""
-        off, covariance = self._contradiction(motion.odometry, predicted, found)
+        return self._denies(found, self._difference(motion.odometry, predicted, found))
+
+    def _denies(self, found: Match, difference: Difference) -> bool:
+        """Returns whether a match of detections is too far off a motion."""
+        off, covariance = difference.off, self.errors.covariance_of(difference)
         enough = found.matched >= self.settings.min_doubting
         return enough and bool(off @ np.linalg.solve(covariance, off) > self._limit**2)
 
@@ -210,34 +216,16 @@ class MotionCheck:
         found = match(self._recent, points, variances, start, self.settings, reaches)
         return found if found.matched >= self.settings.min_matched and found.is_certain else None
 
-    def _contradiction(
-        self, odometry: IntegratedOdometry, predicted: Array, found: Match
-    ) -> tuple[Array, Array]:
-        """Returns how far (3,) the detections are from the predicted pose, and its covariance (3, 3).
-
-        It is in the vehicle's frame. Detections may be late, or those of a sensor that is turned.
-        """
-        off, covariance = self._difference(odometry, predicted, found)
-        shifts = self._shifts(odometry, predicted)
-        return off, covariance + shifts @ self.errors.covariance @ shifts.T
-
-    def _difference(
-        self, odometry: IntegratedOdometry, predicted: Array, found: Match
-    ) -> tuple[Array, Array]:
-        """Returns `_contradiction` for a sensor without errors."""
+    def _difference(self, odometry: IntegratedOdometry, predicted: Array, found: Match) -> Difference:
+        """Returns how far the detections are from the predicted pose (3,), in the vehicle's frame."""
         turn = _to_vehicle(predicted[2])
         spread = np.linalg.inv(found.information) * self._excess
-        return turn @ (found.pose - predicted), turn @ spread @ turn.T + odometry.covariance
-
-    def _shifts(self, odometry: IntegratedOdometry, predicted: Array) -> Array:
-        """Returns the derivatives (3, 2) of the difference by the errors of the sensor."""
-        way = rotation(predicted[2]).T @ (predicted[:2] - self._recent.seen_from)
-        return self.errors.shifts(way, odometry.twist)
-
-    def _learn(self, odometry: IntegratedOdometry, predicted: Array, found: Match, dt: float) -> None:
-        """Learns of the sensor from a match that agrees with the odometry."""
-        off, covariance = self._difference(odometry, predicted, found)
-        self.errors.update(off, covariance, self._shifts(odometry, predicted), dt)
+        way = turn[:2, :2] @ (predicted[:2] - self._recent.seen_from)
+        return Difference(
+            off=turn @ (found.pose - predicted),
+            covariance=turn @ spread @ turn.T + odometry.covariance,
+            shifts=self.errors.shifts(way, odometry.twist),
+        )
 
     @property
     def _excess(self) -> float:
@@ -252,9 +240,10 @@ class MotionCheck:
         mean, covariance = going_on.copy(), np.diag(self._sigmas_going_on(dt) ** 2)
         if best is not None:
             predicted = compose(self.pose, odometry.delta)
-            off, spread = self._contradiction(odometry, predicted, best)
-            near = settings.doubt_rate * np.sqrt(spread[2, 2])
-            if not motion.missing and not motion.stuck and abs(off[2]) <= near:  # the gyro is right
+            difference = self._difference(odometry, predicted, best)
+            near = settings.doubt_rate * np.sqrt(self.errors.covariance_of(difference)[2, 2])
+            right = not motion.missing and not motion.stuck and abs(difference.off[2]) <= near
+            if right:  # so is the gyro
                 mean[2], covariance[2, 2] = odometry.delta[2], odometry.covariance[2, 2]
             own = relative(self.pose, best.pose)
             turn = _to_vehicle(best.pose[2])

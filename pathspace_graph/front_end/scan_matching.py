@@ -48,7 +48,7 @@ class RecentDetections:
 
         Their derivatives by e errors of the sensor are the columns (m, 2, e), in the same frame.
         """
-        turned = np.einsum("ij,mje->mie", rotation(pose[2]), columns)
+        turned = rotation(pose[2]) @ columns
         places, most = np.broadcast_to(pose[:2], measured.shape), self.settings.max_remembered
         self._measured = np.concatenate([self._measured, to_map(measured, pose[None])])[-most:]
         self._columns = np.concatenate([self._columns, turned])[-most:]

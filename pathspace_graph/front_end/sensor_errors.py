@@ -7,12 +7,13 @@ detections shows it, but each change of the velocity does. No map is needed for 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.sensor import SENSOR, by_sensor
+from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.front_end import MotionSettings
 
@@ -20,15 +21,32 @@ Array = NDArray[np.float64]
 
 ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]
 """These errors of a sensor are learned, as indices of its calibration."""
+MINUTE: Final = 60.0
+"""This is a minute in seconds."""
 
 
 def by_errors(points_vehicle: Array, twist: Array) -> Array:
     """Returns the derivatives (m, 2, 2) of detections (m, 2), vehicle frame, by the yaw and by the latency.
 
-    The vehicle moved with the twist (3,), in m/s, m/s and rad/s.
+    The vehicle moved with the twist (3,), in m/s, m/s and rad/s. They are two columns of
+    `factors.sensor:by_sensor`.
     """
-    twists = np.broadcast_to(twist, (len(points_vehicle), 3))
-    return by_sensor(points_vehicle, twists)[:, :, ERRORS]
+    columns = np.empty((len(points_vehicle), 2, len(ERRORS)))
+    columns[:, 0, 0], columns[:, 1, 0] = -points_vehicle[:, 1], points_vehicle[:, 0]
+    columns[:, :, 1] = -twist[:2] - twist[2] * columns[:, :, 0]
+    return columns
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """Says how far a match of detections is off the odometry, in the vehicle frame."""
+
+    off: Array
+    """(3,) It is off by this, in m, m and rad."""
+    covariance: Array
+    """(3, 3) This is the covariance of that, for a sensor without errors."""
+    shifts: Array
+    """(3, 2) These are the derivatives by the errors of the sensor."""
 
 
 class SensorErrors:
@@ -46,14 +64,11 @@ class SensorErrors:
         self.settings = settings
         self.mean: Array = np.zeros(len(ERRORS))
         """(2,) These are the yaw (rad, to the left) and the latency (s)."""
-        self._information: Array = np.diag(1.0 / np.square(settings.sigmas_errors))
+        self.covariance: Array = np.diag(np.square(settings.sigmas_errors))
+        """(2, 2) This is their covariance."""
+        self._drift: Array = np.diag(np.square(settings.sigmas_changes)) / MINUTE
         self._velocity: Array = np.zeros(3)
-
-    @property
-    def covariance(self) -> Array:
-        """Returns the covariance (2, 2) of the errors, which may change a little from cycle to cycle."""
-        changes = np.diag(np.square(self.settings.sigmas_changes))
-        return np.asarray(np.linalg.inv(self._information) + changes)
+        self._possible: Array = 0.5 * settings.memory * np.array(settings.accelerations)
 
     def contradict(self, settings: CalibrationSettings) -> bool:
         """Returns whether the errors contradict the sensor's prior, as often as `settings.doubt` says."""
@@ -61,6 +76,11 @@ class SensorErrors:
             return False
         prior = np.square(settings.sigmas)[ERRORS]
         return bool((self.mean**2 > settings.doubt**2 * (np.diag(self.covariance) + prior)).any())
+
+    def covariance_of(self, difference: Difference) -> Array:
+        """Returns the covariance (3, 3) of a difference, with what is not known of the errors."""
+        shifts = difference.shifts
+        return np.asarray(difference.covariance + shifts @ self.covariance @ shifts.T)
 
     def follow(self, velocity: Array, dt: float) -> None:
         """Takes the velocity (3,) of a cycle, which lasted for dt (s), over into the mean velocity."""
@@ -73,16 +93,18 @@ class SensorErrors:
         The way (2,) and the velocity (3,) are in the vehicle frame, in m, m/s, m/s and rad/s. No vehicle
         changes its velocity by more than its accelerations: that is slip, and not to be taken for latency.
         """
-        settings, turned = self.settings, np.array([way[1], -way[0], 0.0])
-        possible = 0.5 * settings.memory * np.array(settings.accelerations)
-        slower = np.clip(self._velocity - velocity, -possible, possible)
-        return np.stack([turned, slower], axis=1)
+        shifts = np.empty((3, len(ERRORS)))
+        shifts[:, 0] = way[1], -way[0], 0.0
+        shifts[:, 1] = np.clip(self._velocity - velocity, -self._possible, self._possible)
+        return shifts
 
-    def update(self, off: Array, covariance: Array, shifts: Array, dt: float) -> None:
-        """Learns from a match that is off the odometry by (3,), with its covariance (3, 3).
+    def update(self, difference: Difference, dt: float) -> None:
+        """Learns from a match that agrees with the odometry, dt (s) after the last cycle.
 
-        Matches share the remembered detections. So one counts by the share of its own time, dt (s).
+        Matches share the remembered detections. So one counts by the share of its own time.
         """
-        weighted = np.linalg.solve(covariance, shifts).T * min(dt / self.settings.memory, 1.0)
-        self._information = self._information + weighted @ shifts
-        self.mean = self.mean + np.linalg.solve(self._information, weighted @ off)
+        shifts, share = difference.shifts, min(dt / self.settings.memory, 1.0)
+        weighted = share * np.linalg.solve(difference.covariance, shifts).T
+        information = np.linalg.inv(self.covariance + dt * self._drift) + weighted @ shifts
+        self.covariance = np.asarray(np.linalg.inv(information))
+        self.mean = self.mean + self.covariance @ weighted @ difference.off

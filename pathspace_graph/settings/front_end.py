@@ -62,12 +62,12 @@ class MotionSettings(Positive):
     """This standard deviation (m) is added to that of a detection, since one side of a cone is seen."""
     sigma_latency: float = 0.05
     """Detections are older than their stamps by this (s, one sigma), before the check has learned more."""
-    sigma_latency_changes: float = 0.003
-    """The latency of detections changes by this standard deviation (s)."""
+    sigma_latency_changes: float = 0.005
+    """The latency of detections changes by this in a minute (s, one sigma)."""
     sigma_yaw: float = 0.02
     """The sensor is turned by this (rad, one sigma), before the check has learned more."""
     sigma_yaw_changes: float = 0.001
-    """The yaw of the sensor changes by this standard deviation (rad)."""
+    """The yaw of the sensor changes by this in a minute (rad, one sigma)."""
     before: float = 0.5
     """A contradiction may have begun a few cycles before it was noticed. So its size, times this, is added to
     the standard deviation of the motion."""
@@ -120,7 +120,7 @@ class MotionSettings(Positive):
 
     @property
     def sigmas_changes(self) -> tuple[float, float]:
-        """Returns the standard deviations (rad, s) by which the sensor's yaw and latency change."""
+        """Returns by how much (rad, s) the sensor's yaw and latency change in a minute, as one sigma."""
         return self.sigma_yaw_changes, self.sigma_latency_changes
 
     @property

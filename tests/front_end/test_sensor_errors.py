@@ -9,10 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import relative, to_vehicle
+from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.motion import MotionCheck
 from pathspace_graph.front_end.scan_matching import RecentDetections, match
-from pathspace_graph.front_end.sensor_errors import SensorErrors, by_errors
+from pathspace_graph.front_end.sensor_errors import ERRORS, Difference, SensorErrors, by_errors
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.calibration import CalibrationSettings
@@ -58,28 +59,41 @@ def test_a_drive_at_one_speed_straight_ahead_says_nothing_of_the_latency() -> No
     known, velocity = SensorErrors(SETTINGS), np.array([10.0, 0.0, 0.0])
     known.follow(velocity, 10.0)
     before = known.covariance[1, 1]
-    known.update(
-        np.array([0.1, -0.2, 0.0]), 0.01 * np.eye(3), known.shifts(np.array([3.0, 0.0]), velocity), 0.1
-    )
-    assert known.covariance[1, 1] == pytest.approx(before)
+    shifts = known.shifts(np.array([3.0, 0.0]), velocity)
+    known.update(Difference(np.array([0.1, -0.2, 0.0]), 0.01 * np.eye(3), shifts), 0.1)
+    assert known.covariance[1, 1] == pytest.approx(before, rel=1e-3)
     assert known.mean[1] == pytest.approx(0.0)
-    assert (
-        known.mean[0] > 0.0
-    )  # but to be drawn to the right is what a sensor does that is turned to the left
+    assert known.mean[0] > 0.0  # but a sensor that is turned to the left draws to the right
 
 
 def test_many_independent_matches_give_the_errors_with_the_claimed_covariance() -> None:
     rng, spread, off = np.random.default_rng(0), np.diag([0.05, 0.05, 0.005]) ** 2, []
+    constant = replace(SETTINGS, sigma_yaw_changes=1e-9, sigma_latency_changes=1e-9)
     for _ in range(300):
         truth = rng.normal(scale=SETTINGS.sigmas_errors)
-        known, left = SensorErrors(SETTINGS), np.zeros(2)
+        known = SensorErrors(constant)
         for _ in range(20):
             shifts = known.shifts(np.array([3.0, 0.1]), np.array([*rng.normal(scale=1.0, size=2), 0.1]))
-            left = truth - known.mean
-            known.update(shifts @ left + rng.multivariate_normal(np.zeros(3), spread), spread, shifts, 10.0)
+            seen = shifts @ (truth - known.mean) + rng.multivariate_normal(np.zeros(3), spread)
+            known.update(Difference(seen, spread, shifts), 10.0)
         off.append(truth - known.mean)
-    claimed = known.covariance - np.diag(np.square(SETTINGS.sigmas_changes))
-    np.testing.assert_allclose(np.sqrt(np.diag(np.cov(np.array(off).T))), np.sqrt(np.diag(claimed)), rtol=0.2)
+    found = np.sqrt(np.diag(np.cov(np.array(off).T)))
+    np.testing.assert_allclose(found, np.sqrt(np.diag(known.covariance)), rtol=0.2)
+
+
+def test_an_old_latency_is_forgotten_so_that_a_new_one_is_learned() -> None:
+    rng, known, spread = np.random.default_rng(1), SensorErrors(SETTINGS), np.diag([0.05, 0.05, 0.005]) ** 2
+    for cycle in range(60_000):
+        truth = np.array([0.0, 0.0 if cycle < 50_000 else 0.03])
+        shifts = known.shifts(np.array([1.0, 0.0]), np.array([*rng.normal(scale=0.5, size=2), 0.1]))
+        known.update(Difference(shifts @ (truth - known.mean), spread, shifts), 0.1)
+    assert known.mean[1] == pytest.approx(0.03, abs=0.003)
+
+
+def test_the_derivatives_are_those_of_the_calibration_of_the_sensor() -> None:
+    points, twist = CONES, np.array([8.0, 0.3, 0.7])
+    whole = by_sensor(points, np.tile(twist, (len(points), 1)))
+    np.testing.assert_allclose(by_errors(points, twist), whole[:, :, ERRORS])
 
 
 # --- whole drives ----------------------------------------------------------------------------------------
