@@ -24,6 +24,8 @@ UNLIMITED = {
     "motion.doubt",
     "motion.huber",
     "calibration.doubt",
+    "closing.gauge_laps",
+    "limits.silence",
 }
 
 

@@ -16,6 +16,7 @@ from pathspace_graph.eval.figures.fit import FitScene, fit
 from pathspace_graph.eval.figures.isolated import FIGURES, MARKER
 from pathspace_graph.eval.figures.simplification import simplification
 from pathspace_graph.eval.figures.uncertainty import UncertaintyScene, uncertainty
+from pathspace_graph.io.manifest import MANIFEST_FILE
 from pathspace_graph.mapping.cubature import cubature_points, square_root
 from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.spline.bspline import BSpline
@@ -175,7 +176,7 @@ def test_the_command_writes_every_figure_and_its_caption(tmp_path: Path) -> None
     out = tmp_path / "figures"
     assert main(["figures", "--out", str(out)]) == 0
     expected = {f"{figure.name}{suffix}" for figure in FIGURES for suffix in (".png", ".pdf")}
-    assert {file.name for file in out.iterdir()} == expected | {MARKER}
+    assert {file.name for file in out.iterdir()} == expected | {MARKER, MANIFEST_FILE}
     assert all(f"({figure.name}.png)" in (out / MARKER).read_text() for figure in FIGURES)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")
