@@ -38,39 +38,35 @@ class RecentDetections:
         self.settings = settings
         self.points: Array = np.zeros((0, 2))
         """(n, 2) Each detection is at this point in m."""
-        self._measured: Array = np.zeros((0, 2))
-        self._columns: Array = np.zeros((0, 2, len(settings.sigmas_errors)))
-        self._places: Array = np.zeros((0, 2))
-        self._stamps: Array = np.zeros(0)
+        # a row is [stamp | point as measured | place of the vehicle | derivatives of x | derivatives of y]
+        self._table: Array = np.zeros((0, 5 + 2 * len(settings.sigmas_errors)))
 
     def add(self, t: float, measured: Array, columns: Array, pose: Array) -> None:
         """Adds the detections of a cycle at t (s), measured at (m, 2) in the frame of the pose (3,).
 
         Their derivatives by e errors of the sensor are the columns (m, 2, e), in the same frame.
         """
-        turned = rotation(pose[2]) @ columns
-        places, most = np.broadcast_to(pose[:2], measured.shape), self.settings.max_remembered
-        self._measured = np.concatenate([self._measured, to_map(measured, pose[None])])[-most:]
-        self._columns = np.concatenate([self._columns, turned])[-most:]
-        self._places = np.concatenate([self._places, places])[-most:]
-        self._stamps = np.concatenate([self._stamps, np.full(len(measured), t)])[-most:]
-        self.points = self._measured
+        new = np.empty((len(measured), self._table.shape[1]))
+        new[:, 0], new[:, 1:3], new[:, 3:5] = t, to_map(measured, pose[None]), pose[:2]
+        new[:, 5:] = (rotation(pose[2]) @ columns).reshape(len(measured), new.shape[1] - 5)
+        self._table = np.concatenate([self._table, new])[-self.settings.max_remembered :]
+        self.points = self._table[:, 1:3]
 
     def correct(self, errors: Array) -> None:
         """Puts the detections where they are if the sensor has these errors (e,)."""
-        self.points = self._measured + self._columns @ errors
+        columns = self._table[:, 5:].reshape(len(self._table), 2, len(errors))
+        self.points = self._table[:, 1:3] + columns @ errors
 
     def forget(self, t: float) -> None:
         """Drops the detections that are too old at t (s)."""
-        first = int(self._stamps.searchsorted(t - self.settings.memory, side="right"))
-        self._measured, self._columns = self._measured[first:], self._columns[first:]
-        self._places, self._stamps = self._places[first:], self._stamps[first:]
-        self.points = self._measured
+        first = int(self._table[:, 0].searchsorted(t - self.settings.memory, side="right"))
+        self._table = self._table[first:]
+        self.points = self._table[:, 1:3]
 
     @property
     def seen_from(self) -> Array:
         """Returns the mean place (2,) from which the detections were seen."""
-        return np.asarray(self._places.mean(axis=0))
+        return np.asarray(self._table[:, 3:5].sum(axis=0) / len(self._table))
 
     def has(self, points: Array) -> BoolArray:
         """Returns whether each point (m, 2) lies where an earlier detection does."""

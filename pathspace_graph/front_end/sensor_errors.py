@@ -74,8 +74,9 @@ class SensorErrors:
         """Returns whether the errors contradict the sensor's prior, as often as `settings.doubt` says."""
         if not settings.sensor:
             return False
-        prior = np.square(settings.sigmas)[ERRORS]
-        return bool((self.mean**2 > settings.doubt**2 * (np.diag(self.covariance) + prior)).any())
+        limit, prior = settings.doubt**2, settings.sigmas
+        known = zip(self.mean.tolist(), self.covariance.diagonal().tolist(), ERRORS, strict=True)
+        return any(mean**2 > limit * (variance + prior[at] ** 2) for mean, variance, at in known)
 
     def covariance_of(self, difference: Difference) -> Array:
         """Returns the covariance (3, 3) of a difference, with what is not known of the errors."""
