@@ -39,7 +39,7 @@ from .keys import (
 )
 from .odometry import calibrated_delta
 from .submaps import Submaps
-from .system import SmootherSettings, WindowSystem
+from .system import HeldMap, SmootherSettings, WindowSystem
 from .user_factors import check_factors
 from .variables import Layout
 from .window import M_co
@@ -258,14 +258,15 @@ class FixedLagSmoother(WindowSystem[M_co]):
         """Holds where a closed map as a whole is, by its points (k,) in ascending order.
 
         The rows C `across` (3, 2k) give the rigid motion (x, y, theta) by `C dx`, for moves dx of the points.
-        It is held at the present estimate, and its covariance counts in `covariance` from now on.
+        It is held at the present estimate, where the shape of the map goes on to be estimated.
         """
         self.reactivate()
-        own = across @ self.covariance(keys) @ across.T
-        root = np.linalg.cholesky(STIFFNESS * np.linalg.inv(own)).T @ across
+        known = self.covariance(keys)
+        information = STIFFNESS * np.linalg.inv(across @ known @ across.T)
+        root = np.linalg.cholesky(information).T @ across
         now = self.variables.change(self.variables.layout.entries(keys))
         self.prior = graph_of(self.prior, jacobian_factor(keys, root, root @ now))
-        self.gauge_covariance, self.epoch = STIFFNESS / (STIFFNESS + 1.0) * own, self.epoch + 1
+        self.held, self.epoch = HeldMap(keys, known), self.epoch + 1
 
     def restart(self, first_cycle: int, removed: IntArray, added: IntArray, points: Array) -> None:
         """Replaces map points `removed` (n,) by `added` (k,) at `points` (k, 2), and drops the prior.
@@ -274,7 +275,7 @@ class FixedLagSmoother(WindowSystem[M_co]):
         keeps its later poses with their odometry. A new prior must be set, on all that remains.
         """
         self.epoch, self.submaps, self.inactive = self.epoch + 1, None, InactiveMap()
-        self.gauge_covariance = np.zeros((POSE, POSE))
+        self.held = None
         self.prior, keyframes = gtsam.GaussianFactorGraph(), self.variables.keyframes
         leaving = np.arange(self.first_cycle, first_cycle)
         for cycle in leaving.tolist():

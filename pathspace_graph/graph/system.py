@@ -27,7 +27,6 @@ from .gaussian import (
 )
 from .inactive import InactiveMap
 from .keys import (
-    POSE,
     POSE_LETTER,
     SENSOR_LETTER,
 )
@@ -64,6 +63,29 @@ class SmootherSettings:
     map must not change under a rigid motion of all variables."""
 
 
+@dataclass(frozen=True, eq=False)
+class HeldMap:
+    """Holds what was known of a closed map when its gauge was held, as the most that is claimed of it."""
+
+    keys: IntArray
+    """(k,) These are the keys of all its points."""
+    covariance: Array
+    """(2k, 2k) This was their joint covariance (m^2)."""
+
+    def claimed(self, joint: Array) -> Array:
+        """Returns the covariance (q, q) of variables, given the joint one (2k + q, 2k + q) with the map's.
+
+        The variables y follow the map m by `A = Sigma_ym Sigma_mm^-1`. With D what the readings since then
+        have taken off the map's covariance, the result is `Sigma_yy + A D A'`.
+        """
+        n = len(self.covariance)
+        now, mixed, own = joint[:n, :n], joint[:n, n:], joint[n:, n:]
+        by_map = np.linalg.solve(now, mixed).T
+        values, vectors = np.linalg.eigh(self.covariance - now)
+        root = by_map @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        return np.asarray(own + root @ root.T)
+
+
 class WindowSystem(Generic[M_co]):
     """Holds the variables, the factors of the window and the prior, and solves for the active variables."""
 
@@ -92,8 +114,8 @@ class WindowSystem(Generic[M_co]):
         """The last Gauss-Newton step solved this damped system; it is None before the first step."""
         self.calibration_sigma: Array = np.array([*settings.sigma_calibration, *settings.sigma_sensor])
         """The priors of the calibrations have these standard deviations, (2,) or (7,)."""
-        self.gauge_covariance: Array = np.zeros((POSE, POSE))
-        """This is the covariance (3, 3) of a rigid motion of everything, once the gauge is held."""
+        self.held: HeldMap | None = None
+        """This is what was known of a closed map when its gauge was held; it is None before."""
         self.epoch = 0
         """This counts the changes of the prior other than the marginalization of a pose."""
 
@@ -279,14 +301,15 @@ class WindowSystem(Generic[M_co]):
     def covariance(self, keys: IntArray) -> Array:
         """Returns the joint covariance (q, q) of variables (k,) at the estimate, without damping.
 
-        It is in the order of the keys, with poses as (x, y, theta) in the map frame (m, m, rad).
+        It is in the order of the keys, with poses as (x, y, theta) in the map frame (m, m, rad). Once a map
+        is held, no more is claimed of it than was known then.
         """
-        own = self._covariance(keys)
-        motions = Layout(keys).rigid_motions(self.variables.of(keys))
-        return own + motions @ self.gauge_covariance @ motions.T
+        if self.held is None:
+            return self._covariance(keys)
+        return self.held.claimed(self._covariance(np.concatenate([self.held.keys, keys])))
 
     def _covariance(self, keys: IntArray) -> Array:
-        """Returns the joint covariance (q, q) of variables (k,), without that of a gauge that is held."""
+        """Returns the joint covariance (q, q) of variables (k,) by the readings alone."""
         whole = bool(np.isin(keys, self.inactive.keys).any())
         if whole or self.chain is not None:
             self.refresh()

@@ -62,18 +62,6 @@ class Layout:
         """Returns the columns of the headings of all poses."""
         return np.asarray(self.starts[are_poses(self.keys)] + POSE - 1)
 
-    def rigid_motions(self, values: Array) -> Array:
-        """Returns the derivatives (n, 3) of the values (n,) by a rigid motion (x, y, theta) of them all.
-
-        The motion is about the origin: a point (x, y) moves by `(1, 0)`, `(0, 1)` and `(-y, x)`, and the
-        heading of a pose turns. Calibrations do not move.
-        """
-        motions, x = np.zeros((self.size, POSE)), self.turning
-        motions[x, 0] = motions[x + 1, 1] = 1.0
-        motions[x, 2], motions[x + 1, 2] = -values[x + 1], values[x]
-        motions[self.headings, 2] = 1.0
-        return motions
-
     def positions(self, keys: IntArray) -> IntArray:
         """Returns the index of each key, in any shape; it is UNKNOWN for a key that is not in the layout."""
         if len(self.keys) == 0:

@@ -5,7 +5,8 @@ laps tell of the gauge comes through the shape of the map alone: the better the 
 known, the better is the heading of all the rest. This is true of the noise of readings, which is new in every
 lap. But cones lie off a curve with few control points by the same distance in each lap. The readings of many
 laps bend the curve to it, and a bend of centimetres beside the start turns the whole map. So the gauge is
-held after a few laps, where the shape goes on to be estimated. The covariance that it had is kept.
+held after a few laps, and the shape goes on to be estimated. What cones share between laps is not averaged
+out, so no more is claimed of the map than was known then.
 """
 
 from __future__ import annotations

@@ -192,9 +192,8 @@ class TrackLoop:
             return
         if self._settled is None:
             self._settled = self._path.length
-        lap = max(boundary.length for boundary in boundaries.values())
-        held = smoother.gauge_covariance.any()
-        if not held and self._path.length > self._settled + self.settings.closing.gauge_laps * lap:
+        enough = self.settings.closing.gauge_laps * max(boundary.length for boundary in boundaries.values())
+        if smoother.held is None and self._path.length > self._settled + enough:
             hold_gauge(smoother)
 
     def _closes(self) -> None:

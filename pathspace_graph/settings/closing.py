@@ -108,7 +108,7 @@ class ClosingSettings(Positive):
     """A cone nearer to the seam than this (m) was also detected at the beginning, and is not counted
     twice."""
     gauge_laps: float = 4.0
-    """After this number of laps on the closed map, its position and heading as a whole are held. It is
-    infinite where they never are."""
+    """After this number of laps on the closed map, its position and heading as a whole are held, and no more
+    is claimed of it than is known then. It is infinite where they never are."""
     recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
     """These settings find the place of a vehicle that is lost after a long lap."""

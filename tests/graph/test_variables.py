@@ -262,23 +262,3 @@ def test_a_copy_has_values_of_its_own() -> None:
     other.remove(MAP_KEYS)
     assert (variables.values != 0.0).all() and (variables.linearized != 0.0).all()
     assert len(variables.keys) == len(KEYS)
-
-
-def test_the_rigid_motions_are_the_derivatives_of_a_rigid_motion_of_all_values() -> None:
-    rng, variables = np.random.default_rng(3), Variables()
-    variables.insert_calibrations(rng.normal(size=7))
-    variables.insert(LEFT_KEYS[:3], rng.normal(size=6))
-    variables.insert(pose_keys(np.arange(2)), rng.normal(size=6))
-    layout, values = variables.layout, variables.values.copy()
-
-    def moved(motion: np.ndarray) -> np.ndarray:
-        x, y, theta = motion
-        turn = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
-        result = values.copy()
-        for start in layout.turning:
-            result[start : start + 2] = turn @ values[start : start + 2] + [x, y]
-        result[layout.headings] += theta
-        return result
-
-    numeric = [(moved(1e-6 * step) - moved(-1e-6 * step)) / 2e-6 for step in np.eye(3)]
-    np.testing.assert_allclose(layout.rigid_motions(values), np.transpose(numeric), atol=1e-9)
