@@ -60,6 +60,11 @@ class UserFactors:
         return np.concatenate([np.zeros(0, np.intp), *(one.keys for one in self._active)])
 
     @property
+    def count(self) -> int:
+        """Returns the number of all factors, active or not."""
+        return len(self._active) + len(self._inactive)
+
+    @property
     def factors(self) -> list[gtsam.NonlinearFactor]:
         """Returns all active factors."""
         return [one.factor for one in self._active]

@@ -24,6 +24,15 @@ _YAML_ERRORS: Final = (yaml.YAMLError, ValueError, LookupError, TypeError, Attri
 def read_text(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) -> str:
     """Returns the text of a file in UTF-8 of at most `most` bytes; an InputError says that `expected` was
     expected."""
+    data = read_bytes(file, expected, most)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(file, "expected text in UTF-8", data.count(b"\n", 0, error.start) + 1) from None
+
+
+def read_bytes(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) -> bytes:
+    """Returns the bytes of a file, at most `most`; an InputError says that `expected` was expected."""
     try:
         # a pipe would block where it is opened
         data = _read(file, most + 1) if stat.S_ISREG(file.stat().st_mode) else None
@@ -35,10 +44,7 @@ def read_text(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) 
         raise InputError(file, f"expected {expected}, found a folder, a device or a pipe")
     if len(data) > most:
         raise InputError(file, f"expected at most {most} bytes, found more")
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(file, "expected text in UTF-8", data.count(b"\n", 0, error.start) + 1) from None
+    return data
 
 
 def _read(file: Path, most: int) -> bytes:

@@ -121,6 +121,11 @@ class DriveRecord:
             self._prepared = True
             _submit(_nothing)
 
+    def resume(self) -> None:
+        """Starts the process again where it was ready when a snapshot was taken."""
+        if self._prepared and self.unsolvable is None:
+            _submit(_nothing)
+
     def corrected(self, smoother: CurveSmoother) -> Array:
         """Returns the poses (P, 3) of all cycles in the frame of the map that has just been closed."""
         window = smoother.first_cycle
@@ -155,10 +160,19 @@ class LapBatch:
         """The marginal replaces the prior in this cycle."""
         self.first_kept = lap.first_kept
         """The window holds the poses from this cycle on until then."""
-        self._future: Future[LapMarginal | None] = _submit(solve_lap, lap)
+        self._lap = lap
+        self._future: Future[LapMarginal | None] | None = None
+        self.send()
+
+    def send(self) -> None:
+        """Hands the lap to the process, unless it has it already; a snapshot holds the lap alone."""
+        if self._future is None:
+            self._future = _submit(solve_lap, self._lap)
 
     def marginal(self) -> LapMarginal | str:
         """Waits for the solution and returns it, or says why there is none."""
+        self.send()
+        assert self._future is not None
         try:
             solved = self._future.result()
         except SingularSystemError as error:

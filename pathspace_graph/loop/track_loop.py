@@ -143,6 +143,13 @@ class TrackLoop:
             return self._take(batch.marginal())
         return None, ""
 
+    def resume(self) -> None:
+        """Sends the lap that was being solved when a snapshot was taken, which the process has not seen."""
+        if self._lap_batch is not None:
+            self._lap_batch.send()
+        elif not self.closed:
+            self.record.resume()
+
     def _record_open_lap(self) -> None:
         """Records the estimate of an open lap, and tries to close it where the drive says that it is over."""
         self.record.estimated(self._smoother.map.state)

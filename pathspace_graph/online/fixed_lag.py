@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Protocol
 
 import gtsam
@@ -35,6 +36,7 @@ from pathspace_graph.mapping.prediction import (
 from pathspace_graph.mapping.registration import register
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.snapshot import restore, save
 from pathspace_graph.spline.boundary import Boundary
 
 from .activation import deactivate_distant
@@ -313,6 +315,39 @@ class FixedLagMapper:
         if self.closed or self.smoother.next_cycle == 0:
             return confirmed(self.smoother)
         return look_ahead(self.smoother, self.growth, self.path)
+
+    # --- the snapshot ------------------------------------------------------------------------------------
+
+    def save(self, path: Path | str) -> None:
+        """Writes the whole mapper to one file, from which `restore` makes one that goes on to the same map.
+
+        Nothing of the mapper changes. An earlier file is kept as a numbered backup, and at each moment the
+        old or the new file is there. A factor of your own or another solver cannot be saved. SettingsError is
+        raised while there is one, which for a factor is as long as one of its poses is in the window.
+        """
+        if self.solver is not None:
+            raise SettingsError(f"save: expected the mapper's own solver, found {type(self.solver).__name__}")
+        count = self.smoother.user_factors.count
+        if count:
+            raise SettingsError(f"save: expected no factors of your own in the window, found {count}")
+        save(self, path)
+
+    @classmethod
+    def restore(cls, path: Path | str) -> FixedLagMapper:
+        """Returns the mapper that `save` has written, with its settings; an InputError if the file is not so.
+
+        A lap that was being solved when it was saved is solved again.
+        """
+        mapper = restore(path, cls, FixedLagMapper._look)
+        mapper.loop.resume()
+        return mapper
+
+    def _look(self) -> None:
+        """Looks at all that the mapper gives; a damaged one raises something."""
+        self.outline()
+        if self.smoother.times:
+            self.vehicle_state()
+            self.map()
 
     # --- the graph ---------------------------------------------------------------------------------------
 

@@ -6,9 +6,7 @@ odd ones that it must bear. Nothing that is refused may change a bit of the esti
 
 from __future__ import annotations
 
-import hashlib
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -23,13 +21,13 @@ from numpy.typing import NDArray
 from pathspace_graph import FixedLagMapper, ReadingError, SettingsError
 from pathspace_graph.ckf.mapper import CkfMapper
 from pathspace_graph.factors.se2 import compose, se2_exp
-from pathspace_graph.front_end.gate import Gate
 from pathspace_graph.graph.keys import pose_key, pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.landmark.ckf import LandmarkCkf
 from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.run import CycleResult
 
+from ..scenes.digest import digest
 from ..scenes.drives import ODOMETRY_SIGMA, corridor, see
 
 Array = NDArray[np.float64]
@@ -48,38 +46,6 @@ TWISTS = st.tuples(
 )
 GAPS = st.sampled_from([0.005, 0.05, 0.1, 0.1, 0.1, 0.1, 0.5, 4.0])
 STRANGE = st.sampled_from([np.nan, np.inf, -np.inf, 1e308, -1e308, 1e18, 1e5, -1e5])
-
-
-def digest(estimator: Estimator) -> str:
-    """Identifies everything that an estimator holds, but for the counts of the gate."""
-    found = hashlib.sha256()
-    for part in _parts(estimator, set()):
-        found.update(part)
-    return found.hexdigest()
-
-
-def _parts(value: Any, seen: set[int]) -> Iterator[bytes]:
-    """The contents of an object, each object once."""
-    if isinstance(value, np.ndarray):
-        yield f"{value.dtype}{value.shape}".encode() + value.tobytes()
-    elif isinstance(value, dict):
-        for key in sorted(value, key=repr):
-            yield repr(key).encode()
-            yield from _parts(value[key], seen)
-    elif isinstance(value, list | tuple | deque):
-        for entry in value:
-            yield from _parts(entry, seen)
-    elif type(value).__module__.startswith("pathspace_graph") and not isinstance(value, Gate):
-        if id(value) not in seen:
-            seen.add(id(value))
-            yield from _parts(vars(value), seen)
-    elif isinstance(value, gtsam.GaussianFactorGraph | gtsam.GaussianBayesNet):
-        for k in range(value.size()):
-            yield from _parts(value.at(k), seen)
-    elif isinstance(value, gtsam.GaussianFactor):
-        yield repr(list(value.keys())).encode() + value.augmentedInformation().tobytes()
-    elif not isinstance(value, Gate):
-        yield repr(value).encode()
 
 
 def state_of(estimator: Estimator) -> tuple[Array, Array]:

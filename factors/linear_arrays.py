@@ -1,0 +1,91 @@
+"""GTSAM's linear factors as arrays, and back again to the last bit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+F = TypeVar("F", bound=gtsam.JacobianFactor)
+
+
+def keys_of_factor(factor: gtsam.GaussianFactor) -> IntArray:
+    """Returns the keys (k,) of a factor in its own order."""
+    return np.array(list(factor.keys()), np.intp)
+
+
+def jacobian_matrix(factor: gtsam.JacobianFactor) -> Array:
+    """Returns `[A b]` (m, n + 1) of a factor or a conditional; ValueError where it has a noise model."""
+    if factor.get_model() is not None:
+        raise ValueError(f"expected whitened rows, found a {type(factor.get_model()).__name__} noise model")
+    return np.array(factor.augmentedJacobian(), np.float64, order="F")
+
+
+def jacobian_factor_of(keys: IntArray, widths: IntArray, matrix: Array) -> gtsam.JacobianFactor:
+    """Returns the factor with the rows `[A b]` (m, n + 1) on keys (k,), whose variables have widths (k,)."""
+    return gtsam.JacobianFactor(conditional_of(keys, widths, 1, matrix))
+
+
+def frontals_of(conditional: gtsam.GaussianConditional, widths: Sequence[int]) -> int:
+    """Returns the number of frontal keys of a conditional, given the widths (k,) of all its variables."""
+    size = conditional.R().shape[1]  # the view is not read, only its shape
+    return int(np.cumsum(widths).searchsorted(size)) + 1
+
+
+def conditional_of(
+    keys: IntArray, widths: IntArray, frontals: int, matrix: Array
+) -> gtsam.GaussianConditional:
+    """Returns the conditional of the first `frontals` keys, with the rows `[A b]` (m, n + 1).
+
+    ValueError is raised where the numbers do not fit each other, which GTSAM does not check.
+    """
+    _check_keys(keys)
+    if not 1 <= frontals <= len(keys):
+        raise ValueError(f"expected 1 to {len(keys)} frontal keys, found {frontals}")
+    _check_matrix(matrix, int(widths.sum()) + 1)
+    blocks = gtsam.VerticalBlockMatrix([*widths.tolist(), 1], np.asfortranarray(matrix), False)
+    return gtsam.GaussianConditional(keys.tolist(), frontals, blocks)
+
+
+def hessian_matrix(factor: gtsam.HessianFactor) -> Array:
+    """Returns `[[H, g], [g', f]]` (n + 1, n + 1) of a factor `1/2 d' H d - g' d + f / 2`."""
+    return np.array(factor.augmentedInformation(), np.float64, order="F")
+
+
+def hessian_factor_of(keys: IntArray, widths: IntArray, matrix: Array) -> gtsam.HessianFactor:
+    """Returns the factor with `[[H, g], [g', f]]` (n + 1, n + 1) on keys (k,) of widths (k,).
+
+    The binding has constructors for at most three keys. So this is the sum of a factor for each block of H,
+    in which each number is added to zeros alone. ValueError is raised where the numbers do not fit.
+    """
+    _check_keys(keys)
+    size = int(widths.sum()) + 1
+    _check_matrix(matrix, size)
+    if len(matrix) != size:
+        raise ValueError(f"expected a square matrix of {size} rows, found {len(matrix)}")
+    ends = np.cumsum(widths).tolist()
+    blocks = [slice(end - width, end) for end, width in zip(ends, widths.tolist(), strict=True)]
+    zeros = [np.zeros((width, width)) for width in widths.tolist()]
+    graph, names = gtsam.GaussianFactorGraph(), keys.tolist()
+    for i, own in enumerate(blocks):
+        constant = float(matrix[-1, -1]) if i == 0 else 0.0
+        graph.push_back(gtsam.HessianFactor(names[i], matrix[own, own], matrix[own, -1], constant))
+        for j, other in enumerate(blocks[:i]):
+            pair = (names[j], names[i], zeros[j], matrix[other, own], zeros[j][0], zeros[i], zeros[i][0])
+            graph.push_back(gtsam.HessianFactor(*pair, 0.0))
+    return gtsam.HessianFactor(graph)
+
+
+def _check_keys(keys: IntArray) -> None:
+    if keys.ndim != 1 or len(keys) == 0 or len(np.unique(keys)) != len(keys):
+        raise ValueError(f"expected one or more different keys, found {keys.size} of shape {keys.shape}")
+
+
+def _check_matrix(matrix: Array, columns: int) -> None:
+    if matrix.ndim != 2 or matrix.shape[1] != columns or matrix.dtype != np.float64:
+        raise ValueError(f"expected a matrix of {columns} columns, found {matrix.dtype} {matrix.shape}")

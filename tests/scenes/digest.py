@@ -1,0 +1,63 @@
+"""A digest of everything that an estimator holds, to see that two are the same to the last bit."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future
+from functools import cached_property
+from typing import Any
+
+import gtsam
+import numpy as np
+from scipy.spatial import KDTree
+
+from pathspace_graph.front_end.gate import Gate
+
+
+def digest(estimator: object) -> str:
+    """Identifies everything that an estimator holds, but for the counts of the gate."""
+    found = hashlib.sha256()
+    for part in _parts(estimator, set()):
+        found.update(part)
+    return found.hexdigest()
+
+
+def _parts(value: Any, seen: set[int]) -> Iterator[bytes]:
+    """The contents of an object, each object once."""
+    if isinstance(value, np.ndarray):
+        yield f"{value.dtype}{value.shape}".encode() + value.tobytes()
+    elif isinstance(value, dict):
+        for key in sorted(value, key=repr):
+            yield repr(key).encode()
+            yield from _parts(value[key], seen)
+    elif isinstance(value, set | frozenset):
+        yield from _parts(sorted(value), seen)
+    elif isinstance(value, list | tuple | deque):
+        for entry in value:
+            yield from _parts(entry, seen)
+    elif type(value).__module__.startswith("pathspace_graph") and not isinstance(value, Gate):
+        if id(value) not in seen:
+            seen.add(id(value))
+            yield type(value).__qualname__.encode()
+            yield from _parts(_held(value), seen)
+    elif isinstance(value, gtsam.GaussianFactorGraph | gtsam.GaussianBayesNet):
+        for k in range(value.size()):
+            yield from _parts(value.at(k), seen)
+    elif isinstance(value, gtsam.GaussianFactor):
+        yield repr(list(value.keys())).encode() + value.augmentedInformation().tobytes()
+    elif isinstance(value, KDTree):
+        yield from _parts(np.array(value.data), seen)
+    elif not isinstance(value, Gate | Future):
+        yield repr(value).encode()
+
+
+def _held(value: object) -> dict[str, Any]:
+    """The attributes of an object, but for those that are computed where they are asked for."""
+    kind = type(value)
+    return {
+        name: held
+        for name, held in vars(value).items()
+        if not isinstance(getattr(kind, name, None), cached_property)
+    }
