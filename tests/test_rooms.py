@@ -18,7 +18,7 @@ EXTRAS = {"distributed"}
 LEAVES = {"errors", "labels", "progress"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "ckf", "landmark"}
-BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "health", "run"}
+BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "health", "run", "snapshot"}
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
 BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "diagnosis"}
 
@@ -34,6 +34,7 @@ ARROWS: dict[str, set[str]] = {
     "health": {"settings"},
     "run": {"io", "laps", "health"},
     "diagnosis": {"factors", "io"},
+    "snapshot": {"factors", "io", "graph"},
     "mapping": BELOW_MAPPING,
     "front_end": BELOW_MAPPING | {"mapping"},
     **dict.fromkeys(ESTIMATORS, BELOW_ESTIMATORS),

@@ -15,6 +15,9 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.front_end.gate import Gate
 
+WALL_TIMES = ("lap_seconds",)
+"""These attributes are times of the machine."""
+
 
 def digest(estimator: object) -> str:
     """Identifies everything that an estimator holds, but for the counts of the gate."""
@@ -59,5 +62,5 @@ def _held(value: object) -> dict[str, Any]:
     return {
         name: held
         for name, held in vars(value).items()
-        if not isinstance(getattr(kind, name, None), cached_property)
+        if name not in WALL_TIMES and not isinstance(getattr(kind, name, None), cached_property)
     }
