@@ -10,7 +10,7 @@ from typing import Final
 from joblib import Parallel, delayed, parallel_config
 from rich.console import Console
 
-from pathspace_graph.estimators import DEFAULT
+from pathspace_graph.estimators import DEFAULT, make_online
 from pathspace_graph.eval.compare.table import side_by_side
 from pathspace_graph.eval.figures.files import save_plot
 from pathspace_graph.eval.figures.map_plot import plot_map
@@ -69,7 +69,7 @@ def map_with_both(log: Log) -> tuple[RunResult, RunResult]:
     with parallel_config(backend="loky", inner_max_num_threads=1):
         # with one job it would be run here, and first
         rival = Parallel(n_jobs=2, return_as="generator")([delayed(run_estimator)(RIVAL, settings, log)])
-        result = map_online(log, settings, DEFAULT)
+        result = map_online(log, make_online(DEFAULT, settings, log))
         with progress(RIVAL):
             (landmarks,) = rival  # to the end, or joblib warns of tasks that were cancelled
         return result, landmarks

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +12,7 @@ from rich.table import Table
 from tyro.conf import Positional, arg
 
 from pathspace_graph.diagnosis import diagnose
+from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.estimators import DEFAULT, check_online, make_online
 from pathspace_graph.eval.metrics.summary import (
     health_of,
@@ -25,13 +26,14 @@ from pathspace_graph.eval.metrics.summary import (
 from pathspace_graph.eval.metrics.table1 import LapMetrics
 from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.health import DEGRADED, LOST, counts
-from pathspace_graph.io.files import check_target
+from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.labels import NAMES
+from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.progress import progress
-from pathspace_graph.run import run_online
+from pathspace_graph.run import OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
 
 
@@ -45,6 +47,10 @@ class Online:
     """The map is written to this folder; an earlier map there is kept as a numbered backup."""
     estimator: str = DEFAULT
     """This is the name of the online estimator."""
+    save: Path | None = None
+    """The mapper is saved to this file at the end, from which `--resume` goes on; `fixed-lag` alone has it."""
+    resume: Path | None = None
+    """A mapper that was saved goes on with the cycles after its newest one, with its settings and its map."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
     """These settings describe the estimator."""
 
@@ -52,20 +58,48 @@ class Online:
         """Reads, maps, writes and reports."""
         check_online(self.estimator)
         check_target(self.out, MAP_FILE)
+        self._check_snapshots()
         log = read_usable_log(self.log, self.settings.limits)
-        result = map_online(log, self.settings, self.estimator)
+        log, estimator = self._begin(log)
+        result = map_online(log, estimator, self.estimator)
         write_result(self.out, result, summarize(result, log))
+        if self.save is not None and isinstance(estimator, FixedLagMapper):
+            estimator.save(self.save)
         report(result, log)
         Console().print(f"written to {self.out}", highlight=False, soft_wrap=True, markup=False)
 
+    def _check_snapshots(self) -> None:
+        """Raises where a snapshot is asked for that cannot be, before anything is mapped."""
+        asked = [f"--{name}" for name in ("save", "resume") if getattr(self, name) is not None]
+        if asked and self.estimator != DEFAULT:
+            raise SettingsError(f"{asked[0]}: expected --estimator {DEFAULT}, found {self.estimator}")
+        if self.resume is not None and self.settings != MapperSettings():
+            raise SettingsError(
+                "--resume: expected no settings, since the saved mapper has its own, found some"
+            )
+        if self.save is not None:
+            check_file_target(self.save)
 
-def map_online(log: Log, settings: MapperSettings, estimator: str = DEFAULT) -> RunResult:
+    def _begin(self, log: Log) -> tuple[Log, OnlineEstimator]:
+        """Returns a new estimator and the log, or the saved mapper and the cycles that it has not seen."""
+        if self.resume is None:
+            return log, make_online(self.estimator, self.settings, log)
+        mapper = FixedLagMapper.restore(self.resume)
+        times = mapper.smoother.times
+        cycles = tuple(cycle for cycle in log.cycles if not times or cycle.t > times[-1])
+        if not cycles:
+            expected = f"expected cycles after {times[-1]:g} s, where {self.resume} ends"
+            raise InputError(self.log, f"{expected}, found none")
+        return replace(log, cycles=cycles), mapper
+
+
+def map_online(log: Log, estimator: OnlineEstimator, name: str = DEFAULT) -> RunResult:
     """Maps a log with progress; the map at the end of each true lap is kept where there is truth."""
     with progress("mapping", len(log.cycles)) as advance:
         return run_online(
             log,
-            make_online(estimator, settings, log),
-            name=estimator,
+            estimator,
+            name=name,
             snapshot_times=lap_times(log),
             on_cycle=lambda _: advance(),
         )

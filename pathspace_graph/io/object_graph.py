@@ -25,11 +25,13 @@ from __future__ import annotations
 import dis
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from copy import copy
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, cached_property
-from itertools import pairwise
-from typing import Any, Final
+from itertools import chain, pairwise
+from types import UnionType
+from typing import Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +63,15 @@ _SEQUENCES: Final[dict[str, Callable[[list[Any]], Any]]] = {
     "tuple": tuple,
     "frozenset": frozenset,
     "slice": lambda values: slice(*values),
+}
+_CONTENTS: Final[dict[type, Callable[[Any], Iterable[Any]]]] = {
+    list: iter,
+    tuple: iter,
+    set: lambda value: sorted(value, key=repr),
+    frozenset: lambda value: sorted(value, key=repr),
+    dict: lambda value: chain.from_iterable(value.items()),
+    deque: lambda value: (value.maxlen, *value),
+    slice: lambda value: (value.start, value.stop, value.step),
 }
 _MUTABLE: Final[dict[str, type]] = {"list": list, "set": set, "dict": dict, "deque": deque}
 _FLOATS: Final = ("nan", "inf", "-inf")
@@ -131,9 +142,7 @@ class Encoder:
     def encode(self, root: Any) -> tuple[Structure, bytes]:
         """Returns the structure and the block of bytes; SettingsError where something cannot be saved."""
         value = self._value(root)
-        nodes = []
-        for reached, self._holder in self._reached:  # the list grows meanwhile
-            nodes.append(self._node(reached))
+        nodes = [*map(self._node, self._all())]
         data = _lay_out(self._arrays)
         classes = [[self._class_names[kind], [*names]] for kind, names in self._rows]
         return {"root": value, "classes": classes, "nodes": nodes}, data
@@ -149,22 +158,22 @@ class Encoder:
             self._reached.append((value, self._holder))
         return [number]
 
+    def _all(self) -> Iterator[Any]:
+        """Yields everything that is reached, also what is reached meanwhile."""
+        for value, holder in self._reached:
+            self._holder = holder
+            yield value
+
     def _node(self, value: Any) -> list[Any]:
         kind = type(value)
         if kind is np.ndarray:
             return self._array(value)
         if kind in self._class_names:
             return self._object(value)
-        if kind in (list, tuple, set, frozenset):
-            return [kind.__name__, *map(self._value, value)]
-        if kind is dict:
-            return ["dict", *(self._value(one) for item in value.items() for one in item)]
-        if kind is deque:
-            return ["deque", value.maxlen, *map(self._value, value)]
-        if kind is slice:
-            return ["slice", *map(self._value, (value.start, value.stop, value.step))]
         if isinstance(value, np.generic) and value.dtype.str in _DTYPES:
             return ["number", value.dtype.str, self._value(value.item())]
+        if kind in _CONTENTS:
+            return [kind.__name__, *map(self._value, _CONTENTS[kind](value))]
         return self._made(value)
 
     def _made(self, value: Any) -> list[Any]:
@@ -180,7 +189,8 @@ class Encoder:
             raise SettingsError(f"snapshot: {expected}, found one of {array.dtype}")
         if array.size and 0 in array.strides:
             array = array.copy()
-        node = ["array", array.dtype.str, [*array.shape], [*array.strides], 0, array.flags.writeable]
+        strides = [*array.strides] if array.size else []
+        node = ["array", array.dtype.str, [*array.shape], strides, 0, array.flags.writeable]
         self._arrays.append((array, node))
         return node
 
@@ -201,31 +211,45 @@ def _lay_out(arrays: list[tuple[NDArray[Any], list[Any]]]) -> bytes:
 
     Arrays that overlap in memory overlap in the block as well. Bytes that belong to no array are zero.
     """
-    bounds = [_bounds(array) for array, _ in arrays]
-    offsets, end, last, first = [0] * len(arrays), 0, -1, 0
-    for i in sorted(range(len(arrays)), key=bounds.__getitem__):
-        low, high = bounds[i]
-        if low >= last:
-            first, last = low, low
-            end = -(-end // _ALIGNMENT) * _ALIGNMENT
-            begin = end
-        offsets[i] = begin + low - first
-        last = max(last, high)
-        end = begin + last - first
+    bounds, end = [_bounds(array) for array, _ in arrays], 0
+    for group in sorted(_overlapping(bounds)):
+        begin = -(-end // _ALIGNMENT) * _ALIGNMENT
+        low, high = min(bounds[i][0] for i in group), max(bounds[i][1] for i in group)
+        for i in group:
+            arrays[i][1][_OFFSET] = begin + _address(arrays[i][0]) - low
+        end = begin + high - low
     block = np.zeros(end, np.uint8)
-    for (array, node), offset in zip(arrays, offsets, strict=True):
-        node[_OFFSET] = offset + array.ctypes.data - _bounds(array)[0]
+    for array, node in arrays:
         _view(block, node)[...] = array
     return block.tobytes()
 
 
+def _overlapping(bounds: list[tuple[int, int]]) -> list[list[int]]:
+    """Returns the groups of intervals that overlap, by their indices; intervals of no length are left out."""
+    groups, last = list[list[int]](), -1
+    for i in sorted(range(len(bounds)), key=bounds.__getitem__):
+        low, high = bounds[i]
+        if low < high:
+            if low >= last:
+                groups.append([])
+            groups[-1].append(i)
+            last = max(last, high)
+    return [sorted(group) for group in groups]
+
+
+def _address(array: NDArray[Any]) -> int:
+    """Returns the address of an array's first element."""
+    return int(array.__array_interface__["data"][0])
+
+
 def _bounds(array: NDArray[Any]) -> tuple[int, int]:
-    """Returns the address of an array's first byte, and of the one after its last."""
-    begin = array.ctypes.data
-    if array.size == 0:
-        return begin, begin
+    """Returns the address of the first byte of an array's memory, and of the one after its last."""
+    begin = _address(array)
+    if array.flags.forc:
+        return begin, begin + array.nbytes
     reach = [stride * (count - 1) for stride, count in zip(array.strides, array.shape, strict=True)]
-    return begin + sum(min(one, 0) for one in reach), begin + sum(max(one, 0) for one in reach) + array.itemsize
+    low, high = sum(min(one, 0) for one in reach), sum(max(one, 0) for one in reach)
+    return begin + low, begin + high + array.itemsize
 
 
 def _view(block: NDArray[np.uint8], node: list[Any]) -> NDArray[Any]:
@@ -248,7 +272,7 @@ class Decoder:
     """Makes the objects of a structure: those that can be changed first, so that circles can be closed."""
 
     def __init__(self, classes: Classes, codecs: Mapping[str, Codec]) -> None:
-        self._known, self._codecs = classes, codecs
+        self._known, self._codecs, self._kinds = classes, codecs, {*classes.values()}
         self._nodes: list[list[Any]] = []
         self._rows: list[tuple[type, list[str]]] = []
         self._made: dict[int, Any] = {}
@@ -268,6 +292,9 @@ class Decoder:
                 self._made[number] = _MUTABLE[node[0]]()
         for number, node in enumerate(self._nodes):
             self._fill(self._at(number), node)
+        for made in self._made.values():
+            if type(made) in self._kinds and is_dataclass(made):
+                _check_fields(made)
         return self._value(structure["root"])
 
     def _row(self, name: str, names: list[str]) -> tuple[type, list[str]]:
@@ -328,3 +355,41 @@ def _index(number: Any) -> int:
     if type(number) is not int or number < 0:
         raise ValueError(f"expected a number of a node, found {shown(number)}")
     return number
+
+
+# --- what a dataclass says of its fields -------------------------------------------------------------------
+
+_NUMBERS: Final = {
+    float: (float, int, np.floating, np.integer),
+    int: (int, np.integer),
+    bool: (bool, np.bool_),
+}
+"""A value of one of these types is enough for a field of a number."""
+
+
+def _check_fields(made: Any) -> None:
+    """Raises a TypeError where a field is of another type, or what the class raises for its own numbers."""
+    for name, hint in _hints(type(made)).items():
+        value = getattr(made, name)
+        if not any(isinstance(value, kind) for kind in _kinds(hint)):
+            where = f"{type(made).__name__}.{name}"
+            raise TypeError(f"expected a {getattr(hint, '__name__', hint)} as {where}, found {shown(value)}")
+    if hasattr(made, "__post_init__"):
+        copy(made).__post_init__()  # it may give its object new fields
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    hints = get_type_hints(kind)
+    return {field.name: hints[field.name] for field in fields(kind)}
+
+
+def _kinds(hint: Any) -> tuple[type, ...]:
+    """Returns the types of the values that a field may have, of which only the outermost are checked."""
+    origin = get_origin(hint)
+    if origin in (Union, UnionType):
+        return tuple(kind for one in get_args(hint) for kind in _kinds(one))
+    if origin is Literal:
+        return (str,)
+    kind = object if isinstance(hint, TypeVar) or hint is Any else (origin or hint)
+    return _NUMBERS.get(kind, (kind,))

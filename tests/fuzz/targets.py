@@ -6,6 +6,7 @@ Bytes before the first section are the content of the target's first file. The r
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,7 +16,9 @@ from pathspace_graph.eval.study.file import read_study
 from pathspace_graph.io.log import read_log
 from pathspace_graph.io.manifest import verify_all
 from pathspace_graph.io.map import read_map
+from pathspace_graph.io.snapshot import FORMAT
 from pathspace_graph.io.trajectory import read_trajectory
+from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.sim.track_files import read_track
 
 SECTION = re.compile(rb"(?:\A|(?<=\n))=== ([a-z_]+\.[a-z]+)\n")
@@ -55,6 +58,21 @@ def read_tracks(folder: Path) -> None:
             read_track(folder / name)
 
 
+def read_snapshots(folder: Path) -> None:
+    """Reads a snapshot as it is, or a structure and numbers with the digest that belongs to them."""
+    structure = folder / "structure.json"
+    if structure.exists():
+        text, data = structure.read_bytes(), (folder / "numbers.bin").read_bytes()
+        (folder / "mapper.snap").write_bytes(signed(text, data))
+    FixedLagMapper.restore(folder / "mapper.snap")
+
+
+def signed(text: bytes, data: bytes) -> bytes:
+    """The content of a snapshot of this structure, with its digest."""
+    content = b"%d\n%s\n%s" % (len(text), text, data)
+    return f"{FORMAT}\n{hashlib.sha256(content).hexdigest()}\n".encode() + content
+
+
 LOG = {
     "log.toml": 'format = "pathspace-log/1"\n[odometry]\nsigma = [0.1, 0.1, 0.01]\n',
     "odometry.csv": "t,vx,vy,wz\n0.0,5,0,0\n0.1,5,0,0.1\n0.2,5,0,0.1\n",
@@ -69,5 +87,6 @@ TARGETS = {
     "trajectory": Target({"trajectory.tum": ""}, lambda folder: read_trajectory(folder / "trajectory.tum")),
     "track": Target({"track.yaml": "", "track.csv": ""}, read_tracks),
     "study": Target({"study.toml": ""}, lambda folder: read_study(folder / "study.toml")),
+    "snapshot": Target({"mapper.snap": "", "structure.json": "", "numbers.bin": "\0" * 64}, read_snapshots),
     "manifest": Target({"manifest.json": "", "odometry.csv": LOG["odometry.csv"]}, verify_all),
 }

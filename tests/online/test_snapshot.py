@@ -51,16 +51,19 @@ def laps() -> Drive:
         {
             "first cycle": lambda mapper, _: True,
             "second cycle": lambda mapper, _: mapper.smoother.next_cycle == 2,
-            "submap": lambda mapper, _: mapper.smoother.submaps is not None
-            and bool(mapper.smoother.submaps.finished),
+            "submap": lambda mapper, _: (
+                mapper.smoother.submaps is not None and bool(mapper.smoother.submaps.finished)
+            ),
             "inactive": lambda mapper, _: len(mapper.smoother.inactive) > 0,
             "more inactive": lambda mapper, _: len(mapper.smoother.inactive) > 2,
             "closing": lambda mapper, _: mapper.closed,
-            "batch": lambda mapper, result: mapper.closed
-            and result.jump is None
-            and mapper.smoother.next_cycle % 5 == 0,
-            "before the swap": lambda mapper, _: mapper.loop._lap_batch is not None
-            and mapper.loop._lap_batch.due == mapper.smoother.next_cycle,
+            "batch": lambda mapper, result: (
+                mapper.closed and result.jump is None and mapper.smoother.next_cycle % 5 == 0
+            ),
+            "before the swap": lambda mapper, _: (
+                mapper.loop._lap_batch is not None
+                and mapper.loop._lap_batch.due == mapper.smoother.next_cycle
+            ),
             "swap": lambda mapper, result: result.jump is not None,
             "after the swap": lambda mapper, result: mapper.loop.lap_seconds > 0.0 and result.jump is None,
             "gauge": lambda mapper, _: bool(mapper.smoother.gauge_covariance.any()),
@@ -112,9 +115,15 @@ def colours() -> Drive:
 def late() -> Drive:
     """A lap of which every seventh cycle comes after the next one."""
     log = simulate(bean_track(), SimulationSettings(laps=1), seed=4)
-    is_late: Callable[[FixedLagMapper, CycleResult], bool] = lambda mapper, result: result.late
-    moments = {"late": is_late, "after": later_than(3.0), "much later": later_than(9.0)}
-    return Drive(log, moments, reorder=every_seventh_late)
+    return Drive(
+        log,
+        {
+            "late": lambda mapper, result: result.late,
+            "after": later_than(3.0),
+            "much later": later_than(9.0),
+        },
+        reorder=every_seventh_late,
+    )
 
 
 def later_than(t: float) -> Callable[[FixedLagMapper, CycleResult], bool]:
@@ -129,8 +138,9 @@ def every_seventh_late(cycles: Cycles) -> Cycles:
         if following is None:
             ordered.append((odometry, detections))
             continue
-        both = (np.concatenate([odometry.t, following[0].t]), np.concatenate([odometry.twist, following[0].twist]))
-        ordered += [(Odometry(*both), following[1]), (NO_TWISTS, detections)]
+        t = np.concatenate([odometry.t, following[0].t])
+        both = Odometry(t, np.concatenate([odometry.twist, following[0].twist]))
+        ordered += [(both, following[1]), (NO_TWISTS, detections)]
     return ordered
 
 

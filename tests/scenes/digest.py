@@ -35,10 +35,8 @@ def _parts(value: Any, seen: set[int]) -> Iterator[bytes]:
         for key in sorted(value, key=repr):
             yield repr(key).encode()
             yield from _parts(value[key], seen)
-    elif isinstance(value, set | frozenset):
-        yield from _parts(sorted(value), seen)
-    elif isinstance(value, list | tuple | deque):
-        for entry in value:
+    elif isinstance(value, list | tuple | deque | set | frozenset):
+        for entry in sorted(value) if isinstance(value, set | frozenset) else value:
             yield from _parts(entry, seen)
     elif type(value).__module__.startswith("pathspace_graph") and not isinstance(value, Gate):
         if id(value) not in seen:
