@@ -48,9 +48,9 @@ class Online:
     estimator: str = DEFAULT
     """This is the name of the online estimator."""
     save: Path | None = None
-    """The mapper is saved to this file at the end, from which `--resume` goes on; `fixed-lag` alone has it."""
+    """The mapper is saved to this file at the end, for `--resume`; only `fixed-lag` can be saved."""
     resume: Path | None = None
-    """A mapper that was saved goes on with the cycles after its newest one, with its settings and its map."""
+    """The mapper that was saved in this file goes on with its settings, and with cycles after its newest."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
     """These settings describe the estimator."""
 

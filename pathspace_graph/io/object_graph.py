@@ -120,7 +120,7 @@ def _stored(function: Any) -> set[str]:
 def _loads(step: dis.Instruction, name: str) -> bool:
     """Returns whether a step ends with a variable on the stack; newer Pythons join two loads to one step."""
     last = step.argval[-1] if isinstance(step.argval, tuple) else step.argval
-    return "LOAD_FAST" in step.opname and last == name
+    return last == name and any(load in step.opname for load in ("LOAD_FAST", "LOAD_DEREF"))
 
 
 # --- from objects to a structure ---------------------------------------------------------------------------
@@ -255,14 +255,18 @@ def _bounds(array: NDArray[Any]) -> tuple[int, int]:
 def _view(block: NDArray[np.uint8], node: list[Any]) -> NDArray[Any]:
     """Returns the array of a node as a view of the block; ValueError or TypeError where it does not fit."""
     _, dtype, shape, strides, offset, _ = node
-    if dtype not in _DTYPES:
-        raise ValueError(f"expected an array of one of {', '.join(_DTYPES)}, found {shown(dtype)}")
-    size = math.prod(shape) * np.dtype(dtype).itemsize
+    size = math.prod(shape) * _known_dtype(dtype).itemsize
     if min(shape, default=1) < 0 or size > len(block):
         raise ValueError(f"expected an array inside the block of {len(block)} bytes, found {shown(shape)}")
     if size == 0:
         return np.empty(shape, dtype)
     return np.ndarray(shape, dtype, block, offset, strides)
+
+
+def _known_dtype(name: Any) -> np.dtype[Any]:
+    if name not in _DTYPES:
+        raise ValueError(f"expected one of the types {', '.join(_DTYPES)}, found {shown(name)}")
+    return np.dtype(name)
 
 
 # --- from a structure to objects ---------------------------------------------------------------------------
@@ -303,9 +307,10 @@ class Decoder:
             raise ValueError(f"expected a known class, found {shown(name)}")
         kind = self._known[name]
         needed, possible = attributes_of(kind)
-        if len(set(names)) != len(names) or not needed <= set(names) <= possible:
-            wrong = sorted(needed - set(names)) or sorted(set(names) - possible) or names
-            raise ValueError(f"expected the attributes of {name}, found others: {shown(wrong[0])}")
+        missing, foreign = sorted(needed - set(names)), sorted(set(names) - possible)
+        if missing or foreign or len(set(names)) != len(names):
+            found = f"no {missing[0]}" if missing else shown(foreign[0] if foreign else names)
+            raise ValueError(f"expected the attributes of {name}, found {found}")
         return kind, names
 
     def _value(self, value: Any) -> Any:
@@ -332,7 +337,8 @@ class Decoder:
             array.flags.writeable = bool(node[-1])
             return array
         if kind == "number":
-            return np.dtype(rest[0]).type(self._value(rest[1])) if rest[0] in _DTYPES else rest.index(rest[0])
+            dtype, value = rest
+            return _known_dtype(dtype).type(self._value(value))
         values = [self._value(one) for one in (rest[1:] if kind == "made" else rest)]
         return self._codecs[rest[0]].make(*values) if kind == "made" else _SEQUENCES[kind](values)
 

@@ -16,7 +16,7 @@ from pathspace_graph.cli import COMMANDS, main
 from pathspace_graph.commands import online as commands_online
 from pathspace_graph.commands.options import one_line
 from pathspace_graph.io.log import Detections, Log, read_log, write_log
-from pathspace_graph.io.map import read_map
+from pathspace_graph.io.map import MAP_FILE, read_map
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -174,6 +174,28 @@ def test_a_second_run_keeps_the_earlier_result(tmp_path: Path) -> None:
     assert contents(tmp_path / "log.~1~") == first
 
 
+def test_a_saved_mapper_goes_on_with_the_rest_of_a_log(
+    log_folder: Path, map_folder: Path, tmp_path: Path
+) -> None:
+    log, file = replace(read_log(log_folder), truth=None), tmp_path / "half.snap"
+    write_log(replace(log, cycles=log.cycles[: len(log.cycles) // 2]), tmp_path / "half")
+    assert main(["online", str(tmp_path / "half"), "--out", str(tmp_path / "map"), "--save", str(file)]) == 0
+    resume = ["online", str(log_folder), "--out", str(tmp_path / "rest"), "--resume", str(file)]
+    assert main(resume) == 0
+    assert (tmp_path / "rest" / MAP_FILE).read_bytes() == (map_folder / MAP_FILE).read_bytes()
+    assert len((tmp_path / "rest" / "cycles.csv").read_text().splitlines()) == 1 + (len(log.cycles) + 1) // 2
+
+
+def test_a_log_that_does_not_go_on_is_refused(
+    log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "end.snap"
+    assert main(["online", str(log_folder), "--out", str(tmp_path / "map"), "--save", str(file)]) == 0
+    assert main(["online", str(log_folder), "--out", str(tmp_path / "more"), "--resume", str(file)]) == 2
+    assert "expected cycles after" in capsys.readouterr().err
+    assert not (tmp_path / "more").exists()
+
+
 def test_a_log_without_detections_says_what_it_could_not_map(
     log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -240,6 +262,12 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
         (["online", "LOG", "--out", "MAP", "--no-such-option", "1"], "--no-such-option"),
         (["online", "LOG", "--out", "MAP", "--estimator", "magic"], "fixed-lag"),
         (["online", "LOG", "--out", "MAP"], "LOG: expected a log folder"),
+        (
+            ["online", "LOG", "--out", "MAP", "--estimator", "ckf", "--save", "S"],
+            "--save: expected --estimator",
+        ),
+        (["online", "LOG", "--out", "MAP", "--resume", "S", "--lag", "2"], "--resume: expected no settings"),
+        (["online", "LOG", "--out", "MAP", "--save", "/"], "expected a file to write, found a folder"),
         (["online", "LOG", "--out", "MAP", "--lag", "nan"], "lag: expected"),
         (["online", "LOG", "--out", "MAP", "--lag", "-1"], "lag: expected"),
         (["online", "LOG", "--out", "MAP", "--spline.degree", "0"], "spline.degree: expected"),

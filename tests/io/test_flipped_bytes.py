@@ -21,6 +21,7 @@ from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import read_health, write_result
 from pathspace_graph.io.trajectory import read_trajectory
+from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings
 from pathspace_graph.sim.track_files import read_track
@@ -38,6 +39,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "trajectory.tum": ("map", lambda folder: read_trajectory(folder / "trajectory.tum")),
     "cycles.csv": ("map", lambda folder: read_health(folder / "cycles.csv")),
     "summary.json": ("map", verify_all),
+    "mapper.snap": ("snapshot", lambda folder: FixedLagMapper.restore(folder / "mapper.snap")),
 }
 
 
@@ -45,6 +47,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("written")
     write_log(small_log(), folder / "log")
+    FixedLagMapper(odometry_sigma=small_log().odometry_sigma).save(folder / "snapshot" / "mapper.snap")
     write_result(folder / "map", result(), {"estimator": "fixed-lag", "laps": [{"lap": 1, "rmse": 0.5}]})
     return folder
 
