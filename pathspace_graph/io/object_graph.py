@@ -25,7 +25,7 @@ from __future__ import annotations
 import dis
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, cached_property
@@ -141,8 +141,10 @@ class Encoder:
 
     def encode(self, root: Any) -> tuple[Structure, bytes]:
         """Returns the structure and the block of bytes; SettingsError where something cannot be saved."""
-        value = self._value(root)
-        nodes = [*map(self._node, self._all())]
+        value, nodes = self._value(root), list[Any]()
+        for one, holder in self._reached:  # the list grows meanwhile
+            self._holder = holder
+            nodes.append(self._node(one))
         data = _lay_out(self._arrays)
         classes = [[self._class_names[kind], [*names]] for kind, names in self._rows]
         return {"root": value, "classes": classes, "nodes": nodes}, data
@@ -157,12 +159,6 @@ class Encoder:
             number = self._numbers[id(value)] = len(self._reached)
             self._reached.append((value, self._holder))
         return [number]
-
-    def _all(self) -> Iterator[Any]:
-        """Yields everything that is reached, also what is reached meanwhile."""
-        for value, holder in self._reached:
-            self._holder = holder
-            yield value
 
     def _node(self, value: Any) -> list[Any]:
         kind = type(value)
@@ -266,7 +262,8 @@ def _view(block: NDArray[np.uint8], node: list[Any]) -> NDArray[Any]:
 def _known_dtype(name: Any) -> np.dtype[Any]:
     if name not in _DTYPES:
         raise ValueError(f"expected one of the types {', '.join(_DTYPES)}, found {shown(name)}")
-    return np.dtype(name)
+    known: np.dtype[Any] = np.dtype(name)
+    return known
 
 
 # --- from a structure to objects ---------------------------------------------------------------------------
@@ -375,11 +372,12 @@ _NUMBERS: Final = {
 
 def _check_fields(made: Any) -> None:
     """Raises a TypeError where a field is of another type, or what the class raises for its own numbers."""
-    for name, hint in _hints(type(made)).items():
+    kind: Any = type(made)
+    for name, hint in _hints(kind).items():
         value = getattr(made, name)
-        if not any(isinstance(value, kind) for kind in _kinds(hint)):
-            where = f"{type(made).__name__}.{name}"
-            raise TypeError(f"expected a {getattr(hint, '__name__', hint)} as {where}, found {shown(value)}")
+        if not isinstance(value, _kinds(hint)):
+            expected = f"expected a {getattr(hint, '__name__', hint)} as {kind.__name__}.{name}"
+            raise TypeError(f"{expected}, found {shown(value)}")
     if hasattr(made, "__post_init__"):
         copy(made).__post_init__()  # it may give its object new fields
 

@@ -21,6 +21,7 @@ from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, UNKNOWN
 from pathspace_graph.loop.finding import FOUND
 from pathspace_graph.loop.mending import MENDED
+from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -42,6 +43,7 @@ class Drive:
     moments: dict[str, Callable[[FixedLagMapper, CycleResult], bool]]
     settings: MapperSettings = field(default_factory=MapperSettings)
     reorder: Callable[[Cycles], Cycles] = lambda cycles: cycles
+    registers: bool = True
 
 
 def laps() -> Drive:
@@ -93,6 +95,34 @@ def mended() -> Drive:
             "mended": lambda mapper, result: result.notice.startswith(MENDED),
         },
     )
+
+
+def places() -> Drive:
+    """A drive with places of the cones on the closed curves."""
+    settings = MapperSettings()
+    return Drive(
+        simulate(bean_track(), SimulationSettings(laps=2), seed=5),
+        {"places": lambda mapper, _: mapper.smoother.map.places is not None, "later": later_than(25.0)},
+        replace(settings, place=replace(settings.place, use="cones")),
+    )
+
+
+def recurring() -> Drive:
+    """A loop that no registration closes, which a batch from odometry closes."""
+    return Drive(
+        simulate(bean_track(), SimulationSettings(laps=3), seed=6),
+        {
+            "tried": lambda mapper, _: not mapper.closed and mapper.loop.first_kept is not None,
+            "closed": lambda mapper, _: mapper.closed,
+        },
+        registers=False,
+    )
+
+
+def standing() -> Drive:
+    cones, labels = corridor(80.0)
+    log = exact_log(np.concatenate([ahead(0.0, 3.0), ahead(8.0, 6.0)]), cones, labels)
+    return Drive(log, {"at rest": later_than(2.0), "driving": later_than(4.0)})
 
 
 def colours() -> Drive:
@@ -160,9 +190,13 @@ def assert_same_map(track: Map, expected: Map) -> None:
         np.testing.assert_array_equal(boundary.covariance, known.covariance)
 
 
-@pytest.mark.parametrize("make", [laps, lost, mended, colours, late])
-def test_a_restored_mapper_goes_on_to_the_same_result(make: Callable[[], Drive], tmp_path: Path) -> None:
+@pytest.mark.parametrize("make", [laps, lost, mended, places, recurring, standing, colours, late])
+def test_a_restored_mapper_goes_on_to_the_same_result(
+    make: Callable[[], Drive], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     drive = make()
+    if not drive.registers:
+        monkeypatch.setattr(TrackLoop, "may_close", lambda _: False)
     waiting, restored = dict(drive.moments), None
     mapper = FixedLagMapper(drive.settings, drive.log.odometry_sigma)
     for number, cycle in enumerate(drive.reorder([*split_odometry(drive.log)])):
