@@ -9,6 +9,8 @@ import pytest
 from pathspace_graph.errors import InputError
 from pathspace_graph.io.snapshot import read_snapshot, write_snapshot
 
+from ..scenes.kills import dies
+
 STRUCTURE = {"root": [0], "text": "ä\n", "numbers": [1, -0.0, 5e-324, 1.7976931348623157e308]}
 
 
@@ -43,3 +45,22 @@ def test_a_number_that_json_does_not_have_is_no_structure(tmp_path: Path) -> Non
     with pytest.raises(ValueError, match="Out of range float"):
         write_snapshot(tmp_path / "a.snap", [float("nan")], b"")
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_kill_at_any_step_leaves_the_old_file_or_the_new_one(tmp_path: Path) -> None:
+    file, step, kills = tmp_path / "a.snap", 0, 0
+    write_snapshot(file, "old", b"1")
+    old = file.read_bytes()
+    killed = True
+    while killed:
+        step += 1
+        killed = dies(lambda: write_snapshot(file, "new", b"2"), tmp_path, step)
+        kills += killed
+        assert read_snapshot(file) in (("old", b"1"), ("new", b"2"))
+        for backup in tmp_path.glob("a.snap.~*"):
+            assert read_snapshot(backup)
+            backup.unlink()
+        file.write_bytes(old)
+    assert kills > 3
+    write_snapshot(file, "new", b"2")
+    assert {path.name for path in tmp_path.iterdir()} == {"a.snap", "a.snap.~1~"}
