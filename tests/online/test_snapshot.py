@@ -68,7 +68,7 @@ def laps() -> Drive:
             ),
             "swap": lambda mapper, result: result.jump is not None,
             "after the swap": lambda mapper, result: mapper.loop.lap_seconds > 0.0 and result.jump is None,
-            "gauge": lambda mapper, _: bool(mapper.smoother.gauge_covariance.any()),
+            "gauge": lambda mapper, _: mapper.smoother.held is not None,
         },
         replace(settings, closing=replace(settings.closing, gauge_laps=1.0)),
     )
