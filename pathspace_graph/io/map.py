@@ -10,10 +10,12 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.planning import CentreLine, centre_line
 
 from .json_file import read_json
 from .limits import MAX_COORDINATE, MAX_DEGREE, shown
@@ -91,6 +93,41 @@ class Map:
     def size(self) -> int:
         """Returns the number of control points or landmarks on both boundaries together."""
         return sum(boundary.size for boundary in self.boundaries.values())
+
+    def centre_line(self, step: float = 1.0) -> CentreLine:
+        """Returns the centre line with widths, heading, curvature and arc length, and their sigmas.
+
+        Its points are `step` (m) apart. Where the joint covariance isn't known, the boundaries are taken as
+        independent. A tentative stretch takes part as well. Both boundaries must be splines; otherwise, or
+        where they are nowhere side by side, SettingsError is raised.
+        """
+        left, right = (self._spline_of(label) for label in BOUNDARIES)
+        return centre_line(
+            left.spline, right.spline, self._covariance_of(left, right), self._is_loop(left, right), step
+        )
+
+    def _spline_of(self, label: int) -> SplineBoundary:
+        boundary = self.boundaries.get(label)
+        if isinstance(boundary, SplineBoundary):
+            return boundary
+        found = "none" if boundary is None else "points in no order"
+        raise SettingsError(f"a centre line: expected a curve as {NAMES[label]} boundary, found {found}")
+
+    def _covariance_of(self, left: SplineBoundary, right: SplineBoundary) -> Array | None:
+        """Returns the covariance of both boundaries' control points; None where it wasn't asked for."""
+        if self.joint_covariance is not None:
+            return self.joint_covariance
+        if any(boundary.covariance.shape[0] != 2 * boundary.size for boundary in (left, right)):
+            return None
+        return np.asarray(block_diag(left.covariance, right.covariance))
+
+    def _is_loop(self, left: SplineBoundary, right: SplineBoundary) -> bool:
+        """Returns whether the centre line is closed: both curves are."""
+        if left.spline.periodic != right.spline.periodic:
+            raise SettingsError(
+                "a centre line: expected both boundaries closed or both open, found one of each"
+            )
+        return left.spline.periodic
 
 
 def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Array:
