@@ -13,17 +13,11 @@ from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.centre_line import find_line
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
+from ..scenes.maps import circle
+
 Array = NDArray[np.float64]
 
 QUANTITIES = ("points", "heading", "curvature", "arc_length", "width_left", "width_right")
-
-
-def circle(radius: float, size: int = 200, turn: float = 1.0) -> BSpline:
-    """Interpolates a circle about the origin, anticlockwise where `turn` is 1, clockwise where it is -1."""
-    breaks = np.linspace(0.0, 2 * np.pi, size + 1)
-    points = radius * np.column_stack([np.cos(breaks[:-1]), turn * np.sin(breaks[:-1])])
-    blank = BSpline.periodic_from(breaks, np.arange(2.0 * size).reshape(-1, 2))
-    return BSpline.periodic_from(breaks, np.linalg.solve(blank.basis_matrix(breaks[:-1]), points))
 
 
 def straight(y: float, begin: float = 0.0, end: float = 30.0, size: int = 12) -> BSpline:
