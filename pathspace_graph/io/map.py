@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.labels import BOUNDARIES, NAMES
+from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
@@ -87,7 +87,7 @@ class Map:
 
     joint_covariance: Array | None = None
     """This is the joint covariance (2m, 2m) in m^2 of the points of all boundaries, in the order of their
-    labels; it is None where it isn't known, for example because the map was read from a file."""
+    labels; it is None where it isn't known."""
 
     @property
     def size(self) -> int:
@@ -150,7 +150,11 @@ def map_to_json(track: Map) -> dict[str, Any]:
     boundaries = {
         NAMES[label]: _boundary_to_json(track.boundaries[label]) for label in sorted(track.boundaries)
     }
-    return {"format": FORMAT, "closed": bool(track.closed), "boundaries": boundaries}
+    content = {"format": FORMAT, "closed": bool(track.closed), "boundaries": boundaries}
+    if track.joint_covariance is not None and len(track.boundaries) == len(BOUNDARIES):
+        left = 2 * track.boundaries[LEFT].size
+        content["cross_covariance"] = track.joint_covariance[:left, left:].tolist()
+    return content
 
 
 def _boundary_to_json(boundary: MapBoundary) -> dict[str, Any]:
@@ -178,14 +182,13 @@ def map_from_json(content: Any, file: Path | str = MAP_FILE) -> Map:
     unknown = sorted(set(boundaries) - {NAMES[label] for label in BOUNDARIES})
     if unknown:
         raise reader.error(f"boundaries: expected left and right, found {shown(unknown[0])}")
-    return Map(
-        closed=reader.boolean(reader.get(top, "closed", ""), "closed"),
-        boundaries={
-            label: reader.boundary(boundaries[NAMES[label]], f"boundaries.{NAMES[label]}")
-            for label in BOUNDARIES
-            if NAMES[label] in boundaries
-        },
-    )
+    closed = reader.boolean(reader.get(top, "closed", ""), "closed")
+    mapped = {
+        label: reader.boundary(boundaries[NAMES[label]], f"boundaries.{NAMES[label]}")
+        for label in BOUNDARIES
+        if NAMES[label] in boundaries
+    }
+    return Map(closed, mapped, reader.joint_covariance(top, mapped))
 
 
 @dataclass(frozen=True)
@@ -282,6 +285,22 @@ class _Reader:
         if not _is_covariance(covariance):
             raise self.error(f"{where}.covariance: expected a symmetric, positive semidefinite matrix")
         return covariance
+
+    def joint_covariance(self, top: dict[str, Any], boundaries: Mapping[int, MapBoundary]) -> Array | None:
+        """Returns the joint covariance of both boundaries, or None where the file doesn't have it."""
+        where = "cross_covariance"
+        if where not in top:
+            return None
+        if len(boundaries) != len(BOUNDARIES):
+            raise self.error(f"{where}: expected both boundaries, found {len(boundaries)}")
+        left, right = (boundaries[label].covariance for label in BOUNDARIES)
+        cross = self.array(top[where], where, len(right), MAX_COORDINATE**2)
+        if len(cross) != len(left):
+            raise self.error(f"{where}: expected {len(left)} rows, found {len(cross)}")
+        joint = np.block([[left, cross], [cross.T, right]])
+        if not _is_covariance(joint):
+            raise self.error(f"{where}: expected a joint covariance that is positive semidefinite")
+        return joint
 
 
 def _is_covariance(P: Array) -> bool:
