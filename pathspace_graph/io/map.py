@@ -99,7 +99,7 @@ class Map:
 
         Its points are `step` (m) apart. Where the joint covariance isn't known, the boundaries are taken as
         independent. A tentative stretch takes part as well. Both boundaries must be splines; otherwise, or
-        where they are nowhere side by side, SettingsError is raised.
+        where they aren't side by side, SettingsError is raised.
         """
         left, right = (self._spline_of(label) for label in BOUNDARIES)
         return centre_line(

@@ -36,6 +36,8 @@ _LEAST_COSINE: Final = 0.1
 """Boundaries that diverge by more than the angle of this cosine are treated as if it were this one."""
 _CROSSING_STEPS: Final = 8
 """The crossing of a normal of the line and a boundary is found by this number of Newton steps."""
+_LARGEST_GAP: Final = 4.0
+"""Neighbours are at most this many mean distances apart; farther ones are on both sides of a break."""
 _FEWEST_POINTS: Final = 4
 """A line has at least this number of fine points."""
 
@@ -99,7 +101,7 @@ def find_line(left: BSpline, right: BSpline, closed: bool, step: float) -> Line:
 
     An open line leads from where both boundaries begin to where both end. A line has a whole number of steps,
     as near to `step` as can be. SettingsError is raised where the step is out of its range, the line
-    would be too long, or the boundaries are nowhere side by side.
+    would be too long, or the boundaries aren't side by side.
     """
     if not LEAST_STEP <= step < np.inf:
         raise SettingsError(f"step: expected a number of at least {LEAST_STEP:g} m, found {step:g}")
@@ -115,7 +117,19 @@ def find_line(left: BSpline, right: BSpline, closed: bool, step: float) -> Line:
         count = max(round(lengths[-1] / step), _FEWEST_POINTS) * every
         stations = _resampled(left, right, stations, lengths, count, closed)
     lengths = arc_lengths(stations, closed)
+    _check(stations, closed)
     return Line(stations, lengths[: len(stations.points)], float(lengths[-1]), every, closed)
+
+
+def _check(stations: Stations, closed: bool) -> None:
+    """Raises a SettingsError where the line breaks, since the boundaries cross or one runs astray."""
+    points = stations.points
+    ahead = np.roll(points, -1, axis=0) if closed else np.concatenate([points[1:], points[-1:]])
+    gaps = np.linalg.norm(ahead - points, axis=1)
+    bad = ~stations.on_line | (gaps > _LARGEST_GAP * gaps.mean())
+    if bad.any():
+        x, y = points[np.argmax(bad)]
+        raise SettingsError(f"{_NOT_SIDE_BY_SIDE} near x = {x:.1f} m, y = {y:.1f} m")
 
 
 def crossing(spline: BSpline, points: Array, normal: Array, foot: FootPoints) -> tuple[Array, Array]:
@@ -218,17 +232,22 @@ def _in_order(left: BSpline, right: BSpline, stations: Stations, closed: bool) -
     stations = stations.where(stations.on_line)
     if len(stations.points) < _FEWEST_POINTS:
         raise SettingsError(_NOT_SIDE_BY_SIDE)
-    along = [left.arc_length(stations.left.u), right.arc_length(stations.right.u)]
-    if closed:
-        first = int(np.argmin(along[0]))
-        lengths = left.length(), right.length()
-        along = [
-            np.mod(s - s[first] + _SETTLED, length) - _SETTLED
-            for s, length in zip(along, lengths, strict=True)
-        ]
-    stations = stations.where(np.argsort(along[0] + along[1], kind="stable"))
+    along = left.arc_length(stations.left.u), right.arc_length(stations.right.u)
+    order = _turns(along, (left.length(), right.length())) if closed else along[0] + along[1]
+    stations = stations.where(np.argsort(order, kind="stable"))
     moved = np.linalg.norm(np.diff(stations.points, axis=0), axis=1) > _SETTLED
     return stations.where(np.append(True, moved))
+
+
+def _turns(along: tuple[Array, Array], lengths: tuple[float, float]) -> Array:
+    """Returns how far round a loop the stations (n,) are, by the arc lengths of both foot points.
+
+    The boundaries begin at different places, by the circular mean of the differences. Without them a station
+    has about the same angle on both, so that their seams don't matter.
+    """
+    angles = [2 * np.pi * s / length for s, length in zip(along, lengths, strict=True)]
+    ahead = np.exp(1j * (angles[1] - angles[0]))
+    return np.asarray(angles[0] + 0.5 * np.angle(ahead * np.conj(ahead.mean())))
 
 
 def arc_lengths(stations: Stations, closed: bool) -> Array:

@@ -189,6 +189,14 @@ def test_a_lap_that_overlaps_its_beginning_is_one_line() -> None:
     assert np.diff(np.unwrap(line.heading)).min() > 0.0
 
 
+def test_boundaries_that_cross_are_refused_with_the_place() -> None:
+    left = circle(18.0, 40)
+    points = left.distinct_control_points.copy()
+    points[9:12] *= 1.4  # at the top, beyond the right boundary
+    with pytest.raises(SettingsError, match=r"near x = -?\d+\.\d m, y = "):
+        centre_line(left.with_points(points), circle(22.0), None, True, 1.0)
+
+
 def test_what_has_no_centre_line() -> None:
     with pytest.raises(SettingsError, match="side by side, the left one on the left"):
         centre_line(circle(22.0), circle(18.0), None, True, 1.0)
