@@ -51,6 +51,7 @@ COMMANDS: Final = {
         "scale", "Scale", "measures the time of an update against map size, detections and laps"
     ),
     "plot": Command("plot", "Plot", "draws a map with its uncertainty band"),
+    "export": Command("export", "Export", "writes a map in a format that planners and other tools read"),
     "verify": Command("verify", "Verify", "checks that the files of a folder are as they were written"),
 }
 

@@ -30,6 +30,7 @@ ARROWS: dict[str, set[str]] = {
     "spline": {"factors", "settings"},
     "io": {"spline", "factors"},
     "sim": {"io"},
+    "export": {"spline", "io"},
     "graph": {"factors"},
     "health": {"settings"},
     "run": {"io", "laps", "health"},
@@ -50,6 +51,7 @@ ARROWS: dict[str, set[str]] = {
     "eval.faults": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "commands": BELOW_EVAL
+    | {"export"}
     | {f"eval.{room}" for room in ("metrics", "harness", "figures", "study", "compare", "scaling", "faults")},
     "cli": {"commands"},
     "__main__": {"cli"},

@@ -10,10 +10,12 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.labels import BOUNDARIES, NAMES
+from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES
 from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.planning import CentreLine, centre_line
 
 from .json_file import read_json
 from .limits import MAX_COORDINATE, MAX_DEGREE, shown
@@ -85,12 +87,47 @@ class Map:
 
     joint_covariance: Array | None = None
     """This is the joint covariance (2m, 2m) in m^2 of the points of all boundaries, in the order of their
-    labels; it is None where it isn't known, for example because the map was read from a file."""
+    labels; it is None where it isn't known."""
 
     @property
     def size(self) -> int:
         """Returns the number of control points or landmarks on both boundaries together."""
         return sum(boundary.size for boundary in self.boundaries.values())
+
+    def centre_line(self, step: float = 1.0) -> CentreLine:
+        """Returns the centre line with widths, heading, curvature and arc length, and their sigmas.
+
+        Its points are `step` (m) apart. Where the joint covariance isn't known, the boundaries are taken as
+        independent. A tentative stretch takes part as well. Both boundaries must be splines; otherwise, or
+        where they aren't side by side, SettingsError is raised.
+        """
+        left, right = (self._spline_of(label) for label in BOUNDARIES)
+        return centre_line(
+            left.spline, right.spline, self._covariance_of(left, right), self._is_loop(left, right), step
+        )
+
+    def _spline_of(self, label: int) -> SplineBoundary:
+        boundary = self.boundaries.get(label)
+        if isinstance(boundary, SplineBoundary):
+            return boundary
+        found = "none" if boundary is None else "points in no order"
+        raise SettingsError(f"a centre line: expected a curve as {NAMES[label]} boundary, found {found}")
+
+    def _covariance_of(self, left: SplineBoundary, right: SplineBoundary) -> Array | None:
+        """Returns the covariance of both boundaries' control points; None where it wasn't asked for."""
+        if self.joint_covariance is not None:
+            return self.joint_covariance
+        if any(boundary.covariance.shape[0] != 2 * boundary.size for boundary in (left, right)):
+            return None
+        return np.asarray(block_diag(left.covariance, right.covariance))
+
+    def _is_loop(self, left: SplineBoundary, right: SplineBoundary) -> bool:
+        """Returns whether the centre line is closed: both curves are."""
+        if left.spline.periodic != right.spline.periodic:
+            raise SettingsError(
+                "a centre line: expected both boundaries closed or both open, found one of each"
+            )
+        return left.spline.periodic
 
 
 def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Array:
@@ -113,7 +150,11 @@ def map_to_json(track: Map) -> dict[str, Any]:
     boundaries = {
         NAMES[label]: _boundary_to_json(track.boundaries[label]) for label in sorted(track.boundaries)
     }
-    return {"format": FORMAT, "closed": bool(track.closed), "boundaries": boundaries}
+    content = {"format": FORMAT, "closed": bool(track.closed), "boundaries": boundaries}
+    if track.joint_covariance is not None and len(track.boundaries) == len(BOUNDARIES):
+        left = 2 * track.boundaries[LEFT].size
+        content["cross_covariance"] = track.joint_covariance[:left, left:].tolist()
+    return content
 
 
 def _boundary_to_json(boundary: MapBoundary) -> dict[str, Any]:
@@ -141,14 +182,13 @@ def map_from_json(content: Any, file: Path | str = MAP_FILE) -> Map:
     unknown = sorted(set(boundaries) - {NAMES[label] for label in BOUNDARIES})
     if unknown:
         raise reader.error(f"boundaries: expected left and right, found {shown(unknown[0])}")
-    return Map(
-        closed=reader.boolean(reader.get(top, "closed", ""), "closed"),
-        boundaries={
-            label: reader.boundary(boundaries[NAMES[label]], f"boundaries.{NAMES[label]}")
-            for label in BOUNDARIES
-            if NAMES[label] in boundaries
-        },
-    )
+    closed = reader.boolean(reader.get(top, "closed", ""), "closed")
+    mapped = {
+        label: reader.boundary(boundaries[NAMES[label]], f"boundaries.{NAMES[label]}")
+        for label in BOUNDARIES
+        if NAMES[label] in boundaries
+    }
+    return Map(closed, mapped, reader.joint_covariance(top, mapped))
 
 
 @dataclass(frozen=True)
@@ -245,6 +285,22 @@ class _Reader:
         if not _is_covariance(covariance):
             raise self.error(f"{where}.covariance: expected a symmetric, positive semidefinite matrix")
         return covariance
+
+    def joint_covariance(self, top: dict[str, Any], boundaries: Mapping[int, MapBoundary]) -> Array | None:
+        """Returns the joint covariance of both boundaries, or None where the file doesn't have it."""
+        where = "cross_covariance"
+        if where not in top:
+            return None
+        if len(boundaries) != len(BOUNDARIES):
+            raise self.error(f"{where}: expected both boundaries, found {len(boundaries)}")
+        left, right = (boundaries[label].covariance for label in BOUNDARIES)
+        cross = self.array(top[where], where, len(right), MAX_COORDINATE**2)
+        if len(cross) != len(left):
+            raise self.error(f"{where}: expected {len(left)} rows, found {len(cross)}")
+        joint = np.block([[left, cross], [cross.T, right]])
+        if not _is_covariance(joint):
+            raise self.error(f"{where}: expected a joint covariance that is positive semidefinite")
+        return joint
 
 
 def _is_covariance(P: Array) -> bool:

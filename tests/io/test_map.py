@@ -113,6 +113,37 @@ def test_what_is_written_is_read_back_exactly(tmp_path: Path) -> None:
         )
 
 
+def joint_map() -> Map:
+    """The same map with the joint covariance of both boundaries, whose blocks are their own."""
+    joint, boundaries = covariance(16, 4), spline_map().boundaries
+    own = {LEFT: joint[:18, :18], RIGHT: joint[18:, 18:]}
+    return Map(True, {k: replace(boundaries[k], covariance=own[k]) for k in own}, joint)
+
+
+def test_the_joint_covariance_is_read_back_exactly() -> None:
+    track = joint_map()
+    assert np.shape(map_to_json(track)["cross_covariance"]) == (18, 14)
+    again = map_from_json(json.loads(json.dumps(map_to_json(track))))
+    np.testing.assert_array_equal(again.joint_covariance, track.joint_covariance)
+    assert map_from_json(map_to_json(spline_map())).joint_covariance is None
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda content: content["cross_covariance"].pop(), "expected 18 rows, found 17"),
+        (lambda content: content["cross_covariance"][0].pop(), "expected rows of 14 finite numbers"),
+        (lambda content: content["cross_covariance"][0].__setitem__(0, 1e3), "positive semidefinite"),
+        (lambda content: content["boundaries"].pop("left"), "expected both boundaries, found 1"),
+    ],
+)
+def test_a_cross_covariance_that_is_none(change: Callable[[Any], None], said: str) -> None:
+    content = map_to_json(joint_map())
+    change(content)
+    with pytest.raises(InputError, match=rf"cross_covariance: .*{said}"):
+        map_from_json(content)
+
+
 def test_a_map_of_points_and_an_empty_one_make_the_round_trip() -> None:
     points = np.random.default_rng(5).normal(0.0, 10.0, (4, 2))
     original = Map(False, {RIGHT: PointBoundary(points, covariance(4, 6)), LEFT: _no_points()})

@@ -17,7 +17,7 @@ from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
 
-from ..scenes.curves import boundary_through
+from ..scenes.maps import boundary_through
 
 Array = NDArray[np.float64]
 

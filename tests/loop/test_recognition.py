@@ -16,7 +16,7 @@ from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.curves import boundary_through
+from ..scenes.maps import boundary_through
 
 Array = NDArray[np.float64]
 

@@ -27,8 +27,8 @@ from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.settings.growth import PathSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.curves import boundary_through
 from ..scenes.drives import detections
+from ..scenes.maps import boundary_through
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from pathspace_graph.settings.knots import Knots
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
-from ..scenes.curves import boundary_through
+from ..scenes.maps import boundary_through
 
 Array = NDArray[np.float64]
 

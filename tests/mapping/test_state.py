@@ -11,7 +11,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import SplineSettings
 
-from ..scenes.curves import boundary_through
+from ..scenes.maps import boundary_through
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from pathspace_graph.online.growth import count_in_order, undisputed
 from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.curves import boundary_through
 from ..scenes.drives import DT, ahead, corridor, detections, exact_log, map_log, true_poses
+from ..scenes.maps import boundary_through
 
 Array = NDArray[np.float64]
 

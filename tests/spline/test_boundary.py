@@ -12,7 +12,7 @@ from scipy.interpolate import BSpline as ScipyBSpline
 from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 from pathspace_graph.spline.boundary import Boundary, open_boundary, relocate
 
-from ..scenes.curves import boundary_through
+from ..scenes.maps import boundary_through
 
 Array = NDArray[np.float64]
 

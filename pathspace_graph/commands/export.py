@@ -1,0 +1,96 @@
+"""`export`: a map in the formats of planners and other tools."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from tyro.conf import Positional, arg
+
+from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.export.geojson import write_geojson
+from pathspace_graph.export.lanelet2 import write_lanelet2
+from pathspace_graph.export.local_plane import LocalPlane
+from pathspace_graph.export.tables import write_centre_line, write_points
+from pathspace_graph.io.files import atomic_file, check_file_target
+from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map
+from pathspace_graph.io.trajectory import TRAJECTORY_FILE, read_trajectory
+from pathspace_graph.spline.centre_line import LEAST_STEP, MOST_POINTS
+
+Format = Literal["centerline", "tum", "geojson", "points", "lanelet2"]
+ON_EARTH = ("geojson", "lanelet2")
+"""These formats have latitude and longitude."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Writes a map in a format that planners and other tools read."""
+
+    map: Positional[Path]
+    """The map is read from this folder."""
+    format: Annotated[Format, arg(name="as")]
+    """The format is the centre line with widths as TUM raceline CSV (`centerline`), the trajectory in the TUM
+    format (`tum`), boundaries and centre line as GeoJSON (`geojson`), both boundaries as CSV with the columns
+    x, y and label (`points`), or both boundaries with one lanelet as OSM XML (`lanelet2`)."""
+    out: Path
+    """The result is written to this file; an earlier one is kept as a numbered backup."""
+    step: float = 1.0
+    """Points are this far apart along a curve (m)."""
+    origin: tuple[float, float, float] | None = None
+    """The origin of the map has this latitude and longitude (degrees, WGS84). Its x axis, which is the way
+    that the vehicle faced at the start, has this heading (degrees, clockwise from north). `geojson` and
+    `lanelet2` need them."""
+
+    def run(self) -> None:
+        """Reads the map and writes the file."""
+        check_file_target(self.out)
+        if not LEAST_STEP <= self.step < np.inf:
+            raise SettingsError(
+                f"--step: expected a number of at least {LEAST_STEP:g} m, found {self.step:g}"
+            )
+        plane = self._plane()
+        track = read_map(self.map)
+        file = self.map / MAP_FILE
+        check_length(track, self.step, file)
+        with atomic_file(self.out) as temporary:
+            try:
+                self._write(temporary, track, plane)
+            except SettingsError as error:
+                raise InputError(file, str(error)) from None
+
+    def _write(self, file: Path, track: Map, plane: LocalPlane | None) -> None:
+        if self.format == "centerline":
+            write_centre_line(file, track, self.step)
+        elif self.format == "points":
+            write_points(file, track, self.step)
+        elif self.format == "tum":
+            copy_trajectory(self.map / TRAJECTORY_FILE, file)
+        elif plane is not None:
+            write = write_geojson if self.format == "geojson" else write_lanelet2
+            write(file, track, self.step, plane)
+
+    def _plane(self) -> LocalPlane | None:
+        if self.origin is not None:
+            return LocalPlane(*self.origin)
+        if self.format in ON_EARTH:
+            expected = "expected LATITUDE LONGITUDE HEADING in degrees, the heading clockwise from north"
+            raise SettingsError(f"--origin: {expected}, found none, which --as {self.format} needs")
+        return None
+
+
+def copy_trajectory(source: Path, target: Path) -> None:
+    """Copies the trajectory of a map, which is in the TUM format already, once it is found right."""
+    read_trajectory(source)
+    shutil.copyfile(source, target)
+
+
+def check_length(track: Map, step: float, file: Path) -> None:
+    """Raises an InputError where a curve has too many points at this step (m)."""
+    most = MOST_POINTS * step
+    for boundary in track.boundaries.values():
+        if isinstance(boundary, SplineBoundary) and boundary.spline.length() > most:
+            found = f"found {boundary.spline.length():.6g} m"
+            raise InputError(file, f"expected curves of at most {most:g} m at this step, {found}")

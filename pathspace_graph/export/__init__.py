@@ -1,0 +1,1 @@
+"""What planners and other tools read: a map in their formats (FORMATS)."""

@@ -1,0 +1,72 @@
+"""`export` on map folders, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pathspace_graph.cli import main
+from pathspace_graph.io.map import Map, map_to_json
+from pathspace_graph.io.trajectory import write_trajectory
+
+from ..scenes.maps import open_map, point_map, ring_map
+
+ORIGIN = ["--origin", "-33.9", "-151.2", "-30"]
+
+
+def folder(path: Path, track: Map) -> Path:
+    path.mkdir()
+    (path / "map.json").write_text(json.dumps(map_to_json(track)))
+    write_trajectory(path / "trajectory.tum", [0.0, 0.1], np.array([[0.0, 0.0, 0.0], [0.5, 0.1, 0.2]]))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["centerline", "tum", "geojson", "points", "lanelet2"])
+def test_each_format_is_written(kind: str, tmp_path: Path) -> None:
+    for name, track in (("ring", ring_map()), ("open", open_map())):
+        source, out = folder(tmp_path / name, track), tmp_path / f"{name}.{kind}"
+        assert main(["export", str(source), "--as", kind, "--out", str(out), "--step", "2", *ORIGIN]) == 0
+        assert out.stat().st_size > 0
+
+
+def test_the_trajectory_is_copied_to_the_byte_and_an_earlier_file_kept(tmp_path: Path) -> None:
+    source, out = folder(tmp_path / "map", ring_map()), tmp_path / "out.tum"
+    out.write_text("mine")
+    assert main(["export", str(source), "--as", "tum", "--out", str(out)]) == 0
+    assert out.read_bytes() == (source / "trajectory.tum").read_bytes()
+    assert (tmp_path / "out.tum.~1~").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--as", "geojson"], "--origin: expected LATITUDE LONGITUDE HEADING in degrees"),
+        (["--as", "lanelet2"], "which --as lanelet2 needs"),
+        (["--as", "lanelet2", "--origin", "95", "0", "0"], "expected a latitude"),
+        (["--as", "points", "--step", "0"], "--step: expected a number of at least"),
+        (["--as", "points", "--step", "nan"], "--step: expected a number of at least"),
+        (["--as", "centerline"], "map.json: a centre line: expected a curve as left boundary"),
+        (["--as", "lanelet2", *ORIGIN], "map.json: lanelet2: expected a curve as left boundary"),
+        (["--as", "word"], "--as"),
+    ],
+)
+def test_bad_usage_ends_in_one_line_and_leaves_nothing(
+    arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, out = folder(tmp_path / "map", point_map()), tmp_path / "new" / "out"
+    assert main(["export", str(source), "--out", str(out), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert not out.parent.exists()
+
+
+def test_a_map_without_a_trajectory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, out = folder(tmp_path / "map", ring_map()), tmp_path / "out"
+    (source / "trajectory.tum").unlink()
+    assert main(["export", str(source), "--as", "tum", "--out", str(out)]) == 2
+    assert "trajectory.tum: expected a trajectory, found none" in capsys.readouterr().err
+    assert not out.exists()

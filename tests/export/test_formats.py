@@ -1,0 +1,139 @@
+"""Each format is read back, and equals what was written to its precision."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.export.geojson import write_geojson
+from pathspace_graph.export.lanelet2 import write_lanelet2
+from pathspace_graph.export.local_plane import LocalPlane
+from pathspace_graph.export.tables import sampled, write_centre_line, write_points
+from pathspace_graph.io.csv_table import read_table
+from pathspace_graph.io.map import Map, SplineBoundary
+from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.sim.track_files import read_track
+
+from ..scenes.maps import open_map, point_map, ring_map
+
+Array = NDArray[np.float64]
+
+PLANE = LocalPlane(48.1, 11.5, 30.0)
+every_map = pytest.mark.parametrize("make", [ring_map, open_map])
+
+
+def points_of(track: Map, label: int, step: float) -> Array:
+    boundary = track.boundaries[label]
+    assert isinstance(boundary, SplineBoundary)
+    return sampled(boundary.spline, step)
+
+
+@every_map
+def test_the_raceline_format(make: Callable[[], Map], tmp_path: Path) -> None:
+    file, track = tmp_path / "line.csv", make()
+    write_centre_line(file, track, 0.7)
+    line = track.centre_line(0.7)
+    rows = np.loadtxt(file, comments="#", delimiter=",")  # as TUM's own tools read it
+    assert np.array_equal(rows, np.column_stack([line.points, line.width_right, line.width_left]))
+
+
+def test_a_raceline_is_a_track_of_the_simulator(tmp_path: Path) -> None:
+    file = tmp_path / "line.csv"
+    write_centre_line(file, ring_map(), 1.0)
+    track = read_track(file)
+    assert np.hypot(*track.left.T) == pytest.approx(18.0, abs=2e-3)
+    assert np.hypot(*track.right.T) == pytest.approx(22.0, abs=2e-3)
+
+
+@every_map
+def test_points(make: Callable[[], Map], tmp_path: Path) -> None:
+    file, track = tmp_path / "points.csv", make()
+    write_points(file, track, 0.7)
+    table = read_table(file, ("x", "y", "label"))
+    labels = np.array(table.columns["label"])
+    for label, name in ((LEFT, "left"), (RIGHT, "right")):
+        points = points_of(track, label, 0.7)
+        assert np.array_equal(table.stack(("x", "y"))[labels == name], points)
+        assert np.linalg.norm(np.diff(points, axis=0), axis=1) == pytest.approx(0.7, abs=0.02)
+
+
+def test_landmarks_are_points_as_they_are(tmp_path: Path) -> None:
+    file = tmp_path / "points.csv"
+    write_points(file, point_map(), 1.0)
+    assert file.read_text().splitlines() == ["x,y,label", "0.0,2.0,left", "4.0,2.5,left", "0.5,-2.0,right"]
+
+
+@every_map
+def test_geojson(make: Callable[[], Map], tmp_path: Path) -> None:
+    file, track = tmp_path / "map.geojson", make()
+    write_geojson(file, track, 0.7, PLANE)
+    content = json.loads(file.read_text())
+    assert content["type"] == "FeatureCollection"
+    assert content["origin"] == {"latitude_deg": 48.1, "longitude_deg": 11.5, "heading_deg": 30.0}
+    features = {feature["properties"]["name"]: feature for feature in content["features"]}
+    line = track.centre_line(0.7)
+    expected = {
+        "left": points_of(track, LEFT, 0.7),
+        "right": points_of(track, RIGHT, 0.7),
+        "centre": line.points,
+    }
+    for name, points in expected.items():
+        geometry = features[name]["geometry"]
+        assert geometry["type"] == "LineString"
+        degrees = np.array(geometry["coordinates"])
+        assert np.array_equal(degrees[0], degrees[-1]) == track.closed
+        there = PLANE.to_map(degrees[: len(points), ::-1])
+        assert there == pytest.approx(points, abs=2e-5)
+        assert len(degrees) == len(points) + track.closed
+    properties = features["centre"]["properties"]
+    assert properties["width_left_m"] == line.width_left.tolist()
+    assert properties["across_sigma_m"] == line.points_sigma.tolist()
+    assert properties["length_m"] == line.length
+
+
+def test_landmarks_are_multi_points_in_geojson(tmp_path: Path) -> None:
+    file = tmp_path / "map.geojson"
+    write_geojson(file, point_map(), 1.0, PLANE)
+    features = json.loads(file.read_text())["features"]
+    assert [feature["geometry"]["type"] for feature in features] == ["MultiPoint", "MultiPoint"]
+    there = PLANE.to_map(np.array(features[0]["geometry"]["coordinates"])[:, ::-1])
+    assert there == pytest.approx(np.array([[0.0, 2.0], [4.0, 2.5]]), abs=2e-5)
+
+
+@every_map
+def test_lanelet2(make: Callable[[], Map], tmp_path: Path) -> None:
+    file, track = tmp_path / "map.osm", make()
+    write_lanelet2(file, track, 0.7, PLANE)
+    root = ET.parse(file).getroot()
+    nodes = {node.get("id"): node for node in root.findall("node")}
+    ways = {way.get("id"): way for way in root.findall("way")}
+    (relation,) = root.findall("relation")
+    assert {tag.get("k"): tag.get("v") for tag in relation.findall("tag")}["type"] == "lanelet"
+    members = {member.get("role"): ways[member.get("ref")] for member in relation.findall("member")}
+    assert len(nodes) + len(ways) + 1 == len({element.get("id") for element in root})
+    for label, name in ((LEFT, "left"), (RIGHT, "right")):
+        refs = [ref.get("ref") for ref in members[name].findall("nd")]
+        assert (refs[0] == refs[-1]) == track.closed
+        own = [nodes[ref] for ref in refs[: len(refs) - track.closed]]
+        points = points_of(track, label, 0.7)
+        degrees = np.array([[float(node.get("lat", "")), float(node.get("lon", ""))] for node in own])
+        assert PLANE.to_map(degrees) == pytest.approx(points, abs=2e-5)
+        tags = [{tag.get("k"): tag.get("v") for tag in node.findall("tag")} for node in own]
+        local = np.array([[float(tag["local_x"] or ""), float(tag["local_y"] or "")] for tag in tags])
+        assert local == pytest.approx(points, abs=1e-5)
+
+
+def test_what_needs_two_curves_says_so(tmp_path: Path) -> None:
+    left_alone = Map(False, {LEFT: open_map().boundaries[LEFT]})
+    for track, found in ((point_map(), "points in no order"), (left_alone, "none")):
+        with pytest.raises(SettingsError, match=f"expected a curve as .* boundary, found {found}"):
+            write_lanelet2(tmp_path / "map.osm", track, 1.0, PLANE)
+        with pytest.raises(SettingsError, match=f"expected a curve as .* boundary, found {found}"):
+            track.centre_line()

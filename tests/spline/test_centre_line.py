@@ -1,0 +1,207 @@
+"""The centre line against circles, straights and perturbed control points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial import KDTree
+
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.centre_line import find_line
+from pathspace_graph.spline.planning import CentreLine, centre_line
+
+from ..scenes.maps import circle
+
+Array = NDArray[np.float64]
+
+QUANTITIES = ("points", "heading", "curvature", "arc_length", "width_left", "width_right")
+
+
+def straight(y: float, begin: float = 0.0, end: float = 30.0, size: int = 12) -> BSpline:
+    """A straight along x."""
+    greville = np.linspace(begin, end, size)
+    return BSpline.open_uniform(np.column_stack([greville, np.full(size, y)]))
+
+
+def wavy(radius: float, size: int, closed: bool, seed: int) -> BSpline:
+    """A ring with three waves and rough control points, or most of it."""
+    rng = np.random.default_rng(seed)
+    angle = np.linspace(0.0, 2 * np.pi, size + 1)[:-1]
+    at = radius + 1.5 * np.sin(3 * angle)
+    points = np.column_stack([at * np.cos(angle), at * np.sin(angle)]) + rng.normal(0.0, 0.05, (size, 2))
+    if closed:
+        return BSpline.periodic_from(np.arange(size + 1.0), points)
+    return BSpline.clamped_from(np.arange(size - 2.0), points)
+
+
+def moved(splines: tuple[BSpline, BSpline], change: Array) -> tuple[BSpline, BSpline]:
+    """Adds a change (2 m,) to the control points of both boundaries."""
+    left, right = splines
+    parts = np.split(change, [2 * left.size])
+    return (
+        left.with_points(left.distinct_control_points + parts[0].reshape(-1, 2)),
+        right.with_points(right.distinct_control_points + parts[1].reshape(-1, 2)),
+    )
+
+
+def where_it_crosses(line: CentreLine, base: CentreLine) -> dict[str, Array]:
+    """What a moved line is where it crosses the normals of the base, by interpolation."""
+    wrap = 3 if line.closed else 0
+
+    def around(values: Array, period: float = 0.0) -> Array:
+        return np.concatenate([values[len(values) - wrap :] - period, values, values[:wrap] + period])
+
+    def curve(values: Array, period: float = 0.0) -> CubicSpline:
+        return CubicSpline(around(line.arc_length, line.length), around(values, period))
+
+    x, y = (curve(line.points[:, d]) for d in range(2))
+    tangent = np.column_stack([np.cos(base.heading), np.sin(base.heading)])
+    s = line.arc_length[KDTree(line.points).query(base.points)[1]]
+    for _ in range(20):
+        off = np.column_stack([x(s), y(s)]) - base.points
+        speed = np.column_stack([x(s, 1), y(s, 1)])
+        s = s - (off * tangent).sum(axis=1) / (speed * tangent).sum(axis=1)
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    turns = 2 * np.pi if line.closed else 0.0
+    result = {name: curve(getattr(line, name))(s) for name in ("curvature", "width_left", "width_right")}
+    result["points"] = (off * normal).sum(axis=1)
+    result["heading"] = curve(np.unwrap(line.heading), turns)(s)
+    return result | {"arc_length": s - s[0]}
+
+
+@pytest.mark.parametrize("turn", [1.0, -1.0])
+@pytest.mark.parametrize("step", [0.2, 1.0, 3.0])
+def test_between_concentric_circles(turn: float, step: float) -> None:
+    left, right = (circle(20.0 - 2.0 * turn, turn=turn), circle(20.0 + 2.0 * turn, 150, turn))
+    line = centre_line(left, right, None, True, step)
+    assert len(line.points) == round(40 * np.pi / step)
+    assert np.hypot(*line.points.T) == pytest.approx(20.0, abs=1e-6)
+    assert line.length == pytest.approx(40 * np.pi, abs=1e-5)
+    assert line.curvature == pytest.approx(turn / 20.0, abs=1e-5)
+    assert line.width_left == pytest.approx(2.0, abs=1e-6)
+    assert line.width_right == pytest.approx(2.0, abs=1e-6)
+    assert np.diff(line.arc_length) == pytest.approx(line.length / len(line.points), abs=1e-6)
+    angle = np.arctan2(line.points[:, 1], line.points[:, 0])
+    assert np.cos(line.heading - angle - turn * np.pi / 2) == pytest.approx(1.0, abs=1e-10)
+    assert np.isnan(line.points_sigma).all()
+
+
+def test_along_a_straight_from_where_both_begin_to_where_both_end() -> None:
+    left, right = straight(1.5, 0.0, 33.0), straight(-2.5, 5.0, 45.0)
+    low, high = (
+        right.evaluate(np.array([right.domain[0]]))[0, 0],
+        left.evaluate(np.array([left.domain[1]]))[0, 0],
+    )
+    line = centre_line(left, right, None, False, 0.5)
+    assert line.points[:, 1] == pytest.approx(-0.5, abs=1e-9)
+    assert line.points[0, 0] == pytest.approx(low, abs=0.3)
+    assert line.points[-1, 0] == pytest.approx(high, abs=0.3)
+    assert line.heading == pytest.approx(0.0, abs=1e-9)
+    assert line.curvature == pytest.approx(0.0, abs=1e-9)
+    assert line.width_left == pytest.approx(2.0, abs=1e-9)
+    assert line.width_right == pytest.approx(2.0, abs=1e-9)
+    assert line.arc_length == pytest.approx(line.points[:, 0] - line.points[0, 0], abs=1e-9)
+
+
+def test_sigmas_of_a_straight_by_hand() -> None:
+    """All control points of a side move together across: by a on the left, and by b on the right."""
+    left, right = straight(2.0), straight(-2.0)
+    a, b = np.tile([0.0, 1.0], left.size), np.tile([0.0, 1.0], right.size)
+    zero = np.zeros_like(a)
+    covariance = (
+        np.outer(np.r_[a, zero], np.r_[a, zero]) * 0.3**2 + np.outer(np.r_[zero, b], np.r_[zero, b]) * 0.4**2
+    )
+    line = centre_line(left, right, covariance, False, 1.0)
+    for sigma in (line.points_sigma, line.width_left_sigma, line.width_right_sigma):
+        assert sigma == pytest.approx(0.25, abs=1e-9)
+    for sigma in (line.heading_sigma, line.curvature_sigma, line.arc_length_sigma):
+        assert sigma == pytest.approx(0.0, abs=1e-9)
+
+
+def test_sigmas_of_circles_by_hand() -> None:
+    """The radii change by a and b: the line by their mean, a width by half their difference."""
+    left, right = circle(18.0), circle(22.0)
+    outward = [
+        (spline.distinct_control_points / radius).ravel() for spline, radius in ((left, 18.0), (right, 22.0))
+    ]
+    change = np.r_[0.3 * outward[0], 0.1 * outward[1]]
+    line = centre_line(left, right, np.outer(change, change), True, 1.0)
+    assert line.points_sigma == pytest.approx(0.2, abs=1e-6)
+    assert line.width_left_sigma == pytest.approx(0.1, abs=1e-6)
+    assert line.width_right_sigma == pytest.approx(0.1, abs=1e-6)
+    assert line.curvature_sigma == pytest.approx(0.2 / 20.0**2, abs=1e-5)
+    assert line.heading_sigma == pytest.approx(0.0, abs=1e-6)
+    assert line.arc_length_sigma == pytest.approx(0.2 / 20.0 * line.arc_length, abs=1e-5)
+    assert line.length_sigma == pytest.approx(0.2 * 2 * np.pi, abs=1e-5)
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_each_sigma_is_the_numeric_derivative_along_a_random_change(closed: bool) -> None:
+    """With the covariance d d^T, a sigma is the size of the derivative in the direction d."""
+    splines = wavy(18.0, 24, closed, 1), wavy(22.0, 27, closed, 2)
+    d = np.random.default_rng(3).normal(size=2 * sum(spline.size for spline in splines))
+    base = centre_line(*splines, np.outer(d, d), closed, 1.0)
+    step = 1e-5
+    forth, back = (
+        where_it_crosses(centre_line(*moved(splines, e * d), None, closed, 0.25), base) for e in (step, -step)
+    )
+    for name in QUANTITIES:
+        error = np.abs(forth[name] - back[name]) / (2 * step) - getattr(base, f"{name}_sigma")
+        # the curvature has kinks at the knots, across which the numbers are interpolated
+        assert np.median(np.abs(error[2:-2])) < 1e-4, name
+        assert np.abs(error[2:-2]).max() < 1e-2, name
+
+
+def test_sigmas_are_those_of_a_monte_carlo() -> None:
+    splines = wavy(18.0, 24, True, 4), wavy(22.0, 27, True, 5)
+    rng = np.random.default_rng(6)
+    size = 2 * sum(spline.size for spline in splines)
+    root = rng.normal(size=(size, size)) * (0.01 / np.sqrt(size))
+    base = centre_line(*splines, root @ root.T, True, 4.0)
+    runs = [
+        where_it_crosses(centre_line(*moved(splines, root @ rng.normal(size=size)), None, True, 0.5), base)
+        for _ in range(80)
+    ]
+    for name in QUANTITIES:
+        drawn = np.array([run[name] for run in runs])
+        ratio = np.std(drawn, axis=0)[1:] / getattr(base, f"{name}_sigma")[1:]
+        assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.08), name
+
+
+def test_every_point_is_equally_far_from_both_boundaries() -> None:
+    left, right = wavy(18.0, 24, True, 1), wavy(22.0, 27, True, 2)
+    points = find_line(left, right, True, 1.0).stations.points
+    far = [np.linalg.norm(points - spline.foot_points(points).position, axis=1) for spline in (left, right)]
+    assert far[0] == pytest.approx(far[1], abs=1e-8)
+
+
+def test_a_lap_that_overlaps_its_beginning_is_one_line() -> None:
+    """The open curves go round more than once, a little off, as before a loop is closed."""
+    angle = np.linspace(0.0, 2.3 * np.pi, 60)
+    drift = 0.02 * angle[:, None]
+    ring = np.column_stack([np.cos(angle), np.sin(angle)])
+    left, right = (BSpline.clamped_from(np.arange(58.0), radius * ring + drift) for radius in (18.0, 22.0))
+    line = centre_line(left, right, None, False, 1.0)
+    assert line.length == pytest.approx(2.3 * np.pi * 20.0, rel=0.02)
+    assert np.diff(np.unwrap(line.heading)).min() > 0.0
+
+
+def test_boundaries_that_cross_are_refused_with_the_place() -> None:
+    left = circle(18.0, 40)
+    points = left.distinct_control_points.copy()
+    points[9:12] *= 1.4  # at the top, beyond the right boundary
+    with pytest.raises(SettingsError, match=r"near x = -?\d+\.\d m, y = "):
+        centre_line(left.with_points(points), circle(22.0), None, True, 1.0)
+
+
+def test_what_has_no_centre_line() -> None:
+    with pytest.raises(SettingsError, match="side by side, the left one on the left"):
+        centre_line(circle(22.0), circle(18.0), None, True, 1.0)
+    for step in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(SettingsError, match="step: expected"):
+            centre_line(circle(18.0), circle(22.0), None, True, step)
+    with pytest.raises(SettingsError, match="at most"):
+        centre_line(circle(1.8e5), circle(2.2e5), None, True, 1.0)
