@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .se2 import left_of
+
 Array = NDArray[np.float64]
 
 
@@ -45,7 +47,7 @@ def along_from_place(
     slope = np.einsum("mj,mjd->md", basis_slope, control_points)
     speed = np.hypot(slope[:, 0], slope[:, 1])
     t = slope / speed[:, None]
-    n = np.stack([-t[:, 1], t[:, 0]], axis=1)
+    n = left_of(t)
     offset, arm = points_map - position, points_map - poses[:, :2]
     turning = (n * offset).sum(axis=1) / speed
     by_theta = t[:, 1] * arm[:, 0] - t[:, 0] * arm[:, 1]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from .footpoint import FootPoints
 from .noise import whiteners
+from .se2 import left_of
 
 Array = NDArray[np.float64]
 
@@ -91,7 +92,7 @@ def offset_from_foot_point(
     """
     W = whiteners(_widened(covariances, poses, sigma_model))
     offset, arm = points_map - foot.position, points_map - poses[:, :2]
-    turned = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+    turned = left_of(arm)
     return OffsetRows(
         residual=np.einsum("mij,mj->mi", W, offset),
         by_pose=np.concatenate([W, np.einsum("mij,mj->mi", W, turned)[:, :, None]], axis=2),

@@ -19,6 +19,11 @@ def rotation(theta: float) -> Array:
     return np.array([[c, -s], [s, c]])
 
 
+def left_of(vectors: Array) -> Array:
+    """Returns vectors (n, 2) turned by a quarter to the left: (x, y) becomes (-y, x)."""
+    return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)
+
+
 def compose(pose: Array, delta: Array) -> Array:
     """Returns `pose * delta` on SE(2), for one pose (3,) or row by row (k, 3).
 

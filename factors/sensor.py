@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .se2 import left_of
+
 Array = NDArray[np.float64]
 
 SENSOR = ("yaw", "lateral", "latency", "range_scale", "range_bias")
@@ -35,7 +37,7 @@ def by_sensor(points_vehicle: Array, twists: Array) -> Array:
 
     The second order is left out: a yaw of 2 degrees shifts a detection at 15 m by 9 mm beside that.
     """
-    turned = np.stack([-points_vehicle[:, 1], points_vehicle[:, 0]], axis=1)
+    turned = left_of(points_vehicle)
     distance = np.maximum(np.hypot(points_vehicle[:, 0], points_vehicle[:, 1]), np.finfo(float).tiny)
     columns = np.empty((len(points_vehicle), 2, SENSOR_SIZE))
     columns[:, :, 0] = turned

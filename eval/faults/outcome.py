@@ -73,8 +73,7 @@ class Outcome:
     @property
     def ratios(self) -> np.ndarray:
         """Returns the ratios of the rmse (k,) of the runs that have one."""
-        ratios = np.array([run.ratio for run in self.runs], float)
-        return np.asarray(ratios[~np.isnan(ratios)])
+        return _known([run.ratio for run in self.runs])
 
     @property
     def said(self) -> dict[str, int]:
@@ -119,16 +118,18 @@ class Outcome:
 
 def mean(values: Any) -> float:
     """Returns the mean of the values that are known, and NaN if there are none."""
-    known = np.asarray(values, float)
-    known = known[~np.isnan(known)]
+    known = _known(values)
     return float(known.mean()) if len(known) else float("nan")
 
 
 def greatest(values: Any) -> float:
     """Returns the greatest of the values that are known, and NaN if there are none."""
-    known = np.asarray(values, float)
-    known = known[~np.isnan(known)]
-    return float(known.max()) if len(known) else float("nan")
+    return float(max(_known(values), default=np.nan))
+
+
+def _known(values: Any) -> np.ndarray:
+    array = np.asarray(values, float)
+    return np.asarray(array[~np.isnan(array)])
 
 
 def outcomes(study: Study, frame: pd.DataFrame) -> list[Outcome]:

@@ -15,6 +15,7 @@ from scipy.stats import chi2
 
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.factors.gauge import greville
+from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 
@@ -111,8 +112,7 @@ def curve_errors(boundary: SplineBoundary, curve_true: Array) -> tuple[Array, Ar
     u = greville(spline.knots, spline.degree)[: spline.size]
     low, high = spline.domain
     u = low + np.mod(u - low, high - low) if spline.periodic else np.unique(np.clip(u, low, high))
-    tangent, position = spline.tangent_unit(u), spline.evaluate(u)
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    normal, position = left_of(spline.tangent_unit(u)), spline.evaluate(u)
     nearest = curve_true[KDTree(curve_true).query(position)[1]]
     error = np.einsum("kd,kd->k", normal, nearest - position)
     design = np.einsum("km,kd->kmd", spline.basis_matrix(u), normal).reshape(len(u), -1)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pathspace_graph.batch.mapper import BatchResult
+from pathspace_graph.batch.recurrence import path_lengths
 from pathspace_graph.diagnosis import by_prior
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
@@ -373,8 +374,7 @@ def closes_falsely(run: RunResult, truth: Truth) -> bool:
     t, ends = closing_stamp(run), lap_end_indices(truth.poses)
     if len(ends) == 0:
         return True
-    steps = np.linalg.norm(np.diff(truth.poses[:, :2], axis=0), axis=1)
-    driven = np.append(0.0, np.cumsum(steps))
+    driven = path_lengths(truth.poses)
     return bool(np.interp(t, truth.pose_t, driven) < driven[ends[0]] - EARLY)
 
 

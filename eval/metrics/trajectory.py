@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.batch.recurrence import path_lengths
 from pathspace_graph.factors.se2 import wrap_angle
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.results import VehicleState
@@ -74,14 +75,14 @@ def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
 def longest_astray(t: Array, poses: Array, truth: Truth, since: float) -> dict[str, float]:
     """Returns the longest time (s) and way (m) for which a vehicle was astray, from a stamp (s) on.
 
-    From the first cycle that is wrong by more than a metre up to the next one that is right, or to the end.
+    It is counted from the first cycle that is wrong by more than a metre up to the next one that is right, or
+    to the end.
     """
     after = (t >= max(since, truth.pose_t[0])) & (t <= truth.pose_t[-1])
     if not after.any():
         return {}
     stamps, errors = t[after], np.linalg.norm(trajectory_errors(t[after], poses[after], truth)[:, :2], axis=1)
-    steps = np.linalg.norm(np.diff(truth.poses[:, :2], axis=0), axis=1)
-    driven = np.interp(stamps, truth.pose_t, np.append(0.0, np.cumsum(steps)))
+    driven = np.interp(stamps, truth.pose_t, path_lengths(truth.poses))
     astray = np.append(errors > ASTRAY, False).astype(int)
     begins = np.flatnonzero(np.diff(astray, prepend=0) == 1)
     ends = np.minimum(np.flatnonzero(np.diff(astray, prepend=0) == -1), len(stamps) - 1)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.graph.elimination import Elimination
 from pathspace_graph.graph.gaussian import graph_of
 from pathspace_graph.graph.rows import Rows
@@ -137,8 +138,7 @@ class Optimizer:
             offset = gauge.carried(points, before.poses, after.poses) - after.control_points(label)
             count = max(int(self.settings.curve_samples * boundary.size), 2)
             u = np.linspace(boundary.tables.low, boundary.tables.high, count)
-            tangent = boundary.evaluate(after.control_points(label), u, 1)
-            normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+            normal = left_of(boundary.evaluate(after.control_points(label), u, 1))
             normal /= np.maximum(np.hypot(*normal.T), np.finfo(float).tiny)[:, None]
             across = (boundary.evaluate(offset, u) * normal).sum(axis=1)
             farthest = max(farthest, float(np.abs(across).max()))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.graph.keys import POINT, POSE, pose_keys
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.curve_map import CurveMap
@@ -72,7 +73,7 @@ def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
         spline = state.spline(label)
         basis = spline.basis_matrix(u) - spline.basis_matrix(w)
         tangents = spline.tangent_unit(w)
-        normals = np.column_stack([-tangents[:, 1], tangents[:, 0]])
+        normals = left_of(tangents)
         by_axis = [(basis[:, :, None] * axis[:, None, :]).reshape(len(u), -1) for axis in (normals, tangents)]
         rows.append(np.concatenate(by_axis))
         columns.append(state.columns(label, np.arange(spline.size)))

@@ -10,8 +10,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.map import Map, SplineBoundary
+from pathspace_graph.io.map import Map
 from pathspace_graph.labels import BOUNDARIES, NAMES
 
 from .local_plane import LocalPlane
@@ -43,7 +42,7 @@ def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> No
     """
     numbers = count(1)
     root = ET.Element("osm", version="0.6", generator="pathspace-graph")
-    curves = [_curve(track, label) for label in BOUNDARIES]
+    curves = [track.curve(label, "lanelet2") for label in BOUNDARIES]
     nodes = [_add_nodes(root, sampled(curve.spline, step), plane, numbers) for curve in curves]
     ways = [
         _add_way(root, own + own[: int(curve.spline.periodic)], numbers)
@@ -55,14 +54,6 @@ def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> No
     _add_tags(relation, LANELET_TAGS)
     ET.indent(root)
     ET.ElementTree(root).write(file, encoding="UTF-8", xml_declaration=True)
-
-
-def _curve(track: Map, label: int) -> SplineBoundary:
-    boundary = track.boundaries.get(label)
-    if not isinstance(boundary, SplineBoundary):
-        found = "none" if boundary is None else "points in no order"
-        raise SettingsError(f"lanelet2: expected a curve as {NAMES[label]} boundary, found {found}")
-    return boundary
 
 
 def _add_nodes(root: ET.Element, points: Array, plane: LocalPlane, numbers: count[int]) -> list[int]:

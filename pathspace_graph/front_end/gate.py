@@ -109,7 +109,7 @@ class Gate:
         self.limits = limits
         self.refused = 0
         """This number of cycles was refused since the last one that was used."""
-        self._after_silence: float | None = None  # a cycle at this stamp (s) was refused, as it came too late
+        self._refused_at: float | None = None  # the stamp (s) of the cycle that has just been refused
         self._late: list[float] = []  # the stamps (s) of late cycles in the window that were used
         self._dropping = False
 
@@ -122,10 +122,10 @@ class Gate:
             admitted = admit(odometry, detections, limits, newest, window, self._late)
         except ReadingError:
             self.refused += 1
-            self._after_silence = _stamp_or_none(detections)
+            self._refused_at = _stamp_or_none(detections)
             raise
         admitted = replace(admitted, refused=self.refused, notice="" if self._dropping else admitted.notice)
-        self.refused, self._dropping, self._after_silence = 0, admitted.dropped > 0, None
+        self.refused, self._dropping, self._refused_at = 0, admitted.dropped > 0, None
         return admitted
 
     def _goes_on(self, detections: Detections) -> bool:
@@ -134,7 +134,7 @@ class Gate:
         One stamp far ahead is an error. Two that agree are of a vehicle that was silent for long, which must
         not be refused for ever.
         """
-        t, before = _stamp_or_none(detections), self._after_silence
+        t, before = _stamp_or_none(detections), self._refused_at
         return t is not None and before is not None and 0.0 < t - before <= self.limits.silence
 
     def use_late(self, t: float, window: Sequence[float]) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import odometry_residuals
-from pathspace_graph.factors.se2 import move_points, rotation, se2_exp
+from pathspace_graph.factors.se2 import left_of, move_points, rotation, se2_exp
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.window import MapRows
 from pathspace_graph.io.log import Detections
@@ -52,7 +52,7 @@ def at_nearest_pose(
     spread = abs(share) * np.linalg.inv(whitener.T @ whitener) + np.diag(bend**2)
     z = detections.points_vehicle
     by_motion = np.zeros((len(z), 2, 3))
-    by_motion[:, :, :2], by_motion[:, 0, 2], by_motion[:, 1, 2] = np.eye(2), -z[:, 1], z[:, 0]
+    by_motion[:, :, :2], by_motion[:, :, 2] = np.eye(2), left_of(z)
     turn = rotation(moved[2])
     covariances = turn @ (detections.covariances + by_motion @ spread @ by_motion.transpose(0, 2, 1)) @ turn.T
     seen = replace(detections, points_vehicle=move_points(moved, z), covariances=covariances)

@@ -242,8 +242,8 @@ class MotionCheck:
             predicted = compose(self.pose, odometry.delta)
             difference = self._difference(odometry, predicted, best)
             near = settings.doubt_rate * np.sqrt(self.errors.covariance_of(difference)[2, 2])
-            right = not motion.missing and not motion.stuck and abs(difference.off[2]) <= near
-            if right:  # so is the gyro
+            gyro_is_right = abs(difference.off[2]) <= near
+            if gyro_is_right and not motion.missing and not motion.stuck:
                 mean[2], covariance[2, 2] = odometry.delta[2], odometry.covariance[2, 2]
             own = relative(self.pose, best.pose)
             turn = _to_vehicle(best.pose[2])

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.front_end import MotionSettings
@@ -32,7 +33,7 @@ def by_errors(points_vehicle: Array, twist: Array) -> Array:
     `factors.sensor:by_sensor`.
     """
     columns = np.empty((len(points_vehicle), 2, len(ERRORS)))
-    columns[:, 0, 0], columns[:, 1, 0] = -points_vehicle[:, 1], points_vehicle[:, 0]
+    columns[:, :, 0] = left_of(points_vehicle)
     columns[:, :, 1] = -twist[:2] - twist[2] * columns[:, :, 0]
     return columns
 

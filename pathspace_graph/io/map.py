@@ -101,17 +101,18 @@ class Map:
         independent. A tentative stretch takes part as well. Both boundaries must be splines; otherwise, or
         where they aren't side by side, SettingsError is raised.
         """
-        left, right = (self._spline_of(label) for label in BOUNDARIES)
+        left, right = (self.curve(label, "a centre line") for label in BOUNDARIES)
         return centre_line(
             left.spline, right.spline, self._covariance_of(left, right), self._is_loop(left, right), step
         )
 
-    def _spline_of(self, label: int) -> SplineBoundary:
+    def curve(self, label: int, purpose: str) -> SplineBoundary:
+        """Returns a boundary that is a curve; a SettingsError says for which purpose one was expected."""
         boundary = self.boundaries.get(label)
         if isinstance(boundary, SplineBoundary):
             return boundary
         found = "none" if boundary is None else "points in no order"
-        raise SettingsError(f"a centre line: expected a curve as {NAMES[label]} boundary, found {found}")
+        raise SettingsError(f"{purpose}: expected a curve as {NAMES[label]} boundary, found {found}")
 
     def _covariance_of(self, left: SplineBoundary, right: SplineBoundary) -> Array | None:
         """Returns the covariance of both boundaries' control points; None where it wasn't asked for."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.mapping.curve_map import CurveSmoother
 
 Array = NDArray[np.float64]
@@ -23,10 +24,9 @@ def hold_gauge(smoother: CurveSmoother) -> None:
     """Holds where the closed map as a whole is, across its curves."""
     state = smoother.map.state
     tangents = [state.spline(label).tangent_unit(b.abscissae) for label, b in state.boundaries.items()]
-    tangent = np.concatenate(tangents)
-    order, normals = np.argsort(state.map_keys), np.column_stack([-tangent[:, 1], tangent[:, 0]])
-    points = state.map_points[order]
-    smoother.hold_gauge(state.map_keys[order], motion_across(points, normals[order]))
+    keys, normals = state.map_keys, left_of(np.concatenate(tangents))
+    order = np.argsort(keys)
+    smoother.hold_gauge(keys[order], motion_across(state.map_points[order], normals[order]))
 
 
 def motion_across(points: Array, normals: Array) -> Array:
@@ -36,9 +36,7 @@ def motion_across(points: Array, normals: Array) -> Array:
     rows N (k, 2k) of the normals and the rigid motions G it is the least squares solution `(N G)^+ N`.
     """
     count = len(points)
-    across = np.zeros((count, 2 * count))
-    across[np.arange(count), 2 * np.arange(count)] = normals[:, 0]
-    across[np.arange(count), 2 * np.arange(count) + 1] = normals[:, 1]
-    turn = normals[:, 1] * points[:, 0] - normals[:, 0] * points[:, 1]
-    motions = np.column_stack([normals, turn])
-    return np.asarray(np.linalg.pinv(motions) @ across)
+    across = np.zeros((count, count, 2))
+    across[np.arange(count), np.arange(count)] = normals
+    turn = (normals * left_of(points)).sum(axis=1)
+    return np.asarray(np.linalg.pinv(np.column_stack([normals, turn])) @ across.reshape(count, -1))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import wrap_angle
+from pathspace_graph.factors.se2 import left_of, wrap_angle
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.registration import (
@@ -134,7 +134,7 @@ def newest_stretch(state: State, length: float) -> Stretch:
         chosen = u[(u > boundary.confirmed_end - length) & (u <= boundary.confirmed_end)]
         cones[label], tangents = boundary.evaluate(points, chosen), boundary.evaluate(points, chosen, 1)
         tangents /= np.hypot(tangents[:, :1], tangents[:, 1:])
-        normals[label] = np.column_stack([-tangents[:, 1], tangents[:, 0]])
+        normals[label] = left_of(tangents)
     return Stretch(length, cones, normals)
 
 

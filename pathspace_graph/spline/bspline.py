@@ -20,6 +20,7 @@ from pathspace_graph.factors.bspline import (
     uniform_knots,
 )
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
+from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.factors.spans import SpanPolynomials
 
 _PERIODIC_TOLERANCE: Final = 1e-9
@@ -303,8 +304,7 @@ class BSpline:
 
     def normal_sigma(self, u: Floats, joint_covariance: Floats) -> Floats:
         """Returns sqrt(n^T cov S(u) n) (k,): the standard deviation across the curve in m."""
-        tangent = self.tangent_unit(u)
-        normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+        normal = left_of(self.tangent_unit(u))
         variance = np.einsum("ka,kab,kb->k", normal, self.covariance_at(u, joint_covariance), normal)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 

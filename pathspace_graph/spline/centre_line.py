@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.footpoint import FootPoints, refine_foot_points
+from pathspace_graph.factors.se2 import left_of
 
 from .bspline import BSpline
 
@@ -289,11 +290,6 @@ def _interpolated(at: Array, lengths: Array, u: Array, spline: BSpline, closed: 
         u = np.unwrap(np.append(u, u[0]), period=high - low)
         return spline.tables.inside(np.interp(at, lengths, u))
     return np.interp(at, lengths, u)
-
-
-def left_of(directions: Array) -> Array:
-    """Returns the directions (n, 2) turned by a quarter to the left."""
-    return np.column_stack([-directions[:, 1], directions[:, 0]])
 
 
 def _unit(vectors: Array) -> Array:

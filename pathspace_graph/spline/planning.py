@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 
 from pathspace_graph.factors.footpoint import FootPoints
+from pathspace_graph.factors.se2 import left_of
 
 from .bspline import BSpline
-from .centre_line import Line, Stations, crossing, find_line, left_of
+from .centre_line import Line, Stations, crossing, find_line
 
 Array = NDArray[np.float64]
 

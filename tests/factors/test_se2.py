@@ -10,6 +10,7 @@ from pathspace_graph.factors.gtsam_factors import pose_array
 from pathspace_graph.factors.se2 import (
     compose,
     inverse,
+    left_of,
     move_points,
     relative,
     rotation,
@@ -72,3 +73,8 @@ def test_an_inverse_undoes_a_motion_of_poses_and_of_points() -> None:
     points = np.array([[1.0, 2.0], [-5.0, 0.5]])
     np.testing.assert_allclose(move_points(inverse(pose), move_points(pose, points)), points, atol=1e-14)
     np.testing.assert_allclose(move_points(pose, points)[0], compose(pose, np.append(points[0], 0.0))[:2])
+
+
+def test_a_quarter_turn_to_the_left_is_the_rotation_by_a_right_angle() -> None:
+    vectors = np.array([[1.0, 0.0], [0.0, 2.0], [-3.0, 0.5]])
+    np.testing.assert_allclose(left_of(vectors), vectors @ rotation(np.pi / 2).T, atol=1e-12)
