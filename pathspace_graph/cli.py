@@ -95,7 +95,7 @@ def overview() -> str:
 
 def parse_command(name: str, arguments: list[str]) -> Any:
     """Returns the command with its options, or None where its help was asked for and printed."""
-    options = import_module(".commands.options", __package__)
+    options = import_module(".options", __package__)
     command = import_module(f".commands.{COMMANDS[name].module}", __package__)
     return options.parse(getattr(command, COMMANDS[name].name), f"{PROGRAM} {name}", arguments)
 

@@ -53,7 +53,8 @@ ARROWS: dict[str, set[str]] = {
     "commands": BELOW_EVAL
     | {"export"}
     | {f"eval.{room}" for room in ("metrics", "harness", "figures", "study", "compare", "scaling", "faults")},
-    "cli": {"commands"},
+    "options": {"io"},
+    "cli": {"options", "commands"},
     "__main__": {"cli"},
 }
 """What each room may import, beside itself and the leaves: arrows point down only."""
