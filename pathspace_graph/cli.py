@@ -37,6 +37,7 @@ COMMANDS: Final = {
         "demo", "Demo", "maps a generated track online, and shows a table, a map and its picture"
     ),
     "simulate": Command("simulate", "Simulate", "writes the log of a simulated drive, with truth"),
+    "convert": Command("convert", "Convert", "writes a ROS bag, CSV files or a known data set as a log"),
     "online": Command("online", "Online", "maps a log online, cycle by cycle"),
     "batch": Command("batch", "Batch", "optimizes a whole log at once, as the ground reference"),
     "compare": Command(

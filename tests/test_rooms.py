@@ -12,7 +12,7 @@ import pytest
 from .scenes.paths import PACKAGE, ROOT, modules, room_of
 
 MOST_FILES = 15
-EXTRAS = {"distributed"}
+EXTRAS = {"distributed", "rosbags"}
 """Optional packages, which are imported only where they are needed."""
 
 LEAVES = {"errors", "labels", "progress"}
@@ -31,6 +31,7 @@ ARROWS: dict[str, set[str]] = {
     "io": {"spline", "factors"},
     "sim": {"io"},
     "export": {"spline", "io"},
+    "convert": {"io", "factors"},
     "graph": {"factors"},
     "health": {"settings"},
     "run": {"io", "laps", "health"},
@@ -51,7 +52,7 @@ ARROWS: dict[str, set[str]] = {
     "eval.faults": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "commands": BELOW_EVAL
-    | {"export"}
+    | {"export", "convert"}
     | {f"eval.{room}" for room in ("metrics", "harness", "figures", "study", "compare", "scaling", "faults")},
     "options": {"io"},
     "cli": {"options", "commands"},

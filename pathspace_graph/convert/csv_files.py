@@ -1,0 +1,250 @@
+"""CSV files with columns of any names and units: one of the odometry, and one of the detections."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import inf, pi
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import InputError, SettingsError, check_name
+from pathspace_graph.io.csv_table import Table, read_table
+from pathspace_graph.io.limits import MAX_STAMP
+from pathspace_graph.labels import UNKNOWN
+
+from .messages import Points
+from .recording import Recording
+from .settings import LabelRule
+
+Array = NDArray[np.float64]
+
+ODOMETRY: Final = "odometry"
+DETECTIONS: Final = "detections"
+QUANTITIES: Final = {
+    ODOMETRY: {"t": "time", "vx": "speed", "vy": "speed", "wz": "yaw_rate"},
+    DETECTIONS: {
+        "t": "time",
+        "x": "length",
+        "y": "length",
+        "range": "length",
+        "bearing": "angle",
+        "label": "",
+        "xx": "length",
+        "xy": "length",
+        "yy": "length",
+    },
+}
+"""Each file has columns for these, which are of these quantities; a covariance is of the square of one."""
+COVARIANCE: Final = ("xx", "xy", "yy")
+"""These columns hold the covariance of a detection, if there is one."""
+UNITS: Final[Mapping[str, Mapping[str, float]]] = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3},
+    "angle": {"rad": 1.0, "deg": pi / 180.0},
+    "speed": {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/s": 1e3, "km/h": 1.0 / 3.6, "mph": 0.44704},
+    "yaw_rate": {"rad/s": 1.0, "deg/s": pi / 180.0},
+}
+"""Each quantity may be in these units, each of which is this number of the SI unit."""
+MAX_BEARING: Final = 2.0 * pi
+"""A bearing is at most this (rad); more are degrees."""
+MIN_PERIOD: Final = 1e-5
+"""Samples are on average at least this far apart (s); less is a wrong unit of time."""
+MAX_PERIOD: Final = 1e3
+"""Samples are on average at most this far apart (s); more is a wrong unit of time."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """Names a column of a file, whose numbers may change their sign."""
+
+    name: str
+    """This is its name in the file."""
+    sign: float = 1.0
+    """The numbers are multiplied by this, which is 1 or -1."""
+
+
+class Columns:
+    """Tells the column of each quantity: `vx=speed`, `y=-cone_y` with the sign changed, `detections.t=stamp`
+    for one of both files only.
+
+    A quantity that is not named is in the column of its own name.
+    """
+
+    def __init__(self, pairs: Sequence[str] = ()) -> None:
+        self._named: dict[tuple[str, str], Column] = {}
+        for pair in pairs:
+            key, equals, name = pair.partition("=")
+            column = Column(name.removeprefix("-"), -1.0 if name.startswith("-") else 1.0)
+            if not equals or not column.name:
+                raise SettingsError(f"--columns: expected QUANTITY=COLUMN, found '{pair}'")
+            only, _, key = key.rpartition(".")
+            known = [key for kind, keys in QUANTITIES.items() if only in ("", kind) for key in keys]
+            check_name(
+                key, known, f"--columns: expected one of {', '.join(dict.fromkeys(known))} in '{pair}'"
+            )
+            for kind in [only] if only else QUANTITIES:
+                self._named[kind, key] = column
+
+    def of(self, kind: str, key: str) -> Column:
+        """Returns the column of a quantity in a file of this kind."""
+        return self._named.get((kind, key), Column(key))
+
+    def is_named(self, kind: str, key: str) -> bool:
+        """Returns whether the column of a quantity was named."""
+        return (kind, key) in self._named
+
+
+class Units:
+    """Tells the unit of each quantity: `length=mm angle=deg time=ns`, and `speed` and `yaw_rate`.
+
+    A speed is in the unit of length, and a yaw rate in that of angle, for each second, unless it has its own.
+    """
+
+    def __init__(self, pairs: Sequence[str] = ()) -> None:
+        self.names = {"time": "s", "length": "m", "angle": "rad"}
+        """Each quantity has this unit."""
+        for pair in pairs:
+            quantity, equals, unit = pair.partition("=")
+            check_name(quantity, UNITS, f"--units: expected one of {', '.join(UNITS)} in '{pair}'")
+            known = UNITS[quantity]
+            if not equals or unit not in known:
+                raise SettingsError(
+                    f"--units: expected {quantity}= one of {', '.join(known)}, found '{pair}'"
+                )
+            self.names[quantity] = unit
+        self.names = {
+            "speed": f"{self.names['length']}/s",
+            "yaw_rate": f"{self.names['angle']}/s",
+            **self.names,
+        }
+
+    def factor(self, quantity: str) -> float:
+        """Returns by what a number is multiplied for the SI unit."""
+        return UNITS[quantity][self.names[quantity]]
+
+    def __str__(self) -> str:
+        return ", ".join(f"{quantity} in {unit}" for quantity, unit in sorted(self.names.items()))
+
+
+def read_csv(odometry: Path, detections: Path, columns: Columns, units: Units, rule: LabelRule) -> Recording:
+    """Returns what two CSV files have of a drive; an InputError names file, row and column."""
+    twists = _File.read(ODOMETRY, odometry, columns, units)
+    found = _File.read(DETECTIONS, detections, columns, units)
+    t = twists.stamps()
+    speeds = [twists.numbers(key) if key != "vy" else twists.optional(key) for key in ("vx", "vy", "wz")]
+    scan_t, scans = _scans(found, rule)
+    source = {"odometry": odometry.name, "detections": detections.name, "units": str(units)}
+    return Recording(t, np.column_stack(speeds), scan_t, scans, source)
+
+
+@dataclass(frozen=True)
+class _File:
+    """Holds one of the files, whose columns are read by quantity and in SI units."""
+
+    kind: str
+    """This is `odometry` or `detections`."""
+    table: Table
+    """These are its rows."""
+    columns: Columns
+    """These are the names of its columns."""
+    units: Units
+    """These are their units."""
+
+    @staticmethod
+    def read(kind: str, file: Path, columns: Columns, units: Units) -> _File:
+        """Returns a file of this kind, which has one row at least."""
+        table = read_table(file, ())
+        if not len(table):
+            raise InputError(file, "expected at least one row, found a header only", 2)
+        return _File(kind, table, columns, units)
+
+    def has(self, key: str) -> bool:
+        """Returns whether the file has the column of a quantity; one that was named must be there."""
+        return self.columns.is_named(self.kind, key) or key in self.table.columns
+
+    def column(self, key: str) -> Column:
+        """Returns the column of a quantity; an InputError lists the columns that are there."""
+        column = self.columns.of(self.kind, key)
+        if column.name not in self.table.columns:
+            raise InputError(
+                self.table.file,
+                f"expected a column '{column.name}' for {key} (--columns {key}=NAME), "
+                f"found the columns {', '.join(self.table.columns)}",
+                1,
+            )
+        return column
+
+    def numbers(self, key: str, power: int = 1) -> Array:
+        """Returns a column (rows,) in the SI unit, or in its square where `power` is 2."""
+        column = self.column(key)
+        factor = self.units.factor(QUANTITIES[self.kind][key]) ** power
+        return np.asarray(column.sign * factor * self.table.numbers(column.name, inf))
+
+    def optional(self, key: str) -> Array:
+        """Returns a column (rows,) in the SI unit, or zeros where the file has none."""
+        return self.numbers(key) if self.has(key) else np.zeros(len(self.table))
+
+    def stamps(self) -> Array:
+        """Returns the stamps (rows,) in s, whose unit has to be plausible."""
+        t, unit = self.numbers("t"), self.units.names["time"]
+        name = self.columns.of(self.kind, "t").name
+        self.table.require(
+            np.abs(t) <= MAX_STAMP,
+            f"expected stamps of at most {MAX_STAMP:g} s in column '{name}', found more: is their unit not "
+            f"{unit} (--units time=ns)?",
+        )
+        stamps = np.unique(t)
+        period = float(np.ptp(stamps)) / max(len(stamps) - 1, 1)
+        if len(stamps) > 1 and not MIN_PERIOD < period < MAX_PERIOD:
+            expected = f"expected stamps in {unit} in column '{name}'"
+            raise InputError(
+                self.table.file, f"{expected}, found them {period:.3g} s apart: is their unit another one?"
+            )
+        return t
+
+
+def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
+    """Returns the stamps of the perception cycles (n,) in s, and the points of each, in the file's order."""
+    t, points, covariances, labels = file.stamps(), _points(file), _covariances(file), _labels(file, rule)
+    stamps, first, cycle = np.unique(t, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    groups = np.split(np.argsort(cycle, kind="stable"), np.cumsum(np.bincount(cycle))[:-1])
+    rows = [groups[index] for index in order]
+    return stamps[order], [Points(points[own], covariances[own], labels[own]) for own in rows]
+
+
+def _points(file: _File) -> Array:
+    if not (file.columns.is_named(DETECTIONS, "range") or not file.has("x")):
+        return np.column_stack([file.numbers("x"), file.numbers("y")])
+    if not file.has("range"):
+        file.column("x")  # raises: neither x and y nor range and bearing are there
+    ranges, bearings = file.numbers("range"), file.numbers("bearing")
+    name, unit = file.column("bearing").name, file.units.names["angle"]
+    file.table.require(
+        np.abs(bearings) <= MAX_BEARING,
+        f"expected bearings of at most a whole turn in column '{name}', found more: is their unit not {unit} "
+        "(--units angle=deg)?",
+    )
+    file.table.require(
+        ranges >= 0.0, f"expected ranges of at least 0 in column '{file.column('range').name}'"
+    )
+    return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
+
+
+def _covariances(file: _File) -> Array:
+    """Returns the covariances (rows, 2, 2) in m^2, which are NaN where the file has none."""
+    if not any(map(file.has, COVARIANCE)):
+        return np.full((len(file.table), 2, 2), np.nan)
+    xx, xy, yy = (file.numbers(key, power=2) for key in COVARIANCE)
+    return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
+
+
+def _labels(file: _File, rule: LabelRule) -> NDArray[np.int_]:
+    if not file.has("label"):
+        return np.full(len(file.table), UNKNOWN)
+    words, place = np.unique(file.table.columns[file.column("label").name], return_inverse=True)
+    return np.array([rule.of(word) for word in words.tolist()], dtype=int)[place]

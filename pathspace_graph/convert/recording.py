@@ -1,0 +1,220 @@
+"""A record as it was found, in any order and with gaps, becomes a log, and what was left out is counted."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import InputError
+from pathspace_graph.factors.se2 import rotation
+from pathspace_graph.io.limits import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
+from pathspace_graph.io.log import MAX_HOLD, MIN_RELATIVE_DETERMINANT, Detections, Log, Odometry, Truth
+
+from .messages import Points
+from .settings import SIGMA_ODOMETRY, Frames, NoiseSettings
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+MAX_ASYMMETRY: Final = 1e-3
+"""The entries xy and yx of a covariance differ by at most this share of the larger variance; messages may
+have them in single precision."""
+FLIP: Final[Array] = np.array([1.0, -1.0, -1.0])
+"""A twist [vx, vy, wz] with y to the right and angles clockwise, times this, has y to the left."""
+MIN_RANGE_OF_BEARING: Final = 1.0
+"""Nearer than this (m), a bearing's standard deviation across counts as at this range, so that a detection at
+the sensor itself has a covariance that is positive definite."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Holds what a record has of a drive, in its own order and its own frames."""
+
+    t: Array
+    """(N,) These are the stamps of the twists (s)."""
+    twists: Array
+    """(N, 3) Each row is a twist in m/s, m/s and rad/s."""
+    scan_t: Array
+    """(M,) These are the stamps of the messages with detections (s)."""
+    scans: list[Points]
+    """These are the detections of each message, in the frame of the sensor."""
+    source: dict[str, str]
+    """These texts say where the record comes from."""
+    notes: Counter[str] = field(default_factory=Counter)
+    """Each of these texts says what was done, with the number of times."""
+    truth: Truth | None = None
+    """This is known of the drive, for evaluation only."""
+    odometry_sigma: Array | None = None
+    """(3,) The record states these standard deviations of a twist (m/s, m/s, rad/s)."""
+
+
+def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) -> Log:
+    """Returns the log of a record, in order of time and in the vehicle frame; it counts in `record.notes`
+    what was left out.
+
+    A record without a usable twist, or without a detection in its time, is an InputError of the `file`.
+    """
+    odometry = _odometry(record, frames, file)
+    cycles = _cycles(record, odometry, frames, noise, file)
+    stated = SIGMA_ODOMETRY if record.odometry_sigma is None else record.odometry_sigma
+    sigma = np.array(stated if noise.sigma_odometry is None else noise.sigma_odometry, dtype=float)
+    return Log(odometry, cycles, sigma, source=record.source, truth=record.truth)
+
+
+# --- odometry --------------------------------------------------------------------------------------------
+
+
+def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
+    t, twists, notes = record.t, record.twists, record.notes
+    good = np.isfinite(t) & np.isfinite(twists).all(axis=1)
+    notes["odometry samples that are not finite were left out"] += int((~good).sum())
+    t, twists = t[good], twists[good]
+    _check_stamps(t, "odometry", file)
+    _check_size(twists[:, :2], MAX_SPEED, "speeds of at most {:g} m/s", file)
+    _check_size(twists[:, 2], MAX_YAW_RATE, "yaw rates of at most {:g} rad/s", file)
+    order = np.argsort(t, kind="stable")
+    notes["odometry samples were out of order, and were sorted"] += int((np.diff(t) < 0).sum())
+    t, twists = t[order], twists[order]
+    last = np.append(np.diff(t) > 0, True)  # of samples with one stamp the last one counts
+    notes["odometry samples had the stamp of another one, and were left out"] += int((~last).sum())
+    twists = twists[last] * (FLIP if frames.y_odometry == "right" else 1.0)
+    return Odometry(t[last], twists)
+
+
+def _check_stamps(t: Array, what: str, file: Path) -> None:
+    if len(t) == 0:
+        raise InputError(file, f"expected {what} with stamps, found none")
+    worst = float(np.abs(t).max())
+    if worst > MAX_STAMP:
+        raise InputError(file, f"expected stamps of {what} in s, at most {MAX_STAMP:g}, found {worst:g}")
+
+
+def _check_size(values: Array, largest: float, expected: str, file: Path) -> None:
+    worst = float(np.abs(values).max(initial=0.0))
+    if worst > largest:
+        raise InputError(file, f"expected {expected.format(largest)}, found {worst:g}: is the unit right?")
+
+
+# --- detections ------------------------------------------------------------------------------------------
+
+
+def _cycles(
+    record: Recording, odometry: Odometry, frames: Frames, noise: NoiseSettings, file: Path
+) -> tuple[Detections, ...]:
+    t, notes = record.scan_t, record.notes
+    _check_stamps(t, "detections", file)
+    notes["messages with detections were out of order, and were sorted"] += int((np.diff(t) < 0).sum())
+    begin, end = float(odometry.t[0]), float(odometry.t[-1]) + MAX_HOLD
+    found: dict[float, list[Points]] = {}
+    for index in np.argsort(t, kind="stable"):
+        points = usable(record.scans[index], notes)
+        if not len(points.labels):
+            notes["messages without any detection give no cycle"] += 1
+        elif not begin <= t[index] <= end:
+            notes["messages with detections outside the time of the odometry were left out"] += 1
+        else:
+            _add(found.setdefault(float(t[index]), []), points, notes)
+    if not found:
+        raise InputError(file, f"expected {_expected(t, begin, end, notes)}")
+    return tuple(in_vehicle_frame(stamp, join(scans), frames, noise, notes) for stamp, scans in found.items())
+
+
+def _expected(t: Array, begin: float, end: float, notes: Counter[str]) -> str:
+    if not notes["messages with detections outside the time of the odometry were left out"]:
+        return f"detections that can be used, found {len(t)} messages without any"
+    return (
+        f"detections in the time of the odometry, {begin:.9g} s to {end - MAX_HOLD:.9g} s, found them from "
+        f"{t.min():.9g} s to {t.max():.9g} s: do both have the same clock?"
+    )
+
+
+def _add(scans: list[Points], points: Points, notes: Counter[str]) -> None:
+    """Adds the points of a message to those of the same stamp, unless it is the same message again."""
+    if any(
+        np.array_equal(scan.points, points.points) and np.array_equal(scan.labels, points.labels)
+        for scan in scans
+    ):
+        notes["messages with detections were repetitions, and were left out"] += 1
+    else:
+        notes["messages with detections have the stamp of another one, and are one cycle with it"] += bool(
+            scans
+        )
+        scans.append(points)
+
+
+def join(scans: list[Points]) -> Points:
+    """Returns the points of several messages as those of one."""
+    if len(scans) == 1:
+        return scans[0]
+    return Points(
+        np.concatenate([scan.points for scan in scans]),
+        np.concatenate([scan.covariances for scan in scans]),
+        np.concatenate([scan.labels for scan in scans]),
+    )
+
+
+def usable(points: Points, notes: Counter[str]) -> Points:
+    """Returns the points that are finite and in the range of the format."""
+    finite = np.isfinite(points.points).all(axis=1)
+    inside: BoolArray = np.hypot(*np.where(finite[:, None], points.points, 0.0).T) < MAX_RANGE
+    notes["detections that are not finite were left out"] += int((~finite).sum())
+    notes[f"detections farther than {MAX_RANGE:g} m were left out"] += int((~inside).sum())
+    good = finite & inside
+    return Points(points.points[good], points.covariances[good], points.labels[good])
+
+
+def in_vehicle_frame(
+    t: float, found: Points, frames: Frames, noise: NoiseSettings, notes: Counter[str]
+) -> Detections:
+    """Returns detections as a perception cycle in the vehicle frame.
+
+    A point `q` with covariance `K` is at `R(yaw) q + (x, y)` with `R K R^T`. Where a covariance is missing or
+    not positive definite, it is made from range and bearing at the sensor.
+    """
+    points, covariances = found.points, found.covariances
+    if frames.y_detections == "right":
+        points = points * [1.0, -1.0]
+        covariances = covariances * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    known = positive_definite(covariances)
+    notes["detections had no covariance that can be used, and were given one"] += int((~known).sum())
+    covariances = np.where(known[:, None, None], covariances, default_covariances(points, noise))
+    turn = rotation(frames.mounting[2])
+    return Detections(
+        t, points @ turn.T + np.array(frames.mounting[:2]), turn @ covariances @ turn.T, found.labels
+    )
+
+
+def positive_definite(covariances: Array) -> BoolArray:
+    """Returns which covariances (m, 2, 2) are finite, symmetric and positive definite, as the format asks."""
+    xx, yy = covariances[:, 0, 0], covariances[:, 1, 1]
+    xy, yx = covariances[:, 0, 1], covariances[:, 1, 0]
+    finite = np.isfinite(covariances).all(axis=(1, 2))
+    with np.errstate(invalid="ignore"):
+        good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
+        good &= np.abs(xy - yx) <= MAX_ASYMMETRY * np.maximum(xx, yy)
+        good &= np.maximum(xx, yy) < MAX_RANGE**2
+    return np.asarray(finite & good)
+
+
+def default_covariances(points: Array, noise: NoiseSettings) -> Array:
+    """Returns the covariances (m, 2, 2) of points by the standard deviations of range and bearing.
+
+    Along the ray it is `(sigma_range + sigma_range_growth r)^2`, across it `(r sigma_bearing)^2`.
+    """
+    ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
+    along = (noise.sigma_range + noise.sigma_range_growth * ranges) ** 2
+    across = (np.maximum(ranges, MIN_RANGE_OF_BEARING) * noise.sigma_bearing) ** 2
+    return polar_covariances(bearings, along, across)
+
+
+def polar_covariances(bearings: Array, along: Array, across: Array) -> Array:
+    """Returns the covariances (m, 2, 2) with these variances along and across the rays at bearings (rad)."""
+    c, s = np.cos(bearings), np.sin(bearings)
+    xx, yy = c * c * along + s * s * across, s * s * along + c * c * across
+    xy = c * s * (along - across)
+    return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
