@@ -160,8 +160,8 @@ def join(scans: list[Points]) -> Points:
 
 def usable(points: Points, notes: Counter[str]) -> Points:
     """Returns the points that are finite and in the range of the format."""
-    finite = np.isfinite(points.points).all(axis=1)
-    inside: BoolArray = np.hypot(*np.where(finite[:, None], points.points, 0.0).T) < MAX_RANGE
+    finite = np.asarray(np.isfinite(points.points).all(axis=1))
+    inside = np.linalg.norm(np.where(finite[:, None], points.points, 0.0), axis=1) < MAX_RANGE
     notes["detections that are not finite were left out"] += int((~finite).sum())
     notes[f"detections farther than {MAX_RANGE:g} m were left out"] += int((~inside).sum())
     good = finite & inside

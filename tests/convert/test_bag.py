@@ -1,0 +1,411 @@
+"""Bags of all three kinds become logs, and what is wrong with them is told in a line."""
+
+from __future__ import annotations
+
+import sqlite3
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pathspace_graph.cli import main
+from pathspace_graph.convert.bag import with_yaw_rate
+from pathspace_graph.front_end.gate import read_usable_log
+from pathspace_graph.io.log import Detections, Log, read_log
+from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.run import run_online
+from pathspace_graph.settings.limits import LimitSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
+
+from .bags import (
+    CONE,
+    CONES,
+    DEFINITIONS,
+    EPOCH,
+    KINDS,
+    Kind,
+    Messages,
+    Written,
+    colour_of,
+    of_log,
+    write_bag,
+)
+
+TOPICS = ["--odometry", "/odom", "--detections", "/cones"]
+
+
+@pytest.fixture(scope="module")
+def drive() -> Log:
+    """The first seconds of a simulated drive."""
+    log = simulate(generate_track(np.random.default_rng(3)), SimulationSettings(laps=1), 3)
+    cycles = log.cycles[:60]
+    until = cycles[-1].t
+    return Log(log.odometry.between(0.0, until), cycles, log.odometry_sigma, log.sensor)
+
+
+def convert(bag: Path, out: Path, *options: str) -> Log:
+    assert main(["convert", str(bag), "--out", str(out), *TOPICS, *options]) == 0
+    return read_log(out)
+
+
+def refused(bag: Path, out: Path, capsys: pytest.CaptureFixture[str], *options: str) -> str:
+    """The one line with which a conversion is refused, which leaves nothing."""
+    assert main(["convert", str(bag), "--out", str(out), *options]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert not out.exists()
+    return line
+
+
+def assert_same_readings(log: Log, drive: Log, *, covariances: bool = True, atol: float = 1e-9) -> None:
+    """The log is the drive at a later time, to the nanosecond of the messages."""
+    np.testing.assert_allclose(log.odometry.t - EPOCH, drive.odometry.t, atol=1e-6)
+    np.testing.assert_array_equal(log.odometry.twist, drive.odometry.twist)
+    assert len(log.cycles) == len(drive.cycles)
+    for cycle, made in zip(log.cycles, drive.cycles, strict=True):
+        assert cycle.t - EPOCH == pytest.approx(made.t, abs=1e-6)
+        order, other = (np.lexsort(c.points_vehicle.T) for c in (cycle, made))
+        np.testing.assert_allclose(cycle.points_vehicle[order], made.points_vehicle[other], atol=atol)
+        np.testing.assert_array_equal(cycle.labels[order], made.labels[other])
+        if covariances:
+            np.testing.assert_allclose(cycle.covariances[order], made.covariances[other], atol=atol)
+
+
+# --- the three kinds -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_drive_comes_back_from_a_bag(kind: Kind, drive: Log, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path, kind, of_log(drive, Messages.cloud_of))
+    log = convert(bag, tmp_path / "log")
+    assert_same_readings(log, drive)
+    np.testing.assert_array_equal(log.odometry_sigma, [0.25, 0.12, 0.035])
+    assert log.source["odometry"] == "/odom (nav_msgs/msg/Odometry)"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cones_with_covariances_come_back_from_a_bag(kind: Kind, drive: Log, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path, kind, of_log(drive, Messages.cones))
+    assert_same_readings(convert(bag, tmp_path / "log"), drive)
+
+
+def test_markers_come_back_by_their_colour_with_the_stated_noise(drive: Log, tmp_path: Path) -> None:
+    def markers(messages: Messages, cycle: Detections) -> Any:
+        rows = zip(cycle.points_vehicle, cycle.labels.tolist(), strict=True)
+        return messages.markers([messages.marker(cycle.t, point, colour_of(label)) for point, label in rows])
+
+    bag = write_bag(tmp_path, "mcap", of_log(drive, markers))
+    log = convert(bag, tmp_path / "log", "--sigma-range", "0.3", "--sigma-range-growth", "0")
+    assert_same_readings(log, drive, covariances=False)
+    cycle = log.cycles[0]
+    along = cycle.points_vehicle[0] / np.hypot(*cycle.points_vehicle[0])
+    assert along @ cycle.covariances[0] @ along == pytest.approx(0.09)
+
+
+def test_a_converted_bag_maps_like_the_log_that_it_was_made_from(tmp_path: Path) -> None:
+    log = simulate(generate_track(np.random.default_rng(3)), SimulationSettings(laps=1), 3)
+    bag = write_bag(tmp_path, "mcap", of_log(log, Messages.cloud_of))
+    convert(bag, tmp_path / "log")
+    converted = read_usable_log(tmp_path / "log", LimitSettings())
+    cycles = 150
+    maps = []
+    for each in (log, converted):
+        part = Log(each.odometry, each.cycles[:cycles], each.odometry_sigma)
+        maps.append(run_online(part, FixedLagMapper(odometry_sigma=log.odometry_sigma)).map)
+    for label, boundary in maps[0].boundaries.items():
+        points, other = boundary.spline.control_points, maps[1].boundaries[label].spline.control_points
+        np.testing.assert_allclose(other, points, atol=1e-4)  # the stamps differ by 0.1 us
+
+
+def test_an_old_bag_without_definitions_is_read_by_those_handed_over(
+    drive: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_bag(tmp_path, "sqlite3", of_log(drive, Messages.cones))
+    forget_definitions(bag)
+    line = refused(bag, tmp_path / "log", capsys, *TOPICS)
+    assert CONES in line
+    assert "--definition" in line
+    files = []
+    for name in (CONE, CONES):
+        file = tmp_path / "ws" / f"{name}.msg"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(DEFINITIONS[name])
+        files.append(str(file))
+    log = convert(bag, tmp_path / "log", "--definition", *files)
+    assert_same_readings(log, drive)
+    named = convert(
+        bag,
+        tmp_path / "other",
+        "--definition",
+        f"{CONE}={files[0]}",
+        f"eufs_msgs/ConeArrayWithCovariance={files[1]}",
+    )
+    assert_same_readings(named, drive)
+
+
+def forget_definitions(bag: Path) -> None:
+    """Makes a bag one of before 2023, which has no definitions of its messages."""
+    (file,) = bag.glob("*.db3")
+    with sqlite3.connect(file) as base:
+        base.execute("DELETE FROM message_definitions")
+    base.close()
+
+
+# --- odometry --------------------------------------------------------------------------------------------
+
+
+def one_cone(messages: Messages, t: float | None, written: float | None = None, **more: Any) -> Written:
+    """A message with one cone 5 m ahead and 1.5 m to the left."""
+    columns = {"x": ("f4", [5.0]), "y": ("f4", [1.5]), "label": ("u1", [0])}
+    return (written if written is not None else (t or 0.0)), "/cones", messages.cloud(t, columns, **more)
+
+
+def written(
+    tmp_path: Path,
+    odometry: Callable[[Messages, float], Any],
+    extra: Callable[[Messages], list[Written]] | None = None,
+) -> Path:
+    """A bag of one second with odometry at 10 Hz and one cone."""
+
+    def make(messages: Messages) -> list[Written]:
+        twists = [(t, "/odom", odometry(messages, t)) for t in np.arange(11) / 10.0]
+        return [*twists, one_cone(messages, 0.5), *(extra(messages) if extra else [])]
+
+    return write_bag(tmp_path, "mcap", make)
+
+
+TWIST = np.array([3.0, 0.1, 0.5])
+
+
+def twist_with_covariance(messages: Messages, t: float) -> Any:
+    name = "geometry_msgs/msg/TwistWithCovariance"
+    twist = messages.make(name, twist=messages.twist(TWIST))
+    return messages.make(f"{name}Stamped", header=messages.header(t), twist=twist)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda messages, t: messages.odometry(t, TWIST),
+        lambda messages, t: messages.twist_stamped(t, TWIST),
+        twist_with_covariance,
+    ],
+)
+def test_each_type_with_a_twist_is_read(make: Callable[[Messages, float], Any], tmp_path: Path) -> None:
+    log = convert(written(tmp_path, make), tmp_path / "log")
+    np.testing.assert_allclose(log.odometry.twist, np.tile(TWIST, (11, 1)))
+    np.testing.assert_allclose(log.odometry.t - EPOCH, np.arange(11) / 10.0, atol=1e-6)
+
+
+def drive_stamped(messages: Messages, t: float) -> Any:
+    speed = messages.make("ackermann_msgs/msg/AckermannDrive", speed=3.0)
+    return messages.make("ackermann_msgs/msg/AckermannDriveStamped", header=messages.header(t), drive=speed)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda messages, t: messages.make("std_msgs/msg/Float64", data=3.0),
+        lambda messages, t: messages.make("std_msgs/msg/Float32", data=3.0),
+        drive_stamped,
+    ],
+)
+def test_a_wheel_speed_goes_with_the_yaw_rate_of_an_imu(
+    make: Callable[[Messages, float], Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def imu(messages: Messages) -> list[Written]:
+        return [(t, "/imu", messages.imu(t, 0.2 + t)) for t in np.arange(-5, 106) / 100.0]
+
+    bag = written(tmp_path, make, imu)
+    assert "expected --imu TOPIC for the yaw rate" in refused(bag, tmp_path / "log", capsys, *TOPICS)
+    log = convert(bag, tmp_path / "log", "--imu", "/imu")
+    np.testing.assert_allclose(log.odometry.twist[:, :2], np.tile([3.0, 0.0], (11, 1)))
+    # the mean of the held yaw rate over 0.1 s, which is that in the middle less half a sample
+    expected = 0.2 + np.arange(10) / 10.0 + 0.05 - 0.005
+    np.testing.assert_allclose(log.odometry.twist[:-1, 2], expected, atol=1e-5)
+
+
+def test_a_slow_imu_gives_its_heading_all_the_same() -> None:
+    t, imu_t = np.arange(21) / 20.0, np.array([0.0, 0.5, 1.0])
+    stamps, twists = with_yaw_rate(t, np.ones((21, 3)), imu_t, np.array([1.0, 3.0, 0.0]))
+    np.testing.assert_allclose(twists[:10, 2], 1.0)
+    np.testing.assert_allclose(twists[10:20, 2], 3.0)
+    assert twists[:-1, 2] @ np.diff(stamps) == pytest.approx(2.0)
+
+
+def test_poses_give_the_twists_that_lead_from_one_to_the_next(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def circle(messages: Messages, t: float) -> Any:
+        angle = TWIST[2] * t
+        x, y = 6.0 * np.sin(angle), 6.0 * (1.0 - np.cos(angle))
+        return messages.odometry(t, (0.0, 0.0, 0.0), (x, y, angle))
+
+    bag = written(tmp_path, circle)
+    assert "--from-poses makes the twists" in refused(bag, tmp_path / "log", capsys, *TOPICS)
+    log = convert(bag, tmp_path / "log", "--from-poses")
+    np.testing.assert_allclose(log.odometry.twist, np.tile([3.0, 0.0, 0.5], (10, 1)), atol=1e-5)
+
+
+# --- what real bags hold ---------------------------------------------------------------------------------
+
+
+def test_disorder_repetitions_and_nonsense_are_told_and_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def make(messages: Messages) -> list[Written]:
+        stamps = [0.0, 0.2, 0.1, 0.3, 0.3, 0.5]
+        received = enumerate(stamps)
+        twists = [(0.01 * at, "/odom", messages.twist_stamped(t, TWIST)) for at, t in received]
+        twists.append((0.6, "/odom", messages.twist_stamped(0.6, [np.nan, 0.0, 0.0])))
+        twists.append((0.7, "/odom", messages.twist_stamped(None, TWIST)))
+        empty = {"x": ("f4", []), "y": ("f4", []), "label": ("u1", [])}
+        hollow = {"x": ("f4", [np.nan, 4.0]), "y": ("f4", [1.0, 1.0]), "label": ("u1", [0, 1])}
+        other = {"x": ("f4", [6.0]), "y": ("f4", [-1.5]), "label": ("u1", [1])}
+        clouds = [messages.cloud(t, columns) for t, columns in [(0.4, hollow), (0.45, empty), (0.2, other)]]
+        return [
+            *twists,
+            *((0.1, "/cones", cloud) for cloud in clouds),
+            *(one_cone(messages, t, written=0.2) for t in (0.2, 0.2, -0.5, 9.0)),
+        ]
+
+    log = convert(write_bag(tmp_path, "sqlite3", make), tmp_path / "log")
+    np.testing.assert_allclose(log.odometry.t - EPOCH, [0.0, 0.1, 0.2, 0.3, 0.5], atol=1e-6)
+    assert [round(cycle.t - EPOCH, 3) for cycle in log.cycles] == [0.2, 0.4]
+    assert log.cycles[0].labels.tolist() == [RIGHT, LEFT]
+    np.testing.assert_array_equal(log.cycles[1].points_vehicle, [[4.0, 1.0]])
+    said = capsys.readouterr().out
+    for line in (
+        "1 odometry samples that are not finite",
+        "1 messages of /odom without a stamp",
+        "1 odometry samples were out of order",
+        "1 odometry samples had the stamp of another one",
+        "1 detections that are not finite",
+        "1 messages without any detection",
+        "2 messages with detections outside the time",
+        "1 messages with detections were repetitions",
+        "1 messages with detections have the stamp of another one",
+        "3 detections had no covariance",
+    ):
+        assert line in said
+
+
+def test_zero_stamps_give_way_to_the_time_of_receipt(tmp_path: Path) -> None:
+    def make(messages: Messages) -> list[Written]:
+        twists = [(t, "/odom", messages.odometry(None, TWIST)) for t in (0.0, 0.1, 0.2)]
+        return [*twists, one_cone(messages, None, written=0.1)]
+
+    log = convert(write_bag(tmp_path, "mcap", make), tmp_path / "log")
+    np.testing.assert_allclose(log.odometry.t - EPOCH, [0.0, 0.1, 0.2], atol=1e-6)
+    assert log.cycles[0].t - EPOCH == pytest.approx(0.1, abs=1e-6)
+
+
+def test_clocks_that_differ_are_told_and_mended_by_the_time_of_receipt(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def make(messages: Messages) -> list[Written]:
+        twists = [(t, "/odom", messages.odometry(t, TWIST)) for t in (0.0, 0.1, 0.2)]
+        return [*twists, one_cone(messages, 500.0, written=0.1)]
+
+    bag = write_bag(tmp_path, "rosbag1", make)
+    assert "do both have the same clock?" in refused(bag, tmp_path / "log", capsys, *TOPICS)
+    assert len(convert(bag, tmp_path / "log", "--received").cycles) == 1
+
+
+def test_a_sensor_of_another_frame_is_told_until_its_mounting_is_stated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def make(frame: str) -> Callable[[Messages], list[Written]]:
+        return lambda messages: [
+            *((t, "/odom", messages.odometry(t, TWIST)) for t in (0.0, 0.1, 0.2)),
+            one_cone(messages, 0.1, frame=frame),
+        ]
+
+    bag = write_bag(tmp_path, "mcap", make("lidar"))
+    convert(bag, tmp_path / "log")
+    assert "in frame lidar, the odometry is of base_link: --mounting" in capsys.readouterr().out
+    log = convert(bag, tmp_path / "other", "--mounting", "1", "2", str(np.pi / 2))
+    assert "--mounting" not in capsys.readouterr().out
+    np.testing.assert_allclose(log.cycles[0].points_vehicle, [[1.0 - 1.5, 2.0 + 5.0]])
+    (tmp_path / "map").mkdir()
+    line = refused(write_bag(tmp_path / "map", "mcap", make("odom")), tmp_path / "new", capsys, *TOPICS)
+    assert "found them in odom, the frame of its pose" in line
+
+
+# --- what is refused -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_wrong_topic_lists_all_with_types_counts_and_rates(
+    kind: Kind, drive: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_bag(tmp_path, kind, of_log(drive, Messages.cones))
+    cases = (
+        (
+            ["--odometry", "/odm", "--detections", "/cones"],
+            "--odometry: expected a topic of the bag, found /odm",
+        ),
+        (["--odometry", "/odom"], "--detections: expected a topic of the bag, found none"),
+        (["--odometry", "/cones", "--detections", "/cones"], "expected a topic of one of the types nav_msgs"),
+        ([*TOPICS, "--imu", "/odom"], "expected a topic of one of the types sensor_msgs/msg/Imu"),
+    )
+    for options, said in cases:
+        line = refused(bag, tmp_path / "log", capsys, *options)
+        assert said in line
+        assert f"/cones ({CONES}, 60 messages, 10." in line
+        assert f"/odom (nav_msgs/msg/Odometry, {len(drive.odometry.t)} messages, " in line
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--odometry", "/odom", "--detections", "/odom"], "supported are sensor_msgs/msg/PointCloud2"),
+        ([*TOPICS, "--label-field", "klass"], "in the field 'klass', found x, y, label"),
+        ([*TOPICS, "--labels", "blue=0"], "--labels: expected LABEL=VALUE"),
+        ([*TOPICS, "--mounting", "0", "0", "90"], "--mounting: expected X Y YAW in m, m and rad"),
+        ([*TOPICS, "--definition", "cone.txt"], "cone.txt"),
+        ([*TOPICS, "--sigma-range", "0"], "sigma_range: expected a positive number"),
+        ([*TOPICS, "--sigma-odometry", "1", "0", "1"], "--sigma-odometry: expected three positive numbers"),
+    ],
+)
+def test_bad_options_are_refused_in_one_line(
+    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = written(tmp_path, lambda messages, t: messages.odometry(t, TWIST))
+    assert said in refused(bag, tmp_path / "log", capsys, *options)
+
+
+def test_labels_may_be_left_out_or_renumbered(tmp_path: Path) -> None:
+    bag = written(tmp_path, lambda messages, t: messages.odometry(t, TWIST))
+    assert convert(bag, tmp_path / "1", "--label-field", "none").cycles[0].labels.tolist() == [UNKNOWN]
+    assert convert(bag, tmp_path / "2", "--labels", "right=0").cycles[0].labels.tolist() == [RIGHT]
+
+
+@pytest.mark.parametrize("name", ["drive.bag", "drive.mcap", "drive.db3", "folder", "drive.txt"])
+def test_what_is_no_bag_is_refused(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / name
+    assert "expected a bag, found none" in refused(path, tmp_path / "log", capsys, *TOPICS)
+    path.mkdir() if name == "folder" else path.write_bytes(b"no bag at all")
+    assert "expected a ROS bag" in refused(path, tmp_path / "log", capsys, *TOPICS)
+
+
+def test_a_bag_cut_short_is_refused(drive: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for kind in KINDS:
+        bag = write_bag(tmp_path, kind, of_log(drive, Messages.cones))
+        file = bag if bag.is_file() else next(file for file in bag.iterdir() if file.suffix != ".yaml")
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+        assert "expected" in refused(bag, tmp_path / "log", capsys, *TOPICS)
+
+
+def test_without_the_package_one_line_says_how_to_install_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = written(tmp_path, lambda messages, t: messages.odometry(t, TWIST))
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    line = refused(bag, tmp_path / "log", capsys, *TOPICS)
+    assert "pip install 'pathspace-graph[ros]'" in line
