@@ -31,7 +31,8 @@ DEFINITIONS = {
     ),
     "ackermann_msgs/msg/AckermannDrive": "float32 steering_angle\nfloat32 steering_angle_velocity\n"
     "float32 speed\nfloat32 acceleration\nfloat32 jerk\n",
-    "ackermann_msgs/msg/AckermannDriveStamped": "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n",
+    "ackermann_msgs/msg/AckermannDriveStamped": "std_msgs/Header header\n"
+    "ackermann_msgs/AckermannDrive drive\n",
 }
 """Messages that ROS itself does not define have these definitions, by the facts of their fields."""
 

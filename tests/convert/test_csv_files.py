@@ -1,0 +1,148 @@
+"""CSV files with columns and units of their own, and what is wrong with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pathspace_graph.cli import main
+from pathspace_graph.io.log import Log, read_log
+from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+
+
+def write(folder: Path, odometry: str, detections: str) -> Path:
+    (folder / "odometry.csv").write_text(odometry)
+    (folder / "detections.csv").write_text(detections)
+    return folder
+
+
+def convert(folder: Path, *options: str) -> Log:
+    assert main(["convert", str(folder), "--from", "csv", "--out", str(folder / "log"), *options]) == 0
+    return read_log(folder / "log")
+
+
+def refused(folder: Path, capsys: pytest.CaptureFixture[str], *options: str) -> str:
+    assert main(["convert", str(folder), "--from", "csv", "--out", str(folder / "log"), *options]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert not (folder / "log").exists()
+    return line
+
+
+ODOMETRY = "stamp,speed,yaw\n1000000000,2000,90\n1100000000,2000,-90\n1200000000,2000,0\n"
+DETECTIONS = (
+    "stamp,cone_x,cone_y,colour\n1050000000,5000,1500,7\n1050000000,4000,-1500,8\n1150000000,3000,0,9\n"
+)
+RENAMED = ["--columns", "t=stamp", "vx=speed", "wz=yaw", "x=cone_x", "y=cone_y", "label=colour"]
+UNITS = ["--units", "length=mm", "angle=deg", "time=ns"]
+LABELS = ["--labels", "left=7", "right=8"]
+
+
+def test_columns_units_and_labels_are_as_they_were_named(tmp_path: Path) -> None:
+    log = convert(write(tmp_path, ODOMETRY, DETECTIONS), *RENAMED, *UNITS, *LABELS)
+    np.testing.assert_allclose(log.odometry.t, [1.0, 1.1, 1.2])
+    quarter = np.pi / 2
+    np.testing.assert_allclose(log.odometry.twist, [[2, 0, quarter], [2, 0, -quarter], [2, 0, 0]])
+    assert [cycle.t for cycle in log.cycles] == pytest.approx([1.05, 1.15])
+    np.testing.assert_allclose(log.cycles[0].points_vehicle, [[5.0, 1.5], [4.0, -1.5]])
+    assert log.cycles[0].labels.tolist() == [LEFT, RIGHT]
+    assert log.cycles[1].labels.tolist() == [UNKNOWN]
+
+
+def test_a_log_of_ours_needs_no_option_and_comes_back(tmp_path: Path) -> None:
+    odometry = "t,vx,vy,wz\n0.0,1.0,0.1,0.2\n0.5,1.5,0.0,-0.1\n"
+    detections = "t,x,y,label,xx,xy,yy\n0.1,4.0,1.0,left,0.02,0.01,0.03\n0.1,5.0,-1.0,yellow,0.02,0.0,0.03\n"
+    log = convert(write(tmp_path, odometry, detections))
+    np.testing.assert_array_equal(log.odometry.twist, [[1.0, 0.1, 0.2], [1.5, 0.0, -0.1]])
+    np.testing.assert_array_equal(log.cycles[0].covariances[0], [[0.02, 0.01], [0.01, 0.03]])
+    assert log.cycles[0].labels.tolist() == [LEFT, RIGHT]
+
+
+def test_y_to_the_right_changes_the_signs_of_all_that_turns(tmp_path: Path) -> None:
+    odometry = "t,vx,vy,wz\n0.0,1.0,0.1,0.2\n0.5,1.0,0.1,0.2\n"
+    detections = "t,x,y,label,xx,xy,yy\n0.1,4.0,1.0,right,0.02,0.01,0.03\n"
+    log = convert(write(tmp_path, odometry, detections), "--y", "right")
+    np.testing.assert_array_equal(log.odometry.twist[0], [1.0, -0.1, -0.2])
+    np.testing.assert_array_equal(log.cycles[0].points_vehicle, [[4.0, -1.0]])
+    np.testing.assert_array_equal(log.cycles[0].covariances[0], [[0.02, -0.01], [-0.01, 0.03]])
+    log = convert(tmp_path, "--y", "right", "--y-odometry", "left")
+    np.testing.assert_array_equal(log.odometry.twist[0], [1.0, 0.1, 0.2])
+    log = convert(tmp_path, "--columns", "wz=-wz")
+    np.testing.assert_array_equal(log.odometry.twist[0], [1.0, 0.1, -0.2])
+
+
+def test_range_and_bearing_take_the_place_of_x_and_y(tmp_path: Path) -> None:
+    detections = "time,r,b\n0.1,2000,30\n0.1,2000,-90\n"
+    folder = write(tmp_path, "t,vx,wz\n0,1,0\n1,1,0\n", detections)
+    names = ["--columns", "detections.t=time", "range=r", "bearing=b"]
+    units = ["--units", "length=mm", "angle=deg", "speed=km/h", "yaw_rate=rad/s"]
+    log = convert(folder, *names, *units)
+    points = [[np.sqrt(3.0), 1.0], [0.0, -2.0]]
+    np.testing.assert_allclose(log.cycles[0].points_vehicle, points, atol=1e-12)
+    assert log.odometry.twist[0, 0] == pytest.approx(1 / 3.6)
+    log = convert(folder, *names, *units, "--y", "right")
+    np.testing.assert_allclose(log.cycles[0].points_vehicle, points * np.array([1, -1]), atol=1e-12)
+
+
+def test_rows_in_any_order_are_cycles_in_order_of_time(tmp_path: Path) -> None:
+    detections = "t,x,y,label\n0.3,3,0,left\n0.1,1,0,left\n0.3,3,1,left\n"
+    log = convert(write(tmp_path, "t,vx,wz\n1,1,0\n0,1,0\n", detections))
+    assert [cycle.t for cycle in log.cycles] == [0.1, 0.3]
+    np.testing.assert_array_equal(log.cycles[1].points_vehicle, [[3.0, 0.0], [3.0, 1.0]])
+    np.testing.assert_array_equal(log.odometry.t, [0.0, 1.0])
+
+
+GOOD_ODOMETRY = "t,vx,wz\n0,1,0\n1,1,0\n"
+GOOD_DETECTIONS = "t,x,y,label\n0.1,4,1,left\n0.3,4,1,left\n"
+
+
+@pytest.mark.parametrize(
+    ("odometry", "detections", "options", "said"),
+    [
+        ("", GOOD_DETECTIONS, [], "odometry.csv"),
+        ("t,vx,wz\n", GOOD_DETECTIONS, [], "odometry.csv, row 2: expected at least one row"),
+        ("t,v,wz\n0,1,0\n", GOOD_DETECTIONS, [], "(--columns vx=NAME), found the columns t, v, wz"),
+        (GOOD_ODOMETRY, "t,x,z\n0,1,0\n", [], "expected a column 'y' for y"),
+        (GOOD_ODOMETRY, "t,z\n0,1\n", [], "detections.csv, row 1: expected a column 'x'"),
+        (GOOD_ODOMETRY, "t,x,y\n0,1,a\n", [], "csv, row 2: expected a number in column 'y', found 'a'"),
+        (GOOD_ODOMETRY, "t,x,y\n0,1,\n", [], "row 2: expected a number in column 'y', found ''"),
+        (GOOD_ODOMETRY, "t,x,y,xx\n0,1,1,1\n", [], "expected a column 'xy'"),
+        (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--columns", "speed=v"], "expected one of t, vx, vy, wz, x"),
+        (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--columns", "vx"], "--columns: expected QUANTITY=COLUMN"),
+        (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--columns", "odometry.x=v"], "expected one of t, vx, vy, wz in"),
+        (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--columns", "vx=v"], "expected a column 'v' for vx"),
+        (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--columns", "vy=v"], "expected a column 'v' for vy"),
+        (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--units", "time=h"], "expected time= one of s, ms, us, ns"),
+        (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--units", "length:mm"], "--units: expected one of time, length"),
+        (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--units", "time=ns"], "is their unit another one?"),
+        ("t,vx,wz\n1700000000000000000,1,0\n", GOOD_DETECTIONS, [], "(--units time=ns)?"),
+        (GOOD_ODOMETRY, "t,range,bearing\n0.1,3,45\n", [], "expected bearings of at most a whole turn"),
+        (GOOD_ODOMETRY, "t,range,bearing\n0.1,-3,1\n", [], "expected ranges of at least 0"),
+        ("t,vx,wz\n0,5000,0\n1,1,0\n", GOOD_DETECTIONS, [], "speeds of at most 1000 m/s, found 5000"),
+        (GOOD_ODOMETRY, "t,x,y\n7,1,1\n", [], "expected detections in the time of the odometry"),
+        ("t,vx,wz\n0,900,0\n2,1,0\n", GOOD_DETECTIONS, [], "its log would be refused (odometry.csv, row 2)"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_named_in_one_line(
+    odometry: str,
+    detections: str,
+    options: list[str],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert said in refused(write(tmp_path, odometry, detections), capsys, *options)
+
+
+def test_files_of_other_names_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "wheels.csv").write_text(GOOD_ODOMETRY)
+    (tmp_path / "cones.csv").write_text(GOOD_DETECTIONS)
+    assert "odometry.csv: expected a file, found none" in refused(tmp_path, capsys)
+    assert len(convert(tmp_path, "--odometry", "wheels.csv", "--detections", "cones.csv").cycles) == 2
+
+
+def test_a_source_is_needed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["convert", "--from", "csv", "--out", str(tmp_path / "log")]) == 2
+    assert "expected a SOURCE" in capsys.readouterr().err
