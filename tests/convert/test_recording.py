@@ -50,7 +50,7 @@ def test_a_covariance_that_is_missing_is_made_at_the_sensor() -> None:
 
 @pytest.mark.parametrize(
     "covariance",
-    [np.nan, 0, [[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]], [[np.inf, 0], [0, 1]], [[1e9, 0], [0, 1]]],
+    [np.nan, 0, [[1, 2], [2, 1]], [[1.0, 0.5], [0, 1]], [[np.inf, 0], [0, 1]], [[1e9, 0], [0, 1]]],
 )  # fmt: skip
 def test_a_covariance_that_cannot_be_used_is_replaced_and_counted(covariance: object) -> None:
     source = record(one(2.0, 1.0, covariance))
