@@ -25,7 +25,7 @@ def example(name: str) -> ModuleType:
 
 
 def test_every_example_has_a_test() -> None:
-    tested = {"gnss", "surveyed_point", "look_at_graph"}
+    tested = {"gnss", "surveyed_point", "look_at_graph", "ros2_node"}  # the last one in tests/convert
     assert {file.stem for file in EXAMPLES.glob("*.py")} == tested
 
 

@@ -24,8 +24,6 @@ BoolArray = NDArray[np.bool_]
 MAX_ASYMMETRY: Final = 1e-3
 """The entries xy and yx of a covariance differ by at most this share of the larger variance; messages may
 have them in single precision."""
-FLIP: Final[Array] = np.array([1.0, -1.0, -1.0])
-"""A twist [vx, vy, wz] with y to the right and angles clockwise, times this, has y to the left."""
 MIN_RANGE_OF_BEARING: Final = 1.0
 """Nearer than this (m), a bearing's standard deviation across counts as at this range, so that a detection at
 the sensor itself has a covariance that is positive definite."""
@@ -82,7 +80,7 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
     t, twists = t[order], twists[order]
     last = np.append(np.diff(t) > 0, True)  # of samples with one stamp the last one counts
     notes["odometry samples had the stamp of another one, and were left out"] += int((~last).sum())
-    twists = twists[last] * (FLIP if frames.y_odometry == "right" else 1.0)
+    twists = twists[last] * frames.flip
     return Odometry(t[last], twists)
 
 
@@ -184,9 +182,9 @@ def in_vehicle_frame(
     notes["detections had no covariance that can be used, and were given one"] += int((~known).sum())
     covariances = np.where(known[:, None, None], covariances, default_covariances(points, noise))
     turn = rotation(frames.mounting[2])
-    return Detections(
-        t, points @ turn.T + np.array(frames.mounting[:2]), turn @ covariances @ turn.T, found.labels
-    )
+    turned = turn @ covariances @ turn.T
+    symmetric = 0.5 * (turned + turned.transpose(0, 2, 1))
+    return Detections(t, points @ turn.T + np.array(frames.mounting[:2]), symmetric, found.labels)
 
 
 def positive_definite(covariances: Array) -> BoolArray:

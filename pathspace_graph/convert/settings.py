@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from math import inf, isfinite, pi
 from typing import Final, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pathspace_graph.errors import SettingsError, check_numbers
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN, label_from_name
 
@@ -58,6 +61,11 @@ class Frames:
         if not all(map(isfinite, self.mounting)) or abs(self.mounting[2]) > 2.0 * pi:
             expected = "--mounting: expected X Y YAW in m, m and rad, with a yaw of at most 2 pi"
             raise SettingsError(f"{expected}, found {' '.join(f'{value:g}' for value in self.mounting)}")
+
+    @property
+    def flip(self) -> NDArray[np.float64]:
+        """Returns by what a twist [vx, vy, wz] (3,) is multiplied, so that its y axis points to the left."""
+        return np.array([1.0, 1.0, 1.0] if self.y_odometry == "left" else [1.0, -1.0, -1.0])
 
 
 class LabelRule:

@@ -1,0 +1,149 @@
+"""A ROS 2 node: it takes odometry and detections, and publishes the map, the path and what is ahead.
+
+    python examples/ros2_node.py --ros-args -r odometry:=/odom -r detections:=/cones -p markers:=false
+
+Detections are a PointCloud2 with labels, or with `markers:=true` a MarkerArray. Only `main` needs ROS.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from pathspace_graph import FixedLagMapper, Map, SplineBoundary
+from pathspace_graph.convert.settings import SIGMA_ODOMETRY, Frames
+from pathspace_graph.convert.stream import MessageStream
+from pathspace_graph.errors import PathspaceError
+from pathspace_graph.factors.se2 import to_vehicle
+from pathspace_graph.io.json_file import write_json
+from pathspace_graph.io.map import MAP_FILE, map_to_json
+from pathspace_graph.labels import LEFT
+from pathspace_graph.run import CycleResult
+
+Array = NDArray[np.float64]
+
+STEP = 1.0
+"""Points of a boundary are published at this distance (m)."""
+AHEAD = 20.0
+"""Boundaries are published in the vehicle's frame up to this distance (m)."""
+LINE_STRIP = 4
+"""A `Marker` of this type is a line."""
+
+
+class Bridge:
+    """Hands ROS messages to a mapper, which no message can stop."""
+
+    def __init__(self, mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        self.mapper = FixedLagMapper(odometry_sigma=np.array(SIGMA_ODOMETRY))
+        self.stream = MessageStream(Frames(mounting))
+
+    def update(self, message: Any, received: float) -> CycleResult | None:
+        """Maps a message with detections, received at this time (s); None means that it could not be used."""
+        cycle = self.stream.take_detections(message, received)
+        if cycle is None:
+            return None
+        try:
+            result = self.mapper.update(*cycle)
+        except PathspaceError as error:  # a ReadingError changes nothing in the mapper
+            self.stream.refused[str(error)] += 1
+            return None
+        self.stream.use(result.t)
+        return result
+
+    def save(self, folder: Path) -> None:
+        """Writes `map.json` to a folder, which `pathspace-graph plot` and `export` read."""
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / MAP_FILE, map_to_json(self.mapper.map()))
+
+
+def boundary_points(track: Map) -> dict[int, Array]:
+    """Returns points (n, 2) along each boundary, in m, map frame."""
+    found = {}
+    for label, boundary in track.boundaries.items():
+        if isinstance(boundary, SplineBoundary):
+            count = max(2, int(boundary.spline.length() / STEP) + 1)
+            found[label] = boundary.spline.evaluate(np.linspace(*boundary.spline.domain, count))
+    return found
+
+
+def points_ahead(points: Array, pose: Array) -> Array:
+    """Returns those of the points (n, 2) that are ahead of a pose (3,) and near, in the vehicle's frame."""
+    seen: Array = to_vehicle(points, np.tile(pose, (len(points), 1)))
+    return np.asarray(seen[(seen[:, 0] >= 0.0) & (np.hypot(*seen.T) <= AHEAD)])
+
+
+def fill_line(marker: Any, points: Array, label: int, make_point: Any) -> Any:
+    """Fills in a `Marker` as the line of a boundary through points (n, 2)."""
+    marker.ns, marker.id, marker.type = "boundary", label, LINE_STRIP
+    marker.scale.x, marker.pose.orientation.w = 0.1, 1.0
+    colour = marker.color
+    colour.r, colour.g, colour.b, colour.a = (0.0, 0.2, 1.0, 1.0) if label == LEFT else (1.0, 0.9, 0.0, 1.0)
+    marker.points = [make_point(x=x, y=y, z=0.0) for x, y in points.tolist()]
+    return marker
+
+
+def fill_pose(stamped: Any, pose: Array) -> Any:
+    """Fills in a `PoseStamped` by a pose (3,), map frame."""
+    x, y, theta = pose.tolist()
+    stamped.pose.position.x, stamped.pose.position.y = x, y
+    stamped.pose.orientation.z, stamped.pose.orientation.w = (
+        float(np.sin(theta / 2)),
+        float(np.cos(theta / 2)),
+    )
+    return stamped
+
+
+def main() -> None:
+    """Runs the node until it is stopped, and then writes the map to the folder `map`."""
+    import rclpy  # ROS is needed here only
+    from geometry_msgs.msg import Point, PoseStamped
+    from nav_msgs.msg import Odometry
+    from nav_msgs.msg import Path as PathMessage
+    from rclpy.executors import ExternalShutdownException
+    from sensor_msgs.msg import PointCloud2
+    from std_msgs.msg import Header
+    from visualization_msgs.msg import Marker, MarkerArray
+
+    rclpy.init()
+    node = rclpy.create_node("pathspace_graph")
+    bridge = Bridge(tuple(node.declare_parameter("mounting", [0.0, 0.0, 0.0]).value))
+    kind = MarkerArray if node.declare_parameter("markers", False).value else PointCloud2
+    to_map, to_ahead = (node.create_publisher(MarkerArray, f"~/{name}", 1) for name in ("map", "ahead"))
+    to_path, path = node.create_publisher(PathMessage, "~/path", 1), PathMessage()
+
+    def now() -> float:
+        return float(node.get_clock().now().nanoseconds) * 1e-9
+
+    def lines(points: dict[int, Array], header: Any) -> Any:
+        markers = [fill_line(Marker(header=header), points[label], label, Point) for label in points]
+        return MarkerArray(markers=markers)
+
+    def take_detections(message: Any) -> None:
+        result = bridge.update(message, now())
+        if result is None or result.late:
+            return
+        stamp, points = node.get_clock().now().to_msg(), boundary_points(bridge.mapper.outline())
+        to_map.publish(lines(points, Header(frame_id="map", stamp=stamp)))
+        ahead = {label: points_ahead(points[label], result.pose) for label in points}
+        to_ahead.publish(lines(ahead, Header(frame_id="base_link", stamp=stamp)))
+        path.header = Header(frame_id="map", stamp=stamp)
+        path.poses.append(fill_pose(PoseStamped(header=path.header), result.pose))
+        to_path.publish(path)
+
+    node.create_subscription(Odometry, "odometry", lambda m: bridge.stream.take_odometry(m, now()), 100)
+    node.create_subscription(kind, "detections", take_detections, 10)
+    try:
+        with suppress(KeyboardInterrupt, ExternalShutdownException), threadpool_limits(limits=1):
+            rclpy.spin(node)
+    finally:
+        bridge.save(Path("map"))
+        node.get_logger().info(f"map written; refused: {dict(bridge.stream.refused)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,150 @@
+"""The example of a ROS 2 node, without ROS: a drive as messages, some of them bad, gives a map."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.map import read_map
+from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
+
+from ..scenes.paths import ROOT
+from .bags import EPOCH, Messages
+
+CYCLES = 40
+
+
+@pytest.fixture(scope="module")
+def node() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("ros2_node", ROOT / "examples" / "ros2_node.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return simulate(generate_track(np.random.default_rng(3)), SimulationSettings(laps=1), 3)
+
+
+def feed(log: Log, odometry: Any, detections: Any) -> None:
+    """Hands over the messages of the first cycles, with a broken, a repeated and a wild one among them."""
+    messages, row = Messages(), 0
+    for index, cycle in enumerate(log.cycles[:CYCLES]):
+        while row < len(log.odometry.t) and log.odometry.t[row] <= cycle.t:
+            odometry(messages.odometry(float(log.odometry.t[row]), log.odometry.twist[row]))
+            row += 1
+        detections(messages.cloud_of(cycle))
+        if index == 10:
+            detections(SimpleNamespace(data=b"rubbish"))
+            odometry(SimpleNamespace())
+            detections(messages.cloud_of(cycle))
+            detections(messages.cloud(1e6, {"x": ("f4", [5.0]), "y": ("f4", [1.5]), "label": ("u1", [0])}))
+
+
+def test_a_bad_message_never_stops_the_mapper(node: ModuleType, log: Log, tmp_path: Path) -> None:
+    bridge, results = node.Bridge(), []
+    feed(
+        log,
+        lambda message: bridge.stream.take_odometry(message, 0.0),
+        lambda message: results.append(bridge.update(message, 0.0)),
+    )
+    assert [result is None for result in results] == [False] * 11 + [True] * 3 + [False] * (CYCLES - 11)
+    assert results[-1].pose[0] > 1.0
+    bridge.save(tmp_path / "map")
+    assert read_map(tmp_path / "map").boundaries.keys() == {LEFT, RIGHT}
+
+
+def test_points_ahead_are_in_the_vehicle_frame(node: ModuleType) -> None:
+    pose = np.array([10.0, 5.0, np.pi / 2])
+    points = np.array([[10.0, 10.0], [10.0, 0.0], [10.0, 50.0], [9.0, 6.0]])
+    np.testing.assert_allclose(node.points_ahead(points, pose), [[5.0, 0.0], [1.0, 1.0]], atol=1e-12)
+
+
+class Blank:
+    """A message whose fields are there once they are asked for, as those of ROS have defaults."""
+
+    def __init__(self, **fields: Any) -> None:
+        vars(self).update(fields)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        value = [] if name in ("poses", "points") else Blank()
+        setattr(self, name, value)
+        return value
+
+
+def test_markers_and_poses_are_filled_in(node: ModuleType) -> None:
+    points = np.array([[1.0, 2.0], [3.0, 4.0]])
+    marker = node.fill_line(Blank(), points, LEFT, Blank)
+    assert [(point.x, point.y, point.z) for point in marker.points] == [(1.0, 2.0, 0.0), (3.0, 4.0, 0.0)]
+    assert marker.color.b > marker.color.r
+    assert node.fill_line(Blank(), points, RIGHT, Blank).color.r > 0.5
+    filled = node.fill_pose(Blank(), np.array([1.0, 2.0, np.pi])).pose
+    assert (filled.position.x, filled.position.y) == (1.0, 2.0)
+    assert filled.orientation.z == pytest.approx(1.0)
+
+
+def test_the_node_publishes_and_saves_when_it_is_stopped(
+    node: ModuleType, log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The whole of `main`, where ROS is a stand-in."""
+    published: dict[str, list[Any]] = {}
+    callbacks: dict[str, Any] = {}
+    clock = SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=EPOCH * 10**9, to_msg=Blank))
+    handle = SimpleNamespace(
+        declare_parameter=lambda _, value: SimpleNamespace(value=value),
+        create_publisher=lambda _, name, depth: SimpleNamespace(
+            publish=published.setdefault(name, []).append, depth=depth
+        ),
+        create_subscription=lambda _, topic, callback, depth: callbacks.update({topic: callback}),
+        get_clock=lambda: clock,
+        get_logger=lambda: SimpleNamespace(info=lambda _: None),
+    )
+
+    def spin(_: Any) -> None:
+        feed(log, callbacks["odometry"], callbacks["detections"])
+        raise KeyboardInterrupt
+
+    names = ("Point", "PoseStamped", "Odometry", "Path", "PointCloud2", "Marker", "MarkerArray", "Header")
+    kinds = {name: type(name, (Blank,), {}) for name in names}
+    ros = {
+        "rclpy": {"init": lambda: None, "create_node": lambda _: handle, "spin": spin},
+        "rclpy.executors": {"ExternalShutdownException": type("ExternalShutdownException", (Exception,), {})},
+        **{f"{package}_msgs.msg": kinds for package in ("geometry", "nav", "sensor", "std", "visualization")},
+    }
+    for name, members in ros.items():
+        module = ModuleType(name)
+        vars(module).update(members)
+        monkeypatch.setitem(sys.modules, name, module)
+        monkeypatch.setitem(
+            sys.modules, name.partition(".")[0], sys.modules.get(name.partition(".")[0], module)
+        )
+    monkeypatch.chdir(tmp_path)
+    node.main()
+    assert read_map(tmp_path / "map").boundaries.keys() == {LEFT, RIGHT}
+    assert {name: len(messages) for name, messages in published.items()} == dict.fromkeys(
+        ("~/map", "~/ahead", "~/path"), CYCLES
+    )
+    assert len(published["~/path"][-1].poses) == CYCLES
+    ahead = published["~/ahead"][-1].markers[0].points
+    assert len(ahead) > 5
+    assert all(point.x >= 0.0 for point in ahead)
+
+
+def test_the_example_is_short_and_says_how_to_run_it() -> None:
+    text = (ROOT / "examples" / "ros2_node.py").read_text()
+    assert "python examples/ros2_node.py" in text
+    assert text.count("\n") < 150
