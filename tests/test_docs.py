@@ -94,8 +94,9 @@ def test_every_page_is_found_from_the_readme() -> None:
 
 NAMED = re.compile(r"`([a-z_]+(?:\.[a-z_]+)*):([A-Za-z_]\w*(?:\.\w+)*)`")
 """`module.path:Name.member`, without the package's own name."""
-FILE = re.compile(r"`((?!\.venv)\.?[a-z_][\w/.-]*/[\w-]*(?:\.(?:py|md))?|\w+\.(?:py|md))`")
-"""`folder/file.py` or `folder/`, below the root or below the package; other suffixes are of data."""
+FILE = re.compile(r"`((?!\.venv|\w+_msgs/)\.?[a-z_][\w/.-]*/[\w-]*(?:\.(?:py|md))?|\w+\.(?:py|md))`")
+"""`folder/file.py` or `folder/`, below the root or below the package; other suffixes are of data, and
+types of ROS are no files."""
 OUTSIDE = {
     "map.json",
     "build/api",

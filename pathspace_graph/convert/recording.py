@@ -178,7 +178,7 @@ def in_vehicle_frame(
     if frames.y_detections == "right":
         points = points * [1.0, -1.0]
         covariances = covariances * np.array([[1.0, -1.0], [-1.0, 1.0]])
-    known = positive_definite(covariances)
+    known = positive_definite(covariances) & (not noise.replace_covariances)
     notes["detections had no covariance that can be used, and were given one"] += int((~known).sum())
     covariances = np.where(known[:, None, None], covariances, default_covariances(points, noise))
     turn = rotation(frames.mounting[2])

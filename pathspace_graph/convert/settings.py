@@ -35,6 +35,8 @@ class NoiseSettings:
     """The standard deviation of the range grows by this with the range (m/m)."""
     sigma_bearing: float = pi / 200.0
     """A detection without a covariance has this standard deviation of its bearing (rad)."""
+    replace_covariances: bool = False
+    """All detections have the covariance by these standard deviations, also where the record has another."""
 
     def __post_init__(self) -> None:
         sigmas = self.sigma_odometry
