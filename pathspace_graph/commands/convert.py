@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Literal
 
+import numpy as np
 from rich.console import Console
 from tyro.conf import Positional, arg
 
@@ -18,7 +18,8 @@ from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings, S
 from pathspace_graph.convert.victoria_park import read_victoria_park
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.io.files import check_target
-from pathspace_graph.io.log import LOG_FILE, Log, read_log, write_log
+from pathspace_graph.io.log import LOG_FILE, Log, write_log
+from pathspace_graph.labels import NAMES
 from pathspace_graph.progress import progress
 
 from .simulate import describe
@@ -88,8 +89,7 @@ class Convert:
             record = self._read(rule)
             file = self.source or Path(self.kind)
             log = to_log(record, frames, self.noise, file)
-            check_readable(log, file)
-            write_log(log, self.out)
+            write_checked(log, self.out, file)
         report(record.notes, log, self.out)
 
     def _read(self, rule: LabelRule) -> Recording:
@@ -118,15 +118,13 @@ class Convert:
         )
 
 
-def check_readable(log: Log, file: Path) -> None:
-    """Raises an InputError of the `file` where its log would be refused when it is read."""
-    with TemporaryDirectory() as folder:
-        write_log(log, Path(folder, "log"))
-        try:
-            read_log(Path(folder, "log"))
-        except InputError as error:
-            where = f"{error.file.name}, row {error.row}" if error.row else error.file.name
-            raise InputError(file, f"its log would be refused ({where}): {error.message}") from None
+def write_checked(log: Log, out: Path, source: Path) -> None:
+    """Writes a log, or raises an InputError of its source where it would be refused when it is read."""
+    try:
+        write_log(log, out, check=True)
+    except InputError as error:
+        where = f"{error.file.name}, row {error.row}" if error.row else error.file.name
+        raise InputError(source, f"its log would be refused ({where}): {error.message}") from None
 
 
 def report(notes: Counter[str], log: Log, out: Path) -> None:
@@ -135,4 +133,18 @@ def report(notes: Counter[str], log: Log, out: Path) -> None:
     for text, count in notes.items():
         if count:
             console.print(f"{count} {text}", highlight=False, soft_wrap=True, markup=False)
-    console.print(f"{out}: {describe(log)}", highlight=False, soft_wrap=True, markup=False)
+    for line in (outline(log), f"{out}: {describe(log)}"):
+        console.print(line, highlight=False, soft_wrap=True, markup=False)
+
+
+def outline(log: Log) -> str:
+    """Returns in a line what a look at the log should show first: rates, speeds, ranges and labels."""
+    twists, seconds = log.odometry.twist, max(float(np.ptp(log.odometry.t)), np.finfo(float).tiny)
+    ranges = np.concatenate([np.hypot(*cycle.points_vehicle.T) for cycle in log.cycles])
+    labels = np.bincount(np.concatenate([cycle.labels for cycle in log.cycles]), minlength=len(NAMES))
+    told = ", ".join(f"{count} {name}" for name, count in zip(NAMES, labels.tolist(), strict=True) if count)
+    return (
+        f"odometry at {len(twists) / seconds:.3g} Hz, up to {np.hypot(*twists[:, :2].T).max():.3g} m/s and "
+        f"{np.abs(twists[:, 2]).max():.3g} rad/s; detections at {len(log.cycles) / seconds:.3g} Hz, "
+        f"{ranges.min():.3g} m to {ranges.max():.3g} m away: {told}"
+    )

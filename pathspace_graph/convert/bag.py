@@ -276,12 +276,12 @@ class Bag:
         return received, messages
 
     def _store(self, connection: Any) -> Any:
-        """Returns the types of a topic: those of the bag, then those handed over, then those of ROS."""
+        """Returns the types of a topic: those of the bag, or else those handed over and those of ROS."""
         *_, typesys = _rosbags()
-        default = typesys.Stores.ROS1_NOETIC if self._is_ros1 else typesys.Stores.ROS2_HUMBLE
-        known = {**typesys.get_typestore(default).fielddefs, **self._definitions}
+        ros = typesys.Stores.ROS1_NOETIC if self._is_ros1 else typesys.Stores.ROS2_HUMBLE
         try:
-            known |= _types_of(connection, typesys)
+            known = _types_of(connection, typesys)
+            known = known or {**typesys.get_typestore(ros).fielddefs, **self._definitions}
             store = typesys.get_typestore(typesys.Stores.EMPTY)
             store.register(known)
             store.get_msgdef(connection.msgtype)

@@ -173,11 +173,12 @@ def _read_log(folder: Path) -> Log:
     )
 
 
-def write_log(log: Log, folder: Path | str) -> None:
+def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
     """Writes a log folder that `read_log` gives back exactly.
 
     A cycle without detections has no row in the file, so it is left out. The folder appears as a whole or not
-    at all; an earlier log there is kept as a numbered backup.
+    at all; an earlier log there is kept as a numbered backup. With `check`, a log that cannot be read is an
+    InputError, and is not written.
     """
     with atomic_folder(folder, LOG_FILE) as target:
         (target / LOG_FILE).write_text(_toml(log), encoding="utf-8", newline="\n")
@@ -186,6 +187,8 @@ def write_log(log: Log, folder: Path | str) -> None:
         _write_csv(target / DETECTIONS_FILE, "t,x,y,label,xx,xy,yy", _detection_rows(log.cycles))
         if log.truth is not None:
             _write_truth(log.truth, target)
+        if check:
+            _read_log(target)
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

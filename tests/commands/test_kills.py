@@ -130,6 +130,7 @@ def commands(recorded: Recorded) -> dict[str, list[str]]:
     log, track = str(recorded.folder / "log"), str(recorded.folder / "map")
     return {
         "simulate": ["--generate", "0"],
+        "convert": [log, "--from", "csv"],
         "online": [log, "--estimator", "rings"],
         "batch": [log, "--estimator", "rings-batch"],
         "compare": [log, "--estimators", "rings", "gaps"],
@@ -170,7 +171,7 @@ def place(target: Path, like: Contents) -> None:
 
 @pytest.mark.parametrize("old", [False, True], ids=["first", "again"])
 @pytest.mark.parametrize(
-    "name", ["simulate", "online", "batch", "scale", "figures", "plot", *map(slow, LONG)]
+    "name", ["simulate", "convert", "online", "batch", "scale", "figures", "plot", *map(slow, LONG)]
 )
 def test_a_kill_at_any_step_leaves_the_old_or_the_new(
     name: str, old: bool, recorded: Recorded, tmp_path: Path

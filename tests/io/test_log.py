@@ -267,3 +267,13 @@ def test_binary_content_is_bad_input(folder: Path, spoil: Callable[[bytes], byte
 def test_last_twist_is_held_for_a_while(folder: Path) -> None:
     (folder / "detections.csv").write_text("t,x,y,label,xx,xy,yy\n1.4,3,1,left,1,0,1\n")
     assert read_log(folder).cycles[0].t == 1.4
+
+
+def test_a_log_that_cannot_be_read_is_not_written_where_it_is_checked(tmp_path: Path) -> None:
+    odometry = Odometry(np.array([0.0, 1.0]), np.array([[2e3, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    log = Log(odometry, (), np.ones(3))
+    with pytest.raises(InputError, match="row 2"):
+        write_log(log, tmp_path / "log", check=True)
+    assert not list(tmp_path.iterdir())
+    write_log(log, tmp_path / "log")
+    assert (tmp_path / "log").is_dir()
