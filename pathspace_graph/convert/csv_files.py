@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import inf, pi
+from math import pi
 from pathlib import Path
 from typing import Final
 
@@ -51,6 +51,8 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
 """Each quantity may be in these units, each of which is this number of the SI unit."""
 MAX_BEARING: Final = 2.0 * pi
 """A bearing is at most this (rad); more are degrees."""
+LARGEST: Final = 1e30
+"""A number of a file is at most this; stamps in nanoseconds are large."""
 MIN_PERIOD: Final = 1e-5
 """Samples are on average at least this far apart (s); less is a wrong unit of time."""
 MAX_PERIOD: Final = 1e3
@@ -182,7 +184,7 @@ class _File:
         """Returns a column (rows,) in the SI unit, or in its square where `power` is 2."""
         column = self.column(key)
         factor = self.units.factor(QUANTITIES[self.kind][key]) ** power
-        return np.asarray(column.sign * factor * self.table.numbers(column.name, inf))
+        return np.asarray(column.sign * factor * self.table.numbers(column.name, LARGEST))
 
     def optional(self, key: str) -> Array:
         """Returns a column (rows,) in the SI unit, or zeros where the file has none."""

@@ -146,14 +146,7 @@ def _cloud_columns(cloud: Any) -> dict[str, NDArray[Any]]:
         raise MessageError(f"expected a point cloud with the fields x and y, found {', '.join(known)}")
     if not cloud.width * cloud.height:
         return {name: np.zeros(0) for name in known}
-    layout = np.dtype(
-        {
-            "names": list(known),
-            "formats": [order + CLOUD_TYPES[field.datatype] for field in known.values()],
-            "offsets": [field.offset for field in known.values()],
-            "itemsize": cloud.point_step,
-        }
-    )
+    layout = _layout(cloud, known, order)
     rows = np.frombuffer(bytes(cloud.data), np.uint8)
     needed = cloud.height * cloud.row_step
     if cloud.row_step < cloud.width * cloud.point_step or len(rows) < needed:
@@ -161,6 +154,20 @@ def _cloud_columns(cloud: Any) -> dict[str, NDArray[Any]]:
     rows = rows[:needed].reshape(cloud.height, cloud.row_step)[:, : cloud.width * cloud.point_step]
     points = np.ascontiguousarray(rows).reshape(-1).view(layout)
     return {name: points[name] for name in known}
+
+
+def _layout(cloud: Any, fields: dict[str, Any], order: str) -> np.dtype[Any]:
+    """Returns how the numbers of a point lie in its bytes."""
+    types = [order + CLOUD_TYPES[field.datatype] for field in fields.values()]
+    offsets = [field.offset for field in fields.values()]
+    try:
+        return np.dtype(
+            {"names": list(fields), "formats": types, "offsets": offsets, "itemsize": cloud.point_step}
+        )
+    except ValueError as error:
+        raise MessageError(
+            f"expected fields inside the {cloud.point_step} bytes of a point: {error}"
+        ) from None
 
 
 def marker_points(array: Any, rule: LabelRule) -> Points:
@@ -200,13 +207,12 @@ def cone_points(message: Any, rule: LabelRule, label_field: str | None = None) -
     lists a cone has its own. Its covariance has 4 (x, y), 9 (x, y, z) or 36 entries (a pose), row by row.
     """
     lists = {name: getattr(message, name) for name in _names(message)}
-    lists = {name: cones for name, cones in lists.items() if _is_list(cones)}
+    lists = {name: listed for name, listed in lists.items() if _is_list(listed)}
     if not lists:
         raise MessageError(f"expected a message with a list of cones, found the fields {_names(message)}")
+    cones = [(name, cone) for name, listed in lists.items() for cone in listed]
     found = [
-        (*_place(cone), _covariance(cone), _cone_label(name, cone, rule, label_field))
-        for name, cones in lists.items()
-        for cone in cones
+        (*_place(cone), _covariance(cone), _cone_label(name, cone, rule, label_field)) for name, cone in cones
     ]
     points = np.array([row[:2] for row in found], dtype=float).reshape(-1, 2)
     covariances = np.array([row[2] for row in found], dtype=float).reshape(-1, 2, 2)

@@ -159,7 +159,7 @@ def join(scans: list[Points]) -> Points:
 def usable(points: Points, notes: Counter[str]) -> Points:
     """Returns the points that are finite and in the range of the format."""
     finite = np.asarray(np.isfinite(points.points).all(axis=1))
-    inside = np.linalg.norm(np.where(finite[:, None], points.points, 0.0), axis=1) < MAX_RANGE
+    inside = ~finite | (np.abs(points.points) <= MAX_RANGE).all(axis=1)
     notes["detections that are not finite were left out"] += int((~finite).sum())
     notes[f"detections farther than {MAX_RANGE:g} m were left out"] += int((~inside).sum())
     good = finite & inside
@@ -192,7 +192,7 @@ def positive_definite(covariances: Array) -> BoolArray:
     xx, yy = covariances[:, 0, 0], covariances[:, 1, 1]
     xy, yx = covariances[:, 0, 1], covariances[:, 1, 0]
     finite = np.isfinite(covariances).all(axis=(1, 2))
-    with np.errstate(invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
         good &= np.abs(xy - yx) <= MAX_ASYMMETRY * np.maximum(xx, yy)
         good &= np.maximum(xx, yy) < MAX_RANGE**2

@@ -63,6 +63,13 @@ def test_a_cloud_of_padded_rows_is_read(messages: Messages) -> None:
         points_of(tall, RULE)
 
 
+def test_fields_beyond_the_bytes_of_a_point_are_refused(messages: Messages) -> None:
+    cloud = messages.cloud(1.0, COLUMNS)
+    cloud.fields[0].offset = 1000
+    with pytest.raises(MessageError, match="expected fields inside the 18 bytes"):
+        points_of(cloud, RULE)
+
+
 def test_a_cloud_without_places_is_refused(messages: Messages) -> None:
     with pytest.raises(MessageError, match="fields x and y, found intensity"):
         points_of(messages.cloud(1.0, {"intensity": ("f4", [1.0])}), RULE)

@@ -50,7 +50,7 @@ def test_a_covariance_that_is_missing_is_made_at_the_sensor() -> None:
 
 @pytest.mark.parametrize(
     "covariance",
-    [np.nan, 0, [[1, 2], [2, 1]], [[1.0, 0.5], [0, 1]], [[np.inf, 0], [0, 1]], [[1e9, 0], [0, 1]]],
+    [np.nan, 0, [[1, 2], [2, 1]], [[1.0, 0.5], [0, 1]], [[np.inf, 0], [0, 1]], [[1e308, 0], [0, 1e308]]],
 )  # fmt: skip
 def test_a_covariance_that_cannot_be_used_is_replaced_and_counted(covariance: object) -> None:
     source = record(one(2.0, 1.0, covariance))
@@ -68,7 +68,7 @@ def test_what_states_its_noise_keeps_it_unless_another_is_given() -> None:
     assert to_log(stated, Frames(), given, FILE).odometry_sigma.tolist() == [1.0, 2.0, 3.0]
 
 
-@pytest.mark.parametrize("points", [one(np.nan, 1.0), one(2e4, 1.0)])
+@pytest.mark.parametrize("points", [one(np.nan, 1.0), one(2e4, 1.0), one(1e308, 1e308)])
 def test_a_record_without_a_usable_detection_is_refused(points: Points) -> None:
     with pytest.raises(
         InputError, match="expected detections that can be used, found 1 messages without any"
