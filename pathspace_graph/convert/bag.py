@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +39,10 @@ SPEED_TYPES: Final = (
 """Messages of these types have a speed alone, so that the yaw rate must come from an IMU."""
 IMU_TYPES: Final = ("sensor_msgs/msg/Imu",)
 """Messages of these types have a yaw rate."""
+SUPPORTED: Final = (
+    "sensor_msgs/msg/PointCloud2, visualization_msgs/msg/MarkerArray, or a list of cones with points"
+)
+"""Detections are in messages of these types."""
 UNDEFINED: Final = "a type without a definition"
 """This says that neither the bag, nor ROS, nor a file that was handed over defines a message."""
 
@@ -68,7 +72,7 @@ class BagOptions:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Holds the messages of one topic in the order of the bag."""
+    """Holds what was taken of the messages of one topic, in the order of the bag."""
 
     topic: str
     """This is the topic."""
@@ -76,8 +80,8 @@ class Samples:
     """This is their type."""
     t: Array
     """(N,) These are their stamps (s)."""
-    messages: list[Any]
-    """These are the messages."""
+    values: list[Any]
+    """This was taken of each message."""
 
 
 def read_bag(path: Path, options: BagOptions, rule: LabelRule) -> Recording:
@@ -88,15 +92,19 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule) -> Recording:
     notes: Counter[str] = Counter()
     with Bag.opened(path, options.definitions) as bag:
         odometry = bag.samples(options.odometry, "--odometry", TWIST_TYPES + SPEED_TYPES, options, notes)
-        detections = bag.samples(options.detections, "--detections", (), options, notes)
         imu = None if options.imu is None else bag.samples(options.imu, "--imu", IMU_TYPES, options, notes)
         t, twists = _twists(odometry, imu, options, path)
-        scans = [_scan(path, detections, message, rule, options) for message in detections.messages]
+
+        def points(message: Any) -> tuple[str, Points]:
+            return frame_of(message), points_of(message, rule, options.label_field)
+
+        detections = bag.samples(options.detections, "--detections", (), options, notes, points)
     if not options.mounted:
         _judge_frames(odometry, detections, notes, path)
     source = {"bag": path.name, "odometry": _named(odometry), "detections": _named(detections)}
     if imu is not None:
         source["imu"] = _named(imu)
+    scans = [found for _, found in detections.values]
     return Recording(t, twists, detections.t, scans, source, notes)
 
 
@@ -104,22 +112,10 @@ def _named(samples: Samples) -> str:
     return f"{samples.topic} ({samples.kind})"
 
 
-def _scan(path: Path, samples: Samples, message: Any, rule: LabelRule, options: BagOptions) -> Points:
-    try:
-        return points_of(message, rule, options.label_field)
-    except MessageError as error:
-        supported = (
-            "sensor_msgs/msg/PointCloud2, visualization_msgs/msg/MarkerArray, or a list of cones with points"
-        )
-        raise InputError(
-            path, f"--detections {_named(samples)}: {error}; supported are {supported}"
-        ) from None
-
-
 def _judge_frames(odometry: Samples, detections: Samples, notes: Counter[str], path: Path) -> None:
     """Notes detections in another frame than the vehicle's; those in the frame of its pose are refused."""
-    world, body = frame_of(odometry.messages[0]), frame_of(odometry.messages[0], "child_frame_id")
-    frames = {frame_of(message) for message in detections.messages} - {"", body}
+    world, body = frame_of(odometry.values[0]), frame_of(odometry.values[0], "child_frame_id")
+    frames = {frame for frame, _ in detections.values} - {"", body}
     if odometry.kind != ODOMETRY or not body or not frames:
         return
     if world in frames:
@@ -130,7 +126,7 @@ def _judge_frames(odometry: Samples, detections: Samples, notes: Counter[str], p
     notes[
         f"messages with detections are in frame {', '.join(sorted(frames))}, the odometry is of {body}: "
         "--mounting says where the sensor is"
-    ] += len(detections.messages)
+    ] += len(detections.values)
 
 
 # --- twists ----------------------------------------------------------------------------------------------
@@ -141,19 +137,19 @@ def _twists(odometry: Samples, imu: Samples | None, options: BagOptions, path: P
     if options.from_poses:
         t, twists = _from_poses(odometry, path)
     else:
-        t, twists = odometry.t, np.array([twist_of(message) for message in odometry.messages])
+        t, twists = odometry.t, np.array([twist_of(message) for message in odometry.values])
         _check_motion(odometry, twists, path)
     if imu is None:
         if odometry.kind in SPEED_TYPES:
             raise InputError(path, f"{_named(odometry)}: expected --imu TOPIC for the yaw rate, found none")
         return t, twists
-    return with_yaw_rate(t, twists, imu.t, np.array([yaw_rate_of(message) for message in imu.messages]))
+    return with_yaw_rate(t, twists, imu.t, np.array([yaw_rate_of(message) for message in imu.values]))
 
 
 def _check_motion(odometry: Samples, twists: Array, path: Path) -> None:
     """Raises an InputError where the twists are all zero and the poses are not."""
     if odometry.kind == ODOMETRY and not np.any(twists):
-        poses = np.array([pose_of(message) for message in odometry.messages])
+        poses = np.array([pose_of(message) for message in odometry.values])
         if np.ptp(poses, axis=0).any():
             raise InputError(
                 path,
@@ -169,7 +165,7 @@ def _from_poses(odometry: Samples, path: Path) -> tuple[Array, Array]:
     t, first = np.unique(odometry.t, return_index=True)
     if len(t) < 2:
         raise InputError(path, f"--from-poses: expected two poses at least, found {len(t)}")
-    poses = np.array([pose_of(odometry.messages[index]) for index in first])
+    poses = np.array([pose_of(odometry.values[index]) for index in first])
     return t[:-1], twists_between(t, poses)
 
 
@@ -233,8 +229,12 @@ class Bag:
         kinds: tuple[str, ...],
         options: BagOptions,
         notes: Counter[str],
+        take: Callable[[Any], Any] = lambda message: message,
     ) -> Samples:
-        """Returns the messages of a topic, which has to be of one of these `kinds`, if there are any."""
+        """Returns what to `take` of the messages of a topic, which is of one of the `kinds`, if any.
+
+        A message may be large, so only what is taken of it is kept.
+        """
         connections = [entry for entry in self._reader.connections if entry.topic == topic]
         if not connections:
             found = "found none" if topic is None else f"found {topic}"
@@ -243,11 +243,12 @@ class Bag:
         if kinds and kind not in kinds:
             expected = f"expected a topic of one of the types {', '.join(kinds)}"
             raise self._error(f"{option}: {expected}, found {topic} ({kind})")
-        received, messages = self._read(connections, kind)
-        if not messages:
+        received, stamps, values = self._read(connections, kind, take, option)
+        if not values:
             raise self._error(f"{option}: expected messages of {topic}, found none")
-        stamps = [None if options.received else stamp_of(message) for message in messages]
-        return _stamped(str(topic), kind, stamps, received, messages, notes)
+        if options.received:
+            stamps = [None] * len(stamps)
+        return _stamped(str(topic), kind, stamps, received, values, notes)
 
     def _error(self, message: str) -> InputError:
         """Returns an InputError that also lists all topics with type, number of messages and rate."""
@@ -262,18 +263,28 @@ class Bag:
         )
         return InputError(self.path, f"{message}; {listed}")
 
-    def _read(self, connections: list[Any], kind: str) -> tuple[list[float], list[Any]]:
+    def _read(
+        self, connections: list[Any], kind: str, take: Callable[[Any], Any], option: str
+    ) -> tuple[list[float], list[float | None], list[Any]]:
+        """Returns the times of receipt, the stamps and what was taken of all messages of a topic."""
         store = self._store(connections[0])
         decode = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
-        received, messages = [], []
+        received: list[float] = []
+        stamps: list[float | None] = []
+        values: list[Any] = []
         try:
-            for _, stamp, data in self._reader.messages(connections):
-                received.append(1e-9 * stamp)
-                messages.append(decode(data, kind))
+            for _, time, data in self._reader.messages(connections):
+                message = decode(data, kind)
+                values.append(take(message))
+                stamps.append(stamp_of(message))
+                received.append(1e-9 * time)
+        except MessageError as error:
+            where = f"{option} {connections[0].topic} ({kind})"
+            raise InputError(self.path, f"{where}: {error}; supported are {SUPPORTED}") from None
         except Exception as error:
-            where = f"message {len(messages) + 1} of {connections[0].topic} ({kind})"
+            where = f"message {len(values) + 1} of {connections[0].topic} ({kind})"
             raise InputError(self.path, f"{where}: expected one that can be read ({error})") from None
-        return received, messages
+        return received, stamps, values
 
     def _store(self, connection: Any) -> Any:
         """Returns the types of a topic: those of the bag, or else those handed over and those of ROS."""
@@ -296,21 +307,21 @@ def _stamped(
     kind: str,
     stamps: list[float | None],
     received: list[float],
-    messages: list[Any],
+    values: list[Any],
     notes: Counter[str],
 ) -> Samples:
-    """Returns messages with header stamps where most have one, else with the times of receipt.
+    """Returns samples with header stamps where most have one, else with the times of receipt.
 
     Both are not mixed, since they may be of different clocks: a message without a stamp among others that
     have one is left out.
     """
     stamped = [index for index, stamp in enumerate(stamps) if stamp is not None]
     if 2 * len(stamped) <= len(stamps):
-        notes[f"messages of {topic} have the time at which they were received"] += len(messages)
-        return Samples(topic, kind, np.array(received), messages)
+        notes[f"messages of {topic} have the time at which they were received"] += len(values)
+        return Samples(topic, kind, np.array(received), values)
     notes[f"messages of {topic} without a stamp were left out"] += len(stamps) - len(stamped)
     t = np.array([stamps[index] for index in stamped], dtype=float)
-    return Samples(topic, kind, t, [messages[index] for index in stamped])
+    return Samples(topic, kind, t, [values[index] for index in stamped])
 
 
 def _types_of(connection: Any, typesys: Any) -> dict[str, Any]:
