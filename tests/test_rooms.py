@@ -30,7 +30,7 @@ ARROWS: dict[str, set[str]] = {
     "spline": {"factors", "settings"},
     "io": {"spline", "factors"},
     "sim": {"io"},
-    "export": {"spline", "io"},
+    "export": {"settings", "spline", "io"},
     "graph": {"factors"},
     "health": {"settings"},
     "run": {"io", "laps", "health"},
