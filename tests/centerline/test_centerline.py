@@ -74,12 +74,20 @@ def test_the_online_map_is_that_of_a_ribbon(log: Log) -> None:
 
 
 def test_without_two_boundaries_the_map_is_that_of_one(log: Log) -> None:
-    only = replace(log, cycles=tuple(left_of(cycle) for cycle in log.cycles[:120]))
+    """A boundary that is seen alone is mapped alone."""
+    only = replace(log, cycles=tuple(left_of(cycle) for cycle in log.cycles))
     mapper = CenterlineMapper(odometry_sigma=log.odometry_sigma)
-    run = run_online(only, mapper)
-    assert set(run.map.boundaries) == {LEFT}
+    online = run_online(only, mapper)
     batch = CenterlineBatch(odometry_sigma=log.odometry_sigma, online=FixedLagMapper).solve(only)
-    assert set(batch.map.boundaries) == {LEFT}
+    assert log.truth is not None
+    cones = log.truth.cones[log.truth.cone_labels == LEFT]
+    for run in (online, batch):
+        assert set(run.map.boundaries) == {LEFT}
+        distance = run.map.curve(LEFT, "a test").spline.foot_points(cones).distance
+        assert np.sqrt(np.mean(distance**2)) < 0.35
+    ahead = mapper.boundaries.ahead(10.0)
+    assert ahead.length == 0.0
+    assert len(ahead.left) > 5
 
 
 def test_a_ribbon_is_found_again_from_its_own_edges() -> None:
