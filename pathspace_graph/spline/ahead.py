@@ -29,8 +29,8 @@ _BEHIND: Final = 3.0
 """The samples begin this far behind the vehicle (m), since it may stand askew."""
 _OUTER: Final = 1.8
 """The outer boundary of a turn is at most this number of times as long as the centre line."""
-_SETTLING_STEPS: Final = 3
-"""The stations are settled by this number of Newton steps."""
+_SETTLING_STEPS: Final = 8
+"""The stations are settled by at most this number of Newton steps; mostly two are enough."""
 _SETTLED: Final = 1e-3
 """A station is on the line where its distances are equal, and its foot points perpendicular, to this (m)."""
 _LARGEST_GAP: Final = 2.0
@@ -143,6 +143,11 @@ class _Samples:
         points, tangents = _derivatives(curve.spline, u, 1)
         return cls(u, points, tangents, u - curve.beside)
 
+    def along(self, points: Array, rows: NDArray[np.intp]) -> Array:
+        """Returns how far (k,) in the parameter the foot points of points (k, 2) are ahead of samples."""
+        tangents = self.tangents[rows]
+        return _dot(points - self.points[rows], tangents) / _dot(tangents, tangents)
+
     def beside(self, distance: float) -> Array:
         """Returns the points (k, 2) from beside the vehicle on, along a distance (m)."""
         along = self.points[self.ahead >= 0.0]
@@ -172,7 +177,8 @@ def _first_line(left: _Samples, right: _Samples) -> _Line:
     own, other = own[forward], other[forward]
     points = 0.5 * (lefts[own] + rights[other])
     apart = np.append(True, _distances(points)[1:] > _SETTLED)
-    return _Line(points[apart], u[own][apart], v[other][apart])
+    own, other, points = own[apart], other[apart], points[apart]
+    return _Line(points, u[own] + left.along(points, own), v[other] + right.along(points, other))
 
 
 def _from_beside(line: _Line, position: Array, distance: float, step: float) -> _Line:
@@ -208,8 +214,10 @@ def _settled(
         moved = -(feet[0].distance(points) + feet[1].distance(points)) / _dot(both, normal)
         feet = feet[0].refined(points, normal, moved), feet[1].refined(points, normal, moved)
         points = points + moved[:, None] * normal
-    distances = -feet[0].distance(points), feet[1].distance(points)
-    off = np.abs(distances[1] - distances[0]) + sum(np.abs(foot.along(points)) for foot in feet)
+        distances = -feet[0].distance(points), feet[1].distance(points)
+        off = np.abs(distances[1] - distances[0]) + sum(np.abs(foot.along(points)) for foot in feet)
+        if off.max() <= _SETTLED:
+            break
     good = (off <= _SETTLED) & (distances[0] > 0.0) & (distances[1] > 0.0)
     good &= _distances(points) <= _LARGEST_GAP * step
     both = feet[0].tangent + feet[1].tangent
