@@ -65,7 +65,7 @@ def spline_projection_factor(
             f"expected as many detections, covariances and stretches, at least one, found "
             f"{len(points_vehicle)}, {len(covariances)} and {len(low)}, {len(high)}"
         )
-    curve = _Curve.of(control_keys, tables, low, high)
+    curve = Curve.of(control_keys, tables, low, high)
     moving = np.zeros((len(low), 3)) if twists is None else twists
     function = _Projection(
         int(pose_key), curve, points_vehicle, covariances, sigma_model, huber, sensor_key, moving
@@ -132,13 +132,13 @@ def boundary_point_factor(
             f"expected as many points, sigmas and stretches, at least one, found "
             f"{len(points_map)}, {len(sigma)} and {len(low)}, {len(high)}"
         )
-    curve = _Curve.of(control_keys, tables, low, high)
+    curve = Curve.of(control_keys, tables, low, high)
     function = _BoundaryPoint(curve, points_map, sigma)
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(low)), list(curve.keys), function)
 
 
 @dataclass(frozen=True, eq=False)
-class _Curve:
+class Curve:
     """Holds the stretches of a curve that a factor depends on, and the keys that matter there."""
 
     keys: tuple[int, ...]
@@ -153,33 +153,45 @@ class _Curve:
     """The stretch where each foot point is searched for ends here (m,)."""
 
     @staticmethod
-    def of(control_keys: Sequence[int], tables: SpanPolynomials, low: Array, high: Array) -> _Curve:
+    def of(control_keys: Sequence[int], tables: SpanPolynomials, low: Array, high: Array) -> Curve:
         """Selects, from the keys of all distinct control points, those that matter in the stretches (m,)."""
         size = _distinct(tables)
         if len(control_keys) != size:
             raise ValueError(f"expected a key for each of {size} control points, found {len(control_keys)}")
         touched = _touched(tables, low, high)
-        return _Curve(tuple(int(control_keys[j]) for j in touched), touched, tables, low, high)
+        return Curve(tuple(int(control_keys[j]) for j in touched), touched, tables, low, high)
+
+    @property
+    def size(self) -> int:
+        """Returns the number of distinct control points."""
+        return _distinct(self.tables)
+
+    @property
+    def step(self) -> float:
+        """Returns the coarse step of the foot-point search (m along the curve)."""
+        return GRID_SHARE * (self.tables.high - self.tables.low) / len(self.tables.starts)
+
+    def unwrapped(self, distinct: Array) -> Array:
+        """Returns the control points, with those that a closed curve repeats, from the distinct ones."""
+        return np.asarray(distinct[np.arange(_unwrapped(self.tables)) % len(distinct)])
 
     def find(self, values: gtsam.Values, points: Array) -> FootPoints:
         """Returns foot points within the stretches; control points that do not matter there stay zero."""
-        distinct = np.zeros((_distinct(self.tables), 2))
+        distinct = np.zeros((self.size, 2))
         distinct[self.touched] = [values.atPoint2(key) for key in self.keys]
-        unwrapped = distinct[np.arange(_unwrapped(self.tables)) % len(distinct)]
-        step = GRID_SHARE * (self.tables.high - self.tables.low) / len(self.tables.starts)
-        return foot_points(self.tables, unwrapped, points, self.low, self.high, step)
+        return foot_points(self.tables, self.unwrapped(distinct), points, self.low, self.high, self.step)
 
     def usable(self, foot: FootPoints) -> tuple[NDArray[np.bool_], IntArray]:
         """Returns which rows (m,) may contribute, and the slots (m, p + 1) of their control points' keys."""
-        size = _distinct(self.tables)
+        size = self.size
         slot_of = np.full(size, -1, dtype=np.intp)
         slot_of[self.touched] = np.arange(len(self.touched))
         slots = slot_of[(foot.span[:, None] + np.arange(-self.tables.degree, 1)) % size]
         return foot.interior & (slots >= 0).all(axis=1), slots
 
     def by_key(self, by_control: Array, slots: IntArray) -> Array:
-        """Returns derivatives by key (keys, m, 2) from those by the points of each span (m, p + 1, 2)."""
-        blocks = np.zeros((len(self.touched), len(by_control), 2))
+        """Returns derivatives by key (keys, m, d) from those by the points of each span (m, p + 1, d)."""
+        blocks = np.zeros((len(self.touched), len(by_control), by_control.shape[2]))
         np.add.at(blocks, (slots, np.arange(len(by_control))[:, None]), by_control)
         return blocks
 
@@ -190,7 +202,7 @@ class _Projection:
 
     pose_key: int
     """This is the key of the pose that the detections were made from."""
-    curve: _Curve
+    curve: Curve
     """The detections are projected on this curve."""
     points_vehicle: Array
     """These are the detections (m, 2) in the vehicle frame, in m."""
@@ -225,7 +237,7 @@ class _Projection:
         by_pose[:, :2] = by_pose[:, :2] @ rotation(pose.theta())
         by_calibration = [by.by_sensor * own[:, None]] if len(sensor) else []
         by_control = self.curve.by_key(rows.by_control * scale[:, None, None], slots)
-        _fill(H, [by_pose, *by_calibration, *by_control])
+        fill(H, [by_pose, *by_calibration, *by_control])
         return np.asarray(whitened * root)
 
 
@@ -233,7 +245,7 @@ class _Projection:
 class _BoundaryPoint:
     """Evaluates a boundary-point factor."""
 
-    curve: _Curve
+    curve: Curve
     """This curve passes through the points."""
     points: Array
     """These are the points (m, 2) in the map frame, in m."""
@@ -247,7 +259,7 @@ class _BoundaryPoint:
         scale = usable / self.sigma
         if H is not None:
             by_control = -foot.basis[:, :, None] * foot.normal_unit[:, None, :] * scale[:, None, None]
-            _fill(H, [*self.curve.by_key(by_control, slots)])
+            fill(H, [*self.curve.by_key(by_control, slots)])
         return np.asarray(foot.distance * scale)
 
 
@@ -277,7 +289,7 @@ def _touched(tables: SpanPolynomials, low: Array, high: Array) -> IntArray:
     return np.unique(np.concatenate([np.arange(i, end) for i, end in stretches]) % _distinct(tables))
 
 
-def _fill(H: JacobianList, blocks: Sequence[Array]) -> None:
+def fill(H: JacobianList, blocks: Sequence[Array]) -> None:
     """Writes every Jacobian to H; GTSAM does not check shapes, so they are checked here."""
     if len(H) != len(blocks):
         raise ValueError(f"expected {len(H)} Jacobians, one a key, found {len(blocks)}")
@@ -378,6 +390,6 @@ class _CalibratedOdometry:
         by_start[0, :, :2] = by_start[0, :, :2] @ rotation(start.theta())
         by_end[0, :, :2] = by_end[0, :, :2] @ rotation(end.theta())
         if H is not None:
-            _fill(H, [by_start[0], by_end[0], self.odometry.calibration_jacobian])
+            fill(H, [by_start[0], by_end[0], self.odometry.calibration_jacobian])
         calibration = values.atPoint2(self.keys[2])
         return np.asarray(residual[0] + self.odometry.calibration_jacobian @ calibration)

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchMapper
+from pathspace_graph.centerline import batch as centerline_batch
+from pathspace_graph.centerline import online as centerline_online
 from pathspace_graph.ckf.mapper import CkfMapper
 from pathspace_graph.io.log import Log
 from pathspace_graph.landmark.batch import LandmarkBatch
@@ -30,6 +32,9 @@ Array = NDArray[np.float64]
 MakeOnline = Callable[[MapperSettings, Array], OnlineEstimator]
 MakeBatch = Callable[[MapperSettings, Array], BatchEstimator]
 
+MapKind = Literal["boundaries", "centerline"]
+"""A track is mapped as two boundaries, or as one centre line with a width."""
+
 DEFAULT: Final = "fixed-lag"
 """This online estimator runs where none is named."""
 DEFAULT_BATCH: Final = "spline"
@@ -42,6 +47,10 @@ BATCH_GROUP: Final = "pathspace_graph.batch"
 
 def _spline(settings: MapperSettings, odometry_sigma: Array) -> BatchEstimator:
     return BatchMapper(settings, odometry_sigma, FixedLagMapper)
+
+
+def _centerline(settings: MapperSettings, odometry_sigma: Array) -> BatchEstimator:
+    return centerline_batch.CenterlineBatch(settings, odometry_sigma, FixedLagMapper)
 
 
 def _installed(group: str) -> dict[str, Callable[[MapperSettings, Array], Any]]:
@@ -63,6 +72,7 @@ ONLINE: Final[dict[str, MakeOnline]] = {
     "ckf": CkfMapper,
     "landmark-ckf": LandmarkCkf,
     "incremental-fixed-lag": incremental_fixed_lag,
+    centerline_online.NAME: centerline_online.CenterlineMapper,
 }
 """Each online estimator is made from its settings and the standard deviations (3,) of a twist (m/s, m/s,
 rad/s)."""
@@ -71,6 +81,7 @@ BATCH: Final[dict[str, MakeBatch]] = {
     **_installed(BATCH_GROUP),
     DEFAULT_BATCH: _spline,
     "landmark-batch": LandmarkBatch,
+    centerline_batch.NAME: _centerline,
 }
 """Each batch estimator is made from its settings and the standard deviations (3,) of a twist (m/s, m/s,
 rad/s)."""
@@ -84,6 +95,20 @@ def check_online(name: str) -> None:
 def check_batch(name: str) -> None:
     """Raises a SettingsError that names the known batch estimators, unless the name is one of them."""
     _check(name, BATCH, "batch")
+
+
+def for_map(name: str, kind: MapKind) -> str:
+    """Returns the estimator that maps a track as asked for, in place of a default one.
+
+    SettingsError is raised where the named estimator has no such map.
+    """
+    lines = {DEFAULT: centerline_online.NAME, DEFAULT_BATCH: centerline_batch.NAME}
+    if kind == "boundaries" or name in lines.values():
+        return name
+    if name not in lines:
+        expected = f"expected --estimator {' or '.join(lines)}"
+        raise SettingsError(f"--map {kind}: {expected}, found {name}")
+    return lines[name]
 
 
 def _check(name: str, known: dict[str, Any], kind: str) -> None:

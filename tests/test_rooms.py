@@ -17,7 +17,7 @@ EXTRAS = {"distributed", "rosbags"}
 
 LEAVES = {"errors", "labels", "progress"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
-ESTIMATORS = {"online", "batch", "ckf", "landmark"}
+ESTIMATORS = {"online", "batch", "ckf", "landmark", "centerline"}
 BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "health", "run", "snapshot"}
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
 BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "diagnosis"}
@@ -30,7 +30,7 @@ ARROWS: dict[str, set[str]] = {
     "spline": {"factors", "settings"},
     "io": {"spline", "factors"},
     "sim": {"io"},
-    "export": {"spline", "io"},
+    "export": {"settings", "spline", "io"},
     "convert": {"io", "factors"},
     "graph": {"factors"},
     "health": {"settings"},
@@ -42,6 +42,7 @@ ARROWS: dict[str, set[str]] = {
     **dict.fromkeys(ESTIMATORS, BELOW_ESTIMATORS),
     "loop": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes
     "online": BELOW_ESTIMATORS | {"loop"},
+    "centerline": BELOW_ESTIMATORS | {"loop", "batch", "online"},
     "estimators": BELOW_ESTIMATORS | ESTIMATORS,
     "eval.metrics": BELOW_EVAL,
     "eval.figures": BELOW_EVAL | {"eval.metrics"},

@@ -32,6 +32,8 @@ from .metric import Metric
 
 Array = NDArray[np.float64]
 
+AHEAD: Final = 20.0
+"""The track is looked at this far ahead (m) after every cycle, as a controller does."""
 RIVAL: Final = "landmark-fixed-lag"
 """This estimator gets the same cycles in turn."""
 SAMPLE_EVERY: Final = 10
@@ -55,6 +57,8 @@ SOLVE_SECONDS: Final = 1.5
 """The batch of the lap takes at most this time (s) in its own process."""
 SWAP_MILLISECONDS: Final = 100.0
 """The cycle that replaces the map takes at most this."""
+AHEAD_MILLISECONDS: Final = 1.0
+"""A look at the track ahead takes at most this at the median."""
 
 MEAN_TOLERANCE: Final = 0.2
 """A ratio of two means over the whole run may be worse than its baseline by this share."""
@@ -96,6 +100,8 @@ class Measurement:
     """This cycle replaced the map by one that was solved as a batch; it is None where none did."""
     solve: float = float("nan")
     """That batch took this time (s) in its own process."""
+    ahead: tuple[float, ...] = ()
+    """Each look at the track ahead took this time (s), after each cycle."""
 
 
 class _Sampler:
@@ -106,6 +112,7 @@ class _Sampler:
         self._cycles, self._rival = split_odometry(log), make_online(RIVAL, mapper.settings, log)
         self._timings: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
         self.rival: list[float] = []
+        self.ahead: list[float] = []
         self.closing: CycleRecord | None = None
         self.swap: CycleRecord | None = None
         self._interval = log.cycles[-1].t / len(log.cycles)
@@ -121,6 +128,9 @@ class _Sampler:
         elif sampled and self._mapper.boundaries:
             for ordering, times in time_gtsam(linear_window(self._mapper)).items():
                 self._timings[ordering].append(times)
+        begin = time.perf_counter()
+        self._mapper.ahead(AHEAD)
+        self.ahead.append(time.perf_counter() - begin)
         _, seconds = timed_update(self._rival, *next(self._cycles))
         self.rival.append(seconds)
         self._advance()
@@ -147,7 +157,14 @@ def measure(log: Log, settings: MapperSettings, every: int = SAMPLE_EVERY) -> Me
         result = run_online(log, mapper, on_cycle=sampler)
     closing, swap = (None if at is None else at.cycle for at in (sampler.closing, sampler.swap))
     return Measurement(
-        result.cycles, result.laps, closing, sampler.fastest(), tuple(sampler.rival), swap, mapper.lap_seconds
+        result.cycles,
+        result.laps,
+        closing,
+        sampler.fastest(),
+        tuple(sampler.rival),
+        swap,
+        mapper.lap_seconds,
+        tuple(sampler.ahead),
     )
 
 
@@ -167,6 +184,7 @@ def metrics(measurement: Measurement) -> tuple[Metric, ...]:
         Metric("last_lap_by_lap_2", slowdown, "", bound=LAP_RATIO, tolerance=LAP_TOLERANCE),
         Metric("closing", 1e3 * closing, "ms", bound=CLOSING_MILLISECONDS),
         *_swap_metrics(measurement, times),
+        *_ahead_metrics(measurement),
         Metric("p99_by_mean", p99 / mean, "", tolerance=TAIL_TOLERANCE),
         Metric("closing_by_mean", closing / mean, "", tolerance=TAIL_TOLERANCE),
         Metric("mean", 1e3 * _mean(times), "ms"),
@@ -193,6 +211,15 @@ def _swap_metrics(measurement: Measurement, times: Array) -> Iterator[Metric]:
     yield Metric("solve", measurement.solve, "s", bound=SOLVE_SECONDS)
     yield Metric("swap", 1e3 * float(times[swap]), "ms", bound=SWAP_MILLISECONDS)
     yield Metric("meanwhile_by_after", _mean(meanwhile) / _mean(times[swap + 1 :][: len(meanwhile)]), "")
+
+
+def _ahead_metrics(measurement: Measurement) -> Iterator[Metric]:
+    """Yields the median time of a look ahead, on the open map and on the closed one."""
+    closed = np.array([record.closed for record in measurement.cycles[: len(measurement.ahead)]], bool)
+    times = 1e3 * np.array(measurement.ahead)
+    for name, own in (("ahead_open", times[~closed][WARM_UP:]), ("ahead_closed", times[closed])):
+        if len(own):
+            yield Metric(name, float(np.median(own)), "ms", bound=AHEAD_MILLISECONDS)
 
 
 def _lap_means(cycles: Sequence[CycleRecord], laps: int) -> list[float]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator
 from scipy.spatial import KDTree
 
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
@@ -26,6 +27,10 @@ TRUE_STEP: Final = 0.02
 """Points of a true curve are at most this far (m) apart: a distance of 0.1 m is at most 0.5 mm too long."""
 MAPPED_STEP: Final = 0.1
 """Distances are measured from points of a curve that are at most this far (m) apart."""
+CENTRE_STEP: Final = 1.0
+"""The centre line is compared with the true one at points that are this far (m) apart."""
+FARTHEST: Final = 3.0
+"""A true boundary farther than this (m) from the mapped one is missed, as cones are in the paper's table."""
 ROUND_OFF: Final = 1e-9
 """A length that exceeds whole steps by less than this share of a step gets no further step."""
 _OVERLAP: Final = 3
@@ -143,6 +148,70 @@ def two_way_distance(first: MapBoundary, second: MapBoundary) -> float:
     forth = boundary_distances(second, mapped_points(first))
     back = boundary_distances(first, mapped_points(second))
     return 0.5 * (_mean(forth) + _mean(back))
+
+
+# --- the centre line -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CentreLineErrors:
+    """Holds the errors of a mapped centre line at its n points, along their normals, and their sigmas (m).
+
+    A value is NaN where a true boundary does not cross the normal near the mapped one.
+    """
+
+    across: Array
+    """(n,) The true centre is this far to the left of the mapped one."""
+    across_sigma: Array
+    """(n,) The map claims this standard deviation of it."""
+    width: Array
+    """(n,) The true track is this much wider to each side than the mapped one."""
+    width_sigma: Array
+    """(n,) The map claims this standard deviation of it: the mean of both sides."""
+
+
+def centre_line_errors(track: Map, truth: Truth, step: float = CENTRE_STEP) -> CentreLineErrors | None:
+    """Returns the errors of the centre line at points `step` (m) apart; None where the map has no such line.
+
+    The normal of a point crosses the true boundaries at the offsets o_l and o_r. The true centre is at their
+    mean, and half the width is half their difference.
+    """
+    try:
+        line = track.centre_line(step)
+    except SettingsError:
+        return None
+    normals = np.column_stack([-np.sin(line.heading), np.cos(line.heading)])
+    left, right = (
+        _crossings(line.points, normals, offsets, true_curve(truth, label, MAPPED_STEP))
+        for label, offsets in zip(BOUNDARIES, (line.width_left, -line.width_right), strict=True)
+    )
+    return CentreLineErrors(
+        across=0.5 * (left + right),
+        across_sigma=line.points_sigma,
+        width=0.5 * (left - right - line.width_left - line.width_right),
+        width_sigma=0.5 * (line.width_left_sigma + line.width_right_sigma),
+    )
+
+
+def _crossings(points: Array, normals: Array, expected: Array, curve: Array) -> Array:
+    """Returns the offsets (n,) at which normals through points (n, 2) cross a curve (k, 2), by its chords.
+
+    Of several crossings it is the one nearest to the expected offset; none as far off as `FARTHEST` counts.
+    """
+    tangents = np.column_stack([normals[:, 1], -normals[:, 0]])
+    offsets = np.full(len(points), np.nan)
+    for i, (point, tangent, normal) in enumerate(zip(points, tangents, normals, strict=True)):
+        relative = curve - point
+        ahead = relative @ tangent
+        at = np.flatnonzero(ahead[:-1] * ahead[1:] <= 0.0)
+        if len(at):
+            run = ahead[at] - ahead[at + 1]
+            share = np.divide(ahead[at], run, out=np.zeros(len(at)), where=run != 0.0)
+            across = (relative[at] + share[:, None] * (relative[at + 1] - relative[at])) @ normal
+            nearest = across[np.abs(across - expected[i]).argmin()]
+            if abs(nearest - expected[i]) < FARTHEST:
+                offsets[i] = nearest
+    return offsets
 
 
 def _mean(distances: Array) -> float:

@@ -20,7 +20,7 @@ from pathspace_graph.laps import lap_end_indices
 
 from .consistency import joint_cone_error, map_nees, normal_errors, with_marginals
 from .cost import covariance_bytes, map_bytes, stage_times
-from .curves import curve_distance
+from .curves import centre_line_errors, curve_distance
 from .ghosts import GhostSettings, ghosts
 from .limit import limit
 from .reach import reach_values
@@ -105,6 +105,10 @@ _ALL: Final = (
     Metric("mapped_to_truth", "curve distance, mapped to truth", "m"),
     Metric("truth_to_mapped", "curve distance, truth to mapped", "m"),
     Metric("two_way", "curve distance, two-way", "m"),
+    Metric("centre", "error of the centre line, across", "m"),
+    Metric("centre_nees", "NEES of the centre line, across", digits=2),
+    Metric("half_width", "error of the width to each side", "m"),
+    Metric("half_width_nees", "NEES of the width to each side", digits=2),
     Metric("ghost_landmarks", "ghost landmarks", digits=1),
     Metric("ghost_metres", "ghost curve", "m", 1),
     Metric("ghost_share", "ghosts, share of the map", "%", 2),
@@ -278,7 +282,7 @@ def _map_values(
     if truth is None or not has_cones(truth):
         return values
     values |= _cone_values(track, truth) | _curve_values(track, truth, ghost_settings)
-    values |= _consistency_values(track, truth) | _turn_values(track, truth)
+    values |= _consistency_values(track, truth) | _turn_values(track, truth) | _centre_values(track, truth)
     if marginals:
         by_marginals = _consistency_values(with_marginals(track), truth)
         keys = ("nees", "inside", "normalized_error")
@@ -332,6 +336,24 @@ def _turn_values(track: Map, truth: Truth) -> dict[str, float]:
     found = turn_from_truth(track, truth)
     values = {"turn": found.angle, "turn_sigma": found.sigma, "turn_nees": found.nees}
     return {key: value for key, value in values.items() if not np.isnan(value)}
+
+
+def _centre_values(track: Map, truth: Truth) -> dict[str, float]:
+    """Returns the rms errors (m) of the centre line and of its widths, and mean e^2 / sigma^2 of each."""
+    errors = centre_line_errors(track, truth)
+    if errors is None:
+        return {}
+    values = {}
+    for name, error, sigma in (
+        ("centre", errors.across, errors.across_sigma),
+        ("half_width", errors.width, errors.width_sigma),
+    ):
+        known = ~np.isnan(error)
+        if known.any():
+            values[name] = root_mean_square(error[known])
+            if (sigma[known] > 0.0).all():
+                values[f"{name}_nees"] = float(np.mean((error[known] / sigma[known]) ** 2))
+    return values
 
 
 def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:

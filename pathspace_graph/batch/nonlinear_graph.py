@@ -44,18 +44,22 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     if system.places is not None:
         raise SettingsError(f"graph: expected place.use none, found {system.settings.place.use}")
     graph = gtsam.NonlinearFactorGraph()
-    for factor in _odometry(system.chain):
+    for factor in drive_factors(system, at):
         graph.add(factor)
-    for factor in _priors(system.chain, at.state.poses[0, 2]):
-        graph.add(factor)
-    sensor_key = at.state.variables.sensor_key
-    if sensor_key is not None:
-        sigmas = gtsam.noiseModel.Diagonal.Sigmas(np.array(system.settings.calibration.sigmas))
-        graph.add(gtsam.PriorFactorVector(sensor_key, np.zeros(SENSOR_SIZE), sigmas))
     for label, gauge in system.gauges.items():
         for factor in (*_gauge(gauge, at.state.control_points(label)), *_projections(system, at, label)):
             graph.add(factor)
     return graph
+
+
+def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.NonlinearFactor]:
+    """Yields all factors that hold no control point: odometry, first pose and the priors of calibrations."""
+    yield from _odometry(system.chain)
+    yield from _priors(system.chain, at.state.poses[0, 2])
+    sensor_key = at.state.variables.sensor_key
+    if sensor_key is not None:
+        sigmas = gtsam.noiseModel.Diagonal.Sigmas(np.array(system.settings.calibration.sigmas))
+        yield gtsam.PriorFactorVector(sensor_key, np.zeros(SENSOR_SIZE), sigmas)
 
 
 def _odometry(chain: LogOdometry) -> Iterator[gtsam.NonlinearFactor]:

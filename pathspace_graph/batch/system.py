@@ -9,9 +9,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.cone_place import PlaceRows
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.projection import ProjectionRows, project, sigma_across
+from pathspace_graph.factors.projection import PlaceRows, ProjectionRows, project, sigma_across
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import SensorRows, range_rates, sensor_rows
 from pathspace_graph.front_end.log_odometry import LogOdometry, sensor_prior, sensor_prior_cost

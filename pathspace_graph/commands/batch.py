@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.estimators import DEFAULT_BATCH, check_batch, make_batch
+from pathspace_graph.estimators import DEFAULT_BATCH, MapKind, check_batch, for_map, make_batch
 from pathspace_graph.eval.metrics.gap import gap
 from pathspace_graph.eval.metrics.summary import summarize
 from pathspace_graph.front_end.gate import read_usable_log
@@ -39,6 +39,8 @@ class Batch:
     """The map is written to this folder; an earlier map there is kept as a numbered backup."""
     estimator: str = DEFAULT_BATCH
     """This is the name of the batch estimator."""
+    map: MapKind = "boundaries"
+    """The track is mapped as two boundaries, or as one centre line with a width."""
     start: Start | None = None
     """The optimization begins at an online map, or at odometry alone; by default `batch.start` decides."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
@@ -47,12 +49,13 @@ class Batch:
     def run(self) -> None:
         """Reads, optimizes, writes and reports; the exit code is 3 if it did not converge."""
         check_batch(self.estimator)
-        if self.start == "odometry" and self.estimator != DEFAULT_BATCH:
-            raise SettingsError(f"--start: expected online for {self.estimator}, found {self.start}")
+        name = for_map(self.estimator, self.map)
+        if self.start == "odometry" and name != DEFAULT_BATCH:
+            raise SettingsError(f"--start: expected online for {name}, found {self.start}")
         check_target(self.out, MAP_FILE)
         log = read_usable_log(self.log, self.settings.limits)
         with progress("optimizing") as advance:
-            estimator = make_batch(self.estimator, self.settings, log)
+            estimator = make_batch(name, self.settings, log)
             if isinstance(estimator, BatchMapper):
                 result: BatchRun = estimator.solve(log, self.start, advance)
             else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,13 +14,14 @@ from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.export.geojson import write_geojson
 from pathspace_graph.export.lanelet2 import write_lanelet2
 from pathspace_graph.export.local_plane import LocalPlane
-from pathspace_graph.export.tables import write_centre_line, write_points
+from pathspace_graph.export.tables import write_centre_line, write_points, write_profile
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map
 from pathspace_graph.io.trajectory import TRAJECTORY_FILE, read_trajectory
+from pathspace_graph.settings.speed import SpeedSettings
 from pathspace_graph.spline.centre_line import LEAST_STEP, MOST_POINTS
 
-Format = Literal["centerline", "tum", "geojson", "points", "lanelet2"]
+Format = Literal["centerline", "tum", "geojson", "points", "lanelet2", "profile"]
 ON_EARTH = ("geojson", "lanelet2")
 """These formats have latitude and longitude."""
 
@@ -34,7 +35,8 @@ class Export:
     format: Annotated[Format, arg(name="as")]
     """The format is the centre line with widths as TUM raceline CSV (`centerline`), the trajectory in the TUM
     format (`tum`), boundaries and centre line as GeoJSON (`geojson`), both boundaries as CSV with the columns
-    x, y and label (`points`), or both boundaries with one lanelet as OSM XML (`lanelet2`)."""
+    x, y and label (`points`), both boundaries with one lanelet as OSM XML (`lanelet2`), or the centre line
+    with the speed that friction and curvature allow as CSV (`profile`)."""
     out: Path
     """The result is written to this file; an earlier one is kept as a numbered backup."""
     step: float = 1.0
@@ -43,6 +45,8 @@ class Export:
     """The origin of the map has this latitude and longitude (degrees, WGS84). Its x axis, which is the way
     that the vehicle faced at the start, has this heading (degrees, clockwise from north). `geojson` and
     `lanelet2` need them."""
+    speed: SpeedSettings = field(default_factory=SpeedSettings)
+    """These settings describe the vehicle of a `profile`."""
 
     def run(self) -> None:
         """Reads the map and writes the file."""
@@ -64,6 +68,8 @@ class Export:
     def _write(self, file: Path, track: Map, plane: LocalPlane | None) -> None:
         if self.format == "centerline":
             write_centre_line(file, track, self.step)
+        elif self.format == "profile":
+            write_profile(file, track, self.step, self.speed)
         elif self.format == "points":
             write_points(file, track, self.step)
         elif self.format == "tum":

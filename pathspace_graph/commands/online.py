@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 
 from pathspace_graph.diagnosis import diagnose
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.estimators import DEFAULT, check_online, make_online
+from pathspace_graph.estimators import DEFAULT, MapKind, check_online, for_map, make_online
 from pathspace_graph.eval.metrics.summary import (
     health_of,
     lap_times,
@@ -47,6 +47,8 @@ class Online:
     """The map is written to this folder; an earlier map there is kept as a numbered backup."""
     estimator: str = DEFAULT
     """This is the name of the online estimator."""
+    map: MapKind = "boundaries"
+    """The track is mapped as two boundaries, or as one centre line with a width."""
     save: Path | None = None
     """The mapper is saved to this file at the end, for `--resume`; only `fixed-lag` can be saved."""
     resume: Path | None = None
@@ -57,22 +59,23 @@ class Online:
     def run(self) -> None:
         """Reads, maps, writes and reports."""
         check_online(self.estimator)
+        name = for_map(self.estimator, self.map)
         check_target(self.out, MAP_FILE)
-        self._check_snapshots()
+        self._check_snapshots(name)
         log = read_usable_log(self.log, self.settings.limits)
-        log, estimator = self._begin(log)
-        result = map_online(log, estimator, self.estimator)
+        log, estimator = self._begin(log, name)
+        result = map_online(log, estimator, name)
         write_result(self.out, result, summarize(result, log))
         if self.save is not None and isinstance(estimator, FixedLagMapper):
             estimator.save(self.save)
         report(result, log)
         Console().print(f"written to {self.out}", highlight=False, soft_wrap=True, markup=False)
 
-    def _check_snapshots(self) -> None:
+    def _check_snapshots(self, estimator: str) -> None:
         """Raises where a snapshot is asked for that cannot be, before anything is mapped."""
         asked = [f"--{name}" for name in ("save", "resume") if getattr(self, name) is not None]
-        if asked and self.estimator != DEFAULT:
-            raise SettingsError(f"{asked[0]}: expected --estimator {DEFAULT}, found {self.estimator}")
+        if asked and estimator != DEFAULT:
+            raise SettingsError(f"{asked[0]}: expected --estimator {DEFAULT}, found {estimator}")
         if self.resume is not None and self.settings != MapperSettings():
             raise SettingsError(
                 "--resume: expected no settings, since the saved mapper has its own, found some"
@@ -80,10 +83,10 @@ class Online:
         if self.save is not None:
             check_file_target(self.save)
 
-    def _begin(self, log: Log) -> tuple[Log, OnlineEstimator]:
+    def _begin(self, log: Log, name: str) -> tuple[Log, OnlineEstimator]:
         """Returns a new estimator and the log, or the saved mapper and the cycles that it has not seen."""
         if self.resume is None:
-            return log, make_online(self.estimator, self.settings, log)
+            return log, make_online(name, self.settings, log)
         mapper = FixedLagMapper.restore(self.resume)
         times = mapper.smoother.times
         cycles = tuple(cycle for cycle in log.cycles if not times or cycle.t > times[-1])

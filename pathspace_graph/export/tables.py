@@ -10,12 +10,16 @@ from numpy.typing import NDArray
 
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary
 from pathspace_graph.labels import NAMES
+from pathspace_graph.settings.speed import SpeedSettings
 from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.speed import speed_profile
 
 Array = NDArray[np.float64]
 
 CENTRE_LINE_HEADER: Final = "# x_m,y_m,w_tr_right_m,w_tr_left_m"
 """This is the header of TUM's raceline format; its reader takes the line for a comment."""
+PROFILE_HEADER: Final = "# s_m,x_m,y_m,psi_rad,kappa_radpm,vx_mps,ax_mps2"
+"""These are the columns of TUM's trajectories."""
 POINTS_HEADER: Final = "x,y,label"
 """This is the header of a table of points, as that of a log's true cones."""
 _FEWEST_INTERVALS: Final = 4
@@ -30,6 +34,25 @@ def write_centre_line(file: Path, track: Map, step: float) -> None:
     line = track.centre_line(step)
     rows = np.column_stack([line.points, line.width_right, line.width_left])
     _write(file, [CENTRE_LINE_HEADER, *(",".join(map(repr, row)) for row in rows.tolist())])
+
+
+def write_profile(file: Path, track: Map, step: float, settings: SpeedSettings) -> None:
+    """Writes the centre line with heading, curvature, speed and acceleration (m, rad, 1/m, m/s, m/s^2).
+
+    The columns are those of TUM's trajectories. The heading is measured from the x axis of the map.
+    """
+    line = track.centre_line(step)
+    profile = speed_profile(line, settings)
+    columns = (
+        line.arc_length,
+        line.points,
+        line.heading,
+        line.curvature,
+        profile.speed,
+        profile.acceleration,
+    )
+    rows = np.column_stack(columns)
+    _write(file, [PROFILE_HEADER, *(",".join(map(repr, row)) for row in rows.tolist())])
 
 
 def write_points(file: Path, track: Map, step: float) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.cone_place import PlaceRows, along_from_place
+from pathspace_graph.factors.projection import PlaceRows, along_from_place
 from pathspace_graph.settings.mapper import PlaceSettings
 
 from .curves import Curves

@@ -37,6 +37,7 @@ from pathspace_graph.mapping.registration import register
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.snapshot import restore, save
+from pathspace_graph.spline.ahead import CurveAhead, TrackAhead, track_ahead
 from pathspace_graph.spline.boundary import Boundary
 
 from .activation import deactivate_distant
@@ -305,13 +306,35 @@ class FixedLagMapper:
         self.smoother.variables.values[:] = values  # to look at the map must not change the estimate
         return Map(self.closed, boundaries)
 
+    def ahead(self, distance: float, step: float = 1.0) -> TrackAhead:
+        """Returns the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.
+
+        This is what a controller asks for in each cycle, so it is fast, and nothing of the estimate changes.
+        While the loop is open, it goes on beyond the confirmed ends, as `outline` does, and says where.
+        SettingsError is raised where a length is out of its range.
+        """
+        if not self.smoother.times:
+            return track_ahead({}, np.zeros(POSE), distance, step)
+        state, outlooks = self.smoother.map.state, self._outlooks(refresh=False)
+        pose, beside = self.poses[-1], {label: u[-1] for label, u in state.pose_u.items()}
+        curves = {}
+        for label, outlook in outlooks.items():
+            spline = outlook.spline
+            begin = beside.get(label, spline.domain[0])
+            curves[label] = CurveAhead(spline, begin, outlook.confirmed_until)
+        return track_ahead(curves, pose, distance, step)
+
     def vehicle_state(self) -> VehicleState:
         """Returns the newest pose and the calibration, with their joint covariance."""
         return vehicle_state(self.smoother)
 
-    def _outlooks(self) -> dict[int, Outlook]:
-        """Returns the curves; open ones have a tentative stretch."""
-        self.smoother.refresh()
+    def _outlooks(self, refresh: bool = True) -> dict[int, Outlook]:
+        """Returns the curves; open ones have a tentative stretch.
+
+        What the vehicle has left behind is brought up to date only if it is asked for.
+        """
+        if refresh:
+            self.smoother.refresh()
         if self.closed or self.smoother.next_cycle == 0:
             return confirmed(self.smoother)
         return look_ahead(self.smoother, self.growth, self.path)

@@ -103,3 +103,24 @@ class LandmarkSettings(Positive):
     min_lead: float = 2.0
     """The recognized pairs must score this much better than any other set, where each landmark counts as one
     gate (landmarks)."""
+
+
+@dataclass(frozen=True)
+class CenterlineSettings(Positive):
+    """Describes the estimators that map a track as one centre line with a width."""
+
+    spacing: float = 3.0
+    """The knots of the centre line are about this far apart (m)."""
+    sigma_width: float = 0.3
+    """This is the standard deviation (m) of the second difference of the half widths at neighbouring control
+    points."""
+    room: float = 4.0
+    """Foot points are searched for within this distance (m along the line) of where they are expected."""
+    rounds: int = 2
+    """The batch holds the control points beside the poses anew, and is optimized again, in each round."""
+    max_iterations: int = 15
+    """Each round takes at most this number of iterations."""
+    tolerance: float = 1e-5
+    """A round ends where an iteration lowers the error by less than this share."""
+    sigma_edge: float = 0.05
+    """This is the standard deviation (m) of what an edge cannot follow of a mapped boundary, online."""

@@ -10,7 +10,7 @@ from .batch import BatchSettings, OpenLapSettings
 from .calibration import CalibrationSettings
 from .checked import Positive
 from .closing import ClosingSettings
-from .comparison import CkfSettings, LandmarkSettings
+from .comparison import CenterlineSettings, CkfSettings, LandmarkSettings
 from .front_end import MotionSettings, SidesSettings
 from .growth import GrowthSettings, PathSettings, TentativeSettings
 from .health import FindingSettings, HealthSettings, MendingSettings
@@ -273,6 +273,8 @@ class MapperSettings(Positive):
     """These settings describe the Hungarian landmark graph."""
     ckf: CkfSettings = field(default_factory=CkfSettings)
     """These settings describe the paper's filters."""
+    centerline: CenterlineSettings = field(default_factory=CenterlineSettings)
+    """These settings describe the estimators of a centre line with a width."""
 
     @property
     def sigmas_calibrations(self) -> tuple[float, ...]:

@@ -164,8 +164,8 @@ def _first_stations(left: BSpline, right: BSpline, closed: bool) -> Stations:
     lengths = left.arc_length(samples[0]), right.arc_length(samples[1])
     # an open map may overlap itself before its loop is closed
     apart = np.inf if closed else 0.5 * min(left.length(), right.length())
-    i, j = _across((lefts, rights), tangents, lengths, apart)
-    k, h = _across((rights, lefts), (-tangents[1], -tangents[0]), lengths[::-1], apart)
+    i, j = points_across((lefts, rights), tangents, lengths, apart)
+    k, h = points_across((rights, lefts), (-tangents[1], -tangents[0]), lengths[::-1], apart)
     if not len(i) + len(k):
         raise SettingsError(_NOT_SIDE_BY_SIDE)
     on_right, on_left = _refined(right, lefts[i], samples[1][j]), _refined(left, rights[k], samples[0][h])
@@ -181,7 +181,7 @@ def _samples(spline: BSpline) -> Array:
     return spline.parameters_at(np.linspace(0.0, length, count + 1))
 
 
-def _across(
+def points_across(
     points: tuple[Array, Array], tangents: tuple[Array, Array], lengths: tuple[Array, Array], apart: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Returns the samples of the first curve that have a point across, and that sample of the second curve.

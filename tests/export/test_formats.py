@@ -15,11 +15,13 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.export.geojson import write_geojson
 from pathspace_graph.export.lanelet2 import write_lanelet2
 from pathspace_graph.export.local_plane import LocalPlane
-from pathspace_graph.export.tables import sampled, write_centre_line, write_points
+from pathspace_graph.export.tables import sampled, write_centre_line, write_points, write_profile
 from pathspace_graph.io.csv_table import read_table
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.settings.speed import SpeedSettings
 from pathspace_graph.sim.track_files import read_track
+from pathspace_graph.spline.speed import speed_profile
 
 from ..scenes.maps import open_map, point_map, ring_map
 
@@ -50,6 +52,19 @@ def test_a_raceline_is_a_track_of_the_simulator(tmp_path: Path) -> None:
     track = read_track(file)
     assert np.hypot(*track.left.T) == pytest.approx(18.0, abs=2e-3)
     assert np.hypot(*track.right.T) == pytest.approx(22.0, abs=2e-3)
+
+
+@every_map
+def test_the_speed_profile(make: Callable[[], Map], tmp_path: Path) -> None:
+    file, track, settings = tmp_path / "profile.csv", make(), SpeedSettings(lateral=4.0)
+    write_profile(file, track, 0.7, settings)
+    line = track.centre_line(0.7)
+    profile = speed_profile(line, settings)
+    rows = np.loadtxt(file, comments="#", delimiter=",").T
+    expected = (line.arc_length, *line.points.T, line.heading, line.curvature, profile.speed)
+    assert np.array_equal(rows, np.array([*expected, profile.acceleration]))
+    if line.closed:  # a circle of 20 m
+        assert rows[5] == pytest.approx(np.sqrt(4.0 * 20.0), rel=1e-3)
 
 
 @every_map

@@ -172,6 +172,7 @@ def test_the_studies_listed_are_the_files_on_disk_and_are_shipped() -> None:
     assert set(shipped_studies()) == on_disk
     assert on_disk == {
         "batch",
+        "centerline",
         "closing",
         "covariance",
         "degree",

@@ -1,0 +1,161 @@
+"""The batch of a centre line with a width: all poses and one ribbon, on GTSAM's own optimizer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from pathspace_graph.batch.mapper import BatchMapper, BatchResult
+from pathspace_graph.batch.nonlinear_graph import drive_factors
+from pathspace_graph.batch.start import CurveMapper
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.gtsam_factors import pose_array
+from pathspace_graph.graph.keys import pose_key
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.results import BatchRun
+from pathspace_graph.run import settings_dict
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.ribbon import SIDE, Ribbon, along_ribbon, ribbon_between
+
+from .edges import map_of
+from .graph import EdgeDetections, edge_factors, ribbon_covariance, ribbon_keys, shape_factors
+
+Array = NDArray[np.float64]
+
+NAME: Final = "centerline"
+"""This is the estimator's name on the command line."""
+
+
+class CenterlineBatch:
+    """Maps a whole log as a ribbon.
+
+    The start, with the sides of the detections, is the batch of two boundaries. Where there is no line
+    between them, since one was never seen or they cross, their map is the result.
+    """
+
+    def __init__(
+        self,
+        settings: MapperSettings | None = None,
+        odometry_sigma: Array | None = None,
+        online: Callable[[MapperSettings, Array], CurveMapper] | None = None,
+    ) -> None:
+        """Keeps the settings and what `BatchMapper` takes."""
+        self.settings = settings or MapperSettings()
+        self._boundaries = BatchMapper(self.settings, odometry_sigma, online)
+
+    def solve(self, log: Log) -> BatchRun:
+        """Returns the optimum over a whole log."""
+        start = self._boundaries.solve(log)
+        with threadpool_limits(limits=1):
+            try:
+                return self._solve(start)
+            except SettingsError:
+                return _run(self.settings, start, start)
+
+    def _solve(self, start: BatchResult) -> BatchRun:
+        settings, state = self.settings, start.optimum.state
+        ribbon, detections = begin(start, settings.centerline.spacing)
+        values = _values(start, ribbon)
+        drive = gtsam.NonlinearFactorGraph()
+        for factor in drive_factors(start.system, start.optimum):
+            drive.add(factor)
+        for factor in edge_factors(ribbon, detections, settings, state.variables.sensor_key):
+            drive.add(factor)
+        for _ in range(settings.centerline.rounds):
+            graph = gtsam.NonlinearFactorGraph(drive)
+            poses = _poses(values, len(start.trajectory))
+            for factor in shape_factors(ribbon, poses, settings):
+                graph.add(factor)
+            optimizer = self._optimizer(graph, values)
+            values = optimizer.optimize()
+            points = np.array([values.atPoint3(key) for key in ribbon_keys(ribbon)])
+            ribbon = ribbon.with_points(points)
+        covariance = ribbon_covariance(graph, values, ribbon)
+        shape = settings.spline.sigma_shape
+        return _run(
+            settings,
+            start,
+            replace(start, map=map_of(ribbon, covariance, shape, {})),
+            trajectory=_poses(values, len(start.trajectory)),
+            converged=bool(optimizer.iterations() < settings.centerline.max_iterations),
+            cost=float(optimizer.error()),
+        )
+
+    def _optimizer(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
+    ) -> gtsam.LevenbergMarquardtOptimizer:
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setRelativeErrorTol(self.settings.centerline.tolerance)
+        parameters.setMaxIterations(self.settings.centerline.max_iterations)
+        return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+
+
+def begin(start: BatchResult, spacing: float) -> tuple[Ribbon, EdgeDetections]:
+    """Returns the ribbon between two boundaries, and their detections beside it, in the order of cycles."""
+    state, table = start.optimum.state, start.system.detections
+    splines = state.splines
+    if len(splines) < len(SIDE):
+        raise SettingsError(f"a centre line: expected both boundaries, found {len(splines)}")
+    left, right = splines.values()
+    ribbon, *tables = ribbon_between(left, right, state.closed, spacing)
+    rows, sides, u = [], [], []
+    for (label, spline), along in zip(splines.items(), tables, strict=True):
+        projected = start.optimum.projected[label]
+        used = start.system.scale(projected) > 0.0
+        rows.append(projected.rows[used])
+        sides.append(np.full(int(used.sum()), SIDE[label]))
+        u.append(along_ribbon(along, projected.foot.u[used], spline, ribbon))
+    row, side, at = (np.concatenate(parts) for parts in (rows, sides, u))
+    order = np.lexsort((row, table.cycle[row]))
+    row, side, at = row[order], side[order], at[order]
+    return ribbon, EdgeDetections(
+        table.cycle[row], side, at, table.measured[row], table.covariance[row], table.twist[row]
+    )
+
+
+def _values(start: BatchResult, ribbon: Ribbon) -> gtsam.Values:
+    """Returns poses and calibrations of the start, and the control points of a ribbon."""
+    variables, values = start.optimum.state.variables, gtsam.Values()
+    poses = [pose_key(k) for k in range(len(start.trajectory))]
+    for key, pose in zip(poses, variables.poses, strict=True):
+        values.insert(key, gtsam.Pose2(*pose))
+    calibrations = variables.gtsam_values(variables.calibration_keys)
+    values.insert(calibrations)
+    for key, point in zip(ribbon_keys(ribbon), ribbon.distinct, strict=True):
+        values.insert(key, point)
+    return values
+
+
+def _poses(values: gtsam.Values, count: int) -> Array:
+    """Returns the poses (n, 3), with headings that do not jump."""
+    poses = np.array([pose_array(values.atPose2(pose_key(k))) for k in range(count)])
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    return poses
+
+
+def _run(
+    settings: MapperSettings,
+    start: BatchResult,
+    mapped: BatchRun,
+    trajectory: Array | None = None,
+    converged: bool | None = None,
+    cost: float | None = None,
+) -> BatchRun:
+    """Returns a run with the cycles of the start."""
+    return BatchRun(
+        estimator=NAME,
+        settings=settings_dict(settings),
+        map=mapped.map,
+        trajectory_t=start.trajectory_t,
+        trajectory=start.trajectory if trajectory is None else trajectory,
+        cycles=start.cycles,
+        laps=start.laps,
+        converged=start.converged if converged is None else converged,
+        cost=start.cost if cost is None else cost,
+    )

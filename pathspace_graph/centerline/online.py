@@ -1,0 +1,60 @@
+"""A centre line with a width, online: the ribbon that the fixed-lag posterior of the boundaries tells of."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.io.map import Map
+from pathspace_graph.io.results import VehicleState
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.run import CycleResult
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .edges import map_of, ribbon_of
+
+Array = NDArray[np.float64]
+
+NAME: Final = "centerline-fixed-lag"
+"""This is the estimator's name on the command line."""
+
+
+class CenterlineMapper:
+    """Maps a track online as a ribbon.
+
+    The fixed-lag smoother holds what all readings so far say, as a joint Gaussian of both boundaries. The
+    ribbon is estimated from it whenever the map is asked for, so that every reading counts as much as it does
+    there, and a cycle takes the same time. Where there is no line between the boundaries, the map is theirs.
+    """
+
+    def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
+        self.settings = settings or MapperSettings()
+        self.boundaries = FixedLagMapper(self.settings, odometry_sigma)
+        """It maps both boundaries, and estimates the poses."""
+
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        """Processes one perception cycle, as `FixedLagMapper.update` does."""
+        return self.boundaries.update(odometry, detections)
+
+    def map(self) -> Map:
+        """Returns the edges of the ribbon, with their joint covariance."""
+        return self._edges(self.boundaries.map())
+
+    def outline(self) -> Map:
+        """Returns the edges without covariances."""
+        return self._edges(self.boundaries.outline())
+
+    def vehicle_state(self) -> VehicleState:
+        """Returns the newest pose and the calibration, with their joint covariance."""
+        return self.boundaries.vehicle_state()
+
+    def _edges(self, track: Map) -> Map:
+        try:
+            fitted = ribbon_of(track, self.settings)
+        except SettingsError:
+            return track
+        return map_of(fitted.ribbon, fitted.covariance, self.settings.spline.sigma_shape, fitted.until)

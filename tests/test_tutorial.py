@@ -1,0 +1,61 @@
+"""The tutorial, as a new user types it."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pathspace_graph.io.map import read_map
+from pathspace_graph.io.trajectory import read_trajectory
+
+from .scenes.paths import ROOT
+
+pytest.importorskip("rosbags")
+pytest.importorskip("rerun")
+
+BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```$", flags=re.DOTALL | re.MULTILINE)
+
+
+def commands() -> list[list[str]]:
+    """Every line of the page's shell blocks, and each Python block, as what the interpreter is to run."""
+    found: list[list[str]] = []
+    for language, text in BLOCK.findall((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")):
+        if language == "python":
+            found.append(["-c", text])
+            continue
+        for line in text.strip().splitlines():
+            program, *arguments = shlex.split(line)
+            if program == "python":
+                found.append([str(ROOT / arguments[0]), *arguments[1:]])
+            else:
+                assert program == "pathspace-graph"
+                found.append(["-m", "pathspace_graph", *arguments])
+    return found
+
+
+def test_the_tutorial(tmp_path: Path) -> None:
+    said = []
+    for command in commands():
+        run = subprocess.run(
+            [sys.executable, *command], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert run.returncode == 0, f"{command}: {run.stderr}"
+        said.append(run.stdout)
+    online, reference = (read_map(tmp_path / name) for name in ("map", "reference"))
+    assert online.closed
+    assert reference.closed
+    truth = read_map(tmp_path / "map-with-truth")
+    assert abs(online.size - truth.size) < 10  # the bag lost nothing that matters
+    poses = [read_trajectory(tmp_path / name / "trajectory.tum")[1] for name in ("map", "map-with-truth")]
+    assert np.hypot(*(poses[0] - poses[1])[:, :2].T).max() < 1.5
+    assert (tmp_path / "drive.rrd").stat().st_size > 0
+    assert (tmp_path / "comparison" / "table.md").exists()
+    rows = np.loadtxt(tmp_path / "centerline.csv", delimiter=",")
+    assert 1.0 < rows[:, 2:].mean() < 3.0
+    assert "a lap of" in said[-2]
