@@ -19,10 +19,9 @@ from pathspace_graph import FixedLagMapper, Map, SplineBoundary
 from pathspace_graph.convert.settings import SIGMA_ODOMETRY, Frames
 from pathspace_graph.convert.stream import MessageStream
 from pathspace_graph.errors import PathspaceError
-from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.io.json_file import write_json
 from pathspace_graph.io.map import MAP_FILE, map_to_json
-from pathspace_graph.labels import LEFT
+from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.run import CycleResult
 
 Array = NDArray[np.float64]
@@ -30,7 +29,11 @@ Array = NDArray[np.float64]
 STEP = 1.0
 """Points of a boundary are published at this distance (m)."""
 AHEAD = 20.0
-"""Boundaries are published in the vehicle's frame up to this distance (m)."""
+"""Boundaries and centre line are published in the vehicle's frame up to this distance (m)."""
+CENTRE = 2
+"""The line with this number is the centre line."""
+COLOURS = {LEFT: (0.0, 0.2, 1.0), RIGHT: (1.0, 0.9, 0.0), CENTRE: (1.0, 1.0, 1.0)}
+"""Each line has this red, green and blue."""
 LINE_STRIP = 4
 """A `Marker` of this type is a line."""
 
@@ -71,18 +74,12 @@ def boundary_points(track: Map) -> dict[int, Array]:
     return found
 
 
-def points_ahead(points: Array, pose: Array) -> Array:
-    """Returns those of the points (n, 2) that are ahead of a pose (3,) and near, in the vehicle's frame."""
-    seen: Array = to_vehicle(points, np.tile(pose, (len(points), 1)))
-    return np.asarray(seen[(seen[:, 0] >= 0.0) & (np.hypot(*seen.T) <= AHEAD)])
-
-
 def fill_line(marker: Any, points: Array, label: int, make_point: Any) -> Any:
-    """Fills in a `Marker` as the line of a boundary through points (n, 2)."""
-    marker.ns, marker.id, marker.type = "boundary", label, LINE_STRIP
+    """Fills in a `Marker` as a line through points (n, 2)."""
+    marker.ns, marker.id, marker.type = "track", label, LINE_STRIP
     marker.scale.x, marker.pose.orientation.w = 0.1, 1.0
     colour = marker.color
-    colour.r, colour.g, colour.b, colour.a = (0.0, 0.2, 1.0, 1.0) if label == LEFT else (1.0, 0.9, 0.0, 1.0)
+    (colour.r, colour.g, colour.b), colour.a = COLOURS[label], 1.0
     marker.points = [make_point(x=x, y=y, z=0.0) for x, y in points.tolist()]
     return marker
 
@@ -129,8 +126,9 @@ def main() -> None:
             return
         stamp, points = node.get_clock().now().to_msg(), boundary_points(bridge.mapper.outline())
         to_map.publish(lines(points, Header(frame_id="map", stamp=stamp)))
-        ahead = {label: points_ahead(points[label], result.pose) for label in points}
-        to_ahead.publish(lines(ahead, Header(frame_id="base_link", stamp=stamp)))
+        ahead = bridge.mapper.ahead(AHEAD)
+        near = {LEFT: ahead.left, RIGHT: ahead.right, CENTRE: ahead.points}
+        to_ahead.publish(lines(near, Header(frame_id="base_link", stamp=stamp)))
         path.header = Header(frame_id="map", stamp=stamp)
         path.poses.append(fill_pose(PoseStamped(header=path.header), result.pose))
         to_path.publish(path)
