@@ -111,6 +111,18 @@ def _band_outline(left: Array, right: Array, closed: bool) -> Outline:
     return Outline.make_compound_path(Outline(left, closed=True), Outline(right[::-1], closed=True))
 
 
+def ellipse_outlines(points: Array, joint: Array, corners: int = 16) -> Array:
+    """Returns the 2-sigma ellipse of each point (m, 2) as a closed line (m, corners + 1, 2).
+
+    The joint covariance (2m, 2m) is over x0, y0, x1, y1 and so on.
+    """
+    variances, vectors = np.linalg.eigh(point_blocks(joint))
+    angles = np.linspace(0.0, 2.0 * np.pi, corners + 1)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    axes = vectors * np.sqrt(np.maximum(variances, 0.0))[:, None, :]
+    return np.asarray(points[:, None] + SIGMAS * np.einsum("cj,mij->mci", circle, axes))
+
+
 def draw_ellipses(
     axes: Axes, centres: Array, covariances: Array, color: str, scale: float = 1.0, **options: Any
 ) -> None:
