@@ -125,9 +125,8 @@ class ReadingEstimator(Protocol):
 class WindowEstimator(Protocol):
     """Describes an online estimator that keeps a window of poses."""
 
-    @property
-    def poses(self) -> Array:
-        """Returns the poses (P, 3) in the window, the oldest first, map frame."""
+    def window_poses(self) -> Array:
+        """Returns a copy of the poses (P, 3) in the window, the oldest first, map frame."""
 
 
 def outline(estimator: OnlineEstimator) -> Map:
@@ -173,9 +172,9 @@ class ObservedCycle:
 
     @cached_property
     def window(self) -> Array:
-        """Returns a copy of the poses (P, 3) in the window, the oldest first; a filter has none."""
-        known = self.estimator.poses if isinstance(self.estimator, WindowEstimator) else np.zeros((0, 3))
-        return np.array(known, float)
+        """Returns the poses (P, 3) in the window, the oldest first; a filter has none."""
+        estimator = self.estimator
+        return estimator.window_poses() if isinstance(estimator, WindowEstimator) else np.zeros((0, 3))
 
 
 Observer = Callable[[ObservedCycle], None]

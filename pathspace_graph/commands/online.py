@@ -83,7 +83,9 @@ class Online:
         if self.save is not None and isinstance(estimator, FixedLagMapper):
             estimator.save(self.save)
         report(result, log)
-        written = ", ".join(str(path) for path in (self.out, self.save_view, self.animate) if path is not None)
+        written = ", ".join(
+            str(path) for path in (self.out, self.save_view, self.animate) if path is not None
+        )
         Console().print(f"written to {written}", highlight=False, soft_wrap=True, markup=False)
 
     def _check_snapshots(self) -> None:

@@ -202,10 +202,9 @@ class LandmarkFixedLag:
         joint = self.smoother.last_covariance(state.keys)
         return point_map(state.landmarks, state.labels, joint, self.closed)
 
-    @property
-    def poses(self) -> Array:
-        """Returns a view of the poses (P, 3) in the window, the oldest first, map frame."""
-        return self.smoother.variables.poses
+    def window_poses(self) -> Array:
+        """Returns a copy of the poses (P, 3) in the window, the oldest first, map frame."""
+        return self.smoother.variables.poses.copy()
 
     def readings(self) -> Readings:
         """Returns the detections of the newest cycle as they were used or gated, with their landmarks."""

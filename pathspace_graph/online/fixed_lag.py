@@ -450,6 +450,10 @@ class FixedLagMapper:
         """Returns a view of the poses (P, 3) in the window, the oldest first, map frame."""
         return self.smoother.variables.poses
 
+    def window_poses(self) -> Array:
+        """Returns a copy of the poses (P, 3) in the window, the oldest first, map frame."""
+        return self.poses.copy()
+
     @property
     def calibration(self) -> Array:
         """Returns a view of the odometry's calibration: (scale error [-], yaw-rate bias [rad/s])."""

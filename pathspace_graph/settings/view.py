@@ -12,8 +12,8 @@ class RecordingSettings(Positive):
     """Describes the recording of a run for the live viewer."""
 
     band_every: int = 10
-    """The band is computed in every cycle whose number this divides, since it needs the joint covariance of
-    the map; the curves are shown in every cycle."""
+    """The band is computed in every cycle whose number this divides, and where the map is replaced, since it
+    needs the joint covariance of the map; the curves are shown in every cycle."""
     samples_per_span: int = 6
     """Each span of a curve is shown as this number of lines."""
 

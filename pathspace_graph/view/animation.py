@@ -47,6 +47,9 @@ VEHICLE: Final = np.array([[2.4, 0.0], [-1.2, 1.2], [-0.6, 0.0], [-1.2, -1.2]])
 NOTICE_SECONDS: Final = 2.0
 """What happened is told for this time (s) of the film."""
 
+LEAST_TURN: Final = 0.75
+"""An odometry that turns by less than this share of a full turn has driven no lap."""
+
 _STYLE: Final = MapStyle(curve_width=1.4, path_width=0.8, marker_size=2.8)
 _MAP_PLACE: Final = (0.07, 0.085, 0.69, 0.845)
 """The map has this place in a frame: left, bottom, width, height, as shares of the frame."""
@@ -59,20 +62,22 @@ _FRAME_STEP: Final = 10.0
 _LEAST_FRAME: Final = 30.0
 """At least this length (m) around the start is shown in each direction."""
 _TURN: Final = 2.0 * np.pi
+"""This is a full turn (rad)."""
 
 
 def lap_seconds(log: Log) -> float:
     """Returns how long a lap of the log takes (s), by its truth, or by how far the odometry turns.
 
-    A log of less than three quarters of a turn is taken as one lap.
+    A log of less than `LEAST_TURN` of a turn is taken as one lap.
     """
-    ends = lap_times(log)
-    begin, end = log.cycles[0].t, log.cycles[-1].t
+    if not log.cycles:
+        return 1.0
+    ends, begin, end = lap_times(log), log.cycles[0].t, log.cycles[-1].t
     if len(ends) and ends[0] > begin:
         return float(ends[0] - begin)
-    held = np.diff(np.append(log.odometry.t, max(end, log.odometry.t[-1])))
-    turns = abs(float(log.odometry.twist[:, 2] @ held)) / _TURN
-    return (end - begin) / (turns if turns > 0.75 else 1.0)
+    driven = log.odometry.between(begin, end)
+    turns = abs(float(driven.twist[:, 2] @ np.diff(np.append(driven.t, end)))) / _TURN
+    return ((end - begin) / (turns if turns > LEAST_TURN else 1.0)) or 1.0
 
 
 @dataclass(frozen=True)
@@ -129,10 +134,11 @@ class Animation:
         self._healths.append(result.health.condition)
         self._seconds.append(cycle.seconds)
         self._listen(cycle, film_time)
-        while self._frames <= film_time * self.settings.frames_per_second:
+        due = int(film_time * self.settings.frames_per_second) + 1 - self._frames
+        if due > 0:
             self._draw(cycle, film_time)
-            self._film.add(self._figure, 1.0 / self.settings.frames_per_second)
-            self._frames += 1
+            self._film.add(self._figure, due / self.settings.frames_per_second)
+            self._frames += due
 
     def finish(self) -> None:
         """Holds the last frame for a while."""
@@ -185,7 +191,12 @@ class Animation:
         axes.set_title(self._title, fontsize=10.0)
         if film_time < self._notice_until:
             frame = {"boxstyle": "round,pad=0.5", "facecolor": "white", "edgecolor": DARK, "alpha": 0.9}
-            place = {"ha": "center", "va": "center", "transform": axes.transAxes, "zorder": 20}
+            place: dict[str, Any] = {
+                "ha": "center",
+                "va": "center",
+                "transform": axes.transAxes,
+                "zorder": 20,
+            }
             axes.text(0.5, 0.5, self._notice, fontsize=10.0, bbox=frame, **place)
 
     def _write(self, cycle: ObservedCycle) -> None:

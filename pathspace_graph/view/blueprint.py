@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import ModuleType
 from typing import Any, Final
 
 from .entities import HEALTH, MAP, MESSAGES, READING_COUNTS, SIZES, TIMELINE, TIMELINES, TRAJECTORY, UPDATE
@@ -11,7 +10,7 @@ WHITE: Final = (255, 255, 255)
 """The map is drawn on this, as in all our figures, since the colours are made for it."""
 
 
-def blueprint(rerun: ModuleType) -> Any:
+def blueprint(rerun: Any) -> Any:
     """Returns the arrangement: the map on the left, and all else below each other on the right."""
     views = rerun.blueprint
     beside = views.Vertical(
@@ -30,7 +29,7 @@ def blueprint(rerun: ModuleType) -> Any:
     )
 
 
-def _map_view(rerun: ModuleType) -> Any:
+def _map_view(rerun: Any) -> Any:
     """Returns the view of the map; the trajectory is all that was driven so far."""
     views = rerun.blueprint
     driven = views.VisibleTimeRanges(

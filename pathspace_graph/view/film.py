@@ -6,7 +6,7 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, Final, Protocol
+from typing import BinaryIO, Final, Protocol, cast
 
 import numpy as np
 from matplotlib.animation import FFMpegWriter
@@ -47,7 +47,9 @@ def check_film_file(file: Path | str) -> None:
     if suffix not in SUFFIXES:
         raise SettingsError(f"{file}: expected a film's name that ends in {' or '.join(SUFFIXES)}")
     if suffix == ".mp4" and not FFMpegWriter.isAvailable():
-        raise SettingsError(f"{file}: expected the program ffmpeg for .mp4, found none; a .gif needs no program")
+        raise SettingsError(
+            f"{file}: expected the program ffmpeg for .mp4, found none; a .gif needs no program"
+        )
     check_file_target(file)
 
 
@@ -153,7 +155,7 @@ class _FfmpegFilm:
     """Hands frames to ffmpeg by matplotlib's writer."""
 
     def __init__(self, file: Path, frames_per_second: float) -> None:
-        self.writer = FFMpegWriter(fps=frames_per_second)
+        self.writer = FFMpegWriter(fps=cast(int, frames_per_second))  # ffmpeg takes any number
         self._file, self._begun = file, False
 
     def add(self, figure: Figure, seconds: float) -> None:
@@ -161,5 +163,6 @@ class _FfmpegFilm:
         if not self._begun:
             self.writer.setup(figure, str(self._file), figure.dpi)
             self._begun = True
+        self.writer.fig = figure
         for _ in range(max(1, round(seconds * self.writer.fps))):
             self.writer.grab_frame()

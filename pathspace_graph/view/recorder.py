@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from types import ModuleType
 from typing import Any, Final
 
 import numpy as np
+from matplotlib.colors import to_hex, to_rgb
 from numpy.typing import NDArray
 
 from pathspace_graph.eval.figures.map_plot import BOUNDARY_COLORS, HEALTH_COLORS, TRAJECTORY_COLOR
@@ -27,8 +27,8 @@ VEHICLE: Final = np.array([[1.8, 0.0], [-0.9, 0.7], [-0.9, -0.7], [1.8, 0.0]])
 """The vehicle is shown as this triangle (m, vehicle frame)."""
 LOW, MIDDLE, HIGH, TOP = 10.0, 20.0, 30.0, 40.0
 """Things are drawn in this order, the last one on top."""
-_BAND_ALPHA: Final = "80"
-"""The edges of a band have this opacity, as two hexadecimal digits."""
+_PALE: Final = 0.5
+"""The edges of a band have this share of their boundary's colour, and the rest is white."""
 _MILLISECONDS: Final = 1e3
 
 
@@ -38,7 +38,7 @@ class Recorder:
     Colours and sizes are logged once, for all times. Each cycle logs places and numbers.
     """
 
-    def __init__(self, rerun: ModuleType, stream: Any, settings: RecordingSettings, truth: Truth | None) -> None:
+    def __init__(self, rerun: Any, stream: Any, settings: RecordingSettings, truth: Truth | None) -> None:
         self._rerun, self._stream, self._settings = rerun, stream, settings
         self._last_pose: Array | None = None
         self._last_health = Health()
@@ -52,12 +52,16 @@ class Recorder:
         self._stream.set_time(entities.TIMELINE, sequence=cycle.number)
         self._stream.set_time(entities.TIME, duration=cycle.detections.t)
         self._show_map(cycle.outline)
-        if cycle.number % self._settings.band_every == 0:
+        if cycle.number % self._settings.band_every == 0 or self._is_replaced(cycle):
             self._show_bands(cycle.map)
         self._show_vehicle(cycle)
         self._show_readings(cycle)
         self._show_figures(cycle)
         self._tell(cycle)
+
+    def _is_replaced(self, cycle: ObservedCycle) -> bool:
+        """Returns whether the cycle has replaced the map, so that the last band is not beside it any more."""
+        return cycle.result.jump is not None or cycle.result.closed != self._closed
 
     # --- colours and sizes -------------------------------------------------------------------------------
 
@@ -70,7 +74,7 @@ class Recorder:
             color = BOUNDARY_COLORS[label]
             self._style_lines(_path(label, "curve"), color, 1.5, MIDDLE)
             self._style_lines(_path(label, "tentative"), color, 1.0, MIDDLE)
-            self._style_lines(_path(label, "band"), color + _BAND_ALPHA, 0.7, LOW)
+            self._style_lines(_path(label, "band"), pale(color), 0.7, LOW)
             self._style_points(_path(label, "points"), color, 2.0, MIDDLE)
         self._style_lines(entities.TRAJECTORY, TRAJECTORY_COLOR, 0.7, MIDDLE)
         self._style_lines(entities.WINDOW, TRAJECTORY_COLOR, 2.0, HIGH)
@@ -85,24 +89,28 @@ class Recorder:
         """Names the curves over time, and colours them; the conditions of health have those of the plots."""
         rerun = self._rerun
         for path, color in (
-            (f"{entities.UPDATE}/seconds", BLUE),
+            (f"{entities.UPDATE}/milliseconds", BLUE),
             (f"{entities.SIZES}/left", BLUE),
             (f"{entities.SIZES}/right", ORANGE),
             (f"{entities.READING_COUNTS}/offered", GREY),
-            (f"{entities.READING_COUNTS}/used", DARK),
+            (f"{entities.READING_COUNTS}/used", GREEN),
         ):
             name = path.rpartition("/")[2]
-            self._log_static(path, rerun.SeriesLines(colors=[_rgba(color)], names=[name], widths=[1.0]))
-        colors = [_rgba(HEALTH_COLORS.get(condition, GREEN)) for condition in CONDITIONS]
+            self._log_static(path, rerun.SeriesLines(colors=[_rgb(color)], names=[name], widths=[1.0]))
+        colors = [_rgb(HEALTH_COLORS.get(condition, GREEN)) for condition in CONDITIONS]
         self._log_static(entities.HEALTH, rerun.StateConfiguration(values=list(CONDITIONS), colors=colors))
 
     def _style_lines(self, path: str, color: str, width: float, order: float) -> None:
         radius = self._rerun.Radius.ui_points(width)
-        style = {"colors": [_rgba(color)], "radii": [radius], "draw_order": order}
+        style = {"colors": [_rgb(color)], "radii": [radius], "draw_order": order}
         self._log_static(path, self._rerun.LineStrips2D.from_fields(**style))
 
     def _style_points(self, path: str, color: str, radius: float, order: float) -> None:
-        style = {"colors": [_rgba(color)], "radii": [self._rerun.Radius.ui_points(radius)], "draw_order": order}
+        style = {
+            "colors": [_rgb(color)],
+            "radii": [self._rerun.Radius.ui_points(radius)],
+            "draw_order": order,
+        }
         self._log_static(path, self._rerun.Points2D.from_fields(**style))
 
     def _log_static(self, path: str, what: Any) -> None:
@@ -170,16 +178,16 @@ class Recorder:
     def _show_figures(self, cycle: ObservedCycle) -> None:
         """Shows the figures that are curves over time."""
         left, right = cycle.result.sizes
-        figures = {
+        figures: dict[str, float] = {
             f"{entities.SIZES}/left": left,
             f"{entities.SIZES}/right": right,
             f"{entities.READING_COUNTS}/offered": len(cycle.detections.labels),
             f"{entities.READING_COUNTS}/used": cycle.result.readings,
         }
         if np.isfinite(cycle.seconds):
-            figures[f"{entities.UPDATE}/seconds"] = _MILLISECONDS * cycle.seconds
+            figures[f"{entities.UPDATE}/milliseconds"] = _MILLISECONDS * cycle.seconds
         for path, value in figures.items():
-            self._stream.log(path, self._rerun.Scalars(float(value)))
+            self._stream.log(path, self._rerun.Scalars(value))
 
     def _tell(self, cycle: ObservedCycle) -> None:
         """Tells of a new condition of health with its reason, of the closing of the loop, and of notices."""
@@ -187,7 +195,9 @@ class Recorder:
         if health.condition and health.condition != self._last_health.condition:
             self._stream.log(entities.HEALTH, self._rerun.StateChange(state=[health.condition]))
         if health.condition and health != self._last_health:
-            level = levels.ERROR if health.condition == LOST else levels.WARN if health.reason else levels.INFO
+            level = (
+                levels.ERROR if health.condition == LOST else levels.WARN if health.reason else levels.INFO
+            )
             self._say(f"{health.condition}: {health.reason}" if health.reason else health.condition, level)
         if result.closed and not self._closed:
             self._say(f"the loop is closed, on {sum(result.sizes)} points", levels.INFO)
@@ -211,6 +221,11 @@ def _path(label: int, part: str) -> str:
     return f"{entities.MAP}/{NAMES[label]}/{part}"
 
 
-def _rgba(color: str) -> tuple[int, ...]:
-    """Returns red, green, blue and opacity, 0 to 255 each, of a colour "#rrggbb" or "#rrggbbaa"."""
-    return tuple(bytes.fromhex(color.removeprefix("#").ljust(8, "f")))
+def pale(color: str) -> str:
+    """Returns a colour "#rrggbb" mixed with white."""
+    return str(to_hex(1.0 - _PALE * (1.0 - np.array(to_rgb(color)))))
+
+
+def _rgb(color: str) -> tuple[int, ...]:
+    """Returns red, green and blue, 0 to 255 each, of a colour "#rrggbb"."""
+    return tuple(bytes.fromhex(color.removeprefix("#")))

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Final
 
 from pathspace_graph.errors import SettingsError
@@ -31,11 +30,12 @@ _TIMEOUT: Final = 2.0
 """A viewer that was started answers within this time (s)."""
 
 
-def import_rerun(option: str) -> ModuleType:
+def import_rerun(option: str) -> Any:
     """Returns the package `rerun`; a SettingsError says how to install it where it is missing."""
     try:
-        import rerun
-        import rerun.blueprint
+        # the package is optional
+        import rerun  # noqa: PLC0415
+        import rerun.blueprint  # noqa: PLC0415
     except ImportError as error:
         install = "pip install 'pathspace-graph[view]'"
         raise SettingsError(f"{option}: expected the package rerun-sdk, found none; {install}") from error
@@ -85,7 +85,7 @@ def recording(
         yield Recorder(rerun, stream, settings or RecordingSettings(), truth)
 
 
-def _connect(rerun: ModuleType, stream: Any, path: Path | None, window: bool) -> None:
+def _connect(rerun: Any, stream: Any, path: Path | None, window: bool) -> None:
     """Leads a stream to a file, to a window, or to both; each of them gets the blueprint."""
     if window:
         _open_window(rerun)
@@ -96,7 +96,7 @@ def _connect(rerun: ModuleType, stream: Any, path: Path | None, window: bool) ->
     stream.set_sinks(*sinks, default_blueprint=blueprint(rerun))
 
 
-def _open_window(rerun: ModuleType) -> None:
+def _open_window(rerun: Any) -> None:
     """Starts the viewer, unless one is there already; a SettingsError where it does not start."""
     try:
         rerun.spawn(port=PORT, connect=False, executable_path=_viewer(), hide_welcome_screen=True)

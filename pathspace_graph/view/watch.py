@@ -7,6 +7,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Protocol
 
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import Observer
 from pathspace_graph.settings.view import FilmSettings, RecordingSettings
@@ -63,6 +64,8 @@ def watchers(options: Watched, log: Log) -> Iterator[list[Observer]]:
             observers.append(stack.enter_context(opened))
         animation = None
         if options.animate is not None:
+            if not log.cycles:
+                raise SettingsError("--animate: expected a log with perception cycles, found none")
             reel = stack.enter_context(film(options.animate, options.film.frames_per_second))
             title = " on ".join(filter(None, [options.estimator, str(log.source.get("track", ""))]))
             animation = Animation(reel, lap_seconds(log), options.film, log.truth, title)
