@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import cached_property
 from math import nan
@@ -129,6 +130,14 @@ class WindowEstimator(Protocol):
         """Returns a copy of the poses (P, 3) in the window, the oldest first, map frame."""
 
 
+@runtime_checkable
+class LookedAtEstimator(Protocol):
+    """Describes an online estimator that has to be told that it is looked at only."""
+
+    def looked_at(self) -> AbstractContextManager[None]:
+        """Returns a context in which nothing that is asked for changes the estimate."""
+
+
 def outline(estimator: OnlineEstimator) -> Map:
     """Returns the present map, without covariances where the estimator can give it so."""
     return estimator.outline() if isinstance(estimator, OutliningEstimator) else estimator.map()
@@ -163,7 +172,9 @@ class ObservedCycle:
     @cached_property
     def map(self) -> Map:
         """Returns the map as it stands, with its covariances, which takes much longer than the outline."""
-        return self.estimator.map()
+        estimator = self.estimator
+        with estimator.looked_at() if isinstance(estimator, LookedAtEstimator) else nullcontext():
+            return estimator.map()
 
     @cached_property
     def readings(self) -> Readings | None:

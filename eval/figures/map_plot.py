@@ -66,6 +66,8 @@ class MapStyle:
     """Cones and control points have this size."""
     landmark_size: float = 1.4
     """Landmarks have this size, small enough for their ellipses to be seen."""
+    widest_band: float = np.inf
+    """A band is drawn at most this wide (m) on either side of its curve."""
 
 
 WHOLE_TRACK: Final = MapStyle()
@@ -119,7 +121,8 @@ def _draw_spline(
     axes: Axes, boundary: SplineBoundary, label: int, style: MapStyle, band_scale: float
 ) -> None:
     color, name, spline = BOUNDARY_COLORS[label], NAMES[label], boundary.spline
-    draw_band(axes, boundary, color, f"{name} {_band_name(band_scale)}", band_scale, BAND_ALPHA)
+    text = f"{name} {_band_name(band_scale)}"
+    draw_band(axes, boundary, color, text, band_scale, BAND_ALPHA, widest=style.widest_band)
     until = boundary.confirmed_until
     draw_curve(axes, spline, color, f"{name} boundary", style.curve_width, (-np.inf, until), zorder=4)
     if until < spline.domain[1]:

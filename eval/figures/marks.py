@@ -38,10 +38,15 @@ def normals(spline: BSpline, u: Array) -> Array:
     return left_normals(spline.tangent_unit(u))
 
 
-def uncertainty_band(boundary: SplineBoundary, u: Array, scale: float = 1.0) -> tuple[Array, Array]:
-    """Returns S(u) +- 2 scale sigma(u) n(u), the band's left and right edge (k, 2), m, at u (k,)."""
+def uncertainty_band(
+    boundary: SplineBoundary, u: Array, scale: float = 1.0, widest: float = np.inf
+) -> tuple[Array, Array]:
+    """Returns S(u) +- 2 scale sigma(u) n(u), the band's left and right edge (k, 2), m, at u (k,).
+
+    The edges are at most `widest` (m) away from the curve.
+    """
     spline = boundary.spline
-    half = SIGMAS * scale * spline.normal_sigma(u, boundary.covariance)
+    half = np.minimum(SIGMAS * scale * spline.normal_sigma(u, boundary.covariance), widest)
     offsets = half[:, None] * normals(spline, u)
     centre = spline.evaluate(u)
     return centre + offsets, centre - offsets
@@ -96,9 +101,10 @@ def draw_band(
     scale: float = 1.0,
     alpha: float = ALPHA,
     zorder: float = 2,
+    widest: float = np.inf,
 ) -> None:
-    """Fills the 2-sigma band around a curve, `scale` times as wide as it is."""
-    left, right = uncertainty_band(boundary, curve_parameters(boundary.spline), scale)
+    """Fills the 2-sigma band around a curve, `scale` times as wide as it is, up to `widest` (m) on a side."""
+    left, right = uncertainty_band(boundary, curve_parameters(boundary.spline), scale, widest)
     outline = _band_outline(left, right, boundary.spline.periodic)
     look: dict[str, Any] = {"alpha": alpha, "linewidth": 0.0, "zorder": zorder}
     axes.add_patch(PathPatch(outline, facecolor=color, label=label, **look))

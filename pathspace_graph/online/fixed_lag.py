@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -260,10 +261,6 @@ class FixedLagMapper:
 
         An open curve goes on beyond its confirmed end, as `outline` says.
         """
-        with self.smoother.variables.looked_at():
-            return self._map()
-
-    def _map(self) -> Map:
         state, outlooks = self.smoother.map.state, self._outlooks()
         if not outlooks:
             return Map(self.closed, {})
@@ -309,6 +306,14 @@ class FixedLagMapper:
                 until = spline.domain[1] if self.closed else outlook.confirmed_until
                 boundaries[label] = SplineBoundary(spline, NO_COVARIANCE, until)
         return Map(self.closed, boundaries)
+
+    def looked_at(self) -> AbstractContextManager[None]:
+        """Returns a context in which the mapper may be asked for anything, and its estimate stays as it is.
+
+        Without it, `map` leaves the inactive part of an open map up to date, which may move later estimates
+        by millimetres.
+        """
+        return self.smoother.variables.looked_at()
 
     def readings(self) -> Readings:
         """Returns the detections of the newest cycle as they were used or gated, with their foot points."""

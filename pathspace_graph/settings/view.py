@@ -14,6 +14,9 @@ class RecordingSettings(Positive):
     band_every: int = 10
     """The band is computed in every cycle whose number this divides, and where the map is replaced, since it
     needs the joint covariance of the map; the curves are shown in every cycle."""
+    widest_band: float = 5.0
+    """A band is shown at most this wide (m) on either side of its curve: where nothing is known yet, it would
+    reach far beyond the track."""
     samples_per_span: int = 6
     """Each span of a curve is shown as this number of lines."""
 
@@ -34,5 +37,7 @@ class FilmSettings(Positive):
     """A frame is this high (pixels)."""
     laps: float = float("inf")
     """The film ends after this number of laps, and the mapping goes on without it."""
+    widest_band: float = 5.0
+    """A band is drawn at most this wide (m) on either side of its curve."""
     hold: float = 2.0
     """The last frame is shown for this time (s) of the film."""

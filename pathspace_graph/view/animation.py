@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -26,7 +26,7 @@ from pathspace_graph.eval.figures.map_plot import (
     draw_unhealthy,
 )
 from pathspace_graph.eval.figures.marks import SIGMAS, draw_points
-from pathspace_graph.eval.figures.style import DARK, LIGHT, RED, figure_context, set_frame
+from pathspace_graph.eval.figures.style import DARK, GREY, LIGHT, PALETTE, RED, figure_context, set_frame
 from pathspace_graph.eval.metrics.summary import has_cones, lap_times
 from pathspace_graph.eval.metrics.table1 import lap_metrics
 from pathspace_graph.factors.se2 import to_map
@@ -44,6 +44,8 @@ DPI: Final = 100.0
 """A frame has this resolution (dots per inch), which decides how large the text is."""
 VEHICLE: Final = np.array([[2.4, 0.0], [-1.2, 1.2], [-0.6, 0.0], [-1.2, -1.2]])
 """The vehicle is drawn as this arrow (m, vehicle frame), larger than it is, so that it is seen."""
+COLORS: Final = (*PALETTE, GREY, LIGHT, "#000000")
+"""A frame has these colours on white, and what lies between them."""
 NOTICE_SECONDS: Final = 2.0
 """What happened is told for this time (s) of the film."""
 
@@ -51,6 +53,7 @@ LEAST_TURN: Final = 0.75
 """An odometry that turns by less than this share of a full turn has driven no lap."""
 
 _STYLE: Final = MapStyle(curve_width=1.4, path_width=0.8, marker_size=2.8)
+"""Lines are wider than on paper, since a film has few pixels."""
 _MAP_PLACE: Final = (0.07, 0.085, 0.69, 0.845)
 """The map has this place in a frame: left, bottom, width, height, as shares of the frame."""
 _TEXT_PLACE: Final = (0.775, 0.085, 0.212, 0.845)
@@ -108,6 +111,7 @@ class Animation:
         title: str = "",
     ) -> None:
         self.settings = settings or FilmSettings()
+        self._style = replace(_STYLE, widest_band=self.settings.widest_band)
         self._film, self._lap, self._truth, self._title = film, lap_seconds, truth, title
         self._begin: float | None = None
         self._frames = 0
@@ -164,10 +168,10 @@ class Animation:
             axes.clear()
             draw_points(axes, self._cones, "x", LIGHT, markersize=3.0, markeredgewidth=0.7, zorder=1)
             for label, boundary in sorted(cycle.map.boundaries.items()):
-                draw_boundary(axes, boundary, label, _STYLE)
+                draw_boundary(axes, boundary, label, self._style)
             path = np.array(self._poses)
-            draw_trajectory(axes, path, _STYLE)
-            draw_unhealthy(axes, path, self._healths, _STYLE)
+            draw_trajectory(axes, path, self._style)
+            draw_unhealthy(axes, path, self._healths, self._style)
             _draw_readings(axes, cycle.readings, path[-1])
             _draw_vehicle(axes, path[-1], cycle.window)
             self._show(path[-1:, :2])

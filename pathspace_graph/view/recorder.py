@@ -147,7 +147,7 @@ class Recorder:
         """Returns both edges of a curve's band, or the ellipse of each landmark."""
         if isinstance(boundary, SplineBoundary):
             u = curve_parameters(boundary.spline, self._settings.samples_per_span)
-            return list(uncertainty_band(boundary, u))
+            return list(uncertainty_band(boundary, u, widest=self._settings.widest_band))
         return list(ellipse_outlines(boundary.points, boundary.covariance))
 
     def _show_vehicle(self, cycle: ObservedCycle) -> None:

@@ -12,7 +12,7 @@ from pathspace_graph.io.results import RunResult
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import ObservedCycle, run_online
 from pathspace_graph.settings.view import FilmSettings, RecordingSettings
-from pathspace_graph.view.animation import Animation, lap_seconds
+from pathspace_graph.view.animation import COLORS, Animation, lap_seconds
 from pathspace_graph.view.film import film
 from pathspace_graph.view.recording import recording
 
@@ -47,7 +47,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Watched:
     settings = RecordingSettings(band_every=BAND_EVERY)
     with (
         recording(rrd, settings=settings, truth=log.truth) as recorder,
-        film(gif, FILM.frames_per_second) as reel,
+        film(gif, FILM.frames_per_second, COLORS) as reel,
     ):
         animation = Animation(reel, lap_seconds(log), FILM, log.truth, "a bean")
         mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
