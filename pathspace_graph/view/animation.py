@@ -47,7 +47,7 @@ VEHICLE: Final = np.array([[2.4, 0.0], [-1.2, 1.2], [-0.6, 0.0], [-1.2, -1.2]])
 COLORS: Final = (*PALETTE, GREY, LIGHT, "#000000")
 """A frame has these colours on white, and what lies between them."""
 NOTICE_SECONDS: Final = 2.0
-"""What happened is told for this time (s) of the film."""
+"""A frame tells what happened for this time (s) of the film."""
 
 LEAST_TURN: Final = 0.75
 """An odometry that turns by less than this share of a full turn has driven no lap."""

@@ -88,7 +88,7 @@ def recording(
 def _connect(rerun: Any, stream: Any, path: Path | None, window: bool) -> None:
     """Leads a stream to a file, to a window, or to both; each of them gets the blueprint."""
     if window:
-        _open_window(rerun)
+        _open_window(rerun, stream)
     sinks = [] if path is None else [rerun.FileSink(str(path))]
     sinks += [rerun.GrpcSink(f"rerun+http://127.0.0.1:{PORT}/proxy")] if window else []
     stream.set_log_time_enabled(False)
@@ -96,10 +96,11 @@ def _connect(rerun: Any, stream: Any, path: Path | None, window: bool) -> None:
     stream.set_sinks(*sinks, default_blueprint=blueprint(rerun))
 
 
-def _open_window(rerun: Any) -> None:
+def _open_window(rerun: Any, stream: Any) -> None:
     """Starts the viewer, unless one is there already; a SettingsError where it does not start."""
     try:
-        rerun.spawn(port=PORT, connect=False, executable_path=_viewer(), hide_welcome_screen=True)
+        viewer = {"executable_path": _viewer(), "hide_welcome_screen": True}
+        rerun.spawn(port=PORT, connect=False, recording=stream, **viewer)
     except RuntimeError as error:
         reason = str(error).splitlines()[0]
         raise SettingsError(f"--view: the viewer could not be started: {reason}") from error

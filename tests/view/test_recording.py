@@ -82,9 +82,12 @@ def test_a_viewer_that_does_not_answer_is_told(
     log_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":99")
-    monkeypatch.setattr(module.import_rerun("--view"), "spawn", lambda **_: None)
+    asked: list[dict[str, Any]] = []
+    monkeypatch.setattr(module.import_rerun("--view"), "spawn", lambda **options: asked.append(options))
     monkeypatch.setattr(module, "PORT", 1)
     assert "--view: expected the viewer on port 1, found none" in refused(capsys, log_folder, "--view")
+    # without its recording, rerun opens a window only for a global one, which is not used here
+    assert [(options["port"], options["recording"] is None) for options in asked] == [(1, False)]
 
 
 def test_a_recording_needs_its_suffix_and_its_folder(tmp_path: Path) -> None:
