@@ -261,6 +261,10 @@ class FixedLagMapper:
 
         An open curve goes on beyond its confirmed end, as `outline` says.
         """
+        with self.smoother.variables.looked_at():
+            return self._map()
+
+    def _map(self) -> Map:
         state, outlooks = self.smoother.map.state, self._outlooks()
         if not outlooks:
             return Map(self.closed, {})
