@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, is_dataclass
+from functools import cached_property
+from math import nan
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -20,6 +23,8 @@ from .labels import LEFT, RIGHT
 from .laps import LapCounter
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +99,121 @@ class VehicleEstimator(Protocol):
         """Returns the newest pose and the calibration, with their joint covariance."""
 
 
-Observer = Callable[[CycleResult, Map], None]
-"""It is shown the result of each cycle and the outline of the map, which it must not change."""
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Holds the detections of the newest cycle as the estimator took them, seen from its newest pose."""
+
+    points: Array
+    """Each row is a detected position (k, 2) in m, map frame, corrected as the estimator corrects it."""
+    labels: IntArray
+    """Each detection (k,) belongs to this boundary, LEFT or RIGHT, or is UNKNOWN."""
+    used: BoolArray
+    """The flag (k,) is set when the detection was used, and cleared when it was gated."""
+    feet: Array
+    """Each row is the foot point (k, 2) of a used detection on its curve, or its landmark, in m, map frame;
+    it is NaN for the others."""
+
+
+@runtime_checkable
+class ReadingEstimator(Protocol):
+    """Describes an online estimator that says which detections of the newest cycle it used, and where."""
+
+    def readings(self) -> Readings:
+        """Returns the detections of the newest cycle as they were used or gated."""
+
+
+@runtime_checkable
+class WindowEstimator(Protocol):
+    """Describes an online estimator that keeps a window of poses."""
+
+    def window_poses(self) -> Array:
+        """Returns a copy of the poses (P, 3) in the window, the oldest first, map frame."""
+
+
+@runtime_checkable
+class LookedAtEstimator(Protocol):
+    """Describes an online estimator that has to be told that it is looked at only."""
+
+    def looked_at(self) -> AbstractContextManager[None]:
+        """Returns a context in which nothing that is asked for changes the estimate."""
 
 
 def outline(estimator: OnlineEstimator) -> Map:
     """Returns the present map, without covariances where the estimator can give it so."""
     return estimator.outline() if isinstance(estimator, OutliningEstimator) else estimator.map()
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedCycle:
+    """Shows an observer a cycle that is over: what went in, what came out, and the estimator as it stands.
+
+    The map, the readings and the window are taken when they are first asked for, once for all observers of
+    the cycle. So they must be asked for before the next cycle, and must not be changed.
+    """
+
+    estimator: OnlineEstimator
+    """The estimator has processed the cycle."""
+    detections: Detections
+    """These are the detections of the cycle, as they were handed over."""
+    result: CycleResult
+    """The estimator said this."""
+    number: int = 0
+    """This is the number of the cycle, from 0."""
+    seconds: float = nan
+    """The whole update took this wall time (s), where it was measured."""
+    lap: int = 1
+    """The estimated trajectory is in this lap, counted from 1."""
+
+    @cached_property
+    def record(self) -> CycleRecord:
+        """Returns the cycle as a row of `cycles.csv` has it."""
+        result = self.result
+        return CycleRecord(
+            cycle=self.number,
+            t=self.detections.t,
+            seconds=self.seconds,
+            size_left=result.sizes[LEFT],
+            size_right=result.sizes[RIGHT],
+            readings=result.readings,
+            lap=self.lap,
+            stages=dict(result.stages),
+            closed=result.closed,
+            jump=None if result.jump is None else tuple(np.asarray(result.jump).tolist()),
+            notice=result.notice,
+            offered=len(self.detections.labels),
+            health=result.health.condition,
+            reason=result.health.reason,
+            dropped=result.dropped,
+            late=result.late,
+            refused=result.refused,
+        )
+
+    @cached_property
+    def outline(self) -> Map:
+        """Returns the map as it stands, without covariances where the estimator can give it so."""
+        return outline(self.estimator)
+
+    @cached_property
+    def map(self) -> Map:
+        """Returns the map as it stands, with its covariances, which takes much longer than the outline."""
+        estimator = self.estimator
+        with estimator.looked_at() if isinstance(estimator, LookedAtEstimator) else nullcontext():
+            return estimator.map()
+
+    @cached_property
+    def readings(self) -> Readings | None:
+        """Returns which detections were used; it is None where the estimator does not say it."""
+        return self.estimator.readings() if isinstance(self.estimator, ReadingEstimator) else None
+
+    @cached_property
+    def window(self) -> Array:
+        """Returns the poses (P, 3) in the window, the oldest first; a filter has none."""
+        estimator = self.estimator
+        return estimator.window_poses() if isinstance(estimator, WindowEstimator) else np.zeros((0, 3))
+
+
+Observer = Callable[[ObservedCycle], None]
+"""It is called after each cycle, and its time is not the estimator's."""
 
 
 class Stopwatch:
@@ -145,22 +258,27 @@ def run_online(
     *,
     name: str = "fixed-lag",
     snapshot_times: Sequence[float] | Array = (),
+    observers: Sequence[Observer] = (),
     on_cycle: Callable[[CycleRecord], None] | None = None,
-    observer: Observer | None = None,
+    observer: Callable[[CycleResult, Map], None] | None = None,
 ) -> RunResult:
     """Feeds a log's odometry and cycles to an online estimator, in order of time and never ahead of it.
 
     The truth of the log is not read. For each of the `snapshot_times` (s, ascending) the map is kept as it
-    stood then, after the last cycle that isn't later. `on_cycle` is called after each cycle, and `observer`
-    with what the cycle gave and the outline of the map; neither counts in the times. BLAS has one thread,
+    stood then, after the last cycle that isn't later. Each of the `observers` is shown each cycle once it is
+    over, which does not count in the times of the cycles. `on_cycle` is an observer that takes the record of
+    a cycle only, and `observer` one that takes its result and the outline of the map. BLAS has one thread,
     since its threads stall small solves.
     """
-    run = _Run(estimator, [float(t) for t in snapshot_times], observer)
+    shown = [*observers]
+    if on_cycle is not None:
+        shown.append(lambda cycle: on_cycle(cycle.record))
+    if observer is not None:
+        shown.append(lambda cycle: observer(cycle.result, cycle.outline))
+    run = _Run(estimator, [float(t) for t in snapshot_times], shown)
     with threadpool_limits(limits=1):
         for odometry, detections in split_odometry(log):
-            record = run.cycle(odometry, detections)
-            if on_cycle is not None:
-                on_cycle(record)
+            run.cycle(odometry, detections)
         return run.result(name)
 
 
@@ -168,10 +286,10 @@ class _Run:
     """Collects the results of a run in progress."""
 
     def __init__(
-        self, estimator: OnlineEstimator, snapshot_times: list[float], observer: Observer | None
+        self, estimator: OnlineEstimator, snapshot_times: list[float], observers: Sequence[Observer]
     ) -> None:
         self._estimator = estimator
-        self._observer = observer
+        self._observers = observers
         self._observing = 0.0
         self._snapshot_times = snapshot_times
         self._snapshots: list[Map] = []
@@ -180,8 +298,8 @@ class _Run:
         self._poses: list[Array] = []
         self._records: list[CycleRecord] = []
 
-    def cycle(self, odometry: Odometry, detections: Detections) -> CycleRecord:
-        """Runs and times one update, and records it."""
+    def cycle(self, odometry: Odometry, detections: Detections) -> None:
+        """Runs and times one update, records it, and shows it to the observers."""
         self._take_snapshots(before=detections.t)
         result, seconds = timed_update(self._estimator, odometry, detections)
         lap_before = self._laps.lap
@@ -189,32 +307,13 @@ class _Run:
         if lap > lap_before:
             self._lap_maps.append((lap_before, self._estimator.map()))
         self._poses.append(np.array(result.pose, dtype=float))
-        self._records.append(
-            CycleRecord(
-                cycle=len(self._records),
-                t=detections.t,
-                seconds=seconds,
-                size_left=result.sizes[LEFT],
-                size_right=result.sizes[RIGHT],
-                readings=result.readings,
-                lap=lap,
-                stages=dict(result.stages),
-                closed=result.closed,
-                jump=None if result.jump is None else tuple(np.asarray(result.jump).tolist()),
-                notice=result.notice,
-                offered=len(detections.labels),
-                health=result.health.condition,
-                reason=result.health.reason,
-                dropped=result.dropped,
-                late=result.late,
-                refused=result.refused,
-            )
-        )
-        if self._observer is not None:
-            begin = time.perf_counter()
-            self._observer(result, outline(self._estimator))
+        cycle = ObservedCycle(self._estimator, detections, result, len(self._records), seconds, lap)
+        self._records.append(cycle.record)
+        begin = time.perf_counter()
+        for observer in self._observers:
+            observer(cycle)
+        if self._observers:
             self._observing += time.perf_counter() - begin
-        return self._records[-1]
 
     def result(self, name: str) -> RunResult:
         """Returns the results after the last cycle."""

@@ -12,7 +12,7 @@ import pytest
 from .scenes.paths import PACKAGE, ROOT, modules, room_of
 
 MOST_FILES = 15
-EXTRAS = {"distributed", "rosbags"}
+EXTRAS = {"distributed", "rerun", "rosbags"}
 """Optional packages, which are imported only where they are needed."""
 
 LEAVES = {"errors", "labels", "progress"}
@@ -52,8 +52,9 @@ ARROWS: dict[str, set[str]] = {
     "eval.scaling": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "eval.faults": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
+    "view": BELOW_MAPPING | {"eval.metrics", "eval.figures"},
     "commands": BELOW_EVAL
-    | {"export", "convert"}
+    | {"export", "convert", "view"}
     | {f"eval.{room}" for room in ("metrics", "harness", "figures", "study", "compare", "scaling", "faults")},
     "options": {"io"},
     "cli": {"options", "commands"},

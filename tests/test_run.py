@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -16,7 +17,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.labels import LEFT
-from pathspace_graph.run import CycleResult, outline, run_online, split_odometry
+from pathspace_graph.run import CycleResult, ObservedCycle, outline, run_online, split_odometry
 
 
 def detections(t: float) -> Detections:
@@ -128,17 +129,18 @@ def run(cycles: int, poses: np.ndarray | None = None, **options: Any) -> tuple[A
 
 def test_every_cycle_has_its_record_and_its_pose() -> None:
     poses = circles(0.1, 100)
-    seen: list[CycleRecord] = []
-    result, _ = run(10, poses, on_cycle=seen.append, name="counting")
+    seen: list[ObservedCycle] = []
+    result, _ = run(10, poses, observers=[seen.append], name="counting")
     assert result.estimator == "counting"
     assert result.settings == {"inner": {"a": 1.0}}
-    assert tuple(seen) == result.cycles
-    assert [record.cycle for record in seen] == list(range(10))
-    assert [record.size_left for record in seen] == list(range(1, 11))
-    assert {(record.size_right, record.readings, record.lap) for record in seen} == {(0, 5, 1)}
-    assert all(record.seconds > 0 for record in seen)
+    records = result.cycles
+    assert [record.cycle for record in records] == [cycle.number for cycle in seen] == list(range(10))
+    assert [record.size_left for record in records] == list(range(1, 11))
+    assert {(record.size_right, record.readings, record.lap) for record in records} == {(0, 5, 1)}
+    assert [record.seconds for record in records] == [cycle.seconds for cycle in seen]
+    assert all(record.seconds > 0 for record in records)
     np.testing.assert_array_equal(result.trajectory, poses)
-    np.testing.assert_array_equal(result.trajectory_t, [record.t for record in seen])
+    np.testing.assert_array_equal(result.trajectory_t, [record.t for record in records])
     assert result.map.size == 10
 
 
@@ -185,12 +187,37 @@ def test_a_log_without_cycles_gives_an_empty_result() -> None:
     assert [track.size for track in result.snapshots] == [0]
 
 
-def test_an_observer_sees_each_cycle_with_the_map_as_it_stands_then() -> None:
-    seen: list[tuple[float, int]] = []
-    result, _ = run(5, observer=lambda cycle, track: seen.append((cycle.t, track.size)))
-    assert seen == [(k / 10.0, k + 1) for k in range(5)]
+def test_observers_see_each_cycle_with_the_map_as_it_stands_then() -> None:
+    seen: list[tuple[float, int, int]] = []
+    others: list[Map] = []
+
+    def look(cycle: ObservedCycle) -> None:
+        seen.append((cycle.result.t, cycle.outline.size, cycle.map.size))
+
+    result, _ = run(5, observers=[look, lambda cycle: others.append(cycle.map)])
+    assert seen == [(k / 10.0, k + 1, k + 1) for k in range(5)]
+    assert [track.size for track in others] == [1, 2, 3, 4, 5]
     assert result.observing > 0.0 and result.reach is None
     assert run(5)[0].observing == 0.0
+
+
+def test_the_time_of_an_observer_is_not_the_cycle_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
+
+    def look(_: ObservedCycle) -> None:
+        clock[0] += 1.0
+
+    result, _ = run(3, observers=[look])
+    assert result.observing == 3.0
+    assert [record.seconds for record in result.cycles] == [0.0, 0.0, 0.0]
+
+
+def test_what_an_estimator_does_not_say_is_not_shown() -> None:
+    seen: list[ObservedCycle] = []
+    run(1, observers=[seen.append])
+    assert seen[0].readings is None
+    assert seen[0].window.shape == (0, 3)
 
 
 def test_closing_and_jumps_are_recorded() -> None:
@@ -229,3 +256,18 @@ class Forbidden:
 def test_the_truth_is_not_read() -> None:
     log = replace(make_log(np.array([0.0]), np.arange(5) / 10), truth=Forbidden())
     assert len(run_online(log, Counting()).cycles) == 5
+
+
+def test_a_record_and_an_outline_are_shown_by_their_own_names() -> None:
+    """`on_cycle` and `observer` are the simple forms of an observer."""
+    log = make_log(np.arange(0.0, 1.0, 0.1), np.arange(0.2, 1.0, 0.2))
+    records: list[CycleRecord] = []
+    outlines: list[tuple[float, Map]] = []
+    result = run_online(
+        log,
+        Counting(),
+        on_cycle=records.append,
+        observer=lambda cycle, outline: outlines.append((cycle.t, outline)),
+    )
+    assert tuple(records) == result.cycles
+    assert [t for t, _ in outlines] == [cycle.t for cycle in log.cycles]

@@ -24,7 +24,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.progress import progress
-from pathspace_graph.run import run_online, split_odometry, timed_update
+from pathspace_graph.run import ObservedCycle, run_online, split_odometry, timed_update
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .gtsam_window import linear_window, time_gtsam
@@ -113,17 +113,17 @@ class _Sampler:
         self._timings: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
         self.rival: list[float] = []
         self.ahead: list[float] = []
-        self.closing: CycleRecord | None = None
-        self.swap: CycleRecord | None = None
+        self.closing: ObservedCycle | None = None
+        self.swap: ObservedCycle | None = None
         self._interval = log.cycles[-1].t / len(log.cycles)
 
-    def __call__(self, record: CycleRecord) -> None:
-        if record.closed and self.closing is None:
-            self.closing = record
-        if record.jump is not None:
-            self.swap = record
-        sampled = record.cycle >= WARM_UP and record.cycle % self._every == 0
-        if self._solves(record):
+    def __call__(self, cycle: ObservedCycle) -> None:
+        if cycle.result.closed and self.closing is None:
+            self.closing = cycle
+        if cycle.result.jump is not None:
+            self.swap = cycle
+        sampled = cycle.number >= WARM_UP and cycle.number % self._every == 0
+        if self._solves(cycle):
             time.sleep(self._interval)
         elif sampled and self._mapper.boundaries:
             for ordering, times in time_gtsam(linear_window(self._mapper)).items():
@@ -135,9 +135,9 @@ class _Sampler:
         self.rival.append(seconds)
         self._advance()
 
-    def _solves(self, record: CycleRecord) -> bool:
+    def _solves(self, cycle: ObservedCycle) -> bool:
         """Returns whether a batch of the lap may be under way, which is always shorter than the lag."""
-        since = np.inf if self.closing is None else record.t - self.closing.t
+        since = np.inf if self.closing is None else cycle.result.t - self.closing.result.t
         return self.swap is None and since < self._mapper.settings.lag
 
     def fastest(self) -> Gtsam:
@@ -154,8 +154,8 @@ def measure(log: Log, settings: MapperSettings, every: int = SAMPLE_EVERY) -> Me
     mapper = FixedLagMapper(settings, log.odometry_sigma)
     with progress("benchmark", len(log.cycles)) as advance:
         sampler = _Sampler(mapper, log, every, advance)
-        result = run_online(log, mapper, on_cycle=sampler)
-    closing, swap = (None if at is None else at.cycle for at in (sampler.closing, sampler.swap))
+        result = run_online(log, mapper, observers=[sampler])
+    closing, swap = (None if at is None else at.number for at in (sampler.closing, sampler.swap))
     return Measurement(
         result.cycles,
         result.laps,

@@ -41,16 +41,16 @@ _MAX_HEIGHT: Final = 7.5
 """A figure is at most this high (in); a track that is narrower than it is long is drawn smaller."""
 _LABELS_HEIGHT: Final = 0.85
 """The tick labels and the legend take this height (in)."""
-_COLORS: Final = {LEFT: BLUE, RIGHT: ORANGE}
+BOUNDARY_COLORS: Final = {LEFT: BLUE, RIGHT: ORANGE}
 """Boundaries have their cones' colours; yellow is amber, which can be seen on white paper."""
-_TRAJECTORY_COLOR: Final = GREEN
+TRAJECTORY_COLOR: Final = GREEN
 """The estimated trajectory has this colour."""
-_HEALTH_COLORS: Final = {DEGRADED: PURPLE, LOST: RED}
+HEALTH_COLORS: Final = {DEGRADED: PURPLE, LOST: RED}
 """The trajectory has these colours where it is not good."""
-_BAND_ALPHA: Final = 0.35
+BAND_ALPHA: Final = 0.35
 """The uncertainty band has this opacity."""
 
-_TENTATIVE_DASHES: Final = (0, (4, 2))
+TENTATIVE_DASHES: Final = (0, (4, 2))
 """The stretch of a curve that is not confirmed has these dashes."""
 
 
@@ -66,6 +66,8 @@ class MapStyle:
     """Cones and control points have this size."""
     landmark_size: float = 1.4
     """Landmarks have this size, small enough for their ellipses to be seen."""
+    widest_band: float = np.inf
+    """A band is drawn at most this wide (m) on either side of its curve."""
 
 
 WHOLE_TRACK: Final = MapStyle()
@@ -98,8 +100,8 @@ def plot_map(
         if log is not None and log.truth is not None:
             draw_truth(axes, log.truth, WHOLE_TRACK)
         if trajectory is not None and len(trajectory):
-            _draw_trajectory(axes, np.asarray(trajectory), WHOLE_TRACK)
-            _draw_unhealthy(axes, np.asarray(trajectory), health, WHOLE_TRACK)
+            draw_trajectory(axes, np.asarray(trajectory), WHOLE_TRACK)
+            draw_unhealthy(axes, np.asarray(trajectory), health, WHOLE_TRACK)
         draw_start(axes, WHOLE_TRACK)
         _finish(figure, axes, title)
     return figure
@@ -118,12 +120,13 @@ def draw_boundary(
 def _draw_spline(
     axes: Axes, boundary: SplineBoundary, label: int, style: MapStyle, band_scale: float
 ) -> None:
-    color, name, spline = _COLORS[label], NAMES[label], boundary.spline
-    draw_band(axes, boundary, color, f"{name} {_band_name(band_scale)}", band_scale, _BAND_ALPHA)
+    color, name, spline = BOUNDARY_COLORS[label], NAMES[label], boundary.spline
+    text = f"{name} {_band_name(band_scale)}"
+    draw_band(axes, boundary, color, text, band_scale, BAND_ALPHA, widest=style.widest_band)
     until = boundary.confirmed_until
     draw_curve(axes, spline, color, f"{name} boundary", style.curve_width, (-np.inf, until), zorder=4)
     if until < spline.domain[1]:
-        text, dashed = f"{name} tentative", {"linestyle": _TENTATIVE_DASHES, "zorder": 4}
+        text, dashed = f"{name} tentative", {"linestyle": TENTATIVE_DASHES, "zorder": 4}
         draw_curve(axes, spline, color, text, style.curve_width, (until, np.inf), **dashed)
     squares = {"markersize": style.marker_size, "markeredgewidth": 0.6, "zorder": 5}
     points, text = spline.distinct_control_points, f"{name} control points"
@@ -133,8 +136,8 @@ def _draw_spline(
 def _draw_landmarks(
     axes: Axes, boundary: PointBoundary, label: int, style: MapStyle, band_scale: float
 ) -> None:
-    color, name = _COLORS[label], NAMES[label]
-    area = {"alpha": _BAND_ALPHA, "linewidth": 0.0}
+    color, name = BOUNDARY_COLORS[label], NAMES[label]
+    area = {"alpha": BAND_ALPHA, "linewidth": 0.0}
     own = point_blocks(boundary.covariance)
     draw_ellipses(axes, boundary.points, own, color, band_scale, zorder=2, **area)
     # a collection of ellipses has no key of its own in a legend: an empty patch lends it one
@@ -150,15 +153,15 @@ def _band_name(scale: float, shape: str = "band") -> str:
     return f"{SIGMAS:g}σ {shape}{exaggerated}"
 
 
-def _draw_trajectory(axes: Axes, trajectory: Array, style: MapStyle) -> None:
+def draw_trajectory(axes: Axes, trajectory: Array, style: MapStyle) -> None:
     """Draws poses (n, 3) or positions (n, 2) as a line, map frame (m)."""
-    line: dict[str, Any] = {"color": _TRAJECTORY_COLOR, "linewidth": style.path_width, "zorder": 3}
+    line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": style.path_width, "zorder": 3}
     axes.plot(*trajectory[:, :2].T, label="trajectory", **line)
 
 
-def _draw_unhealthy(axes: Axes, trajectory: Array, health: Sequence[str], style: MapStyle) -> None:
+def draw_unhealthy(axes: Axes, trajectory: Array, health: Sequence[str], style: MapStyle) -> None:
     """Draws the parts of the trajectory again that were degraded or lost, each in its colour."""
-    for condition, color in _HEALTH_COLORS.items():
+    for condition, color in HEALTH_COLORS.items():
         chosen = np.array([word == condition for word in health], bool)
         if len(chosen) != len(trajectory) or not chosen.any():
             continue

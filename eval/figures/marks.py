@@ -38,10 +38,15 @@ def normals(spline: BSpline, u: Array) -> Array:
     return left_normals(spline.tangent_unit(u))
 
 
-def uncertainty_band(boundary: SplineBoundary, u: Array, scale: float = 1.0) -> tuple[Array, Array]:
-    """Returns S(u) +- 2 scale sigma(u) n(u), the band's left and right edge (k, 2), m, at u (k,)."""
+def uncertainty_band(
+    boundary: SplineBoundary, u: Array, scale: float = 1.0, widest: float = np.inf
+) -> tuple[Array, Array]:
+    """Returns S(u) +- 2 scale sigma(u) n(u), the band's left and right edge (k, 2), m, at u (k,).
+
+    The edges are at most `widest` (m) away from the curve.
+    """
     spline = boundary.spline
-    half = SIGMAS * scale * spline.normal_sigma(u, boundary.covariance)
+    half = np.minimum(SIGMAS * scale * spline.normal_sigma(u, boundary.covariance), widest)
     offsets = half[:, None] * normals(spline, u)
     centre = spline.evaluate(u)
     return centre + offsets, centre - offsets
@@ -96,9 +101,10 @@ def draw_band(
     scale: float = 1.0,
     alpha: float = ALPHA,
     zorder: float = 2,
+    widest: float = np.inf,
 ) -> None:
-    """Fills the 2-sigma band around a curve, `scale` times as wide as it is."""
-    left, right = uncertainty_band(boundary, curve_parameters(boundary.spline), scale)
+    """Fills the 2-sigma band around a curve, `scale` times as wide as it is, up to `widest` (m) on a side."""
+    left, right = uncertainty_band(boundary, curve_parameters(boundary.spline), scale, widest)
     outline = _band_outline(left, right, boundary.spline.periodic)
     look: dict[str, Any] = {"alpha": alpha, "linewidth": 0.0, "zorder": zorder}
     axes.add_patch(PathPatch(outline, facecolor=color, label=label, **look))
@@ -109,6 +115,18 @@ def _band_outline(left: Array, right: Array, closed: bool) -> Outline:
     if not closed:
         return Outline(np.concatenate([left, right[::-1], left[:1]]), closed=True)
     return Outline.make_compound_path(Outline(left, closed=True), Outline(right[::-1], closed=True))
+
+
+def ellipse_outlines(points: Array, joint: Array, corners: int = 16) -> Array:
+    """Returns the 2-sigma ellipse of each point (m, 2) as a closed line (m, corners + 1, 2).
+
+    The joint covariance (2m, 2m) is over x0, y0, x1, y1 and so on.
+    """
+    variances, vectors = np.linalg.eigh(point_blocks(joint))
+    angles = np.linspace(0.0, 2.0 * np.pi, corners + 1)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    axes = vectors * np.sqrt(np.maximum(variances, 0.0))[:, None, :]
+    return np.asarray(points[:, None] + SIGMAS * np.einsum("cj,mij->mci", circle, axes))
 
 
 def draw_ellipses(

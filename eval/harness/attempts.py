@@ -73,5 +73,5 @@ def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
     if log.truth is None or not has_cones(log.truth) or len(log.truth.poses) == 0:
         return run_online(log, estimator, name=name, snapshot_times=times)
     observer = ReachObserver(log.truth)
-    result = run_online(log, estimator, name=name, snapshot_times=times, observer=observer)
+    result = run_online(log, estimator, name=name, snapshot_times=times, observers=[observer])
     return replace(result, reach=observer.rows)

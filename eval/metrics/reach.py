@@ -15,7 +15,7 @@ from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
-from pathspace_graph.run import CycleResult
+from pathspace_graph.run import ObservedCycle
 
 from .table1 import boundary_distances
 
@@ -162,13 +162,14 @@ class ReachObserver:
         self._road = true_road(truth)
         self._rows: list[tuple[float, float, float]] = []
 
-    def __call__(self, result: CycleResult, track: Map) -> None:
+    def __call__(self, cycle: ObservedCycle) -> None:
         """Measures one cycle, with the map as it stands."""
+        result = cycle.result
         station, pose_true = self._road.at(result.t)
         if not self._road.counts(result.t, station):
             self._rows.append(NOT_COUNTED)
             return
-        found = cycle_reach(self._road, station, pose_true, result.pose, track)
+        found = cycle_reach(self._road, station, pose_true, result.pose, cycle.outline)
         self._rows.append((found.reach, found.squares, float(found.cones)))
 
     @property

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
 from rich.console import Console
 from rich.table import Table
-from tyro.conf import Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from pathspace_graph.diagnosis import diagnose
 from pathspace_graph.errors import InputError, SettingsError
@@ -33,8 +34,10 @@ from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.labels import NAMES
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.progress import progress
-from pathspace_graph.run import OnlineEstimator, run_online
+from pathspace_graph.run import Observer, OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.view import FilmSettings, RecordingSettings
+from pathspace_graph.view.watch import check_watchers, watchers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +56,18 @@ class Online:
     """The mapper is saved to this file at the end, for `--resume`; only `fixed-lag` can be saved."""
     resume: Path | None = None
     """The mapper that was saved in this file goes on with its settings, and with cycles after its newest."""
+    view: FlagCreatePairsOff[bool] = False
+    """The run is shown in the window of the live viewer rerun while it goes on."""
+    save_view: Path | None = None
+    """What the viewer shows is written to this file (.rrd), with or without a window; an earlier one is kept
+    as a numbered backup."""
+    animate: Path | None = None
+    """A film of the run is written to this file (.gif, or .mp4 where ffmpeg is installed); an earlier one is
+    kept as a numbered backup."""
+    recording: RecordingSettings = field(default_factory=RecordingSettings)
+    """These settings describe what the viewer shows."""
+    film: FilmSettings = field(default_factory=FilmSettings)
+    """These settings describe the film."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
     """These settings describe the estimator."""
 
@@ -62,14 +77,19 @@ class Online:
         name = for_map(self.estimator, self.map)
         check_target(self.out, MAP_FILE)
         self._check_snapshots(name)
+        check_watchers(self)
         log = read_usable_log(self.log, self.settings.limits)
         log, estimator = self._begin(log, name)
-        result = map_online(log, estimator, name)
-        write_result(self.out, result, summarize(result, log))
+        with watchers(self, log) as observers:
+            result = map_online(log, estimator, name, observers)
+            write_result(self.out, result, summarize(result, log))
         if self.save is not None and isinstance(estimator, FixedLagMapper):
             estimator.save(self.save)
         report(result, log)
-        Console().print(f"written to {self.out}", highlight=False, soft_wrap=True, markup=False)
+        written = ", ".join(
+            str(path) for path in (self.out, self.save_view, self.animate) if path is not None
+        )
+        Console().print(f"written to {written}", highlight=False, soft_wrap=True, markup=False)
 
     def _check_snapshots(self, estimator: str) -> None:
         """Raises where a snapshot is asked for that cannot be, before anything is mapped."""
@@ -96,7 +116,9 @@ class Online:
         return replace(log, cycles=cycles), mapper
 
 
-def map_online(log: Log, estimator: OnlineEstimator, name: str = DEFAULT) -> RunResult:
+def map_online(
+    log: Log, estimator: OnlineEstimator, name: str = DEFAULT, observers: Sequence[Observer] = ()
+) -> RunResult:
     """Maps a log with progress; the map at the end of each true lap is kept where there is truth."""
     with progress("mapping", len(log.cycles)) as advance:
         return run_online(
@@ -104,7 +126,7 @@ def map_online(log: Log, estimator: OnlineEstimator, name: str = DEFAULT) -> Run
             estimator,
             name=name,
             snapshot_times=lap_times(log),
-            on_cycle=lambda _: advance(),
+            observers=[lambda _: advance(), *observers],
         )
 
 

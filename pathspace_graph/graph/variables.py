@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from typing import TypeVar, cast
 
@@ -180,6 +182,15 @@ class Variables:
         self.layout = Layout(self.layout.keys[kept_keys])
         self.values, self.reference = self.values[kept_entries], self.reference[kept_entries]
         self.linearized = self.linearized[kept_entries]
+
+    @contextmanager
+    def looked_at(self) -> Iterator[None]:
+        """Restores all values at the end: to look at the estimate must not change it."""
+        values = self.values.copy()
+        try:
+            yield
+        finally:
+            self.values[:] = values
 
     def of(self, keys: IntArray) -> Array:
         """Returns a copy of the values (n,) of keys (k,), one after the other."""

@@ -157,7 +157,7 @@ class RunResult:
     (m), the sum of squared distances (m^2) of the true cones on that stretch, and their number. The reach is
     NaN where the cycle doesn't count."""
     observing: float = 0.0
-    """The observer took this wall time (s), which is no part of the estimator's."""
+    """The observers took this wall time (s), which is no part of the estimator's."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from pathspace_graph.mapping.prediction import (
 )
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks
-from pathspace_graph.run import CycleResult, Stopwatch
+from pathspace_graph.run import CycleResult, Readings, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import associate_created, associate_newest
@@ -201,6 +201,20 @@ class LandmarkFixedLag:
             return Map(self.closed, {})
         joint = self.smoother.last_covariance(state.keys)
         return point_map(state.landmarks, state.labels, joint, self.closed)
+
+    def window_poses(self) -> Array:
+        """Returns a copy of the poses (P, 3) in the window, the oldest first, map frame."""
+        return self.smoother.variables.poses.copy()
+
+    def readings(self) -> Readings:
+        """Returns the detections of the newest cycle as they were used or gated, with their landmarks."""
+        table, state = self.smoother.map.detections, self.smoother.map.state
+        rows = np.flatnonzero(table.cycle == self.smoother.next_cycle - 1)
+        used = table.used[rows]
+        points = to_map(table.point[rows], self.smoother.variables.poses_at(table.cycle[rows]))
+        feet = np.full(points.shape, np.nan)
+        feet[used] = state.landmarks[state.positions(table.landmark[rows[used]])]
+        return Readings(points, table.label[rows], used, feet)
 
     def vehicle_state(self) -> VehicleState:
         """Returns the newest pose and the calibration, with their joint covariance."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -34,7 +35,7 @@ from pathspace_graph.mapping.prediction import (
     vehicle_state,
 )
 from pathspace_graph.mapping.registration import register
-from pathspace_graph.run import CycleResult, Stopwatch
+from pathspace_graph.run import CycleResult, Readings, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.snapshot import restore, save
 from pathspace_graph.spline.ahead import CurveAhead, TrackAhead, track_ahead
@@ -44,6 +45,7 @@ from .activation import deactivate_distant
 from .growth import Growth
 from .nonlinear_graph import window_graph
 from .outlook import Outlook, confirmed, joint_covariance_of, look_ahead
+from .readings import newest_readings
 
 Array = NDArray[np.float64]
 
@@ -260,6 +262,10 @@ class FixedLagMapper:
 
         An open curve goes on beyond its confirmed end, as `outline` says.
         """
+        with self.smoother.variables.looked_at():
+            return self._map()
+
+    def _map(self) -> Map:
         state, outlooks = self.smoother.map.state, self._outlooks()
         if not outlooks:
             return Map(self.closed, {})
@@ -298,12 +304,12 @@ class FixedLagMapper:
         cones that were seen less often, and is fitted anew in each call. A curve that has not begun may
         consist of a tentative stretch alone.
         """
-        values, boundaries = self.smoother.variables.values.copy(), {}
-        for label, outlook in self._outlooks().items():
-            spline = outlook.spline
-            until = spline.domain[1] if self.closed else outlook.confirmed_until
-            boundaries[label] = SplineBoundary(spline, NO_COVARIANCE, until)
-        self.smoother.variables.values[:] = values  # to look at the map must not change the estimate
+        boundaries = {}
+        with self.smoother.variables.looked_at():
+            for label, outlook in self._outlooks().items():
+                spline = outlook.spline
+                until = spline.domain[1] if self.closed else outlook.confirmed_until
+                boundaries[label] = SplineBoundary(spline, NO_COVARIANCE, until)
         return Map(self.closed, boundaries)
 
     def ahead(self, distance: float, step: float = 1.0) -> TrackAhead:
@@ -324,9 +330,22 @@ class FixedLagMapper:
             curves[label] = CurveAhead(spline, begin, outlook.confirmed_until)
         return track_ahead(curves, pose, distance, step)
 
+    def looked_at(self) -> AbstractContextManager[None]:
+        """Returns a context in which the mapper may be asked for anything, and its estimate stays as it is.
+
+        Without it, `control_points` leaves the inactive part of an open map up to date, which may move later
+        estimates by millimetres.
+        """
+        return self.smoother.variables.looked_at()
+
+    def readings(self) -> Readings:
+        """Returns the detections of the newest cycle as they were used or gated, with their foot points."""
+        return newest_readings(self.smoother)
+
     def vehicle_state(self) -> VehicleState:
         """Returns the newest pose and the calibration, with their joint covariance."""
-        return vehicle_state(self.smoother)
+        with self.smoother.variables.looked_at():
+            return vehicle_state(self.smoother)
 
     def _outlooks(self, refresh: bool = True) -> dict[int, Outlook]:
         """Returns the curves; open ones have a tentative stretch.
@@ -462,6 +481,10 @@ class FixedLagMapper:
     def poses(self) -> Array:
         """Returns a view of the poses (P, 3) in the window, the oldest first, map frame."""
         return self.smoother.variables.poses
+
+    def window_poses(self) -> Array:
+        """Returns a copy of the poses (P, 3) in the window, the oldest first, map frame."""
+        return self.poses.copy()
 
     @property
     def calibration(self) -> Array:

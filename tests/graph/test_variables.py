@@ -262,3 +262,12 @@ def test_a_copy_has_values_of_its_own() -> None:
     other.remove(MAP_KEYS)
     assert (variables.values != 0.0).all() and (variables.linearized != 0.0).all()
     assert len(variables.keys) == len(KEYS)
+
+
+def test_looking_restores_every_value_also_after_an_error() -> None:
+    variables = Variables()
+    variables.insert(np.array([CALIBRATION_KEY]), np.array([0.1, 0.2]))
+    with pytest.raises(ZeroDivisionError), variables.looked_at():
+        variables.values[:] = 7.0
+        raise ZeroDivisionError
+    assert variables.values.tolist() == [0.1, 0.2]

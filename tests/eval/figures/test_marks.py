@@ -13,6 +13,7 @@ from pathspace_graph.eval.figures.marks import (
     draw_band,
     draw_control_points,
     draw_ellipses,
+    ellipse_outlines,
     point_blocks,
     uncertainty_band,
 )
@@ -106,3 +107,16 @@ def test_a_control_polygon_is_drawn_if_asked_for() -> None:
     assert len(axes.lines) == 1
     draw_control_points(axes, np.zeros((3, 2)), "black")
     assert len(axes.lines) == 3
+
+
+def test_an_outline_of_an_ellipse_is_two_sigma_away_in_every_direction() -> None:
+    points = np.array([[1.0, 2.0], [-3.0, 0.5]])
+    covariance = np.array([[4.0, 1.0], [1.0, 2.0]])
+    joint = np.block([[np.eye(2), 0.1 * np.eye(2)], [0.1 * np.eye(2), covariance]])
+    first, second = ellipse_outlines(points, joint, corners=12)
+    assert first.shape == (13, 2)
+    np.testing.assert_allclose(np.linalg.norm(first - points[0], axis=1), 2.0, rtol=1e-12)
+    offset = second - points[1]
+    squares = np.einsum("ci,ij,cj->c", offset, np.linalg.inv(covariance), offset)
+    np.testing.assert_allclose(squares, 4.0, rtol=1e-12)
+    np.testing.assert_allclose(second[0], second[-1], atol=1e-12)

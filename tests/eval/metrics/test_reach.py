@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.reach import MOST, ReachObserver, cycle_reach, reach_values, true_road
 from pathspace_graph.factors.se2 import compose, to_map
-from pathspace_graph.io.log import Truth
+from pathspace_graph.io.log import Detections, Odometry, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.run import CycleResult
+from pathspace_graph.run import CycleResult, ObservedCycle
 from pathspace_graph.spline.bspline import BSpline
 
 from .straight_maps import landmarks, line
@@ -50,9 +50,28 @@ def at(pose: Array, t: float = 2.0) -> CycleResult:
     return CycleResult(t, pose, (4, 4), 0, False)
 
 
+class Drawn:
+    """An estimator that has nothing but a map."""
+
+    def __init__(self, track: Map) -> None:
+        self.settings = None
+        self.track = track
+
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        raise NotImplementedError
+
+    def map(self) -> Map:
+        return self.track
+
+
+def seen(result: CycleResult, track: Map) -> ObservedCycle:
+    none = Detections(result.t, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, int))
+    return ObservedCycle(Drawn(track), none, result)
+
+
 def observed(track: Map, pose: Array, t: float = 2.0) -> list[float]:
     observer = ReachObserver(straight_truth())
-    observer(at(pose, t), track)
+    observer(seen(at(pose, t), track))
     return list(observer.rows[0])
 
 

@@ -1,0 +1,283 @@
+"""The film of a run: the map as it grows, the vehicle, its window and readings, and what is known by then."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
+from numpy.typing import NDArray
+
+from pathspace_graph.eval.figures.map_plot import (
+    BAND_ALPHA,
+    BOUNDARY_COLORS,
+    HEALTH_COLORS,
+    MARGIN,
+    TENTATIVE_DASHES,
+    TRAJECTORY_COLOR,
+    MapStyle,
+    draw_boundary,
+    draw_trajectory,
+    draw_unhealthy,
+)
+from pathspace_graph.eval.figures.marks import SIGMAS, draw_points
+from pathspace_graph.eval.figures.style import DARK, GREY, LIGHT, PALETTE, RED, figure_context, set_frame
+from pathspace_graph.eval.metrics.summary import has_cones, lap_times
+from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.io.map import Map, PointBoundary
+from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES
+from pathspace_graph.run import ObservedCycle, Readings
+from pathspace_graph.settings.view import FilmSettings
+
+from .film import Film
+
+Array = NDArray[np.float64]
+
+DPI: Final = 100.0
+"""A frame has this resolution (dots per inch), which decides how large the text is."""
+VEHICLE: Final = np.array([[2.4, 0.0], [-1.2, 1.2], [-0.6, 0.0], [-1.2, -1.2]])
+"""The vehicle is drawn as this arrow (m, vehicle frame), larger than it is, so that it is seen."""
+COLORS: Final = (*PALETTE, GREY, LIGHT, "#000000")
+"""A frame has these colours on white, and what lies between them."""
+NOTICE_SECONDS: Final = 2.0
+"""A frame tells what happened for this time (s) of the film."""
+
+LEAST_TURN: Final = 0.75
+"""An odometry that turns by less than this share of a full turn has driven no lap."""
+
+_STYLE: Final = MapStyle(curve_width=1.4, path_width=0.8, marker_size=2.8)
+"""Lines are wider than on paper, since a film has few pixels."""
+_MAP_PLACE: Final = (0.07, 0.085, 0.69, 0.845)
+"""The map has this place in a frame: left, bottom, width, height, as shares of the frame."""
+_TEXT_PLACE: Final = (0.775, 0.085, 0.212, 0.845)
+"""The figures of the moment have this place."""
+_LINE: Final = 0.062
+"""A line of the figures of the moment takes this share of the height of their place."""
+_FRAME_STEP: Final = 10.0
+"""The part of the plane that is shown grows by steps of this length (m)."""
+_LEAST_FRAME: Final = 30.0
+"""At least this length (m) around the start is shown in each direction."""
+_TURN: Final = 2.0 * np.pi
+"""This is a full turn (rad)."""
+
+
+def lap_seconds(log: Log) -> float:
+    """Returns how long a lap of the log takes (s), by its truth, or by how far the odometry turns.
+
+    A log of less than `LEAST_TURN` of a turn is taken as one lap.
+    """
+    if not log.cycles:
+        return 1.0
+    ends, begin, end = lap_times(log), log.cycles[0].t, log.cycles[-1].t
+    if len(ends) and ends[0] > begin:
+        return float(ends[0] - begin)
+    driven = log.odometry.between(begin, end)
+    turns = abs(float(driven.twist[:, 2] @ np.diff(np.append(driven.t, end)))) / _TURN
+    return ((end - begin) / (turns if turns > LEAST_TURN else 1.0)) or 1.0
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Holds a figure of the moment."""
+
+    name: str
+    """It is named so."""
+    value: str
+    """This is its value, with the unit."""
+    color: str = "black"
+    """The value is written in this colour."""
+
+
+class Animation:
+    """Draws a frame of a film at equal steps of the log's time; it is an observer of `run.run_online`.
+
+    `finish` must be called at the end. The true cones are drawn, and held against the map, where there is
+    a truth.
+    """
+
+    def __init__(
+        self,
+        film: Film,
+        lap_seconds: float,
+        settings: FilmSettings | None = None,
+        truth: Truth | None = None,
+        title: str = "",
+    ) -> None:
+        self.settings = settings or FilmSettings()
+        self._style = replace(_STYLE, widest_band=self.settings.widest_band)
+        self._film, self._lap, self._truth, self._title = film, lap_seconds, truth, title
+        self._begin: float | None = None
+        self._frames = 0
+        self._poses: list[Array] = []
+        self._healths: list[str] = []
+        self._seconds: list[float] = []
+        self._notice, self._notice_until = "", -np.inf
+        self._was_closed, self._size = False, 0
+        self._low, self._high = np.full(2, -_LEAST_FRAME), np.full(2, _LEAST_FRAME)
+        self._cones = np.zeros((0, 2)) if truth is None else truth.cones
+        self._show(self._cones)
+        self._figure = Figure(figsize=(self.settings.width / DPI, self.settings.height / DPI), dpi=DPI)
+        self._axes = self._figure.add_axes(_MAP_PLACE)
+        self._text = self._figure.add_axes(_TEXT_PLACE)
+
+    def __call__(self, cycle: ObservedCycle) -> None:
+        """Notes what happened in a cycle, and draws a frame where one is due."""
+        t, result = cycle.detections.t, cycle.result
+        self._begin = t if self._begin is None else self._begin
+        film_time = (t - self._begin) * self.settings.seconds_per_lap / self._lap
+        if film_time > self.settings.laps * self.settings.seconds_per_lap:
+            return
+        self._poses.append(np.array(result.pose, float))
+        self._healths.append(result.health.condition)
+        self._seconds.append(cycle.seconds)
+        self._listen(cycle, film_time)
+        due = int(film_time * self.settings.frames_per_second) + 1 - self._frames
+        if due > 0:
+            self._draw(cycle, film_time)
+            self._film.add(self._figure, due / self.settings.frames_per_second)
+            self._frames += due
+
+    def finish(self) -> None:
+        """Holds the last frame for a while."""
+        if self._frames:
+            self._film.add(self._figure, self.settings.hold)
+
+    def _listen(self, cycle: ObservedCycle, film_time: float) -> None:
+        """Takes up what a cycle has to tell."""
+        result, told = cycle.result, [cycle.result.notice] if cycle.result.notice else []
+        if result.closed and not self._was_closed:
+            told.append(f"loop closed: {self._size} control points become {sum(result.sizes)}")
+        if result.jump is not None:
+            told.append(f"the lap was solved again: the pose moves by {np.hypot(*result.jump[:2]):.2f} m")
+        if told:
+            self._notice, self._notice_until = "\n".join(told), film_time + NOTICE_SECONDS
+        self._was_closed, self._size = result.closed, sum(result.sizes)
+
+    # --- a frame -----------------------------------------------------------------------------------------
+
+    def _draw(self, cycle: ObservedCycle, film_time: float) -> None:
+        axes = self._axes
+        with figure_context():
+            axes.clear()
+            draw_points(axes, self._cones, "x", LIGHT, markersize=3.0, markeredgewidth=0.7, zorder=1)
+            for label, boundary in sorted(cycle.map.boundaries.items()):
+                draw_boundary(axes, boundary, label, self._style)
+            path = np.array(self._poses)
+            draw_trajectory(axes, path, self._style)
+            draw_unhealthy(axes, path, self._healths, self._style)
+            _draw_readings(axes, cycle.readings, path[-1])
+            _draw_vehicle(axes, path[-1], cycle.window)
+            self._show(path[-1:, :2])
+            self._set_frame(film_time)
+            self._write(cycle)
+
+    def _show(self, points: Array) -> None:
+        """Enlarges what is shown so that it holds points (k, 2), m, map frame."""
+        if len(points):
+            low, high = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
+            self._low = np.minimum(self._low, _FRAME_STEP * np.floor(low / _FRAME_STEP))
+            self._high = np.maximum(self._high, _FRAME_STEP * np.ceil(high / _FRAME_STEP))
+
+    def _set_frame(self, film_time: float) -> None:
+        axes, middle = self._axes, 0.5 * (self._low + self._high)
+        box = np.array([_MAP_PLACE[2] * self.settings.width, _MAP_PLACE[3] * self.settings.height])
+        half = 0.5 * box * ((self._high - self._low) / box).max()  # the map's place is filled
+        set_frame(axes, middle - half, middle + half)
+        axes.set_xlabel("x [m]", labelpad=1.0)
+        axes.set_ylabel("y [m]", labelpad=0.0)
+        axes.set_title(self._title, fontsize=10.0)
+        if film_time < self._notice_until:
+            frame = {"boxstyle": "round,pad=0.5", "facecolor": "white", "edgecolor": DARK, "alpha": 0.9}
+            place: dict[str, Any] = {
+                "ha": "center",
+                "va": "center",
+                "transform": axes.transAxes,
+                "zorder": 20,
+            }
+            axes.text(0.5, 0.5, self._notice, fontsize=10.0, bbox=frame, **place)
+
+    def _write(self, cycle: ObservedCycle) -> None:
+        """Writes the figures of the moment, and below them what is what."""
+        axes = self._text
+        axes.clear()
+        axes.set_axis_off()
+        moments = [*_moments(cycle, self._seconds), *_against_truth(cycle.map, self._truth)]
+        self._seconds.clear()
+        for number, moment in enumerate(moments):
+            y = 1.0 - _LINE * (number + 0.5)
+            axes.text(0.0, y, moment.name, color=DARK, va="center", fontsize=8.5)
+            axes.text(1.0, y, moment.value, color=moment.color, va="center", ha="right", fontsize=8.5)
+        axes.legend(handles=_legend(self._truth), loc="lower left", borderaxespad=0.0, borderpad=0.0)
+
+
+def _moments(cycle: ObservedCycle, seconds: Sequence[float]) -> list[Moment]:
+    result = cycle.result
+    condition = result.health.condition
+    used = f"{result.readings} of {len(cycle.detections.labels)}"
+    points = any(isinstance(one, PointBoundary) for one in cycle.map.boundaries.values())
+    kind = "landmarks" if points else "control points"
+    moments = [
+        Moment("time", f"{result.t:.1f} s"),
+        Moment("lap", str(cycle.lap)),
+        Moment("loop", "closed" if result.closed else "open"),
+        Moment(kind, " + ".join(map(str, result.sizes))),
+        Moment("readings used", used),
+        Moment("update", f"{1e3 * float(np.mean(seconds)):.1f} ms"),
+    ]
+    if condition:
+        moments.append(Moment("health", condition, HEALTH_COLORS.get(condition, TRAJECTORY_COLOR)))
+    return moments
+
+
+def _against_truth(track: Map, truth: Truth | None) -> list[Moment]:
+    """Returns the paper's metrics of the moment, where there are true cones."""
+    if truth is None or not has_cones(truth):
+        return []
+    metrics = lap_metrics(track, truth, 0)
+    rmse = "" if np.isnan(metrics.rmse) else f"{metrics.rmse:.2f} m"
+    return [Moment("rmse", rmse), Moment("cones missed", f"{100.0 * metrics.missed:.0f} %")]
+
+
+def _draw_readings(axes: Axes, readings: Readings | None, pose: Array) -> None:
+    """Draws the readings of the cycle with a ray from the vehicle, used and gated ones apart."""
+    if readings is None or len(readings.points) == 0:
+        return
+    for chosen, color, marker in ((readings.used, DARK, "o"), (~readings.used, RED, "x")):
+        points = readings.points[chosen]
+        for point in points:
+            axes.plot(*np.array([pose[:2], point]).T, color=color, linewidth=0.35, alpha=0.6, zorder=5)
+        draw_points(axes, points, marker, color, markersize=3.2, markeredgewidth=1.0, zorder=8)
+
+
+def _draw_vehicle(axes: Axes, pose: Array, window: Array) -> None:
+    """Draws the vehicle at its pose (3,), and the window of poses (P, 3) behind it."""
+    axes.plot(*window[:, :2].T, color=TRAJECTORY_COLOR, linewidth=2.6, solid_capstyle="round", zorder=6)
+    outline = to_map(VEHICLE, np.tile(pose, (len(VEHICLE), 1)))
+    axes.add_patch(Polygon(outline, facecolor="black", edgecolor="white", linewidth=0.5, zorder=10))
+
+
+def _legend(truth: Truth | None) -> list[Any]:
+    def line(name: str, color: str, **look: Any) -> Line2D:
+        return Line2D([], [], color=color, label=name, **look)
+
+    def mark(name: str, color: str, marker: str) -> Line2D:
+        return line(name, color, marker=marker, linestyle="none", markersize=4.0)
+
+    curves = [line(f"{NAMES[label]} boundary", BOUNDARY_COLORS[label], linewidth=1.4) for label in BOUNDARIES]
+    entries = [
+        *curves,
+        line("tentative", BOUNDARY_COLORS[LEFT], linestyle=TENTATIVE_DASHES),
+        Patch(facecolor=BOUNDARY_COLORS[LEFT], alpha=BAND_ALPHA, label=f"{SIGMAS:g}σ band"),
+        mark("reading, used", DARK, "o"),
+        mark("reading, gated", RED, "x"),
+        line("trajectory", TRAJECTORY_COLOR, linewidth=0.8),
+        line("window", TRAJECTORY_COLOR, linewidth=2.6),
+    ]
+    return entries if truth is None or len(truth.cones) == 0 else [*entries, mark("true cone", LIGHT, "x")]

@@ -1,0 +1,116 @@
+"""Opens a recording of the live viewer rerun: as a file, in a window, or as both."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.io.files import atomic_file, check_file_target
+from pathspace_graph.io.log import Truth
+from pathspace_graph.settings.view import RecordingSettings
+
+from .blueprint import blueprint
+from .recorder import Recorder
+
+APPLICATION: Final = "pathspace_graph"
+"""The viewer keeps what a user arranges by this name."""
+SUFFIX: Final = ".rrd"
+"""A recording's file has this suffix."""
+DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
+"""One of these variables of the environment is set where there is a display, on Linux."""
+PORT: Final = 9876
+"""The viewer listens on this port, which is rerun's own; a viewer that is there already is used."""
+_TIMEOUT: Final = 2.0
+"""A viewer that was started answers within this time (s)."""
+
+
+def import_rerun(option: str) -> Any:
+    """Returns the package `rerun`; a SettingsError says how to install it where it is missing."""
+    try:
+        # the package is optional
+        import rerun  # noqa: PLC0415
+        import rerun.blueprint  # noqa: PLC0415
+    except ImportError as error:
+        install = "pip install 'pathspace-graph[view]'"
+        raise SettingsError(f"{option}: expected the package rerun-sdk, found none; {install}") from error
+    return rerun
+
+
+def check_recording(file: Path | None, window: bool) -> None:
+    """Raises a SettingsError where a recording could not be opened, before anything is mapped."""
+    if file is not None:
+        if file.suffix.lower() != SUFFIX:
+            raise SettingsError(f"{file}: expected a recording's name that ends in {SUFFIX}")
+        check_file_target(file)
+    if file is not None or window:
+        import_rerun("--view" if window else "--save-view")
+    if window and not has_display(sys.platform, os.environ):
+        names = " or ".join(DISPLAYS[:2])
+        hint = f"--save-view FILE{SUFFIX} writes the recording without a window"
+        raise SettingsError(f"--view: expected a display ({names}), found none; {hint}")
+
+
+def has_display(platform: str, environment: Mapping[str, str]) -> bool:
+    """Returns whether a window can be opened, as far as the environment tells."""
+    return not platform.startswith("linux") or any(environment.get(name) for name in DISPLAYS)
+
+
+@contextmanager
+def recording(
+    file: Path | str | None = None,
+    *,
+    window: bool = False,
+    settings: RecordingSettings | None = None,
+    truth: Truth | None = None,
+) -> Iterator[Recorder]:
+    """Yields an observer that records each cycle that it is shown, to a file, to a window, or to both.
+
+    The file appears as a whole at the end, and an earlier one is kept as a numbered backup. The window stays
+    open afterwards. The true cones are shown where there is a truth.
+    """
+    target = None if file is None else Path(file)
+    check_recording(target, window)
+    rerun = import_rerun("recording")
+    with ExitStack() as stack:
+        path = None if target is None else stack.enter_context(atomic_file(target))
+        stream = rerun.RecordingStream(APPLICATION)
+        stack.callback(stream.disconnect)  # before the file gets its name
+        _connect(rerun, stream, path, window)
+        yield Recorder(rerun, stream, settings or RecordingSettings(), truth)
+
+
+def _connect(rerun: Any, stream: Any, path: Path | None, window: bool) -> None:
+    """Leads a stream to a file, to a window, or to both; each of them gets the blueprint."""
+    if window:
+        _open_window(rerun, stream)
+    sinks = [] if path is None else [rerun.FileSink(str(path))]
+    sinks += [rerun.GrpcSink(f"rerun+http://127.0.0.1:{PORT}/proxy")] if window else []
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    stream.set_sinks(*sinks, default_blueprint=blueprint(rerun))
+
+
+def _open_window(rerun: Any, stream: Any) -> None:
+    """Starts the viewer, unless one is there already; a SettingsError where it does not start."""
+    try:
+        viewer = {"executable_path": _viewer(), "hide_welcome_screen": True}
+        rerun.spawn(port=PORT, connect=False, recording=stream, **viewer)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[0]
+        raise SettingsError(f"--view: the viewer could not be started: {reason}") from error
+    try:
+        socket.create_connection(("127.0.0.1", PORT), _TIMEOUT).close()
+    except OSError as error:
+        raise SettingsError(f"--view: expected the viewer on port {PORT}, found none: {error}") from error
+
+
+def _viewer() -> str | None:
+    """Returns the viewer beside this Python, which need not be on the path; None leaves the search to it."""
+    viewer = Path(sys.executable).with_name("rerun")
+    return str(viewer) if viewer.exists() else None

@@ -1,0 +1,57 @@
+"""A short drive that is mapped once alone, and once with all that can watch it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.results import RunResult
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.run import ObservedCycle, run_online
+from pathspace_graph.settings.view import FilmSettings, RecordingSettings
+from pathspace_graph.view.animation import COLORS, Animation, lap_seconds
+from pathspace_graph.view.film import film
+from pathspace_graph.view.recording import recording
+
+from ..scenes.drives import bean_track, lap_log, noisy
+
+BAND_EVERY = 7
+FILM = FilmSettings(seconds_per_lap=1.0, frames_per_second=10.0, width=300, height=200, hold=0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """Holds a run and what has watched it."""
+
+    log: Log
+    alone: RunResult
+    watched: RunResult
+    cycles: list[ObservedCycle]
+    window: list[int]
+    """(n,) Each cycle had this number of poses in the window."""
+    rrd: Path
+    gif: Path
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Watched:
+    folder = tmp_path_factory.mktemp("view")
+    log = noisy(lap_log(bean_track(), overrun=35.0), seed=0)
+    alone = run_online(log, FixedLagMapper(odometry_sigma=log.odometry_sigma))
+    cycles: list[ObservedCycle] = []
+    window: list[int] = []
+    rrd, gif = folder / "run.rrd", folder / "run.gif"
+    settings = RecordingSettings(band_every=BAND_EVERY)
+    with (
+        recording(rrd, settings=settings, truth=log.truth) as recorder,
+        film(gif, FILM.frames_per_second, COLORS) as reel,
+    ):
+        animation = Animation(reel, lap_seconds(log), FILM, log.truth, "a bean")
+        mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
+        look = [recorder, animation, cycles.append, lambda cycle: window.append(len(cycle.window))]
+        watched = run_online(log, mapper, observers=look)
+        animation.finish()
+    return Watched(log, alone, watched, cycles, window, rrd, gif)
