@@ -13,6 +13,7 @@ from pathspace_graph.settings.plausibility import PlausibilitySettings
 from .hint import Hint
 from .hypotheses import Frame, Trial, Trials, verdict
 from .meanings import frame_hints, odometry_hints
+from .motions import Meaning, motions
 from .mounting import Mounting, best_lateness, mounting_of
 from .pairs import Pairs, pairs_of
 from .units import beyond_any_vehicle, one_clock, positions_in_metres, stamps_in_seconds, whole_stamps
@@ -40,11 +41,25 @@ def hints(log: Log, settings: PlausibilitySettings | None = None) -> list[Hint]:
     pairs = pairs_of(log.cycles, settings)
     if pairs is None:
         return found + beyond_any_vehicle(log.odometry, settings)
-    return found + _by_motion(Trials(log, pairs, settings), settings)
+    return found + _by_motion(Trials(log, telling_pairs(log, pairs, settings), settings), settings)
+
+
+def telling_pairs(log: Log, pairs: Pairs, settings: PlausibilitySettings) -> Pairs:
+    """Returns the pairs of cycles that see the same cones if the odometry is right.
+
+    One stretch of a track looks like the next. So cycles without cones in common agree best with a vehicle
+    that does not move. Where the odometry is impossible anyway, the pairs are those that follow each other.
+    """
+    if beyond_any_vehicle(log.odometry, settings):
+        return pairs.chosen(pairs.gap <= settings.gaps[1])
+    motion = motions(log.odometry.t, Meaning().poses(log.odometry), pairs.begin, pairs.end)
+    return pairs.chosen(pairs.overlap(motion) >= settings.overlap)
 
 
 def _by_motion(trials: Trials, settings: PlausibilitySettings) -> list[Hint]:
     """Returns what the motion of the detections tells."""
+    if len(trials.pairs) == 0:
+        return beyond_any_vehicle(trials.log.odometry, settings)
     best, found = _meant(trials, settings)
     if best.hypothesis.meaning.content == "nothing":
         return found

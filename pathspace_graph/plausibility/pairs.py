@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,12 @@ from pathspace_graph.settings.plausibility import PlausibilitySettings
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+
+SEEN: Final = 0.95
+"""This share of the detections is nearer than the range, and between the bearings, that a cycle sees."""
+ROUND: Final = 0.1
+"""A sensor sees all around if the mean of the directions to its detections is shorter than this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +36,8 @@ class Pairs:
     """(P, m, 2) These are the detections of the later cycles."""
     variances: Array
     """(P, m, m) These are the variances of one coordinate of each difference of two detections (m^2)."""
+    gap: IntArray
+    """(P,) The later cycle comes this number of cycles after the earlier one."""
     reach: float
     """A detection explains another one at distance d with the weight `exp(-d^2 / 2 reach^2)`."""
 
@@ -58,6 +67,32 @@ class Pairs:
         total = weights.max(axis=2).sum(axis=1) + weights.max(axis=1).sum(axis=1)
         return np.asarray(total / np.maximum(self.count, 1))
 
+    def chosen(self, rows: BoolArray) -> Pairs:
+        """Returns the pairs (P,) that are flagged."""
+        return replace(
+            self,
+            begin=self.begin[rows],
+            end=self.end[rows],
+            before=self.before[rows],
+            after=self.after[rows],
+            variances=self.variances[rows],
+            gap=self.gap[rows],
+        )
+
+    def overlap(self, motion: Array) -> Array:
+        """Returns the share (P,) of the later detections that the earlier cycle could have seen, for a motion.
+
+        What a cycle sees is told from all detections: up to which range, and to both sides of which bearing.
+        """
+        ranges, bearings = _polar(self.before)
+        vector = np.nanmean(np.exp(1j * bearings))
+        middle = float(np.angle(vector)) if abs(vector) > ROUND else 0.0
+        farthest = np.nanquantile(ranges, SEEN)
+        widest = np.nanquantile(np.abs(_wrapped(bearings - middle)), SEEN)
+        ranges, bearings = _polar(self.laid(np.eye(2), motion))
+        inside = (ranges < farthest) & (np.abs(_wrapped(bearings - middle)) < widest)
+        return np.asarray(inside.sum(axis=1) / np.isfinite(ranges).sum(axis=1))
+
     @property
     def count(self) -> IntArray:
         """Returns the number (P,) of detections of both cycles."""
@@ -73,7 +108,7 @@ def pairs_of(cycles: Sequence[Detections], settings: PlausibilitySettings) -> Pa
     if spacing is None:
         return None
     stamps = np.array([cycle.t for cycle in full])
-    firsts, seconds = [], []
+    firsts, seconds, gaps = [], [], []
     shortest = float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
     for gap in settings.gaps:
         later = np.arange(gap, len(full))
@@ -82,6 +117,7 @@ def pairs_of(cycles: Sequence[Detections], settings: PlausibilitySettings) -> Pa
         chosen = later[:: max(1, len(later) // settings.pairs)]
         firsts.append(chosen - gap)
         seconds.append(chosen)
+        gaps.append(np.full(len(chosen), gap))
     first, second = np.concatenate(firsts), np.concatenate(seconds)
     if len(first) == 0:
         return None
@@ -92,6 +128,7 @@ def pairs_of(cycles: Sequence[Detections], settings: PlausibilitySettings) -> Pa
         points[first],
         points[second],
         variances[first][:, :, None] + variances[second][:, None],
+        np.concatenate(gaps),
         settings.reach * spacing,
     )
 
@@ -118,3 +155,12 @@ def spacing_of(cycles: Sequence[Detections]) -> float | None:
         np.fill_diagonal(square, np.inf)
         found.append(np.sqrt(square.min(axis=1)))
     return float(np.median(np.concatenate(found))) if found else None
+
+
+def _polar(points: Array) -> tuple[Array, Array]:
+    """Returns the ranges and the bearings (P, m) of points (P, m, 2)."""
+    return np.hypot(points[..., 0], points[..., 1]), np.arctan2(points[..., 1], points[..., 0])
+
+
+def _wrapped(angles: Array) -> Array:
+    return np.asarray((angles + np.pi) % (2.0 * np.pi) - np.pi)

@@ -26,6 +26,8 @@ class PlausibilitySettings(Positive):
     reach: float = 0.2
     """A detection at this share of the cones' spacing from another one counts as the same cone by
     `exp(-1/2)`."""
+    overlap: float = 0.5
+    """Two cycles are compared if by the odometry one could have seen this share of the other's detections."""
     turn: float = 15.0
     """The frame of the detections is tried in steps of this angle (degrees)."""
     equal: float = 0.02
@@ -52,7 +54,7 @@ class PlausibilitySettings(Positive):
     nearest: float = 0.05
     """No cones are nearer than this, as a rule (m)."""
     fastest: float = 60.0
-    """No vehicle is faster than this, as a rule (m/s)."""
+    """No vehicle is faster than this in a tenth of its time (m/s)."""
     fastest_turn: float = 8.0
     """No vehicle turns faster than this in a tenth of its time (rad/s)."""
     iterations: int = 5
