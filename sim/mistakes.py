@@ -63,7 +63,8 @@ def in_frame(log: Log, turn: float = 0.0, ahead: float = 0.0, left: float = 0.0)
 def y_to_the_right(log: Log) -> Log:
     """Returns the log with detections whose y points to the right."""
     flip = np.diag([1.0, -1.0])
-    return with_points(with_covariances(log, lambda K: flip @ K @ flip), lambda points: points @ flip)
+    turned = with_covariances(log, lambda covariances: flip @ covariances @ flip)
+    return with_points(turned, lambda points: points @ flip)
 
 
 def swapped(log: Log) -> Log:
@@ -72,7 +73,7 @@ def swapped(log: Log) -> Log:
 
 
 def camera(log: Log, height: float = 0.6, sigma: float = 0.02) -> Log:
-    """Returns the log with x (to the right) and y (down) of a camera that stands so high (m); z ahead is lost.
+    """Returns the log with x to the right and y down of a camera at a height (m); z ahead is lost.
 
     The cones are not all equally low, by a standard deviation (m).
     """
@@ -87,7 +88,9 @@ def bearings_as_degrees(log: Log) -> Log:
 
     def wrong(points: FloatArray) -> FloatArray:
         bearings = np.arctan2(points[:, 1], points[:, 0]) / DEGREE
-        return np.hypot(*points.T)[:, None] * np.column_stack([np.cos(bearings), np.sin(bearings)])
+        return np.asarray(
+            np.hypot(*points.T)[:, None] * np.column_stack([np.cos(bearings), np.sin(bearings)])
+        )
 
     return with_points(log, wrong)
 
@@ -136,7 +139,9 @@ def late(log: Log, seconds: float) -> Log:
     first, last = log.odometry.t[[0, -1]]
     moved = (replace(cycle, t=cycle.t + seconds) for cycle in log.cycles)
     kept = tuple(cycle for cycle in moved if first <= cycle.t <= last)
-    return replace(log, cycles=kept, truth=None if log.truth is None else replace(log.truth, associations=None))
+    return replace(
+        log, cycles=kept, truth=None if log.truth is None else replace(log.truth, associations=None)
+    )
 
 
 def all_left(log: Log) -> Log:

@@ -20,7 +20,7 @@ LEAVES = {"errors", "labels", "progress"}
 ESTIMATORS = {"online", "batch", "ckf", "landmark"}
 BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "health", "run", "snapshot"}
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
-BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "diagnosis"}
+BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "diagnosis", "plausibility"}
 
 ARROWS: dict[str, set[str]] = {
     **{leaf: set() for leaf in LEAVES},
@@ -38,6 +38,7 @@ ARROWS: dict[str, set[str]] = {
     "snapshot": {"factors", "io", "graph"},
     "mapping": BELOW_MAPPING,
     "front_end": BELOW_MAPPING | {"mapping"},
+    "plausibility": {"factors", "settings", "io", "front_end"},
     **dict.fromkeys(ESTIMATORS, BELOW_ESTIMATORS),
     "loop": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes
     "online": BELOW_ESTIMATORS | {"loop"},
@@ -49,6 +50,7 @@ ARROWS: dict[str, set[str]] = {
     "eval.compare": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "eval.scaling": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "eval.faults": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
+    "eval.hints": BELOW_EVAL | {"eval.metrics", "eval.harness"},
     "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "commands": BELOW_EVAL
     | {"export"}

@@ -149,7 +149,7 @@ def judged(log: Log, causes: Sequence[str] = ()) -> Row:
 
 
 def mapped(log: Log) -> Row:
-    """Returns what the default estimator makes of a log that it reads from files: a refusal, or the errors."""
+    """Returns what the default estimator makes of a log in files: a refusal, or the errors of its map."""
     with TemporaryDirectory() as folder, threadpool_limits(limits=1):
         write_log(log, Path(folder) / "log")
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -24,7 +25,6 @@ from pathspace_graph.eval.metrics.summary import (
     vehicle_of,
 )
 from pathspace_graph.eval.metrics.table1 import LapMetrics
-from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import Log
@@ -32,6 +32,8 @@ from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.labels import NAMES
 from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.plausibility.hint import Hint
+from pathspace_graph.plausibility.reading import read_plausible_log
 from pathspace_graph.progress import progress
 from pathspace_graph.run import OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
@@ -59,10 +61,11 @@ class Online:
         check_online(self.estimator)
         check_target(self.out, MAP_FILE)
         self._check_snapshots()
-        log = read_usable_log(self.log, self.settings.limits)
+        log, hints = read_plausible_log(self.log, self.settings.limits)
+        tell(hints)
         log, estimator = self._begin(log)
         result = map_online(log, estimator, self.estimator)
-        write_result(self.out, result, summarize(result, log))
+        write_result(self.out, result, summarize(result, log, hints))
         if self.save is not None and isinstance(estimator, FixedLagMapper):
             estimator.save(self.save)
         report(result, log)
@@ -91,6 +94,14 @@ class Online:
             expected = f"expected cycles after {times[-1]:g} s, where {self.resume} ends"
             raise InputError(self.log, f"{expected}, found none")
         return replace(log, cycles=cycles), mapper
+
+
+def tell(hints: Sequence[Hint], of: str = "") -> None:
+    """Prints a line for each hint as an error, with the name of the log `of` which it is where there are
+    several."""
+    say = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
+    for hint in hints:
+        say.print(f"hint: {of}{'/' if of else ''}{hint.line}")
 
 
 def map_online(log: Log, estimator: OnlineEstimator, name: str = DEFAULT) -> RunResult:

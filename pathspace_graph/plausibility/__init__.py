@@ -1,1 +1,1 @@
-"""Plausibility: a log is judged before it is mapped, and what is wrong with it is told with its likely cause."""
+"""Plausibility: a log is judged before it is mapped, and likely mistakes in it are told with their cause."""

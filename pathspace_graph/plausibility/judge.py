@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from pathspace_graph.io.log import DETECTIONS_FILE, Log
@@ -11,7 +9,7 @@ from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.settings.plausibility import PlausibilitySettings
 
 from .hint import Hint
-from .hypotheses import Frame, Trial, Trials, verdict
+from .hypotheses import Trial, Trials, verdict
 from .meanings import frame_hints, odometry_hints
 from .motions import Meaning, motions
 from .mounting import Mounting, best_lateness, mounting_of
@@ -143,7 +141,9 @@ def _certain(mounting: Mounting, settings: PlausibilitySettings) -> list[Hint]:
         likely = "the covariances are in mm^2 or cm^2, not in m^2, or no covariances at all"
     else:
         return []
-    found = f"detections of one cone are {scatter:.2g} m apart as a rule, by their covariances {claimed:.2g} m"
+    found = (
+        f"detections of one cone are {scatter:.2g} m apart as a rule, by their covariances {claimed:.2g} m"
+    )
     advice = "give each detection's covariance in m^2"
     return [Hint("covariances", DETECTIONS_FILE, "columns xx, xy, yy", found, likely, advice)]
 
@@ -193,4 +193,6 @@ def _optical(pairs: Pairs) -> Hint:
     thin = "xy"[int(spread.argmin())]
     found = f"column {thin} varies by {spread.min():.2g} m only, the other one by {spread.max():.2g} m"
     likely = "the detections are in the frame of a camera, with z ahead, x to the right and y down"
-    return Hint("sensor frame", DETECTIONS_FILE, COLUMNS, found, likely, "put z into column x and -x into column y")
+    return Hint(
+        "sensor frame", DETECTIONS_FILE, COLUMNS, found, likely, "put z into column x and -x into column y"
+    )

@@ -82,7 +82,9 @@ def _advice(frame: Frame) -> str:
     if np.allclose(matrix, np.round(matrix), atol=1e-9):
         signs = {1: "", -1: "-"}
         terms = [
-            f"{signs[int(row[k])]}{'xy'[k]}" for row in np.round(matrix) for k in np.flatnonzero(np.round(row))
+            f"{signs[int(row[k])]}{'xy'[k]}"
+            for row in np.round(matrix)
+            for k in np.flatnonzero(np.round(row))
         ]
         return f"put {terms[0]} into column x and {terms[1]} into column y"
     mirror = "negate column y, then " if frame.mirrored else ""

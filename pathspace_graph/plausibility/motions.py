@@ -1,4 +1,4 @@
-"""The motion of the vehicle by its odometry, under different beliefs of what the columns of the odometry mean."""
+"""The motion of the vehicle by its odometry, for different meanings of the odometry's columns."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Meaning:
 
 
 def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
-    """Returns the motions (P, 3) from stamps `begin` to stamps `end` (P,), each in the frame of its beginning.
+    """Returns the motions (P, 3) between stamps (P,), each in the frame of its beginning.
 
     Between the stamps (N,) of the poses (N, 3) the motion is even.
     """

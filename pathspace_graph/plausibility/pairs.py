@@ -1,4 +1,4 @@
-"""Pairs of nearby cycles: cones stand still, so that a right motion lays the detections of one on the other's."""
+"""Pairs of nearby cycles: cones stand still, so a right motion lays detections of one on the other's."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Pairs:
         )
 
     def overlap(self, motion: Array) -> Array:
-        """Returns the share (P,) of the later detections that the earlier cycle could have seen, for a motion.
+        """Returns the share (P,) of the later detections that the earlier cycle could have seen.
 
         What a cycle sees is told from all detections: up to which range, and to both sides of which bearing.
         """

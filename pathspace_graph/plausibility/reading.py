@@ -1,4 +1,4 @@
-"""Logs are read together with the hints about them; a log that is refused is refused with its likely cause."""
+"""Logs are read together with the hints about them; where one is refused, its likely cause is told."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def read_plausible_log(folder: Path, limits: LimitSettings) -> tuple[Log, list[H
 
 
 def refused_hints(folder: Path) -> list[Hint]:
-    """Returns the hints about a log that was refused; there are none where its files cannot even be parsed."""
+    """Returns the hints about a log that was refused; there are none where it cannot even be parsed."""
     try:
         odometry = read_table(folder / ODOMETRY_FILE, ("t", "vx", "vy", "wz"))
         detections = read_table(folder / DETECTIONS_FILE, ("t", "x", "y", "label", "xx", "xy", "yy"))

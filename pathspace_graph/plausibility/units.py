@@ -122,7 +122,7 @@ def moved(log: Log, by: Callable[[Array], Array]) -> Log:
 
 
 def beyond_any_vehicle(odometry: Odometry, settings: PlausibilitySettings) -> list[Hint]:
-    """Returns hints about a speed and a yaw rate that no vehicle has, for a log that has no other evidence."""
+    """Returns hints about speeds and yaw rates that no vehicle has."""
     found = []
     speed = float(np.quantile(np.hypot(odometry.twist[:, 0], odometry.twist[:, 1]), 0.9))
     if speed > settings.fastest:
