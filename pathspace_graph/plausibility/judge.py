@@ -27,6 +27,8 @@ def hints(log: Log, settings: PlausibilitySettings | None = None) -> list[Hint]:
     on, the evidence is weak, and nothing is said.
     """
     settings = settings or PlausibilitySettings()
+    if len(log.odometry.t) < settings.least_twists:
+        return []
     of_parts = whole_stamps(log)
     if of_parts:
         return of_parts

@@ -19,8 +19,8 @@ from pathspace_graph.settings.limits import LimitSettings
 from .hint import Hint, because
 from .judge import hints
 
-NO_LIMIT: Final = float("inf")
-"""Numbers of any size are read, so that it can be said what they mean."""
+MOST: Final = 1e20
+"""Numbers up to this size are read, so that it can be said what they mean."""
 NO_LABEL: Final = frozenset({"unknown", "", "none", "nan", "null"})
 """These words say that a detection has no label."""
 SHOWN_WORDS: Final = 3
@@ -59,10 +59,10 @@ def _is_data(file: Path) -> bool:
 
 def _unchecked(odometry: Table, detections: Table) -> Log:
     """Returns a log of any numbers, whatever their size and order."""
-    t = odometry.numbers("t", NO_LIMIT)
-    twist = odometry.stack(("vx", "vy", "wz"), NO_LIMIT)
-    stamps, points = detections.numbers("t", NO_LIMIT), detections.stack(("x", "y"), NO_LIMIT)
-    xx, xy, yy = (detections.numbers(name, NO_LIMIT) for name in ("xx", "xy", "yy"))
+    t = odometry.numbers("t", MOST)
+    twist = odometry.stack(("vx", "vy", "wz"), MOST)
+    stamps, points = detections.numbers("t", MOST), detections.stack(("x", "y"), MOST)
+    xx, xy, yy = (detections.numbers(name, MOST) for name in ("xx", "xy", "yy"))
     covariances = np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
     labels = np.array([label_from_name(name) for name in detections.columns["label"]], dtype=int)
     starts = np.flatnonzero(np.append(True, np.diff(stamps) != 0.0)) if len(stamps) else np.zeros(0, int)

@@ -11,6 +11,8 @@ from .checked import Positive
 class PlausibilitySettings(Positive):
     """Describes how a log is judged before it is mapped."""
 
+    least_twists: int = 20
+    """Nothing is said of a log with fewer twists than this."""
     min_detections: int = 2
     """Cycles with fewer detections than this are not compared."""
     most_detections: int = 14
