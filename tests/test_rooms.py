@@ -56,6 +56,7 @@ ARROWS: dict[str, set[str]] = {
     | {"export"}
     | {f"eval.{room}" for room in ("metrics", "harness", "figures", "study", "compare", "scaling", "faults")},
     "options": {"io"},
+    "frames": {"io"},
     "cli": {"options", "commands"},
     "__main__": {"cli"},
 }
