@@ -61,7 +61,7 @@ def _by_motion(trials: Trials, settings: PlausibilitySettings) -> list[Hint]:
     if len(trials.pairs) == 0:
         return beyond_any_vehicle(trials.log.odometry, settings)
     best, found = _meant(trials, settings)
-    if best.hypothesis.meaning.content == "nothing":
+    if best.hypothesis.meaning.content == "nothing" or (found and is_a_line(trials.pairs, settings)):
         return found
     late, of_clocks = _late(trials, best, settings)
     if best.share < settings.least_share and late is best:
@@ -80,8 +80,8 @@ def _meant(trials: Trials, settings: PlausibilitySettings) -> tuple[Trial, list[
     told = verdict(best, trials.as_written, settings)
     if best is trials.as_written or not told.is_clear(settings):
         return trials.as_written, beyond_any_vehicle(trials.log.odometry, settings)
-    if best.hypothesis.meaning.content == "nothing" and is_a_line(trials.pairs, settings):
-        return best, [_optical(trials.pairs)]
+    if is_a_line(trials.pairs, settings):
+        return trials.as_written, [_optical(trials.pairs)]
     return best, frame_hints(best, trials, told) + odometry_hints(best, told)
 
 
@@ -168,8 +168,6 @@ def _labelled(trials: Trials, best: Trial, settings: PlausibilitySettings) -> li
 def _unexplained(trials: Trials, best: Trial, settings: PlausibilitySettings) -> list[Hint]:
     """Returns a hint where detections of cycles close to each other agree with no motion at all."""
     pairs = trials.pairs
-    if is_a_line(pairs, settings):
-        return [_optical(pairs)]
     motion = trials.motion(best.hypothesis)
     ranges = np.nanmedian(np.hypot(pairs.before[..., 0], pairs.before[..., 1]))
     near = np.hypot(motion[:, 0], motion[:, 1]) < settings.near * ranges
@@ -178,6 +176,8 @@ def _unexplained(trials: Trials, best: Trial, settings: PlausibilitySettings) ->
     share = float(best.explained[near].mean()) if near.sum() >= settings.least_near else 1.0
     if share > settings.unexplained:
         return []
+    if is_a_line(pairs, settings):
+        return [_optical(pairs)]
     found = f"only {share:.0%} of the detections lie where any motion expects them".replace("%", " %")
     likely = "bearings in degrees were taken for radians, or the two files are not of one drive"
     advice = "compare a few cycles with what the sensor saw"
