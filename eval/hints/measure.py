@@ -31,7 +31,7 @@ from pathspace_graph.run import run_online
 from pathspace_graph.settings.limits import LimitSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.mistakes import MISTAKES
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.simulate import simulate
 
 from .good import GOOD, Good, half_of
 
@@ -41,6 +41,8 @@ BAD_INPUT: Final = 2
 """This is the exit code where a track can't be read or the output can't be written."""
 MARKER: Final = "hints.csv"
 """The results are in this file; their folder is recognized by it."""
+AS_SIMULATED: Final = "as simulated"
+"""The good logs of this kind have nothing unusual."""
 CONFIDENCE: Final = 0.95
 """The intervals have this confidence."""
 MISSED: Final = 0.05
@@ -82,6 +84,8 @@ class HintStudy:
     """Good logs of all kinds are judged as well."""
     mistakes: tuple[str, ...] = tuple(MISTAKES)
     """Logs are spoiled by these mistakes."""
+    kinds: tuple[str, ...] = (AS_SIMULATED,)
+    """Good logs of these kinds are spoiled."""
     maps: bool = False
     """What becomes of the map of each spoiled log is measured, too, which takes long."""
 
@@ -89,6 +93,8 @@ class HintStudy:
         """Judges every log, writes the results and returns the table."""
         for name in self.mistakes:
             check_name(name, MISTAKES, "--mistakes: expected a known mistake")
+        for name in self.kinds:
+            check_name(name, GOOD, "--kinds: expected a known kind of good log")
         check_target(self.out, MARKER)
         tracks = load_tracks([int(one) if one.isdigit() else Path(one) for one in self.tracks])
         rows: list[Row] = []
@@ -106,15 +112,21 @@ class HintStudy:
     def _drive(self, track: NamedTrack, seed: int) -> Iterator[Row]:
         """Yields a row for each log of a drive."""
         drive = {"track": track.name, "seed": seed}
-        for name, kind in GOOD.items() if self.good else ():
-            yield {**drive, "kind": "good", "name": name, **judged(good_log(track, kind, seed, self.laps))}
-        log = simulate(track.track, SimulationSettings(laps=self.laps), seed)
+        for name, kind in GOOD.items():
+            if self.good or name in self.kinds:
+                log = good_log(track, kind, seed, self.laps)
+            if self.good:
+                yield {**drive, "kind": "good", "name": name, "of": name, **judged(log)}
+            if name in self.kinds:
+                yield from ({**drive, "of": name, **row} for row in self._spoiled(log))
+
+    def _spoiled(self, log: Log) -> Iterator[Row]:
+        """Yields a row for each mistake in a good log."""
         clean = mapped(log) if self.maps else {}
         for name in self.mistakes:
-            row = {**drive, "kind": "spoiled", "name": name, **judged(MISTAKES[name](log), causes_of(name))}
-            if self.maps:
-                row |= outcome(mapped(MISTAKES[name](log)), clean)
-            yield row
+            spoiled = MISTAKES[name](log)
+            row = {"kind": "spoiled", "name": name, **judged(spoiled, causes_of(name))}
+            yield row | (outcome(mapped(spoiled), clean) if self.maps else {})
 
 
 def good_log(track: NamedTrack, kind: Good, seed: int, laps: int) -> Log:

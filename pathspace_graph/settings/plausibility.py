@@ -55,7 +55,7 @@ class PlausibilitySettings(Positive):
     (m)."""
     nearest: float = 0.05
     """No cones are nearer than this, as a rule (m)."""
-    fastest: float = 60.0
+    fastest: float = 100.0
     """No vehicle is faster than this in a tenth of its time (m/s)."""
     fastest_turn: float = 8.0
     """No vehicle turns faster than this in a tenth of its time (rad/s)."""

@@ -15,7 +15,7 @@ import pytest
 from pathspace_graph.cli import main
 from pathspace_graph.io.log import Log, write_log
 
-from ..scenes.spoiled import short_drive
+from ..scenes.drives import short_drive
 
 
 def evo_ape(reference: Path, estimate: Path, home: Path) -> str:

@@ -14,8 +14,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.sim.mistakes import MISTAKES, in_frame, with_points, with_twists
 
-from ..scenes.drives import ahead, corridor, exact_log
-from ..scenes.spoiled import short_drive
+from ..scenes.drives import ahead, corridor, exact_log, short_drive
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

@@ -11,7 +11,7 @@ from pathspace_graph.settings.plausibility import PlausibilitySettings
 from pathspace_graph.sim.mistakes import in_frame
 
 from ..scenes.batch import course_log
-from ..scenes.spoiled import short_drive
+from ..scenes.drives import short_drive
 
 SETTINGS = PlausibilitySettings()
 

@@ -15,7 +15,7 @@ from pathspace_graph.plausibility.reading import read_plausible_log, refused_hin
 from pathspace_graph.settings.limits import LimitSettings
 from pathspace_graph.sim.mistakes import MISTAKES
 
-from ..scenes.spoiled import short_drive
+from ..scenes.drives import short_drive
 
 
 def written(log: Log, folder: Path) -> Path:

@@ -12,7 +12,7 @@ from pathspace_graph.eval.hints.good import GOOD
 from pathspace_graph.eval.hints.measure import CAUSES, causes_of, judged, main, outcome, summary
 from pathspace_graph.sim.mistakes import MISTAKES
 
-from ...scenes.spoiled import short_drive
+from ...scenes.drives import short_drive
 
 
 def test_every_mistake_has_its_causes_by_the_longest_beginning() -> None:
@@ -63,6 +63,7 @@ def test_the_script_leaves_rows_and_a_table(
     main()
     frame = pd.read_csv(out / "hints.csv")
     assert frame["kind"].tolist() == ["good", "spoiled"]
+    assert frame["of"].tolist() == ["as simulated"] * 2
     assert frame["told"].tolist() == [False, True]
     assert "| told: y to the right" in (out / "hints.md").read_text()
     assert "told: y to the right" in capsys.readouterr().out
