@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log
+from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE
 
 from .hint import Hint
 from .hypotheses import Frame, Trial, Trials, Verdict
@@ -47,7 +47,7 @@ def frame_hints(best: Trial, trials: Trials, told: Verdict) -> list[Hint]:
         return []
     if frame == MIRRORED:
         return [_mirrored(best, trials, told)]
-    of_odometry = _of_odometry(frame, trials.log)
+    of_odometry = _of_odometry(frame, trials)
     if of_odometry is not None:
         likely, advice = of_odometry
         return [Hint("odometry", ODOMETRY_FILE, "columns vx, vy", told.text, likely, advice)]
@@ -66,12 +66,13 @@ def _mirrored(best: Trial, trials: Trials, told: Verdict) -> Hint:
     return Hint("yaw rate", ODOMETRY_FILE, "column wz", told.text, likely, advice)
 
 
-def _of_odometry(frame: Frame, log: Log) -> tuple[str, str] | None:
+def _of_odometry(frame: Frame, trials: Trials) -> tuple[str, str] | None:
     """Returns cause and advice where it is the odometry that goes backward or to a side, or else None."""
-    vx, vy = np.median(log.odometry.twist[:, :2], axis=0)
+    vx, vy = np.median(trials.log.odometry.twist[:, :2], axis=0)
+    sees_ahead = np.nanmedian(trials.pairs.before[..., 0]) > 0.0
     if abs(vy) > abs(vx) and abs(frame.turn) == 90.0:
         return "vx and vy are swapped, or in a frame whose x axis points to a side", "give vx ahead, vy left"
-    if vx < 0.0 and frame == Frame(180.0):
+    if vx < 0.0 and sees_ahead and frame == Frame(180.0):
         return "the speed ahead is negative", "negate columns vx and vy"
     return None
 

@@ -75,7 +75,7 @@ class PlausibilitySettings(Positive):
     """The turn is told if its standard deviation is at most this (degrees)."""
     arm: float = 1.0
     """A sensor that sits farther than this from the point that the odometry describes is told (m)."""
-    arm_sigma: float = 0.15
+    arm_sigma: float = 0.2
     """Its place is told if its standard deviation is at most this share of the distance."""
     claimed_less: float = 10.0
     """Covariances are too small if detections of one cone are this number of times as far apart."""
