@@ -10,10 +10,13 @@ if TYPE_CHECKING:
     from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, read_map
     from pathspace_graph.io.results import CycleRecord, RunResult, write_result
     from pathspace_graph.online.fixed_lag import FixedLagMapper
+    from pathspace_graph.plausibility.hint import Hint
+    from pathspace_graph.plausibility.judge import hints
     from pathspace_graph.settings.mapper import MapperSettings
     from pathspace_graph.spline.bspline import BSpline
 
     from .errors import InputError, OutputError, PathspaceError, ReadingError, SettingsError
+    from .frames import read_cycles, read_study
     from .run import run_online
 
 __all__ = [
@@ -21,6 +24,7 @@ __all__ = [
     "CycleRecord",
     "Detections",
     "FixedLagMapper",
+    "Hint",
     "InputError",
     "Log",
     "Map",
@@ -33,8 +37,11 @@ __all__ = [
     "RunResult",
     "SettingsError",
     "SplineBoundary",
+    "hints",
+    "read_cycles",
     "read_log",
     "read_map",
+    "read_study",
     "run_online",
     "write_log",
     "write_result",
@@ -43,10 +50,13 @@ __all__ = [
 # imported when first asked for: the command line's help, and sim, need no estimator
 _HOMES = {
     "errors": ("InputError", "OutputError", "PathspaceError", "ReadingError", "SettingsError"),
+    "frames": ("read_cycles", "read_study"),
     "io.log": ("Detections", "Log", "Odometry", "read_log", "write_log"),
     "io.map": ("Map", "PointBoundary", "SplineBoundary", "read_map"),
     "io.results": ("CycleRecord", "RunResult", "write_result"),
     "online.fixed_lag": ("FixedLagMapper",),
+    "plausibility.hint": ("Hint",),
+    "plausibility.judge": ("hints",),
     "run": ("run_online",),
     "settings.mapper": ("MapperSettings",),
     "spline.bspline": ("BSpline",),

@@ -20,7 +20,7 @@ LEAVES = {"errors", "labels", "progress"}
 ESTIMATORS = {"online", "batch", "ckf", "landmark", "centerline"}
 BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "health", "run", "snapshot"}
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
-BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "diagnosis"}
+BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "diagnosis", "plausibility"}
 
 ARROWS: dict[str, set[str]] = {
     **{leaf: set() for leaf in LEAVES},
@@ -39,6 +39,7 @@ ARROWS: dict[str, set[str]] = {
     "snapshot": {"factors", "io", "graph"},
     "mapping": BELOW_MAPPING,
     "front_end": BELOW_MAPPING | {"mapping"},
+    "plausibility": {"factors", "settings", "io", "front_end"},
     **dict.fromkeys(ESTIMATORS, BELOW_ESTIMATORS),
     "loop": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes
     "online": BELOW_ESTIMATORS | {"loop"},
@@ -51,12 +52,14 @@ ARROWS: dict[str, set[str]] = {
     "eval.compare": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "eval.scaling": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "eval.faults": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
+    "eval.hints": BELOW_EVAL | {"eval.metrics", "eval.harness"},
     "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.harness", "eval.figures", "eval.study"},
     "view": BELOW_MAPPING | {"eval.metrics", "eval.figures"},
     "commands": BELOW_EVAL
     | {"export", "convert", "view"}
     | {f"eval.{room}" for room in ("metrics", "harness", "figures", "study", "compare", "scaling", "faults")},
     "options": {"io"},
+    "frames": {"io"},
     "cli": {"options", "commands"},
     "__main__": {"cli"},
 }

@@ -17,10 +17,11 @@ from pathspace_graph.eval.harness.workers import check_jobs, outcomes, workers
 from pathspace_graph.eval.metrics.cost import StageTime, stage_times
 from pathspace_graph.eval.metrics.ghosts import GhostSettings
 from pathspace_graph.eval.metrics.measures import measure, online_cycles
-from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.io.log import LOG_FILE, Log
 from pathspace_graph.io.results import BatchRun, RunResult
 from pathspace_graph.io.temporary import is_temporary
+from pathspace_graph.plausibility.hint import Hint
+from pathspace_graph.plausibility.reading import read_plausible_log
 from pathspace_graph.settings.limits import LimitSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -38,6 +39,8 @@ class NamedLog:
     """This is the name of the log's folder."""
     log: Log
     """This is the log."""
+    hints: tuple[Hint, ...] = ()
+    """These mistakes are likely in it."""
 
 
 @dataclass(frozen=True)
@@ -121,12 +124,17 @@ def read_logs(folder: Path, limits: LimitSettings | None = None) -> tuple[NamedL
     are none, or if a cycle of one cannot be used."""
     limits = limits or LimitSettings()
     if (folder / LOG_FILE).exists() or not folder.is_dir():
-        return (NamedLog(folder.resolve().name, read_usable_log(folder, limits)),)
+        return (_named(folder.resolve().name, folder, limits),)
     entries = (entry for entry in folder.iterdir() if not is_temporary(entry.name))
     inside = sorted(entry for entry in entries if (entry / LOG_FILE).is_file())
     if not inside:
         raise InputError(folder, f"expected a log ({LOG_FILE}) or folders that are logs, found neither")
-    return tuple(NamedLog(entry.name, read_usable_log(entry, limits)) for entry in inside)
+    return tuple(_named(entry.name, entry, limits) for entry in inside)
+
+
+def _named(name: str, folder: Path, limits: LimitSettings) -> NamedLog:
+    log, hints = read_plausible_log(folder, limits)
+    return NamedLog(name, log, tuple(hints))
 
 
 def choose(names: Sequence[str]) -> tuple[str, ...]:

@@ -69,7 +69,9 @@ def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
     outcomes = comparison.of(named.name)
     for outcome in outcomes:
         if outcome.result is not None:
-            write_result(folder / outcome.estimator, outcome.result, summarize(outcome.result, named.log))
+            write_result(
+                folder / outcome.estimator, outcome.result, summarize(outcome.result, named.log, named.hints)
+            )
     if any(outcome.result is not None for outcome in outcomes):
         save_figures(folder, {"maps": plot_maps(outcomes, named.log)})
     figure = blind_spot_figure(outcomes, named, comparison.reference)

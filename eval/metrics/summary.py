@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any, Final
@@ -18,6 +19,7 @@ from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.laps import lap_end_indices
+from pathspace_graph.plausibility.hint import Hint
 
 from .consistency import normal_errors
 from .table1 import LapMetrics, lap_metrics, root_mean_square
@@ -29,8 +31,11 @@ LIBRARIES: Final = ("pathspace-graph", "gtsam", "numpy", "scipy")
 """The versions of these libraries are recorded."""
 
 
-def summarize(result: RunResult, log: Log) -> dict[str, Any]:
-    """Returns the estimator, settings, versions, laps and timing, and with truth the paper's metrics."""
+def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
+    """Returns the estimator, settings, versions, laps and timing, and with truth the paper's metrics.
+
+    What was said of the log before it was mapped is in it, too, where anything was.
+    """
     summary: dict[str, Any] = {
         "estimator": result.estimator,
         "settings": result.settings,
@@ -46,6 +51,8 @@ def summarize(result: RunResult, log: Log) -> dict[str, Any]:
             "refused": sum(record.refused for record in result.cycles),
         },
     }
+    if hints:
+        summary["hints"] = [asdict(hint) for hint in hints]
     events = _events(result)
     if events:
         summary["events"] = events

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -14,16 +15,17 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT_BATCH, MapKind, check_batch, for_map, make_batch
 from pathspace_graph.eval.metrics.gap import gap
 from pathspace_graph.eval.metrics.summary import summarize
-from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.results import BatchRun, write_result
+from pathspace_graph.plausibility.hint import Hint
+from pathspace_graph.plausibility.reading import read_plausible_log
 from pathspace_graph.progress import progress
 from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .online import report
+from .online import report, tell
 
 NOT_CONVERGED: Final = 3
 """This is the exit code of a run whose result is written, but is not the optimum."""
@@ -53,14 +55,16 @@ class Batch:
         if self.start == "odometry" and name != DEFAULT_BATCH:
             raise SettingsError(f"--start: expected online for {name}, found {self.start}")
         check_target(self.out, MAP_FILE)
-        log = read_usable_log(self.log, self.settings.limits)
+        log, hints = read_plausible_log(self.log, self.settings.limits)
+        tell(hints)
         with progress("optimizing") as advance:
             estimator = make_batch(name, self.settings, log)
             if isinstance(estimator, BatchMapper):
                 result: BatchRun = estimator.solve(log, self.start, advance)
             else:
                 result = estimator.solve(log)
-        write_result(self.out, result, summarize_batch(result, log, self.start or self.settings.batch.start))
+        start = self.start or self.settings.batch.start
+        write_result(self.out, result, summarize_batch(result, log, start, hints))
         report(result, log)
         Console().print(f"written to {self.out}", highlight=False, soft_wrap=True, markup=False)
         if not result.converged:
@@ -72,9 +76,9 @@ class Batch:
             raise SystemExit(NOT_CONVERGED)
 
 
-def summarize_batch(result: BatchRun, log: Log, start: Start) -> dict[str, Any]:
+def summarize_batch(result: BatchRun, log: Log, start: Start, hints: Sequence[Hint] = ()) -> dict[str, Any]:
     """Returns the summary of a run, how its optimization ended, and its gap from its online start."""
-    summary = summarize(result, log) | {"start": start, "converged": result.converged}
+    summary = summarize(result, log, hints) | {"start": start, "converged": result.converged}
     if not isinstance(result, BatchResult):
         return summary
     summary["convergence"] = asdict(result.convergence)

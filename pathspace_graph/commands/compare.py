@@ -18,6 +18,8 @@ from pathspace_graph.io.files import check_target
 from pathspace_graph.progress import progress
 from pathspace_graph.settings.mapper import MapperSettings
 
+from .online import tell
+
 FAILED: Final = 3
 """This is the exit code of a comparison that is written, but in which an estimator failed."""
 FILE_WIDTH: Final = 160
@@ -57,6 +59,8 @@ class Compare:
         check_jobs(self.jobs)
         check_target(self.out, MARKER)
         logs = read_logs(self.log, self.settings.limits)
+        for named in logs:
+            tell(named.hints, of=named.name if len(logs) > 1 else "")
         with progress("comparing", len(logs) * len(estimators)) as advance:
             comparison = compare(
                 logs,

@@ -20,8 +20,11 @@ from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import LOG_FILE, Log, write_log
 from pathspace_graph.labels import NAMES
+from pathspace_graph.plausibility.hint import because
+from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.progress import progress
 
+from .online import tell
 from .simulate import describe
 
 Kind = Literal["bag", "csv", "victoria-park"]
@@ -91,6 +94,7 @@ class Convert:
             log = to_log(record, frames, self.noise, file)
             write_checked(log, self.out, file)
         report(record.notes, log, self.out)
+        tell(hints(log))
 
     def _read(self, rule: LabelRule) -> Recording:
         if self.kind == "victoria-park":
@@ -124,7 +128,9 @@ def write_checked(log: Log, out: Path, source: Path) -> None:
         write_log(log, out, check=True)
     except InputError as error:
         where = f"{error.file.name}, row {error.row}" if error.row else error.file.name
-        raise InputError(source, f"its log would be refused ({where}): {error.message}") from None
+        likely = because(hints(log))
+        why = f"{error.message}; {likely}" if likely else error.message
+        raise InputError(source, f"its log would be refused ({where}): {why}") from None
 
 
 def report(notes: Counter[str], log: Log, out: Path) -> None:

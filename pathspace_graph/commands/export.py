@@ -16,8 +16,9 @@ from pathspace_graph.export.lanelet2 import write_lanelet2
 from pathspace_graph.export.local_plane import LocalPlane
 from pathspace_graph.export.tables import write_centre_line, write_points, write_profile
 from pathspace_graph.io.files import atomic_file, check_file_target
+from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE, read_log
 from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map
-from pathspace_graph.io.trajectory import TRAJECTORY_FILE, read_trajectory
+from pathspace_graph.io.trajectory import TRAJECTORY_FILE, read_trajectory, write_trajectory
 from pathspace_graph.settings.speed import SpeedSettings
 from pathspace_graph.spline.centre_line import LEAST_STEP, MOST_POINTS
 
@@ -31,7 +32,7 @@ class Export:
     """Writes a map in a format that planners and other tools read."""
 
     map: Positional[Path]
-    """The map is read from this folder."""
+    """The map is read from this folder. With `tum` it may also be a log, whose true path is written."""
     format: Annotated[Format, arg(name="as")]
     """The format is the centre line with widths as TUM raceline CSV (`centerline`), the trajectory in the TUM
     format (`tum`), boundaries and centre line as GeoJSON (`geojson`), both boundaries as CSV with the columns
@@ -56,6 +57,9 @@ class Export:
                 f"--step: expected a number of at least {LEAST_STEP:g} m, found {self.step:g}"
             )
         plane = self._plane()
+        if self.format == "tum" and not (self.map / MAP_FILE).exists() and (self.map / LOG_FILE).exists():
+            write_true_path(self.map, self.out)
+            return
         track = read_map(self.map)
         file = self.map / MAP_FILE
         check_length(track, self.step, file)
@@ -85,6 +89,15 @@ class Export:
             expected = "expected LATITUDE LONGITUDE HEADING in degrees, the heading clockwise from north"
             raise SettingsError(f"--origin: {expected}, found none, which --as {self.format} needs")
         return None
+
+
+def write_true_path(folder: Path, out: Path) -> None:
+    """Writes the true poses of a log in the TUM format; InputError where they are not known."""
+    truth = read_log(folder).truth
+    if truth is None or len(truth.poses) == 0:
+        raise InputError(folder, f"expected a log with {TRUTH_POSES_FILE}, or a map, found neither")
+    with atomic_file(out) as temporary:
+        write_trajectory(temporary, truth.pose_t, truth.poses)
 
 
 def copy_trajectory(source: Path, target: Path) -> None:

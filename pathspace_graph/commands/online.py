@@ -25,7 +25,6 @@ from pathspace_graph.eval.metrics.summary import (
     vehicle_of,
 )
 from pathspace_graph.eval.metrics.table1 import LapMetrics
-from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import Log
@@ -33,6 +32,8 @@ from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.labels import NAMES
 from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.plausibility.hint import Hint
+from pathspace_graph.plausibility.reading import read_plausible_log
 from pathspace_graph.progress import progress
 from pathspace_graph.run import Observer, OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
@@ -78,11 +79,12 @@ class Online:
         check_target(self.out, MAP_FILE)
         self._check_snapshots(name)
         check_watchers(self)
-        log = read_usable_log(self.log, self.settings.limits)
+        log, hints = read_plausible_log(self.log, self.settings.limits)
+        tell(hints)
         log, estimator = self._begin(log, name)
         with watchers(self, log) as observers:
             result = map_online(log, estimator, name, observers)
-            write_result(self.out, result, summarize(result, log))
+            write_result(self.out, result, summarize(result, log, hints))
         if self.save is not None and isinstance(estimator, FixedLagMapper):
             estimator.save(self.save)
         report(result, log)
@@ -114,6 +116,14 @@ class Online:
             expected = f"expected cycles after {times[-1]:g} s, where {self.resume} ends"
             raise InputError(self.log, f"{expected}, found none")
         return replace(log, cycles=cycles), mapper
+
+
+def tell(hints: Sequence[Hint], of: str = "") -> None:
+    """Prints a line for each hint as an error, with the name of the log `of` which it is where there are
+    several."""
+    say = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
+    for hint in hints:
+        say.print(f"hint: {of}{'/' if of else ''}{hint.line}")
 
 
 def map_online(

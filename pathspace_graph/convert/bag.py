@@ -201,7 +201,7 @@ class Bag:
         self.path = path
         self._reader = reader
         self._definitions = definitions
-        self._is_ros1 = path.suffix == ".bag"
+        self._is_ros1 = is_ros1(path)
 
     @staticmethod
     @contextmanager
@@ -212,7 +212,7 @@ class Bag:
         rosbag1, rosbag2, _ = _rosbags()
         given = _given_definitions(definitions)
         try:
-            reader = (rosbag1 if path.suffix == ".bag" else rosbag2).Reader(path)
+            reader = (rosbag1 if is_ros1(path) else rosbag2).Reader(path)
             reader.open()
         except Exception as error:
             expected = "expected a ROS bag: a file .bag, .mcap or .db3, or a folder with metadata.yaml"
@@ -300,6 +300,11 @@ class Bag:
             found = f"found {UNDEFINED} ({connection.msgtype}: {error}); --definition hands one over"
             raise InputError(self.path, f"{connection.topic}: expected a known type, {found}") from None
         return store
+
+
+def is_ros1(path: Path) -> bool:
+    """Returns whether a bag is one of rosbag1: a file. A folder is a bag of rosbag2, whatever its name."""
+    return path.suffix == ".bag" and not path.is_dir()
 
 
 def _stamped(

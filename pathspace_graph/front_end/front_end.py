@@ -23,7 +23,8 @@ from .sides import SideJudge
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 SWAPPED: Final = {
-    True: "the cones on the left have the colour of the right boundary: the colours are swapped",
+    True: "the cones on the left have the colour of the right boundary: the colours are swapped, the track "
+    "is driven the other way round, or y points to the right in the whole log",
     False: "the colours are as they were said to be",
 }
 """These notices say that the colours are swapped from now on, or no longer."""

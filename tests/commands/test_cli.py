@@ -303,7 +303,8 @@ def test_bad_usage_is_one_line_and_exit_code_2(
 def test_the_output_is_checked_before_the_work(
     log_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(commands_online, "read_usable_log", lambda *_: pytest.fail("read before the check"))
+    read = "read_plausible_log"
+    monkeypatch.setattr(commands_online, read, lambda *_: pytest.fail("read before the check"))
     (tmp_path / "thesis.tex").write_text("mine")
     assert main(["online", str(log_folder), "--out", str(tmp_path)]) == 2
     assert main(["online", str(log_folder), "--out", str(tmp_path / "thesis.tex" / "map")]) == 2

@@ -1,8 +1,9 @@
-"""Drives without noise, for tests of the mapper: what is seen is exactly what is there."""
+"""Drives without noise, in which what is seen is exactly what is there, and a short one with noise."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,9 @@ from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track, to_map_frame
+from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 from pathspace_graph.sim.vehicle import VehicleSettings, drive, integrate
 
 Array = NDArray[np.float64]
@@ -112,3 +115,14 @@ def true_poses(log: Log) -> Array:
     """Poses (n, 3) at the cycles of an exact log."""
     assert log.truth is not None
     return log.truth.poses[np.searchsorted(log.truth.pose_t, [c.t - 1e-9 for c in log.cycles])]
+
+
+SHORT = TrackGeneratorSettings(lap_length=(100.0, 160.0), corners=(3, 4), hairpins=(0, 0), cones=90)
+"""A track of this kind is driven in twenty seconds."""
+
+
+@cache
+def short_drive(seed: int = 4) -> Log:
+    """The log of one lap of a short generated track, with the simulator's noise."""
+    track = generate_track(np.random.default_rng(seed), SHORT)
+    return simulate(track, SimulationSettings(laps=1), seed)

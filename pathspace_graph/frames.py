@@ -1,0 +1,110 @@
+"""Results as data frames: the cycles of a run and the runs of a study for pandas, and a study for xarray."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import pandas as pd
+
+from pathspace_graph.io.csv_table import Table, read_table
+from pathspace_graph.io.manifest import verified
+from pathspace_graph.io.results import CYCLES_FILE
+
+from .errors import InputError, SettingsError
+
+if TYPE_CHECKING:
+    import xarray
+
+CYCLE_TYPES: Final = {
+    "cycle": "int64",
+    "t": "float64",
+    "seconds": "float64",
+    "size_left": "int64",
+    "size_right": "int64",
+    "readings": "int64",
+    "lap": "int64",
+    "offered": "int64",
+    "health": "str",
+    "reason": "str",
+    "dropped": "int64",
+}
+"""The columns of `cycles.csv` have these types; any further column is text."""
+OPTIONAL: Final = ("offered", "health", "reason", "dropped")
+"""These columns of `cycles.csv` may be missing."""
+RESULTS_FILE: Final = "results.csv"
+"""A study has its metrics in this file, a row for each run and lap."""
+TIMES_FILE: Final = "times.csv"
+"""A study has its wall times in this file, in the same rows."""
+KEYS: Final = ("study", "track", "seed", "noise", "estimator", "variant", "lap")
+"""These columns tell the rows of a study apart."""
+TEXTS: Final = ("study", "track", "noise", "estimator", "variant", "failure", "said")
+"""These columns of a study are text, also where it looks like a number."""
+DIMENSIONS: Final = KEYS[1:]
+"""The metrics of a study have these dimensions."""
+
+
+def read_cycles(folder: Path | str) -> pd.DataFrame:
+    """Returns the cycles of a run from the folder of its map, a row for each, with the cycle as its index.
+
+    Times are in s. Columns that the estimator does not write are not there. InputError on a wrong file.
+    """
+    file = Path(folder) / CYCLES_FILE
+    with verified(file.parent, file.name):
+        required = [name for name in CYCLE_TYPES if name not in OPTIONAL]
+        table = read_table(file, required)
+    columns = {name: _column(table, name, CYCLE_TYPES.get(name, "str")) for name in table.columns}
+    return pd.DataFrame(columns).set_index("cycle")
+
+
+def _column(table: Table, name: str, kind: str) -> pd.Series:
+    if kind == "str":
+        return pd.Series(table.columns[name], dtype="str")
+    values = table.numbers(name)
+    if kind == "int64":
+        table.require(values == values.round(), f"expected whole numbers in column '{name}'")
+    return pd.Series(values).astype(kind)
+
+
+def read_study(folder: Path | str) -> pd.DataFrame:
+    """Returns the runs of a study from the folder that `ablate` wrote: a tidy row for each run and lap.
+
+    The metrics come with the wall times. A run that failed has one row without a lap or metrics, and its
+    `failure`. InputError on a wrong file.
+    """
+    results, times = (_table(Path(folder) / name) for name in (RESULTS_FILE, TIMES_FILE))
+    keys = list(KEYS)
+    if not results[keys].equals(times[keys]):
+        raise InputError(Path(folder) / TIMES_FILE, f"expected the rows of {RESULTS_FILE}, found other ones")
+    place = results.columns.get_loc("failure") if "failure" in results else len(results.columns)
+    parts = [results.iloc[:, :place], times.drop(columns=keys), results.iloc[:, place:]]
+    return pd.concat(parts, axis=1)
+
+
+def _table(file: Path) -> pd.DataFrame:
+    """Returns a file of a study; empty texts stay empty, and empty numbers are NaN."""
+    read_table(file, KEYS)  # which says what is wrong with it
+    frame = pd.read_csv(file, dtype=dict.fromkeys(TEXTS, "str"), keep_default_na=False, na_values=[""])
+    flags = [name for name in frame if name not in TEXTS and frame[name].dropna().isin([True, False]).all()]
+    flags = [name for name in flags if frame[name].dtype.kind not in "fiu"]
+    types = {"lap": "Int64", **dict.fromkeys(flags, "boolean")}
+    return frame.astype(types).fillna({name: "" for name in TEXTS if name in frame})
+
+
+def to_dataset(study: pd.DataFrame) -> xarray.Dataset:
+    """Returns the numbers of a study as a Dataset with the dimensions DIMENSIONS; what is true is 1.
+
+    Where a run failed or was not made its values are NaN. Texts that are the same in every row, such as the
+    versions, are attributes. SettingsError where xarray is not installed.
+    """
+    if find_spec("xarray") is None:
+        raise SettingsError("to_dataset: expected xarray (pip install 'pathspace-graph[frames]'), found none")
+    numbers = study.select_dtypes(["number", "bool", "boolean"]).columns.difference(DIMENSIONS, sort=False)
+    finished = study[study["lap"].notna()].astype({"lap": "int64", **dict.fromkeys(numbers, "float64")})
+    dataset: xarray.Dataset = finished.set_index(list(DIMENSIONS))[list(numbers)].to_xarray()
+    whole = {name: study[name].dropna().unique() for name in DIMENSIONS}
+    whole["lap"] = whole["lap"].astype("int64")
+    texts = study.drop(columns=[*numbers, *DIMENSIONS])
+    same = {name: texts[name].iloc[0] for name in texts if texts[name].nunique(dropna=False) == 1}
+    return dataset.reindex(whole).assign_attrs(same)

@@ -1,0 +1,85 @@
+"""Logs are read together with the hints about them; where one is refused, its likely cause is told."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from pathspace_graph.errors import InputError
+from pathspace_graph.front_end.gate import read_usable_log
+from pathspace_graph.io.csv_table import Table, read_table
+from pathspace_graph.io.limits import shown
+from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry
+from pathspace_graph.labels import UNKNOWN, label_from_name
+from pathspace_graph.settings.limits import LimitSettings
+
+from .hint import Hint, because
+from .judge import hints
+
+MOST: Final = 1e20
+"""Numbers up to this size are read, so that it can be said what they mean."""
+NO_LABEL: Final = frozenset({"unknown", "", "none", "nan", "null"})
+"""These words say that a detection has no label."""
+SHOWN_WORDS: Final = 3
+"""At most this number of foreign labels is shown."""
+
+
+def read_plausible_log(folder: Path, limits: LimitSettings) -> tuple[Log, list[Hint]]:
+    """Reads a log whose cycles may all be used, and judges it; otherwise raises an InputError.
+
+    The error names the file, the row and what was expected, and where the log tells it, the likely cause.
+    """
+    try:
+        log = read_usable_log(folder, limits)
+    except InputError as error:
+        causes = because(refused_hints(folder)) if _is_data(error.file) else ""
+        if not causes:
+            raise
+        raise InputError(error.file, f"{error.message}; {causes}", error.row) from error
+    return log, hints(log) + _foreign_labels(folder, log)
+
+
+def refused_hints(folder: Path) -> list[Hint]:
+    """Returns the hints about a log that was refused; there are none where it cannot even be parsed."""
+    try:
+        odometry = read_table(folder / ODOMETRY_FILE, ("t", "vx", "vy", "wz"))
+        detections = read_table(folder / DETECTIONS_FILE, ("t", "x", "y", "label", "xx", "xy", "yy"))
+        log = _unchecked(odometry, detections)
+    except InputError:
+        return []
+    return hints(log)
+
+
+def _is_data(file: Path) -> bool:
+    return file.name in (ODOMETRY_FILE, DETECTIONS_FILE)
+
+
+def _unchecked(odometry: Table, detections: Table) -> Log:
+    """Returns a log of any numbers, whatever their size and order."""
+    t = odometry.numbers("t", MOST)
+    twist = odometry.stack(("vx", "vy", "wz"), MOST)
+    stamps, points = detections.numbers("t", MOST), detections.stack(("x", "y"), MOST)
+    xx, xy, yy = (detections.numbers(name, MOST) for name in ("xx", "xy", "yy"))
+    covariances = np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
+    labels = np.array([label_from_name(name) for name in detections.columns["label"]], dtype=int)
+    starts = np.flatnonzero(np.append(True, np.diff(stamps) != 0.0)) if len(stamps) else np.zeros(0, int)
+    spans = [slice(a, b) for a, b in zip(starts, np.append(starts[1:], len(stamps)), strict=True)]
+    cycles = (Detections(float(stamps[s.start]), points[s], covariances[s], labels[s]) for s in spans)
+    return Log(Odometry(t, twist), tuple(cycles), np.ones(3))
+
+
+def _foreign_labels(folder: Path, log: Log) -> list[Hint]:
+    """Returns a hint where no label is left or right, but many are other words than unknown."""
+    if not log.cycles or any((cycle.labels != UNKNOWN).any() for cycle in log.cycles):
+        return []
+    words = Counter(read_table(folder / DETECTIONS_FILE, ("label",)).columns["label"])
+    foreign = [word for word, _ in words.most_common() if word.strip().lower() not in NO_LABEL]
+    if not foreign:
+        return []
+    found = f"the labels are {', '.join(shown(word) for word in foreign[:SHOWN_WORDS])}"
+    likely = "the classes of the detector were not turned into left and right"
+    advice = "write left, right or unknown (or blue, yellow) for each detection"
+    return [Hint("labels", DETECTIONS_FILE, "column label", found, likely, advice)]

@@ -1,0 +1,132 @@
+"""Hints: each mistake is told with its cause and its figure, and good logs are not accused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pathspace_graph import hints
+from pathspace_graph.eval.hints.good import GOOD, backs_up, in_unix_time, one_boundary, stands_first
+from pathspace_graph.eval.hints.measure import causes_of
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.labels import UNKNOWN
+from pathspace_graph.sim.mistakes import MISTAKES, in_frame, with_points, with_twists
+
+from ..scenes.drives import ahead, corridor, exact_log, short_drive
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_each_mistake_is_told_by_its_cause(mistake: str) -> None:
+    found = hints(MISTAKES[mistake](short_drive()))
+    assert {hint.cause for hint in found} & set(causes_of(mistake)), found
+    assert all("\n" not in hint.line for hint in found)
+
+
+def test_good_logs_are_not_accused() -> None:
+    log = short_drive()
+    colourless = replace(log, cycles=tuple(replace(c, labels=c.labels * 0 + UNKNOWN) for c in log.cycles))
+    for good in (log, colourless, stands_first(log), backs_up(log), one_boundary(log), in_unix_time(log)):
+        assert hints(good) == []
+
+
+def test_the_truth_is_not_read() -> None:
+    log = MISTAKES["y to the right"](short_drive())
+    assert hints(replace(log, truth=None)) == hints(log)
+
+
+@pytest.mark.parametrize("turn", [-120.0, -25.0, 12.0, 65.0])
+def test_the_angle_of_a_turned_sensor_is_told(turn: float) -> None:
+    (found,) = hints(in_frame(short_drive(), turn=np.deg2rad(turn)))
+    assert found.cause == "sensor frame"
+    told = float(found.likely.split(" by ")[1].split(" degrees")[0])
+    assert told == pytest.approx(abs(turn), abs=1.0)
+    assert ("to the left" in found.likely) == (turn > 0.0)
+
+
+def test_the_place_of_a_sensor_is_told() -> None:
+    (found,) = hints(in_frame(short_drive(), ahead=2.5, left=-1.0))
+    assert found.cause == "mounting"
+    words = found.advice.split()
+    assert [float(words[1]), float(words[5])] == pytest.approx([2.5, -1.0], abs=0.4)
+
+
+def test_advice_for_quarter_turns_undoes_them() -> None:
+    (found,) = hints(MISTAKES["sensor frame: x to the right, y ahead"](short_drive()))
+    assert found.likely == "the sensor's frame has x to the right and y ahead"
+    assert found.advice == "put y into column x and -x into column y"
+
+
+def test_two_mistakes_are_both_told() -> None:
+    log = with_twists(with_points(short_drive(), lambda points: 1000.0 * points[:, ::-1]), (3.6, 3.6, 1.0))
+    assert [hint.cause for hint in hints(log)] == ["positions", "sensor frame", "speeds"]
+
+
+def test_a_vehicle_that_goes_backward_by_its_odometry_alone_is_told() -> None:
+    (found,) = hints(with_twists(short_drive(), (-1.0, -1.0, 1.0)))
+    assert (found.cause, found.likely) == ("odometry", "the speed ahead is negative")
+
+
+# --- weak evidence: nothing is said ----------------------------------------------------------------------
+
+
+def test_straight_on_a_mirrored_log_cannot_be_told() -> None:
+    cones, labels = corridor(80.0)
+    log = exact_log(ahead(6.0, 10.0), cones, labels)
+    assert hints(log) == []
+    assert hints(MISTAKES["y to the right"](log)) == []
+
+
+def test_a_vehicle_at_rest_is_not_accused() -> None:
+    cones, labels = corridor(80.0)
+    log = exact_log(ahead(0.0, 20.0), cones, labels)
+    for mistake in ("y to the right", "sensor frame: x to the left", "speeds in km/h"):
+        assert hints(MISTAKES[mistake](log)) == []
+
+
+def test_a_short_log_is_not_accused() -> None:
+    log = short_drive()
+    short = replace(
+        log,
+        odometry=Odometry(log.odometry.t[:60], log.odometry.twist[:60]),
+        cycles=tuple(cycle for cycle in log.cycles if cycle.t < 1.0),
+    )
+    assert hints(MISTAKES["y to the right"](short)) == []
+
+
+def test_impossible_speeds_are_told_without_detections() -> None:
+    odometry = Odometry(0.02 * np.arange(100), np.tile([8e3, 0.0, 40.0], (100, 1)))
+    nothing = Detections(0.5, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, int))
+    for cycles in ((), (nothing,)):
+        found = hints(Log(odometry, cycles, np.ones(3)))
+        assert [hint.cause for hint in found] == ["speeds", "yaw rate"]
+
+
+def test_a_log_with_hardly_any_odometry_is_not_judged() -> None:
+    assert hints(Log(Odometry(np.zeros(0), np.zeros((0, 3))), (), np.ones(3))) == []
+
+
+# --- stamps ----------------------------------------------------------------------------------------------
+
+
+def test_stamps_that_are_only_fractions_or_whole_seconds_are_told() -> None:
+    log = short_drive()
+    for change, likely in ((lambda t: t % 1.0, "only the fraction"), (np.floor, "only the whole seconds")):
+        spoiled = replace(log, odometry=replace(log.odometry, t=change(log.odometry.t)))
+        (found,) = hints(spoiled)
+        assert (found.cause, found.file) == ("stamps", "odometry.csv")
+        assert likely in found.likely
+
+
+def test_files_of_different_clocks_are_told() -> None:
+    log = short_drive()
+    spoiled = replace(log, cycles=tuple(replace(cycle, t=cycle.t + 1.7e9) for cycle in log.cycles))
+    (found,) = hints(spoiled)
+    assert found.cause == "clocks"
+    assert "different clocks" in found.likely
+
+
+def test_every_kind_of_good_log_has_settings_of_its_own() -> None:
+    kinds = [(kind.simulation, kind.edit, kind.open_road) for kind in GOOD.values()]
+    assert all(kinds.count(kind) == 1 for kind in kinds)

@@ -1,0 +1,91 @@
+"""Logs with hints: a refusal names its likely cause, the commands tell hints, and `summary.json` has them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pathspace_graph.cli import main
+from pathspace_graph.errors import InputError
+from pathspace_graph.io.log import Log, write_log
+from pathspace_graph.plausibility.reading import read_plausible_log, refused_hints
+from pathspace_graph.settings.limits import LimitSettings
+from pathspace_graph.sim.mistakes import MISTAKES
+
+from ..scenes.drives import short_drive
+
+
+def written(log: Log, folder: Path) -> Path:
+    write_log(log, folder)
+    return folder
+
+
+def test_a_good_log_is_read_without_hints(tmp_path: Path) -> None:
+    log, found = read_plausible_log(written(short_drive(), tmp_path / "log"), LimitSettings())
+    assert found == []
+    np.testing.assert_array_equal(log.odometry.twist, short_drive().odometry.twist)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "file", "likely"),
+    [
+        ("stamps in nanoseconds", "odometry.csv", "the stamps are in nanoseconds"),
+        ("stamps of the detections in nanoseconds", "detections.csv", "the stamps are in nanoseconds"),
+        ("all lengths in millimetres", "odometry.csv", "the speeds are in mm/s"),
+        ("speeds in mm/s", "odometry.csv", "the speeds are in mm/s"),
+        ("yaw rate in degrees per second", "odometry.csv", "the yaw rate is in degrees per second"),
+        ("covariances of zero", "detections.csv", "the covariances are in another unit, or no covariances"),
+    ],
+)
+def test_a_refusal_names_its_likely_cause_in_one_line(
+    mistake: str, file: str, likely: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = written(MISTAKES[mistake](short_drive()), tmp_path / "log")
+    assert main(["online", str(folder), "--out", str(tmp_path / "map")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert said.startswith(f"pathspace-graph: {folder / file}, row ")
+    assert f"likely cause: {likely}" in said or f"; {likely}" in said
+    assert not (tmp_path / "map").exists()
+
+
+def test_a_refusal_without_a_likely_cause_is_as_it_was(tmp_path: Path) -> None:
+    folder = written(short_drive(), tmp_path / "log")
+    (folder / "manifest.json").unlink(missing_ok=True)
+    lines = (folder / "odometry.csv").read_text().splitlines()
+    lines[5] = "0.08,fast,0,0"
+    (folder / "odometry.csv").write_text("\n".join(lines))
+    with pytest.raises(InputError) as error:
+        read_plausible_log(folder, LimitSettings())
+    expected = "row 6: expected a number in column 'vx', found 'fast'"
+    assert str(error.value) == f"{folder / 'odometry.csv'}, {expected}"
+    assert refused_hints(folder) == []
+
+
+@pytest.mark.parametrize("command", ["online", "batch"])
+def test_a_hint_is_told_and_the_log_is_mapped(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = MISTAKES["positions in centimetres"](short_drive())
+    short = Log(log.odometry, log.cycles[:60], log.odometry_sigma)
+    folder, out = written(short, tmp_path / "log"), tmp_path / "map"
+    assert main([command, str(folder), "--out", str(out)]) in (0, 3)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line for line in lines if line.startswith("hint: ")] == lines[:1]
+    assert "the positions are in centimetres" in lines[0]
+    (hint,) = json.loads((out / "summary.json").read_text())["hints"]
+    assert (hint["cause"], hint["file"], hint["columns"]) == ("positions", "detections.csv", "columns x, y")
+
+
+def test_labels_of_a_detector_are_told(tmp_path: Path) -> None:
+    folder = written(short_drive(), tmp_path / "log")
+    (folder / "manifest.json").unlink(missing_ok=True)
+    text = (folder / "detections.csv").read_text()
+    (folder / "detections.csv").write_text(text.replace("left", "cone_b").replace("right", "cone_y"))
+    _, (hint,) = read_plausible_log(folder, LimitSettings())
+    assert hint.found in ("the labels are 'cone_b', 'cone_y'", "the labels are 'cone_y', 'cone_b'")
+    (folder / "detections.csv").write_text(text.replace("left", "unknown").replace("right", ""))
+    assert read_plausible_log(folder, LimitSettings())[1] == []
