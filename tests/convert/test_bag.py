@@ -79,6 +79,29 @@ def assert_same_readings(log: Log, drive: Log, *, covariances: bool = True, atol
 # --- the three kinds -------------------------------------------------------------------------------------
 
 
+def test_a_folder_is_a_bag_of_rosbag2_whatever_its_name(drive: Log, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path, "mcap", of_log(drive, Messages.cloud_of)).rename(tmp_path / "drive.bag")
+    assert_same_readings(convert(bag, tmp_path / "log"), drive)
+
+
+def test_a_mistake_in_the_bag_is_told_with_its_cause(
+    drive: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The good bag is told nothing of; with y to the right the log is written, and told of in a line."""
+
+    def mirrored(messages: Messages, cycle: Detections) -> Any:
+        flip = np.array([1.0, -1.0])
+        points, covariances = cycle.points_vehicle * flip, cycle.covariances * np.outer(flip, flip)
+        return messages.cloud_of(Detections(cycle.t, points, covariances, cycle.labels))
+
+    convert(write_bag(tmp_path, "mcap", of_log(drive, Messages.cloud_of)), tmp_path / "good")
+    assert capsys.readouterr().err == ""
+    convert(write_bag(tmp_path, "sqlite3", of_log(drive, mirrored)), tmp_path / "spoiled")
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("hint: ")
+    assert "to the right" in line
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_drive_comes_back_from_a_bag(kind: Kind, drive: Log, tmp_path: Path) -> None:
     bag = write_bag(tmp_path, kind, of_log(drive, Messages.cloud_of))
