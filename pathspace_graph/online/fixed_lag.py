@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -16,12 +15,9 @@ from pathspace_graph.errors import ReadingError, SettingsError
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.front_end.gate import Admitted
 from pathspace_graph.front_end.late import at_nearest_pose
-from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
+from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
-from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
-from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.association import associate, associate_late
 from pathspace_graph.loop.closing import apply_correspondences, optimize_loop, simplify
@@ -32,20 +28,15 @@ from pathspace_graph.mapping.prediction import (
     odometry_noise,
     predict,
     smoother_settings,
-    vehicle_state,
 )
 from pathspace_graph.mapping.registration import register
-from pathspace_graph.run import CycleResult, Readings, Stopwatch
+from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.snapshot import restore, save
-from pathspace_graph.spline.ahead import CurveAhead, TrackAhead, track_ahead
-from pathspace_graph.spline.boundary import Boundary
 
 from .activation import deactivate_distant
+from .estimate import MapperEstimate
 from .growth import Growth
-from .nonlinear_graph import window_graph
-from .outlook import Outlook, confirmed, joint_covariance_of, look_ahead
-from .readings import newest_readings
 
 Array = NDArray[np.float64]
 
@@ -57,7 +48,7 @@ class Solver(Protocol):
         """Moves the smoother's variables to the estimate, and leaves its `last_step` for gating."""
 
 
-class FixedLagMapper:
+class FixedLagMapper(MapperEstimate):
     """Maps a track's two boundaries cycle by cycle, as splines in one factor graph with the vehicle's poses.
 
     Each cycle solves for the poses of the last `settings.lag` seconds and for every control point; all
@@ -257,107 +248,6 @@ class FixedLagMapper:
         pose, sizes = self.poses[-1].copy(), (left, right)
         return CycleResult(t, pose, sizes, used, self.closed, stages, jump, notice, self.loop.health)
 
-    def map(self) -> Map:
-        """Returns a copy of the present map, with the joint covariance of each boundary's control points.
-
-        An open curve goes on beyond its confirmed end, as `outline` says.
-        """
-        with self.smoother.variables.looked_at():
-            return self._map()
-
-    def _map(self) -> Map:
-        state, outlooks = self.smoother.map.state, self._outlooks()
-        if not outlooks:
-            return Map(self.closed, {})
-        newest = pose_keys(np.array([self.smoother.next_cycle - 1]))
-        joint = self.smoother.covariance(np.concatenate([state.map_keys, newest]))
-        if self.closed:
-            return self._closed_map(joint[:-POSE, :-POSE])
-        joint, blocks = joint_covariance_of(
-            list(outlooks.values()), joint, self.poses[-1], self.settings.tentative.sigma_bend
-        )
-        boundaries = {
-            label: SplineBoundary(outlook.spline, joint[block, block].copy(), outlook.confirmed_until)
-            for (label, outlook), block in zip(outlooks.items(), blocks, strict=True)
-        }
-        return Map(False, boundaries, joint)
-
-    def _closed_map(self, joint: Array) -> Map:
-        """Returns the closed map, whose control points have a covariance (2m, 2m) from the graph.
-
-        What a curve with few control points cannot follow is added: no number of detections averages it out.
-        """
-        shape, scatter = self.settings.spline.sigma_shape, self.smoother.map.scatter
-        boundaries, at = {}, 0
-        for label, boundary in self.boundaries.items():
-            block = slice(at, at := at + POINT * boundary.size)
-            sigma = scatter.get(label, np.full(boundary.size, shape))
-            covariance = joint[block, block] + np.diag(np.repeat(sigma, POINT) ** 2)
-            spline = self.smoother.map.state.spline(label)
-            boundaries[label] = SplineBoundary(spline, covariance, spline.domain[1])
-        return Map(True, boundaries, joint_covariance(joint, boundaries))
-
-    def outline(self) -> Map:
-        """Returns a copy of the present map without covariances, which takes a hundredth of the time.
-
-        An open curve is confirmed up to `confirmed_until`. From there on it is tentative: it leads through
-        cones that were seen less often, and is fitted anew in each call. A curve that has not begun may
-        consist of a tentative stretch alone.
-        """
-        boundaries = {}
-        with self.smoother.variables.looked_at():
-            for label, outlook in self._outlooks().items():
-                spline = outlook.spline
-                until = spline.domain[1] if self.closed else outlook.confirmed_until
-                boundaries[label] = SplineBoundary(spline, NO_COVARIANCE, until)
-        return Map(self.closed, boundaries)
-
-    def ahead(self, distance: float, step: float = 1.0) -> TrackAhead:
-        """Returns the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.
-
-        This is what a controller asks for in each cycle, so it is fast, and nothing of the estimate changes.
-        While the loop is open, it goes on beyond the confirmed ends, as `outline` does, and says where.
-        SettingsError is raised where a length is out of its range.
-        """
-        if not self.smoother.times:
-            return track_ahead({}, np.zeros(POSE), distance, step)
-        state, outlooks = self.smoother.map.state, self._outlooks(refresh=False)
-        pose, beside = self.poses[-1], {label: u[-1] for label, u in state.pose_u.items()}
-        curves = {}
-        for label, outlook in outlooks.items():
-            spline = outlook.spline
-            begin = beside.get(label, spline.domain[0])
-            curves[label] = CurveAhead(spline, begin, outlook.confirmed_until)
-        return track_ahead(curves, pose, distance, step)
-
-    def looked_at(self) -> AbstractContextManager[None]:
-        """Returns a context in which the mapper may be asked for anything, and its estimate stays as it is.
-
-        Without it, `control_points` leaves the inactive part of an open map up to date, which may move later
-        estimates by millimetres.
-        """
-        return self.smoother.variables.looked_at()
-
-    def readings(self) -> Readings:
-        """Returns the detections of the newest cycle as they were used or gated, with their foot points."""
-        return newest_readings(self.smoother)
-
-    def vehicle_state(self) -> VehicleState:
-        """Returns the newest pose and the calibration, with their joint covariance."""
-        with self.smoother.variables.looked_at():
-            return vehicle_state(self.smoother)
-
-    def _outlooks(self, refresh: bool = True) -> dict[int, Outlook]:
-        """Returns the curves; open ones have a tentative stretch.
-
-        What the vehicle has left behind is brought up to date only if it is asked for.
-        """
-        if refresh:
-            self.smoother.refresh()
-        if self.closed or self.smoother.next_cycle == 0:
-            return confirmed(self.smoother)
-        return look_ahead(self.smoother, self.growth, self.path)
-
     # --- the snapshot ------------------------------------------------------------------------------------
 
     def save(self, path: Path | str) -> None:
@@ -390,108 +280,3 @@ class FixedLagMapper:
         if self.smoother.times:
             self.vehicle_state()
             self.map()
-
-    # --- the graph ---------------------------------------------------------------------------------------
-
-    def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Returns the window as GTSAM factors: projection, spacing, smoothness, odometry, your own and prior.
-
-        The factors hold the active variables, which `values` returns. The graph shares nothing with the
-        mapper: optimize it, print its errors, or compute its marginals with GTSAM's own classes. There is no
-        such factor for `spline.residual` "point" or for places of cones, where SettingsError is raised.
-        """
-        if self.settings.spline.residual != "across":
-            raise SettingsError(
-                f"graph: expected spline.residual across, found {self.settings.spline.residual}"
-            )
-        if self.settings.place.use != "none":
-            raise SettingsError(f"graph: expected place.use none, found {self.settings.place.use}")
-        return window_graph(self.smoother)
-
-    def values(self) -> gtsam.Values:
-        """Returns the active variables: poses as `Pose2`, control points and the calibration as points."""
-        return self.smoother.variables.gtsam_values(self.smoother.layout.keys)
-
-    def marginal_covariance(self, keys: Sequence[int]) -> Array:
-        """Returns the joint covariance (q, q) of any variables (k,), in the order of their keys.
-
-        Control points are in m, poses (x, y, theta) in m and rad, both in the map frame; the calibration is
-        (-, rad/s). SettingsError is raised for a key that is not a variable: its pose has left the window, or
-        its curve has new knots.
-        """
-        wanted = np.array(keys, np.intp)
-        unknown = wanted[self.smoother.variables.layout.positions(wanted) == UNKNOWN_PLACE]
-        if len(unknown):
-            first, last = self.smoother.first_cycle, self.smoother.next_cycle - 1
-            raise SettingsError(
-                f"covariance of {name(unknown[0])}: expected keys of poses x{first} to x{last}, "
-                "of control points of the present curves, or of the calibration"
-            )
-        return self.smoother.covariance(wanted)
-
-    @staticmethod
-    def pose_key(cycle: int) -> int:
-        """Returns GTSAM's key of the pose at a perception cycle, counted from 0."""
-        return pose_key(cycle)
-
-    @property
-    def next_pose_key(self) -> int:
-        """Returns the key of the pose that the next update adds."""
-        return pose_key(self.smoother.next_cycle)
-
-    def control_keys(self, label: int) -> list[int]:
-        """Returns the keys of a boundary's control points, which change only when the loop closes."""
-        keys: list[int] = self.smoother.map.state.keys(label).tolist()
-        return keys
-
-    # --- the loop ----------------------------------------------------------------------------------------
-
-    @property
-    def closed(self) -> bool:
-        """Returns whether the loop has closed: the map has its final size."""
-        return self.loop.closed
-
-    @property
-    def corrected_poses(self) -> Array:
-        """Returns the poses (k, 3) of the first k cycles as the closing of the loop has corrected them."""
-        return self.loop.corrected_poses
-
-    @property
-    def lap_seconds(self) -> float:
-        """Returns the wall time (s) of the batch of the lap, once it has replaced the prior."""
-        return self.loop.lap_seconds
-
-    # --- the estimate ------------------------------------------------------------------------------------
-
-    @property
-    def boundaries(self) -> dict[int, Boundary]:
-        """Returns the curves by label; their control points are in `control_points`."""
-        return self.smoother.map.state.boundaries
-
-    def control_points(self, label: int) -> Array:
-        """Returns a view of a boundary's control points (m, 2) in m, map frame."""
-        self.smoother.refresh()
-        return self.smoother.map.state.control_points(label)
-
-    def pose_parameter(self, label: int) -> float:
-        """Returns the parameter (m) of the newest pose's foot point; it increases from lap to lap."""
-        return float(self.smoother.map.state.pose_u[label][-1])
-
-    @property
-    def poses(self) -> Array:
-        """Returns a view of the poses (P, 3) in the window, the oldest first, map frame."""
-        return self.smoother.variables.poses
-
-    def window_poses(self) -> Array:
-        """Returns a copy of the poses (P, 3) in the window, the oldest first, map frame."""
-        return self.poses.copy()
-
-    @property
-    def calibration(self) -> Array:
-        """Returns a view of the odometry's calibration: (scale error [-], yaw-rate bias [rad/s])."""
-        return self.smoother.variables.calibration
-
-    @property
-    def calibrations(self) -> Array:
-        """Returns a view of the calibrations of the odometry and, where it is estimated, of the sensor."""
-        return self.smoother.variables.calibrations
