@@ -23,7 +23,7 @@ BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
 BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "diagnosis", "plausibility"}
 
 ARROWS: dict[str, set[str]] = {
-    **{leaf: set() for leaf in LEAVES},
+    **{leaf: set() for leaf in sorted(LEAVES)},
     "factors": set(),
     "settings": set(),
     "laps": set(),
@@ -40,7 +40,7 @@ ARROWS: dict[str, set[str]] = {
     "mapping": BELOW_MAPPING,
     "front_end": BELOW_MAPPING | {"mapping"},
     "plausibility": {"factors", "settings", "io", "front_end"},
-    **dict.fromkeys(ESTIMATORS, BELOW_ESTIMATORS),
+    **dict.fromkeys(sorted(ESTIMATORS), BELOW_ESTIMATORS),
     "loop": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes
     "online": BELOW_ESTIMATORS | {"loop"},
     "centerline": BELOW_ESTIMATORS | {"loop", "batch", "online"},
