@@ -153,7 +153,7 @@ def test_the_example_of_the_readme_runs(
 def test_the_readme_sets_up_with_one_command_each() -> None:
     demo, tests = (block.strip() for block in blocks("sh")[:2])
     assert demo.endswith(".venv/bin/pathspace-graph demo")
-    assert tests.endswith(".venv/bin/pytest")
+    assert tests.endswith(".venv/bin/pytest -n auto --dist loadfile")
     assert all("\n" not in command for command in (demo, tests))
 
 
