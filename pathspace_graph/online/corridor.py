@@ -65,14 +65,16 @@ def _next(row: Row, other: Row, driven: Array, threshold: float, settings: Tenta
     """Returns the index of the candidate that continues a row, or None."""
     step = row.candidates - row.end
     distance = np.hypot(step[:, 0], step[:, 1])
-    (cos, sin) = row.direction
-    turn = np.abs(np.arctan2(cos * step[:, 1] - sin * step[:, 0], step @ row.direction))
     near = (distance > threshold) & (distance < settings.gap)
-    allowed = near & (turn < settings.turn - settings.turn_rate * distance)
-    allowed[row.chosen] = False
-    indices = np.flatnonzero(allowed)
-    cost = distance[indices] * (1.0 + settings.turn_cost * turn[indices] ** 2)
-    indices = indices[np.argsort(cost)]
+    near[row.chosen] = False
+    indices = np.flatnonzero(near)
+    if len(indices) == 0:
+        return None
+    (cos, sin), step, distance = row.direction, step[indices], distance[indices]
+    turn = np.abs(np.arctan2(cos * step[:, 1] - sin * step[:, 0], step @ row.direction))
+    allowed = turn < settings.turn - settings.turn_rate * distance
+    cost = distance * (1.0 + settings.turn_cost * turn**2)
+    indices = indices[allowed][np.argsort(cost[allowed])]
     if len(indices):
         points = row.candidates[indices]
         possible = _has_width(row, other, points, settings)
