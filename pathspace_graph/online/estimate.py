@@ -26,7 +26,7 @@ from pathspace_graph.spline.boundary import Boundary
 
 from .growth import Growth
 from .nonlinear_graph import window_graph
-from .outlook import Outlook, confirmed, joint_covariance_of, look_ahead
+from .outlook import Outlook, confirmed, curves_ahead, joint_covariance_of, look_ahead
 from .readings import newest_readings
 
 Array = NDArray[np.float64]
@@ -102,18 +102,19 @@ class MapperEstimate:
         """Returns the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.
 
         This is what a controller asks for in each cycle, so it is fast, and nothing of the estimate changes.
-        While the loop is open, it goes on beyond the confirmed ends, as `outline` does, and says where.
+        While the loop is open, it goes on beyond the confirmed ends through the cones of `outline`, and says
+        where.
         SettingsError is raised where a length is out of its range.
         """
         if not self.smoother.times:
             return track_ahead({}, np.zeros(POSE), distance, step)
-        state, outlooks = self.smoother.map.state, self._outlooks(refresh=False)
-        pose, beside = self.poses[-1], {label: u[-1] for label, u in state.pose_u.items()}
+        pose, state = self.poses[-1], self.smoother.map.state
+        if not self.closed:
+            return track_ahead(curves_ahead(self.smoother, self.growth, self.path), pose, distance, step)
         curves = {}
-        for label, outlook in outlooks.items():
-            spline = outlook.spline
-            begin = beside.get(label, spline.domain[0])
-            curves[label] = CurveAhead(spline, begin, outlook.confirmed_until)
+        for label, boundary in self.boundaries.items():
+            points, beside = boundary.extended(state.control_points(label)), float(state.pose_u[label][-1])
+            curves[label] = CurveAhead(boundary.tables, points, beside)
         return track_ahead(curves, pose, distance, step)
 
     def looked_at(self) -> AbstractContextManager[None]:
@@ -133,13 +134,9 @@ class MapperEstimate:
         with self.smoother.variables.looked_at():
             return vehicle_state(self.smoother)
 
-    def _outlooks(self, refresh: bool = True) -> dict[int, Outlook]:
-        """Returns the curves; open ones have a tentative stretch.
-
-        What the vehicle has left behind is brought up to date only if it is asked for.
-        """
-        if refresh:
-            self.smoother.refresh()
+    def _outlooks(self) -> dict[int, Outlook]:
+        """Returns the curves; open ones have a tentative stretch."""
+        self.smoother.refresh()
         if self.closed or self.smoother.next_cycle == 0:
             return confirmed(self.smoother)
         return look_ahead(self.smoother, self.growth, self.path)

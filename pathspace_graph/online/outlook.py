@@ -20,6 +20,7 @@ from pathspace_graph.mapping.candidates import SIDES
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.ahead import CurveAhead
 from pathspace_graph.spline.boundary import Boundary, Placement, open_boundary
 from pathspace_graph.spline.bspline import BSpline
 
@@ -106,12 +107,44 @@ def joint_covariance_of(
     return np.asarray(0.5 * (covariance + covariance.T)), blocks
 
 
-def look_ahead(smoother: CurveSmoother, growth: Growth, path: DrivenPath) -> dict[int, Outlook]:
-    """Returns each open curve with its tentative stretch, and curves that have not begun but may."""
-    state, settings = smoother.map.state, smoother.map.settings
+def led_rows(
+    smoother: CurveSmoother, growth: Growth, path: DrivenPath
+) -> tuple[dict[int, Row], dict[int, IntArray]]:
+    """Returns the row of each boundary, led on through its tentative tracks, and the indices of these."""
+    settings = smoother.map.settings
     tracks = {label: _tracks(smoother, growth, label) for label in BOUNDARIES}
     rows = {label: _row(smoother, growth, label, tracks[label]) for label in BOUNDARIES}
     lead_on(rows[LEFT], rows[RIGHT], path.points, settings.growth.threshold, settings.tentative)
+    return rows, tracks
+
+
+def curves_ahead(smoother: CurveSmoother, growth: Growth, path: DrivenPath) -> dict[int, CurveAhead]:
+    """Returns each open curve from beside the vehicle on, with the tracks that lead on, for `track_ahead`.
+
+    These are the tracks of `look_ahead`, but no curve is fitted to them, which would take most of the time.
+    """
+    state, settings = smoother.map.state, smoother.map.settings
+    rows, tracks = led_rows(smoother, growth, path)
+    curves = {}
+    for label, row in rows.items():
+        if label in state.boundaries:
+            boundary = state.boundaries[label]
+            points, beside = state.control_points(label), float(state.pose_u[label][-1])
+            on = row.candidates[row.chosen]
+            curves[label] = CurveAhead(boundary.tables, points, beside, boundary.confirmed_end, on)
+        elif len(row.chosen) >= MIN_TRACKS:
+            variances = growth.tentative[label].variances(tracks[label][row.chosen])
+            outlook = _begun(settings, row, variances)
+            boundary = outlook.boundary
+            points = outlook.control_points
+            curves[label] = CurveAhead(boundary.tables, points, 0.0, boundary.tables.high, confirmed=False)
+    return curves
+
+
+def look_ahead(smoother: CurveSmoother, growth: Growth, path: DrivenPath) -> dict[int, Outlook]:
+    """Returns each open curve with its tentative stretch, and curves that have not begun but may."""
+    state, settings = smoother.map.state, smoother.map.settings
+    rows, tracks = led_rows(smoother, growth, path)
     outlooks = {}
     for label, row in rows.items():
         chosen = tracks[label][row.chosen]

@@ -1,7 +1,7 @@
 """What lies ahead of a vehicle: the next metres of the track in its own frame, for a controller.
 
-It is the line of `centre_line`, but only its next stretch, and a hundred times faster. All stations are
-settled on both boundaries at once, by a few steps of Newton's method.
+It is the line of `centre_line`, but only its next stretch, and a hundred times faster: each boundary is
+sampled once, and near a sample it is taken as the circle that osculates it there.
 """
 
 from __future__ import annotations
@@ -15,16 +15,19 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.se2 import left_of, wrap_angle
+from pathspace_graph.factors.spans import SpanPolynomials
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
-from .bspline import BSpline
 from .centre_line import LEAST_STEP, MOST_POINTS, points_across
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Ints = NDArray[np.intp]
 
-_SAMPLE_STEP: Final = 1.0
-"""The points across are searched among samples of the boundaries that are this far apart (m)."""
+_SAMPLE_STEP: Final = 0.5
+"""The boundaries are sampled at about this distance (m). The circle at a sample is right to a millimetre."""
+_ACROSS: Final = 2
+"""The points across are searched among every so-manyth sample."""
 _BEHIND: Final = 3.0
 """The samples begin this far behind the vehicle (m), since it may stand askew."""
 _OUTER: Final = 1.8
@@ -32,25 +35,27 @@ _OUTER: Final = 1.8
 _SETTLING_STEPS: Final = 8
 """The stations are settled by at most this number of Newton steps; mostly two are enough."""
 _SETTLED: Final = 1e-3
-"""A station is on the line where its distances are equal, and its foot points perpendicular, to this (m)."""
+"""A station is on the line where its distances from both boundaries differ by at most this (m)."""
 _LARGEST_GAP: Final = 2.0
 """Neighbours are at most this many steps apart."""
 
 
 @dataclass(frozen=True, eq=False)
 class CurveAhead:
-    """Holds a boundary, and where the vehicle is on it."""
+    """Holds a boundary in the direction of travel, and where the vehicle is on it."""
 
-    spline: BSpline
-    """The curve is in the map frame, in the direction of travel; its parameter is about a length in m."""
+    tables: SpanPolynomials
+    """The parameter is about a length in m."""
+    control_points: Array
+    """(n, 2) These are its control points in m, map frame; those of a closed curve repeat."""
     beside: float
     """The vehicle's foot point is at about this parameter."""
-    confirmed_until: float = np.inf
-    """The curve is confirmed up to this parameter; beyond, it is tentative. A closed one is confirmed."""
-
-    def is_confirmed(self, u: Array) -> Bools:
-        """Returns where (n,) the curve is confirmed."""
-        return (u <= self.confirmed_until) | self.spline.periodic
+    until: float = np.inf
+    """An open curve is confirmed up to this parameter, where it ends."""
+    tentative: Array | None = None
+    """(k, 2) From its end the boundary leads on through these points (m, map frame), as far as is known."""
+    confirmed: bool = True
+    """The curve itself may be taken back where this is false."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,98 +107,144 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
     if not LEAST_STEP <= step < np.inf or distance > MOST_POINTS * step:
         least = max(LEAST_STEP, distance / MOST_POINTS)
         raise SettingsError(f"step: expected a number of at least {least:g} m, found {step:g}")
-    samples = {label: _Samples.of(curve, distance) for label, curve in curves.items()}
+    samples = {label: _sampled(curve, distance) for label, curve in curves.items()}
     sides = [
         _in_frame(samples[label].beside(distance), pose) if label in samples else np.zeros((0, 2))
         for label in BOUNDARIES
     ]
-    line = _first_line(samples[LEFT], samples[RIGHT]) if len(samples) == len(BOUNDARIES) else None
-    if line is None or len(line.u) < 2:
+    line = None
+    if len(samples) == len(BOUNDARIES):
+        line = _first_line(samples[LEFT], samples[RIGHT])
+    if line is None or len(line.points) < 2:
         none = np.zeros(0)
         return TrackAhead(
             np.zeros((0, 2)), none, none, none, none, none, none > 0.0, sides[LEFT], sides[RIGHT]
         )
     line = _from_beside(line, pose[:2], distance, step)
-    return _settled(curves[LEFT], curves[RIGHT], line, pose, step, sides)
+    return _settled(samples[LEFT], samples[RIGHT], line, pose, step, sides)
+
+
+# --- samples of the boundaries ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Holds a boundary at n places."""
+
+    points: Array
+    """These are the points (n, 2) in m, map frame."""
+    tangents: Array
+    """These are the unit tangents (n, 2)."""
+    curvature: Array
+    """This is the curvature (n,) in 1/m."""
+    station: Array
+    """This is the length (n,) along the boundary, from beside the vehicle, in m."""
+    confirmed: Bools
+    """A sample (n,) is confirmed, or may be taken back."""
+
+    def beside(self, distance: float) -> Array:
+        """Returns the points (k, 2) from beside the vehicle on, along a distance (m)."""
+        wanted = (self.station >= -_SETTLED) & (self.station <= distance + _SETTLED)
+        return self.points[wanted][::_ACROSS]
+
+
+def _sampled(curve: CurveAhead, distance: float) -> _Samples:
+    """Returns samples from behind the vehicle to where the curve is no longer needed."""
+    tables = curve.tables
+    begin, end = curve.beside - _BEHIND, curve.beside + _OUTER * distance + _BEHIND
+    if tables.periodic:
+        end = min(end, begin + tables.length)  # at most once round
+    else:
+        begin, end = max(begin, tables.low), min(end, tables.high, curve.until)
+    # a sample is beside the vehicle, if the curve is there
+    first = int(np.floor((begin - curve.beside) / _SAMPLE_STEP + _SETTLED))
+    last = int(np.ceil((end - curve.beside) / _SAMPLE_STEP - _SETTLED))
+    u = curve.beside + _SAMPLE_STEP * np.arange(first, last + 1)
+    u = np.minimum(np.maximum(u, begin), max(end, begin))
+    values, span = tables.evaluate(u, 2)
+    columns = span[:, None] + np.arange(-tables.degree, 1)
+    parts = list(np.einsum("rkj,kjd->rkd", values, curve.control_points[columns]))
+    confirmed = np.full(len(u), curve.confirmed)
+    if curve.tentative is not None and len(curve.tentative):
+        on = _led_on(parts[0][-1], parts[1][-1], curve.tentative)
+        parts = [np.concatenate(pair) for pair in zip(parts, on, strict=True)]
+        confirmed = np.append(confirmed, np.zeros(len(on[0]), bool))
+    points, first_order, second = parts
+    square = _dot(first_order, first_order)
+    speed = np.sqrt(square)
+    ahead = float(u[0] - curve.beside)
+    return _Samples(
+        points=points,
+        tangents=first_order / speed[:, None],
+        curvature=_dot(left_of(first_order), second) / (square * speed),
+        station=ahead + np.cumsum(_distances(points)),
+        confirmed=confirmed,
+    )
+
+
+def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Array]:
+    """Returns the positions and two derivatives (n, 2) of a cubic from an end (2,) through points (k, 2).
+
+    It begins with the slope of the curve (2,), and has the slopes of Catmull and Rom at the points.
+    """
+    nodes = np.concatenate([end[None], points])
+    edges = np.diff(nodes, axis=0)
+    lengths = np.hypot(edges[:, 0], edges[:, 1])
+    unit = edges / lengths[:, None]
+    share = (lengths[:-1] / (lengths[:-1] + lengths[1:]))[:, None]
+    inner = unit[:-1] * (1.0 - share) + unit[1:] * share
+    slopes = np.concatenate([slope[None] / np.hypot(*slope), inner, unit[-1:]])
+    counts = np.maximum(np.ceil(lengths / _SAMPLE_STEP).astype(int), 1)
+    piece = np.repeat(np.arange(len(counts)), counts)
+    within = np.arange(len(piece)) - np.repeat(np.cumsum(counts) - counts, counts) + 1.0
+    x, h = (within / counts[piece])[:, None], lengths[piece][:, None]
+    a, c = nodes[piece], edges[piece]
+    m, n = slopes[piece] * h, slopes[piece + 1] * h
+    bend, twist = 3.0 * c - 2.0 * m - n, m + n - 2.0 * c
+    position = a + x * (m + x * (bend + x * twist))
+    return position, (m + x * (2.0 * bend + 3.0 * x * twist)) / h, (2.0 * bend + 6.0 * x * twist) / h**2
 
 
 # --- the first line --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class _Samples:
-    """Holds points (n, 2) of a boundary and its tangents, at parameters (n,) that are evenly spaced."""
-
-    u: Array
-    points: Array
-    tangents: Array
-    ahead: Array
-    """(n,) These parameters are counted from beside the vehicle."""
-
-    @classmethod
-    def of(cls, curve: CurveAhead, distance: float) -> _Samples:
-        """Returns samples from behind the vehicle to where the curve is no longer needed."""
-        low, high = curve.spline.domain
-        begin, end = curve.beside - _BEHIND, curve.beside + _OUTER * distance + _BEHIND
-        if curve.spline.periodic:
-            end = min(end, begin + (high - low))  # at most once round
-        else:
-            begin, end = max(begin, low), min(end, high)
-        u = np.linspace(begin, max(end, begin), max(int((end - begin) / _SAMPLE_STEP), 0) + 1)
-        points, tangents = _derivatives(curve.spline, u, 1)
-        return cls(u, points, tangents, u - curve.beside)
-
-    def along(self, points: Array, rows: NDArray[np.intp]) -> Array:
-        """Returns how far (k,) in the parameter the foot points of points (k, 2) are ahead of samples."""
-        tangents = self.tangents[rows]
-        return _dot(points - self.points[rows], tangents) / _dot(tangents, tangents)
-
-    def beside(self, distance: float) -> Array:
-        """Returns the points (k, 2) from beside the vehicle on, along a distance (m)."""
-        along = self.points[self.ahead >= 0.0]
-        return np.asarray(along[np.cumsum(_distances(along)) <= distance + _SETTLED])
-
-
-@dataclass(frozen=True, eq=False)
 class _Line:
-    """Holds points (n, 2) near the centre line, with the parameters (n,) of their foot points."""
+    """Holds points (n, 2) near the centre line, with the stations (n,) of their foot points."""
 
     points: Array
-    u: Array
-    v: Array
+    left: Array
+    right: Array
 
 
 def _first_line(left: _Samples, right: _Samples) -> _Line:
-    """Returns the middles between samples of each boundary and the points across, in the order of travel."""
-    u, v, lefts, rights = left.u, right.u, left.points, right.points
-    along = left.ahead, right.ahead
-    apart = 0.5 * min(u[-1] - u[0], v[-1] - v[0])  # a loop must not be paired across its ends
-    i, j = points_across((lefts, rights), (left.tangents, right.tangents), along, apart)
-    k, h = points_across((rights, lefts), (-right.tangents, -left.tangents), along[::-1], apart)
-    own, other = np.concatenate([i, h]), np.concatenate([j, k])
-    order = np.argsort(u[own] + v[other], kind="stable")
-    own, other = own[order], other[order]
-    forward = np.append(True, (np.diff(u[own]) >= 0.0) & (np.diff(v[other]) >= 0.0))
-    own, other = own[forward], other[forward]
-    points = 0.5 * (lefts[own] + rights[other])
-    apart = np.append(True, _distances(points)[1:] > _SETTLED)
-    own, other, points = own[apart], other[apart], points[apart]
-    return _Line(points, u[own] + left.along(points, own), v[other] + right.along(points, other))
+    """Returns the middles between samples of the left boundary and those across, in the order of travel."""
+    of = slice(None, None, _ACROSS)
+    lefts, rights = left.points[of], right.points[of]
+    stations = left.station[of], right.station[of]
+    apart = 0.5 * min(left.station[-1], right.station[-1])  # a loop must not be paired across its ends
+    i, j = points_across((lefts, rights), (left.tangents[of], right.tangents[of]), stations, apart)
+    forward = j >= np.maximum.accumulate(j) if len(j) else np.zeros(0, bool)
+    i, j = i[forward], j[forward]
+    points = 0.5 * (lefts[i] + rights[j])
+    apart_enough = np.append(True, _distances(points)[1:] > _SETTLED)[: len(points)]
+    i, j = i[apart_enough], j[apart_enough]
+    return _Line(points[apart_enough], stations[0][i], stations[1][j])
 
 
 def _from_beside(line: _Line, position: Array, distance: float, step: float) -> _Line:
     """Returns the line at even steps, from the point beside a position (2,) on."""
     edges = np.diff(line.points, axis=0)
-    squares = np.einsum("kd,kd->k", edges, edges)
+    squares = _dot(edges, edges)
     offset = position - line.points[:-1]
-    share = np.minimum(np.maximum(np.einsum("kd,kd->k", offset, edges) / squares, 0.0), 1.0)
+    share = np.minimum(np.maximum(_dot(offset, edges) / squares, 0.0), 1.0)
     away = offset - share[:, None] * edges
-    nearest = int(np.einsum("kd,kd->k", away, away).argmin())
+    nearest = int(_dot(away, away).argmin())
     lengths = np.append(0.0, np.cumsum(np.sqrt(squares)))
     begin = lengths[nearest] + share[nearest] * (lengths[nearest + 1] - lengths[nearest])
     count = int(min(distance, lengths[-1] - begin) / step + _SETTLED)
     at = begin + step * np.arange(count + 1)
-    x, y, u, v = (np.interp(at, lengths, values) for values in (*line.points.T, line.u, line.v))
+    x, y, u, v = (np.interp(at, lengths, values) for values in (*line.points.T, line.left, line.right))
     return _Line(np.column_stack([x, y]), u, v)
 
 
@@ -201,90 +252,98 @@ def _from_beside(line: _Line, position: Array, distance: float, step: float) -> 
 
 
 def _settled(
-    left: CurveAhead, right: CurveAhead, line: _Line, pose: Array, step: float, sides: Sequence[Array]
+    left: _Samples, right: _Samples, line: _Line, pose: Array, step: float, sides: Sequence[Array]
 ) -> TrackAhead:
-    """Returns the track ahead at the points of the line, moved along its normals to equal distances.
-
-    With the foot point S(u) of c, F = S'(u) . (c - S(u)) vanishes; the signed distance is N . (c - S(u)).
-    """
-    points, feet = line.points, (_Foot(left.spline, line.u), _Foot(right.spline, line.v))
+    """Returns the track ahead at the points of the line, moved along its normals to equal distances."""
+    points, feet = line.points, [_Feet(left, line.left), _Feet(right, line.right)]
     for _ in range(_SETTLING_STEPS):
+        for foot in feet:
+            foot.find(points)
+        off = feet[0].distance + feet[1].distance
         both = feet[0].normal + feet[1].normal
-        normal = both / np.linalg.norm(both, axis=1, keepdims=True)
-        moved = -(feet[0].distance(points) + feet[1].distance(points)) / _dot(both, normal)
-        feet = feet[0].refined(points, normal, moved), feet[1].refined(points, normal, moved)
-        points = points + moved[:, None] * normal
-        distances = -feet[0].distance(points), feet[1].distance(points)
-        off = np.abs(distances[1] - distances[0]) + sum(np.abs(foot.along(points)) for foot in feet)
-        if off.max() <= _SETTLED:
+        inside = feet[0].inside & feet[1].inside
+        if not (inside & ((np.abs(off) > _SETTLED) | feet[0].slid | feet[1].slid)).any():
             break
-    good = (off <= _SETTLED) & (distances[0] > 0.0) & (distances[1] > 0.0)
-    good &= _distances(points) <= _LARGEST_GAP * step
-    both = feet[0].tangent + feet[1].tangent
-    tangent = both / np.linalg.norm(both, axis=1, keepdims=True)
-    cosine = _dot(tangent, feet[0].tangent)
-    bend = 0.5 * cosine * (feet[0].offset_curvature(points) + feet[1].offset_curvature(points))
-    turned = np.arctan2(tangent[:, 1], tangent[:, 0]) - pose[2]
-    widths = [foot.width(points, tangent) for foot in feet]
-    confirmed = left.is_confirmed(feet[0].u) & right.is_confirmed(feet[1].u)
+        points = points - (off / _dot(both, both))[:, None] * both
+    good = (np.abs(off) <= _SETTLED) & (feet[0].distance < 0.0) & (feet[1].distance > 0.0)
+    good &= inside & (_distances(points) <= _LARGEST_GAP * step)
     n = len(good) if good.all() else int(good.argmin())
+    normal = both / np.sqrt(_dot(both, both))[:, None]
+    heading = np.arctan2(-normal[:, 0], normal[:, 1]) - pose[2]
+    bend = 0.5 * _dot(normal, feet[0].normal) * (feet[0].offset_curvature + feet[1].offset_curvature)
     return TrackAhead(
         points=_in_frame(points[:n], pose),
-        heading=wrap_angle(turned[:n]),
+        heading=wrap_angle(heading[:n]),
         curvature=bend[:n],
-        arc_length=_lengths(points[:n], turned[:n]),
-        width_left=widths[0][:n],
-        width_right=widths[1][:n],
-        confirmed=confirmed[:n],
+        arc_length=_lengths(points[:n], heading[:n]),
+        width_left=feet[0].width(points, normal)[:n],
+        width_right=feet[1].width(points, -normal)[:n],
+        confirmed=(feet[0].confirmed & feet[1].confirmed)[:n],
         left=sides[LEFT],
         right=sides[RIGHT],
     )
 
 
-class _Foot:
-    """Holds a boundary at the foot points (n,) of stations."""
+class _Feet:
+    """Finds the foot points (n,) of stations on a boundary, by the circle that osculates it at a sample.
 
-    def __init__(self, spline: BSpline, u: Array) -> None:
-        self.spline, self.u = spline, u
-        self.position, self.first, self.second = _derivatives(spline, u, 2)
-        self.speed = np.sqrt(_dot(self.first, self.first))
-        self.tangent = self.first / self.speed[:, None]
-        self.normal = left_of(self.tangent)
+    In the frame of the sample, with a point at (a, b), a along and b to the left, and the curvature k, the
+    circle has its centre at (0, 1 / k). With q = |(k a, 1 - k b)| the distance is
+    `(2 b - k (a^2 + b^2)) / (1 + q)`.
+    """
 
-    def distance(self, points: Array) -> Array:
-        """Returns the signed distances (n,) of points (n, 2), positive to the left."""
-        return _dot(self.normal, points - self.position)
+    def __init__(self, samples: _Samples, station: Array) -> None:
+        self._samples = samples
+        self._at = np.minimum(samples.station.searchsorted(station), len(samples.station) - 1)
+        self._normals = left_of(samples.tangents)
 
-    def along(self, points: Array) -> Array:
-        """Returns how far points (n, 2) are ahead of their foot points, in m."""
-        return _dot(self.tangent, points - self.position)
+    def find(self, points: Array) -> None:
+        """Finds the foot points of points (n, 2), and goes on to the sample that is nearest to each."""
+        samples, last = self._samples, len(self._samples.station) - 1
+        self._frame(points)
+        ahead = self.a / self.spread
+        now = samples.station[self._at] + ahead
+        nearest = np.minimum(samples.station.searchsorted(now), last)
+        before = np.maximum(nearest - 1, 0)
+        nearest -= now - samples.station[before] < samples.station[nearest] - now
+        nearest = np.maximum(nearest, 0)
+        self.slid = nearest != self._at
+        self._at = nearest
+        self._frame(points)
+        q = np.hypot(self.k * self.a, 1.0 - self.k * self.b)
+        self.distance = (2.0 * self.b - self.k * (self.a**2 + self.b**2)) / (1.0 + q)
+        tangent, normal = samples.tangents[nearest], self._normals[nearest]
+        self.normal = ((1.0 - self.k * self.b) / q)[:, None] * normal - (self.k * self.a / q)[
+            :, None
+        ] * tangent
+        beyond = np.abs(self.a / self.spread) > 0.5 * _SAMPLE_STEP + _SETTLED
+        self.inside = ~(beyond & ((nearest == 0) | (nearest == last)))
+        self.confirmed = samples.confirmed[nearest]
 
-    def refined(self, points: Array, normal: Array, moved: Array) -> _Foot:
-        """Returns the foot points of points (n, 2), moved along the normals, after a Newton step."""
-        offset = points - self.position
-        slope = _dot(self.first, offset) + moved * _dot(self.first, normal)
-        bend = self.speed**2 - _dot(self.second, offset)
-        return _Foot(self.spline, self.u + slope / np.where(bend > 0.0, bend, self.speed**2))
+    def _frame(self, points: Array) -> None:
+        samples, at = self._samples, self._at
+        offset = points - samples.points[at]
+        self.a, self.b = _dot(offset, samples.tangents[at]), _dot(offset, self._normals[at])
+        self.k = samples.curvature[at]
+        spread = 1.0 - self.k * self.b
+        self.spread = np.where(np.abs(spread) > _SETTLED, spread, _SETTLED)
 
-    def offset_curvature(self, points: Array) -> Array:
+    @property
+    def offset_curvature(self) -> Array:
         """Returns k / (1 - k d) (n,), the curvature of the parallel curve through each point."""
-        curvature = _dot(left_of(self.first), self.second) / self.speed**3
-        spread = 1.0 - curvature * self.distance(points)
-        return np.asarray(np.divide(curvature, spread, out=np.zeros_like(spread), where=spread != 0.0))
+        spread = 1.0 - self.k * self.distance
+        return np.asarray(self.k / np.where(np.abs(spread) > _SETTLED, spread, _SETTLED))
 
-    def width(self, points: Array, tangent: Array) -> Array:
-        """Returns how far (n,) along the normals of the line the boundary is, by two Newton steps."""
-        ahead = _dot(self.position - points, tangent) / _dot(self.first, tangent)
-        position, first = _derivatives(self.spline, self.u - ahead, 1)
-        rest = _dot(position - points, tangent) / _dot(first, tangent)
-        return np.abs(_dot(position - rest[:, None] * first - points, left_of(tangent)))
+    def width(self, points: Array, way: Array) -> Array:
+        """Returns how far (n,) the circle is from points (n, 2) along unit vectors (n, 2).
 
-
-def _derivatives(spline: BSpline, u: Array, orders: int) -> Array:
-    """Returns S(u) and its derivatives up to an order (orders + 1, n, 2)."""
-    values, span = spline.tables.evaluate(u, orders)
-    columns = span[:, None] + np.arange(-spline.degree, 1)
-    return np.asarray(np.einsum("rkj,kjd->rkd", values, spline.control_points[columns]))
+        The distance w solves `k w^2 + 2 w (k (a s + b t) - t) + k (a^2 + b^2) - 2 b = 0` for the way (s, t).
+        """
+        s, t = _dot(way, self._samples.tangents[self._at]), _dot(way, self._normals[self._at])
+        half = self.k * (self.a * s + self.b * t) - t
+        rest = self.k * (self.a**2 + self.b**2) - 2.0 * self.b
+        root = np.sqrt(np.maximum(half**2 - self.k * rest, 0.0))
+        return np.abs(rest / (half + np.where(half < 0.0, -root, root)))
 
 
 def _dot(a: Array, b: Array) -> Array:
