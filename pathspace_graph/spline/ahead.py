@@ -261,14 +261,15 @@ def _settled(
             foot.find(points)
         off = feet[0].distance + feet[1].distance
         both = feet[0].normal + feet[1].normal
+        square = np.maximum(_dot(both, both), np.finfo(float).tiny)[:, None]
         inside = feet[0].inside & feet[1].inside
         if not (inside & ((np.abs(off) > _SETTLED) | feet[0].slid | feet[1].slid)).any():
             break
-        points = points - (off / _dot(both, both))[:, None] * both
+        points = points - off[:, None] / square * both
     good = (np.abs(off) <= _SETTLED) & (feet[0].distance < 0.0) & (feet[1].distance > 0.0)
     good &= inside & (_distances(points) <= _LARGEST_GAP * step)
     n = len(good) if good.all() else int(good.argmin())
-    normal = both / np.sqrt(_dot(both, both))[:, None]
+    normal = both / np.sqrt(square)
     heading = np.arctan2(-normal[:, 0], normal[:, 1]) - pose[2]
     bend = 0.5 * _dot(normal, feet[0].normal) * (feet[0].offset_curvature + feet[1].offset_curvature)
     return TrackAhead(
