@@ -28,6 +28,8 @@ class Row:
     """(k, 2) These tracks may continue the row (m, map frame)."""
     chosen: list[int] = field(default_factory=list)
     """The row continues through the candidates with these indices, in driving order."""
+    ended: bool = False
+    """No candidate continues the row, wherever the other one leads."""
 
     @property
     def end(self) -> Array:
@@ -58,7 +60,7 @@ def lead_on(left: Row, right: Row, driven: Array, threshold: float, settings: Te
             waiting = [other for other in waiting if other is not row]
         else:
             row.choose(index)
-            waiting = [left, right]
+            waiting = [other for other in (left, right) if not other.ended]
 
 
 def _next(row: Row, other: Row, driven: Array, threshold: float, settings: TentativeSettings) -> int | None:
@@ -69,18 +71,20 @@ def _next(row: Row, other: Row, driven: Array, threshold: float, settings: Tenta
     near[row.chosen] = False
     indices = np.flatnonzero(near)
     if len(indices) == 0:
+        row.ended = True
         return None
     (cos, sin), step, distance = row.direction, step[indices], distance[indices]
     turn = np.abs(np.arctan2(cos * step[:, 1] - sin * step[:, 0], step @ row.direction))
     allowed = turn < settings.turn - settings.turn_rate * distance
     cost = distance * (1.0 + settings.turn_cost * turn**2)
     indices = indices[allowed][np.argsort(cost[allowed])]
-    if len(indices):
-        points = row.candidates[indices]
-        possible = _has_width(row, other, points, settings)
-        possible &= ~crosses(row.end, points, driven) & ~crosses(row.end, points, other.line)
-        indices = indices[possible]
-    return int(indices[0]) if len(indices) else None
+    if len(indices) == 0:
+        row.ended = True
+        return None
+    points = row.candidates[indices]
+    possible = _has_width(row, other, points, settings)
+    possible &= ~crosses(row.end, points, driven) & ~crosses(row.end, points, other.line)
+    return int(indices[possible.argmax()]) if possible.any() else None
 
 
 def _has_width(row: Row, other: Row, points: Array, settings: TentativeSettings) -> BoolArray:
