@@ -56,7 +56,7 @@ class CenterlineBatch:
             try:
                 return self._solve(start)
             except SettingsError:
-                return _run(self.settings, start, start)
+                return self._run(start)
 
     def _solve(self, start: BatchResult) -> BatchRun:
         settings, state = self.settings, start.optimum.state
@@ -77,14 +77,26 @@ class CenterlineBatch:
             points = np.array([values.atPoint3(key) for key in ribbon_keys(ribbon)])
             ribbon = ribbon.with_points(points)
         covariance = ribbon_covariance(graph, values, ribbon)
-        shape = settings.spline.sigma_shape
-        return _run(
-            settings,
-            start,
-            replace(start, map=map_of(ribbon, covariance, shape, {})),
+        return replace(
+            self._run(start),
+            map=map_of(ribbon, covariance, settings.spline.sigma_shape, {}),
             trajectory=_poses(values, len(start.trajectory)),
             converged=bool(optimizer.iterations() < settings.centerline.max_iterations),
             cost=float(optimizer.error()),
+        )
+
+    def _run(self, start: BatchResult) -> BatchRun:
+        """Returns a run with what the start has found."""
+        return BatchRun(
+            estimator=NAME,
+            settings=settings_dict(self.settings),
+            map=start.map,
+            trajectory_t=start.trajectory_t,
+            trajectory=start.trajectory,
+            cycles=start.cycles,
+            laps=start.laps,
+            converged=start.converged,
+            cost=start.cost,
         )
 
     def _optimizer(
@@ -137,25 +149,3 @@ def _poses(values: gtsam.Values, count: int) -> Array:
     poses = np.array([pose_array(values.atPose2(pose_key(k))) for k in range(count)])
     poses[:, 2] = np.unwrap(poses[:, 2])
     return poses
-
-
-def _run(
-    settings: MapperSettings,
-    start: BatchResult,
-    mapped: BatchRun,
-    trajectory: Array | None = None,
-    converged: bool | None = None,
-    cost: float | None = None,
-) -> BatchRun:
-    """Returns a run with the cycles of the start."""
-    return BatchRun(
-        estimator=NAME,
-        settings=settings_dict(settings),
-        map=mapped.map,
-        trajectory_t=start.trajectory_t,
-        trajectory=start.trajectory if trajectory is None else trajectory,
-        cycles=start.cycles,
-        laps=start.laps,
-        converged=start.converged if converged is None else converged,
-        cost=start.cost if cost is None else cost,
-    )
