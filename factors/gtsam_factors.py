@@ -5,6 +5,7 @@ A factor holds its measurement and its keys, but no graph. It is a pure function
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import MutableSequence, Sequence
 from dataclasses import dataclass
 
@@ -66,12 +67,9 @@ def spline_projection_factor(
             f"{len(points_vehicle)}, {len(covariances)} and {len(low)}, {len(high)}"
         )
     curve = Curve.of(control_keys, tables, low, high)
-    moving = np.zeros((len(low), 3)) if twists is None else twists
-    function = _Projection(
-        int(pose_key), curve, points_vehicle, covariances, sigma_model, huber, sensor_key, moving
-    )
-    keys = [int(pose_key), *([] if sensor_key is None else [int(sensor_key)]), *curve.keys]
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(low)), keys, function)
+    return _Projection(
+        int(pose_key), curve, points_vehicle, covariances, sigma_model, huber, sensor_key, twists
+    ).factor
 
 
 def spline_projection_factors(
@@ -197,13 +195,33 @@ class Curve:
 
 
 @dataclass(frozen=True, eq=False)
-class _Projection:
-    """Evaluates a spline-projection factor."""
+class SightedRows:
+    """Holds a row for each detection of a cycle, not whitened, with r the residual of a point p."""
+
+    residual: Array
+    """These are the residuals (m,) in m."""
+    sigma: Array
+    """These are their standard deviations (m,) in m."""
+    direction: Array
+    """These are the unit vectors (m, 2), map frame, along dr/dp."""
+    steepness: Array
+    """These are the lengths (m,) of dr/dp."""
+    by_pose: Array
+    """These are the derivatives (m, 3) by the pose (x, y, theta) in the map frame."""
+    by_control: Array
+    """These are the derivatives (m, degree + 1, d) by the control points of the foot point's span."""
+    foot: FootPoints
+    """These are the foot points."""
+
+
+@dataclass(frozen=True, eq=False)
+class CycleSightings(ABC):
+    """Evaluates a factor on the detections of one cycle; an heir says what is measured, by `rows`."""
 
     pose_key: int
     """This is the key of the pose that the detections were made from."""
     curve: Curve
-    """The detections are projected on this curve."""
+    """The detections have their foot points on this curve."""
     points_vehicle: Array
     """These are the detections (m, 2) in the vehicle frame, in m."""
     covariances: Array
@@ -214,19 +232,29 @@ class _Projection:
     """The weight of a row falls beyond this whitened residual."""
     sensor_key: int | None
     """This is the key of the sensor's calibration, if the detections are corrected by it."""
-    twists: Array
-    """The vehicle moved with these twists (m, 3), in m/s, m/s and rad/s."""
+    twists: Array | None
+    """The vehicle moved with these twists (m, 3), in m/s, m/s and rad/s; None means that it stood."""
+
+    @abstractmethod
+    def rows(self, values: gtsam.Values, points: Array, poses: Array) -> SightedRows:
+        """Returns the rows of corrected detections (m, 2), map frame, from poses (m, 3)."""
+
+    @property
+    def factor(self) -> gtsam.CustomFactor:
+        """Returns the factor on the pose, the sensor's calibration and the control points."""
+        sensor = [] if self.sensor_key is None else [int(self.sensor_key)]
+        noise = gtsam.noiseModel.Unit.Create(len(self.points_vehicle))
+        return gtsam.CustomFactor(noise, [self.pose_key, *sensor, *self.curve.keys], self)
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
         """Returns robust whitened rows (m,), and writes their Jacobians to H where it is given."""
         pose, measured = values.atPose2(self.pose_key), self.points_vehicle
+        twists = np.zeros((len(measured), 3)) if self.twists is None else self.twists
         poses = np.tile(pose_array(pose), (len(measured), 1))
         sensor = np.zeros(0) if self.sensor_key is None else np.array(values.atVector(self.sensor_key))
-        points = to_map(corrected(measured, self.twists, sensor), poses)
-        foot = self.curve.find(values, points)
-        rows = project(points, self.covariances, poses, foot, self.sigma_model)
-        usable, slots = self.curve.usable(foot)
-        by = sensor_rows(foot.normal_unit, rows.residual, poses, measured, self.twists, sensor)
+        rows = self.rows(values, to_map(corrected(measured, twists, sensor), poses), poses)
+        usable, slots = self.curve.usable(rows.foot)
+        by = sensor_rows(rows.direction, rows.residual / rows.steepness, poses, measured, twists, sensor)
         whitened = by.factor * rows.residual / rows.sigma
         if H is None:
             return np.asarray(huber_roots(whitened, self.huber) * usable)
@@ -235,10 +263,29 @@ class _Projection:
         scale = by.factor * own
         by_pose = rows.by_pose * scale[:, None]
         by_pose[:, :2] = by_pose[:, :2] @ rotation(pose.theta())
-        by_calibration = [by.by_sensor * own[:, None]] if len(sensor) else []
+        by_calibration = [by.by_sensor * (rows.steepness * own)[:, None]] if len(sensor) else []
         by_control = self.curve.by_key(rows.by_control * scale[:, None, None], slots)
         fill(H, [by_pose, *by_calibration, *by_control])
         return np.asarray(whitened * root)
+
+
+@dataclass(frozen=True, eq=False)
+class _Projection(CycleSightings):
+    """Evaluates a spline-projection factor."""
+
+    def rows(self, values: gtsam.Values, points: Array, poses: Array) -> SightedRows:
+        """Returns the signed distances across the curve."""
+        foot = self.curve.find(values, points)
+        across = project(points, self.covariances, poses, foot, self.sigma_model)
+        return SightedRows(
+            residual=across.residual,
+            sigma=across.sigma,
+            direction=foot.normal_unit,
+            steepness=np.ones(len(points)),
+            by_pose=across.by_pose,
+            by_control=across.by_control,
+            foot=foot,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ normal to either edge. The paper leaves this model of a track to future work.
 
 from __future__ import annotations
 
-from collections.abc import MutableSequence, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,11 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .footpoint import FootPoints, foot_points
-from .gtsam_factors import Curve, fill, pose_array
-from .noise import huber_roots, huber_weights
+from .gtsam_factors import Curve, CycleSightings, SightedRows
 from .projection import sigma_across
-from .se2 import rotation, to_map
-from .sensor import corrected, sensor_rows
 from .spans import SpanPolynomials
 
 Array = NDArray[np.float64]
@@ -89,9 +86,8 @@ def ribbon_factor(
     """Returns the factor `e_i = r_i / sigma_i` of the detections of one cycle, on either side of a ribbon.
 
     r is that of `beyond_edge`, and sigma that across the centre line. The keys of the control points hold
-    `Point3` (x, y, h). sides (m,) are 1 for
-    left and -1 for right. All other arguments, and how the robust weights enter, are those of
-    `gtsam_factors.spline_projection_factor`.
+    `Point3` (x, y, h). sides (m,) are 1 for left and -1 for right. All other arguments, and how the robust
+    weights enter, are those of `gtsam_factors.spline_projection_factor`.
     """
     if not len(points_vehicle) == len(covariances) == len(sides) == len(low) == len(high) > 0:
         raise ValueError(
@@ -99,62 +95,36 @@ def ribbon_factor(
             f"{len(points_vehicle)}, {len(covariances)}, {len(sides)} and {len(low)}, {len(high)}"
         )
     curve = Curve.of(control_keys, tables, low, high)
-    moving = np.zeros((len(low), 3)) if twists is None else twists
-    function = _Ribbon(
-        int(pose_key), curve, points_vehicle, covariances, sides, sigma_model, huber, sensor_key, moving
-    )
-    keys = [int(pose_key), *([] if sensor_key is None else [int(sensor_key)]), *curve.keys]
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(low)), keys, function)
+    return _Ribbon(
+        int(pose_key), curve, points_vehicle, covariances, sigma_model, huber, sensor_key, twists, sides
+    ).factor
 
 
 @dataclass(frozen=True, eq=False)
-class _Ribbon:
+class _Ribbon(CycleSightings):
     """Evaluates a ribbon factor."""
 
-    pose_key: int
-    curve: Curve
-    points_vehicle: Array
-    covariances: Array
     sides: Array
-    sigma_model: float
-    huber: float
-    sensor_key: int | None
-    twists: Array
+    """Each detection (m,) is of the left edge where this is 1, and of the right one where it is -1."""
 
-    def __call__(
-        self, _: gtsam.CustomFactor, values: gtsam.Values, H: MutableSequence[Array] | None
-    ) -> Array:
-        """Returns robust whitened rows (m,), and writes their Jacobians to H where it is given."""
-        pose, measured = values.atPose2(self.pose_key), self.points_vehicle
-        poses = np.tile(pose_array(pose), (len(measured), 1))
-        sensor = np.zeros(0) if self.sensor_key is None else np.array(values.atVector(self.sensor_key))
-        points = to_map(corrected(measured, self.twists, sensor), poses)
-        distinct = np.zeros((self.curve.size, RIBBON))
-        distinct[self.curve.touched] = [values.atPoint3(key) for key in self.curve.keys]
-        control_points = self.curve.unwrapped(distinct)
-        foot = foot_points(
-            self.curve.tables,
-            np.ascontiguousarray(control_points[:, :2]),
-            points,
-            self.curve.low,
-            self.curve.high,
-            self.curve.step,
+    def rows(self, values: gtsam.Values, points: Array, poses: Array) -> SightedRows:
+        """Returns how far the detections are beyond their edges."""
+        curve = self.curve
+        distinct = np.zeros((curve.size, RIBBON))
+        distinct[curve.touched] = [values.atPoint3(key) for key in curve.keys]
+        control_points = curve.unwrapped(distinct)
+        centre = np.ascontiguousarray(control_points[:, :2])
+        foot = foot_points(curve.tables, centre, points, curve.low, curve.high, curve.step)
+        beyond = beyond_edge(curve.tables, control_points, self.sides, foot)
+        gradient, arm = beyond.by_point, points - poses[:, :2]
+        by_theta = gradient[:, 1] * arm[:, 0] - gradient[:, 0] * arm[:, 1]
+        steepness = np.hypot(gradient[:, 0], gradient[:, 1])
+        return SightedRows(
+            residual=beyond.residual,
+            sigma=sigma_across(foot.normal_unit, self.covariances, poses, self.sigma_model),
+            direction=gradient / steepness[:, None],
+            steepness=steepness,
+            by_pose=np.column_stack([gradient, by_theta]),
+            by_control=beyond.by_control,
+            foot=foot,
         )
-        rows = beyond_edge(self.curve.tables, control_points, self.sides, foot)
-        usable, slots = self.curve.usable(foot)
-        norm = np.hypot(rows.by_point[:, 0], rows.by_point[:, 1])
-        unit = rows.by_point / norm[:, None]
-        sigma = sigma_across(foot.normal_unit, self.covariances, poses, self.sigma_model)
-        by = sensor_rows(unit, rows.residual / norm, poses, measured, self.twists, sensor)
-        whitened = by.factor * rows.residual / sigma
-        if H is None:
-            return np.asarray(huber_roots(whitened, self.huber) * usable)
-        root = np.sqrt(huber_weights(whitened, self.huber)) * usable
-        scale = by.factor * root / sigma
-        arm = points - poses[:, :2]
-        by_theta = rows.by_point[:, 1] * arm[:, 0] - rows.by_point[:, 0] * arm[:, 1]
-        by_pose = np.column_stack([rows.by_point @ rotation(pose.theta()), by_theta]) * scale[:, None]
-        by_calibration = [by.by_sensor * (norm * root / sigma)[:, None]] if len(sensor) else []
-        by_control = self.curve.by_key(rows.by_control * scale[:, None, None], slots)
-        fill(H, [by_pose, *by_calibration, *by_control])
-        return np.asarray(whitened * root)

@@ -72,17 +72,16 @@ def ribbon_of(track: Map, settings: MapperSettings) -> FittedRibbon:
     standard deviation `centerline.sigma_edge`, that of what an edge cannot follow. To weigh them by the
     covariance of the boundaries would be right if a ribbon could follow these exactly. As it can't, misfits
     of centimetres would turn and shift an open map, which is known to metres as a whole, and to millimetres
-    in its shape.
-    SettingsError is raised where the map has no two boundaries side by side.
+    in its shape. SettingsError is raised where the map has no two boundaries side by side.
     """
     curves = {label: track.curve(label, "a centre line") for label in BOUNDARIES}
+    P = track.covariance_of(*curves.values())
     left, right = (curve.spline for curve in curves.values())
     ribbon, *tables = ribbon_between(left, right, left.periodic, settings.centerline.spacing)
     measured = [
         _Edge(spline, SIDE[label], table, ribbon)
         for label, spline, table in zip(BOUNDARIES, (left, right), tables, strict=True)
     ]
-    P = track.joint_covariance if track.joint_covariance is not None else _blocks(curves)
     sigma = settings.centerline.sigma_edge
     for _ in range(ITERATIONS):
         rows = [edge.rows(ribbon) for edge in measured]
@@ -160,10 +159,3 @@ def _shape_rows(ribbon: Ribbon, settings: MapperSettings) -> tuple[Array, Array]
     slide[np.arange(ribbon.size), np.arange(ribbon.size), :2] = tangent / settings.batch.sigma_slide
     residual = np.concatenate([bend @ ribbon.distinct.ravel(), np.zeros(ribbon.size)])
     return np.concatenate([bend, slide.reshape(ribbon.size, -1)]), residual
-
-
-def _blocks(curves: dict[int, SplineBoundary]) -> Array | None:
-    """Returns the covariance of boundaries that are independent, or None where one is not known."""
-    if any(len(curve.covariance) != 2 * curve.size for curve in curves.values()):
-        return None
-    return np.asarray(block_diag(*(curve.covariance for curve in curves.values())))

@@ -103,7 +103,7 @@ class Map:
         """
         left, right = (self.curve(label, "a centre line") for label in BOUNDARIES)
         return centre_line(
-            left.spline, right.spline, self._covariance_of(left, right), self._is_loop(left, right), step
+            left.spline, right.spline, self.covariance_of(left, right), self._is_loop(left, right), step
         )
 
     def curve(self, label: int, purpose: str) -> SplineBoundary:
@@ -114,7 +114,7 @@ class Map:
         found = "none" if boundary is None else "points in no order"
         raise SettingsError(f"{purpose}: expected a curve as {NAMES[label]} boundary, found {found}")
 
-    def _covariance_of(self, left: SplineBoundary, right: SplineBoundary) -> Array | None:
+    def covariance_of(self, left: SplineBoundary, right: SplineBoundary) -> Array | None:
         """Returns the covariance of both boundaries' control points; None where it wasn't asked for."""
         if self.joint_covariance is not None:
             return self.joint_covariance

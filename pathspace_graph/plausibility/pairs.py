@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.se2 import wrap_angle
 from pathspace_graph.io.log import Detections
 from pathspace_graph.settings.plausibility import PlausibilitySettings
 
@@ -88,9 +89,9 @@ class Pairs:
         vector = np.nanmean(np.exp(1j * bearings))
         middle = float(np.angle(vector)) if abs(vector) > ROUND else 0.0
         farthest = np.nanquantile(ranges, SEEN)
-        widest = np.nanquantile(np.abs(_wrapped(bearings - middle)), SEEN)
+        widest = np.nanquantile(np.abs(wrap_angle(bearings - middle)), SEEN)
         ranges, bearings = _polar(self.laid(np.eye(2), motion))
-        inside = (ranges < farthest) & (np.abs(_wrapped(bearings - middle)) < widest)
+        inside = (ranges < farthest) & (np.abs(wrap_angle(bearings - middle)) < widest)
         return np.asarray(inside.sum(axis=1) / np.isfinite(ranges).sum(axis=1))
 
     @property
@@ -160,7 +161,3 @@ def spacing_of(cycles: Sequence[Detections]) -> float | None:
 def _polar(points: Array) -> tuple[Array, Array]:
     """Returns the ranges and the bearings (P, m) of points (P, m, 2)."""
     return np.hypot(points[..., 0], points[..., 1]), np.arctan2(points[..., 1], points[..., 0])
-
-
-def _wrapped(angles: Array) -> Array:
-    return np.asarray((angles + np.pi) % (2.0 * np.pi) - np.pi)

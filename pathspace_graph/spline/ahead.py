@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.se2 import left_of, wrap_angle
+from pathspace_graph.factors.se2 import left_of, to_vehicle, wrap_angle
 from pathspace_graph.factors.spans import SpanPolynomials
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
@@ -22,7 +22,6 @@ from .centre_line import LEAST_STEP, MOST_POINTS, points_across
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Ints = NDArray[np.intp]
 
 _SAMPLE_STEP: Final = 0.5
 """The boundaries are sampled at about this distance (m). The circle at a sample is right to a millimetre."""
@@ -109,7 +108,7 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
         raise SettingsError(f"step: expected a number of at least {least:g} m, found {step:g}")
     samples = {label: _sampled(curve, distance) for label, curve in curves.items()}
     sides = [
-        _in_frame(samples[label].beside(distance), pose) if label in samples else np.zeros((0, 2))
+        to_vehicle(samples[label].beside(distance), pose[None]) if label in samples else np.zeros((0, 2))
         for label in BOUNDARIES
     ]
     line = None
@@ -273,7 +272,7 @@ def _settled(
     heading = np.arctan2(-normal[:, 0], normal[:, 1]) - pose[2]
     bend = 0.5 * _dot(normal, feet[0].normal) * (feet[0].offset_curvature + feet[1].offset_curvature)
     return TrackAhead(
-        points=_in_frame(points[:n], pose),
+        points=to_vehicle(points[:n], pose[None]),
         heading=wrap_angle(heading[:n]),
         curvature=bend[:n],
         arc_length=_lengths(points[:n], heading[:n]),
@@ -311,12 +310,11 @@ class _Feet:
         self.slid = nearest != self._at
         self._at = nearest
         self._frame(points)
-        q = np.hypot(self.k * self.a, 1.0 - self.k * self.b)
+        sine, cosine = self.k * self.a, 1.0 - self.k * self.b  # of the turn to the foot point, times q
+        q = np.hypot(sine, cosine)
         self.distance = (2.0 * self.b - self.k * (self.a**2 + self.b**2)) / (1.0 + q)
         tangent, normal = samples.tangents[nearest], self._normals[nearest]
-        self.normal = ((1.0 - self.k * self.b) / q)[:, None] * normal - (self.k * self.a / q)[
-            :, None
-        ] * tangent
+        self.normal = (cosine / q)[:, None] * normal - (sine / q)[:, None] * tangent
         beyond = np.abs(self.a / self.spread) > 0.5 * _SAMPLE_STEP + _SETTLED
         self.inside = ~(beyond & ((nearest == 0) | (nearest == last)))
         self.confirmed = samples.confirmed[nearest]
@@ -361,9 +359,3 @@ def _lengths(points: Array, heading: Array) -> Array:
     """Returns the arc length (n,) at points (n, 2), which are joined by circular arcs."""
     half = 0.5 * wrap_angle(np.diff(heading, prepend=heading[:1]))
     return np.asarray(np.cumsum(_distances(points) / np.sinc(half / np.pi)))
-
-
-def _in_frame(points: Array, pose: Array) -> Array:
-    """Returns points (n, 2) of the map frame in the frame of a pose (3,)."""
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    return np.asarray((points - pose[:2]) @ np.array([[cos, -sin], [sin, cos]]))
