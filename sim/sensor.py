@@ -10,7 +10,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError, check_numbers
-from pathspace_graph.io.log import Detections
+from pathspace_graph.io.log import Detections, covariances_of
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
 FloatArray = NDArray[np.float64]
@@ -180,5 +180,5 @@ def _cartesian(
     xx = cos**2 * along + sin**2 * across
     yy = sin**2 * along + cos**2 * across
     xy = cos * sin * (along - across)
-    covariances = np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
+    covariances = covariances_of(xx, xy, yy)
     return np.column_stack([ranges * cos, ranges * sin]), covariances

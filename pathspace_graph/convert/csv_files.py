@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.io.csv_table import Table, read_table
 from pathspace_graph.io.limits import MAX_STAMP
+from pathspace_graph.io.log import covariances_of
 from pathspace_graph.labels import UNKNOWN
 
 from .messages import Points
@@ -242,7 +243,7 @@ def _covariances(file: _File) -> Array:
     if not any(map(file.has, COVARIANCE)):
         return np.full((len(file.table), 2, 2), np.nan)
     xx, xy, yy = (file.numbers(key, power=2) for key in COVARIANCE)
-    return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
+    return covariances_of(xx, xy, yy)
 
 
 def _labels(file: _File, rule: LabelRule) -> NDArray[np.int_]:

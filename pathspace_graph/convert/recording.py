@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.limits import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
-from pathspace_graph.io.log import MAX_HOLD, MIN_RELATIVE_DETERMINANT, Detections, Log, Odometry, Truth
+from pathspace_graph.io.log import (
+    MAX_HOLD,
+    MIN_RELATIVE_DETERMINANT,
+    Detections,
+    Log,
+    Odometry,
+    Truth,
+    covariances_of,
+)
 
 from .messages import Points
 from .settings import SIGMA_ODOMETRY, Frames, NoiseSettings
@@ -215,4 +223,4 @@ def polar_covariances(bearings: Array, along: Array, across: Array) -> Array:
     c, s = np.cos(bearings), np.sin(bearings)
     xx, yy = c * c * along + s * s * across, s * s * along + c * c * across
     xy = c * s * (along - across)
-    return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
+    return covariances_of(xx, xy, yy)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.io.limits import shown
-from pathspace_graph.io.log import Truth
+from pathspace_graph.io.log import Truth, covariances_of
 from pathspace_graph.io.parsing import read_text
 from pathspace_graph.labels import LEFT
 
@@ -128,7 +128,7 @@ def _read(file: Path) -> Drive:
         pose=place[by_pose],
         tree=np.unique(found[:, 1], return_inverse=True)[1],
         points=found[:, 2:4],
-        covariances=np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2),
+        covariances=covariances_of(xx, xy, yy),
     )
 
 

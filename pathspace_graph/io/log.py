@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -273,15 +274,26 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
     late = f"expected a time at most {MAX_HOLD:g} s after the last odometry row ({t_last:g} s)"
     table.require(t <= t_last + MAX_HOLD, late)
     points = table.stack(("x", "y"), MAX_RANGE)
-    covariances = _covariances(table)
-    labels = _labels(table)
-    starts = np.flatnonzero(np.diff(t, prepend=-np.inf))
-    stops = np.append(starts[1:], len(t))
-    if (stops - starts).max() > MAX_DETECTIONS:
-        first = int(starts[np.argmax(stops - starts)])
+    cycles = cycles_of(t, points, _covariances(table), _labels(table))
+    counts = [len(cycle.labels) for cycle in cycles]
+    if max(counts) > MAX_DETECTIONS:
+        first = sum(counts[: int(np.argmax(counts))])
         table.fail(first, f"expected at most {MAX_DETECTIONS} detections in a cycle, found more")
-    spans = [slice(a, b) for a, b in zip(starts, stops, strict=True)]
-    return tuple(Detections(float(t[s.start]), points[s], covariances[s], labels[s]) for s in spans)
+    return cycles
+
+
+def cycles_of(
+    t: FloatArray, points_vehicle: FloatArray, covariances: FloatArray, labels: IntArray
+) -> tuple[Detections, ...]:
+    """Returns the perception cycles of detections (m,): neighbours with the same stamp (s) are one cycle."""
+    starts = np.flatnonzero(np.diff(t, prepend=-np.inf))
+    spans = [slice(a, b) for a, b in pairwise([*starts, len(t)])]
+    return tuple(Detections(float(t[s.start]), points_vehicle[s], covariances[s], labels[s]) for s in spans)
+
+
+def covariances_of(xx: FloatArray, xy: FloatArray, yy: FloatArray) -> FloatArray:
+    """Returns covariances (m, 2, 2) from their entries (m,)."""
+    return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
 
 
 def _covariances(table: Table) -> FloatArray:
@@ -289,7 +301,7 @@ def _covariances(table: Table) -> FloatArray:
     with np.errstate(over="ignore", invalid="ignore"):
         good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
     table.require(good, "expected a positive definite covariance (xx > 0, xx yy > xy^2)")
-    return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
+    return covariances_of(xx, xy, yy)
 
 
 def _labels(table: Table) -> IntArray:

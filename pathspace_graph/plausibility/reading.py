@@ -12,7 +12,7 @@ from pathspace_graph.errors import InputError
 from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.io.csv_table import Table, read_table
 from pathspace_graph.io.limits import shown
-from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry
+from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry, covariances_of, cycles_of
 from pathspace_graph.labels import UNKNOWN, label_from_name
 from pathspace_graph.settings.limits import LimitSettings
 
@@ -63,12 +63,9 @@ def _unchecked(odometry: Table, detections: Table) -> Log:
     twist = odometry.stack(("vx", "vy", "wz"), MOST)
     stamps, points = detections.numbers("t", MOST), detections.stack(("x", "y"), MOST)
     xx, xy, yy = (detections.numbers(name, MOST) for name in ("xx", "xy", "yy"))
-    covariances = np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
+    covariances = covariances_of(xx, xy, yy)
     labels = np.array([label_from_name(name) for name in detections.columns["label"]], dtype=int)
-    starts = np.flatnonzero(np.append(True, np.diff(stamps) != 0.0)) if len(stamps) else np.zeros(0, int)
-    spans = [slice(a, b) for a, b in zip(starts, np.append(starts[1:], len(stamps)), strict=True)]
-    cycles = (Detections(float(stamps[s.start]), points[s], covariances[s], labels[s]) for s in spans)
-    return Log(Odometry(t, twist), tuple(cycles), np.ones(3))
+    return Log(Odometry(t, twist), cycles_of(stamps, points, covariances, labels), np.ones(3))
 
 
 def _foreign_labels(folder: Path, log: Log) -> list[Hint]:
