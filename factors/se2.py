@@ -19,6 +19,12 @@ def rotation(theta: float) -> Array:
     return np.array([[c, -s], [s, c]])
 
 
+def rotations(theta: Array) -> Array:
+    """Return R(theta) (m, 2, 2) of each angle (m,)."""
+    c, s = np.cos(theta), np.sin(theta)
+    return np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
+
+
 def left_of(vectors: Array) -> Array:
     """Returns vectors (n, 2) turned by a quarter to the left: (x, y) becomes (-y, x)."""
     return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)

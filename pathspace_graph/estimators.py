@@ -10,13 +10,11 @@ from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.centerline import batch as centerline_batch
 from pathspace_graph.centerline import online as centerline_online
 from pathspace_graph.ckf.mapper import CkfMapper
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.io.log import Log
 from pathspace_graph.landmark.batch import LandmarkBatch
 from pathspace_graph.landmark.ckf import LandmarkCkf
@@ -28,9 +26,8 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .errors import SettingsError
 from .run import BatchEstimator, OnlineEstimator
 
-Array = NDArray[np.float64]
-MakeOnline = Callable[[MapperSettings, Array], OnlineEstimator]
-MakeBatch = Callable[[MapperSettings, Array], BatchEstimator]
+MakeOnline = Callable[[MapperSettings, KnownNoise], OnlineEstimator]
+MakeBatch = Callable[[MapperSettings, KnownNoise], BatchEstimator]
 
 MapKind = Literal["boundaries", "centerline"]
 """A track is mapped as two boundaries, or as one centre line with a width."""
@@ -45,22 +42,22 @@ BATCH_GROUP: Final = "pathspace_graph.batch"
 """Entry points of this group add batch estimators."""
 
 
-def _spline(settings: MapperSettings, odometry_sigma: Array) -> BatchEstimator:
-    return BatchMapper(settings, odometry_sigma, FixedLagMapper)
+def _spline(settings: MapperSettings, noise: KnownNoise) -> BatchEstimator:
+    return BatchMapper(settings, noise, FixedLagMapper)
 
 
-def _centerline(settings: MapperSettings, odometry_sigma: Array) -> BatchEstimator:
-    return centerline_batch.CenterlineBatch(settings, odometry_sigma, FixedLagMapper)
+def _centerline(settings: MapperSettings, noise: KnownNoise) -> BatchEstimator:
+    return centerline_batch.CenterlineBatch(settings, noise, FixedLagMapper)
 
 
-def _installed(group: str) -> dict[str, Callable[[MapperSettings, Array], Any]]:
+def _installed(group: str) -> dict[str, Callable[[MapperSettings, KnownNoise], Any]]:
     """Returns the estimators that other packages add; each is imported when it is made."""
     return {point.name: _loading(point) for point in entry_points(group=group)}
 
 
-def _loading(point: EntryPoint) -> Callable[[MapperSettings, Array], Any]:
-    def make(settings: MapperSettings, odometry_sigma: Array) -> Any:
-        return point.load()(settings, odometry_sigma)
+def _loading(point: EntryPoint) -> Callable[[MapperSettings, KnownNoise], Any]:
+    def make(settings: MapperSettings, noise: KnownNoise) -> Any:
+        return point.load()(settings, noise.odometry)
 
     return make
 
@@ -74,8 +71,8 @@ ONLINE: Final[dict[str, MakeOnline]] = {
     "incremental-fixed-lag": incremental_fixed_lag,
     centerline_online.NAME: centerline_online.CenterlineMapper,
 }
-"""Each online estimator is made from its settings and the standard deviations (3,) of a twist (m/s, m/s,
-rad/s)."""
+"""Each online estimator is made from its settings and what is known of the noise; one of another package is
+given the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
 
 BATCH: Final[dict[str, MakeBatch]] = {
     **_installed(BATCH_GROUP),
@@ -83,8 +80,8 @@ BATCH: Final[dict[str, MakeBatch]] = {
     "landmark-batch": LandmarkBatch,
     centerline_batch.NAME: _centerline,
 }
-"""Each batch estimator is made from its settings and the standard deviations (3,) of a twist (m/s, m/s,
-rad/s)."""
+"""Each batch estimator is made from its settings and what is known of the noise; one of another package is
+given the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
 
 
 def check_online(name: str) -> None:
@@ -118,12 +115,12 @@ def _check(name: str, known: dict[str, Any], kind: str) -> None:
 
 
 def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimator:
-    """Returns a new online estimator for a log, of which it is given the noise of the odometry only."""
+    """Returns a new online estimator for a log, of which it is given the noise only."""
     check_online(name)
-    return ONLINE[name](settings, log.odometry_sigma)
+    return ONLINE[name](settings, log.noise)
 
 
 def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:
-    """Returns a new batch estimator for a log, of which it is given the noise of the odometry only."""
+    """Returns a new batch estimator for a log, of which it is given the noise only."""
     check_batch(name)
-    return BATCH[name](settings, log.odometry_sigma)
+    return BATCH[name](settings, log.noise)

@@ -73,5 +73,5 @@ def _log(arrays: dict[str, NDArray[Any]]) -> Log:
         arrays["odometry_sigma"],
         SensorInfo(*sensor),
         json.loads(str(arrays["source"])),
-        Truth(**truth) if truth else None,
+        truth=Truth(**truth) if truth else None,
     )

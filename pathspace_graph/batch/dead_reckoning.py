@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.front_end.log_odometry import LogOdometry, no_errors
+from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_keys
 from pathspace_graph.graph.rows import Rows
@@ -43,7 +43,7 @@ def start_odometry(
     Where the path recurs, the drift of the odometry is taken out first: every lap passes the same places. The
     curves are closed then, and otherwise open. By default the path driven says whether it recurs.
     """
-    calibration = no_errors(settings.calibration)
+    calibration = np.array(settings.calibrations)
     poses = chain.dead_reckoned(calibration[:CALIBRATION_SIZE])
     recurrence = recurrence or find_recurrence(poses, settings)
     if recurrence.recurs:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.front_end.front_end import judge_log
@@ -26,7 +27,7 @@ from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, Vehicle
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.prediction import doubted, odometry_noise
+from pathspace_graph.mapping.prediction import doubted, known_noise
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import Stopwatch, settings_dict
 from pathspace_graph.settings.batch import Start
@@ -111,8 +112,8 @@ class BatchMapper:
     def __init__(
         self,
         settings: MapperSettings | None = None,
-        odometry_sigma: Array | None = None,
-        online: Callable[[MapperSettings, Array], CurveMapper] | None = None,
+        odometry_sigma: Array | KnownNoise | None = None,
+        online: Callable[[MapperSettings, KnownNoise], CurveMapper] | None = None,
     ) -> None:
         """Keeps the settings, and the standard deviation (3,) of a measured twist (m/s, m/s, rad/s).
 
@@ -121,7 +122,7 @@ class BatchMapper:
         """
         self.settings = settings or MapperSettings()
         self.online = online
-        self.odometry_sigma = odometry_noise(odometry_sigma)
+        self.noise = known_noise(odometry_sigma)
 
     def solve(
         self, log: Log, start: Start | None = None, on_round: Callable[[], None] | None = None
@@ -136,7 +137,7 @@ class BatchMapper:
 
     def _solve(self, log: Log, start: Start, on_round: Callable[[], None] | None) -> BatchResult:
         settings, batch, watch = own_settings(self.settings), self.settings.batch, Stopwatch()
-        judged = judge_log(log, self.odometry_sigma, settings)
+        judged = judge_log(log, self.noise, settings)
         settings = judged.settings
         chain, detections = judged.chain, DetectionTable.of(judged.cycles, twists=judged.chain.twists)
         system = BatchSystem(detections, chain, settings, Biweight(batch.loose_gate))
@@ -182,7 +183,7 @@ class BatchMapper:
         """Returns the start from an online run of the log, and the run."""
         if self.online is None:
             raise SettingsError("start online: expected an online mapper to begin with, found none")
-        return start_online(log, self.online(self.settings, self.odometry_sigma))
+        return start_online(log, self.online(self.settings, self.noise))
 
 
 def _with_doubt(

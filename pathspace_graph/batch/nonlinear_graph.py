@@ -59,7 +59,7 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
     sensor_key = at.state.variables.sensor_key
     if sensor_key is not None:
         sigmas = gtsam.noiseModel.Diagonal.Sigmas(np.array(system.settings.calibration.sigmas))
-        yield gtsam.PriorFactorVector(sensor_key, np.zeros(SENSOR_SIZE), sigmas)
+        yield gtsam.PriorFactorVector(sensor_key, np.array(system.settings.calibration.means), sigmas)
 
 
 def _odometry(chain: LogOdometry) -> Iterator[gtsam.NonlinearFactor]:
@@ -79,7 +79,7 @@ def _priors(chain: LogOdometry, heading: float) -> Iterator[gtsam.NonlinearFacto
     noise = gtsam.noiseModel.Gaussian.Information(information)
     yield gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(*chain.first), noise)
     sigmas = gtsam.noiseModel.Diagonal.Sigmas(chain.calibration_sigma)
-    yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, np.zeros(2), sigmas)
+    yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, chain.calibration_mean, sigmas)
     if chain.bias is not None:
         noise = gtsam.noiseModel.Diagonal.Precisions(np.array([0.0, chain.bias.sigma**-2]))
         yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, np.array([0.0, chain.bias.value]), noise)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.batch.nonlinear_graph import drive_factors
 from pathspace_graph.batch.start import CurveMapper
@@ -42,8 +43,8 @@ class CenterlineBatch:
     def __init__(
         self,
         settings: MapperSettings | None = None,
-        odometry_sigma: Array | None = None,
-        online: Callable[[MapperSettings, Array], CurveMapper] | None = None,
+        odometry_sigma: Array | KnownNoise | None = None,
+        online: Callable[[MapperSettings, KnownNoise], CurveMapper] | None = None,
     ) -> None:
         """Keeps the settings and what `BatchMapper` takes."""
         self.settings = settings or MapperSettings()

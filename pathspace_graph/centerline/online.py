@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
@@ -31,7 +32,9 @@ class CenterlineMapper:
     there, and a cycle takes the same time. Where there is no line between the boundaries, the map is theirs.
     """
 
-    def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
         self.settings = settings or MapperSettings()
         self.boundaries = FixedLagMapper(self.settings, odometry_sigma)
         """It maps both boundaries, and estimates the poses."""

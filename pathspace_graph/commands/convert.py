@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,6 +17,7 @@ from pathspace_graph.convert.recording import Recording, to_log
 from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings, Side
 from pathspace_graph.convert.victoria_park import read_victoria_park
 from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import LOG_FILE, Log, write_log
 from pathspace_graph.labels import NAMES
@@ -91,7 +92,7 @@ class Convert:
         with progress("converting"):
             record = self._read(rule)
             file = self.source or Path(self.kind)
-            log = to_log(record, frames, self.noise, file)
+            log = with_measured_noise(to_log(record, frames, self.noise, file))
             write_checked(log, self.out, file)
         report(record.notes, log, self.out)
         tell(hints(log))
@@ -120,6 +121,25 @@ class Convert:
             received=self.received,
             mounted=self.mounting is not None,
         )
+
+
+def with_measured_noise(log: Log) -> Log:
+    """Returns a log whose noise is measured where nobody has stated it."""
+    if log.odometry_stated and log.detections_stated:
+        return log
+    measured = measure_log(log)
+    if measured is None:
+        return log
+    log = replace(log, measured=measured)
+    if not log.odometry_stated:
+        log = replace(log, odometry_sigma=measured.twist_sigma)
+    if log.detections_stated or measured.along is None:
+        return log
+    cycles = []
+    for cycle in log.cycles:
+        covariances = measured.covariances(cycle.points_vehicle, inflated=False)
+        cycles.append(cycle if covariances is None else replace(cycle, covariances=covariances))
+    return replace(log, cycles=tuple(cycles))
 
 
 def write_checked(log: Log, out: Path, source: Path) -> None:

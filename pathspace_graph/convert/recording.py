@@ -32,6 +32,8 @@ BoolArray = NDArray[np.bool_]
 MAX_ASYMMETRY: Final = 1e-3
 """The entries xy and yx of a covariance differ by at most this share of the larger variance; messages may
 have them in single precision."""
+ASSUMED: Final = "detections had no covariance that can be used, and were given one"
+"""Note of covariances that the record does not have."""
 MIN_RANGE_OF_BEARING: Final = 1.0
 """Nearer than this (m), a bearing's standard deviation across counts as at this range, so that a detection at
 the sensor itself has a covariance that is positive definite."""
@@ -69,7 +71,15 @@ def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) 
     cycles = _cycles(record, odometry, frames, noise, file)
     stated = SIGMA_ODOMETRY if record.odometry_sigma is None else record.odometry_sigma
     sigma = np.array(stated if noise.sigma_odometry is None else noise.sigma_odometry, dtype=float)
-    return Log(odometry, cycles, sigma, source=record.source, truth=record.truth)
+    return Log(
+        odometry,
+        cycles,
+        sigma,
+        source=record.source,
+        odometry_stated=noise.sigma_odometry is not None or record.odometry_sigma is not None,
+        detections_stated=noise.states_detections or not record.notes[ASSUMED],
+        truth=record.truth,
+    )
 
 
 # --- odometry --------------------------------------------------------------------------------------------
@@ -187,7 +197,7 @@ def in_vehicle_frame(
         points = points * [1.0, -1.0]
         covariances = covariances * np.array([[1.0, -1.0], [-1.0, 1.0]])
     known = positive_definite(covariances) & (not noise.replace_covariances)
-    notes["detections had no covariance that can be used, and were given one"] += int((~known).sum())
+    notes[ASSUMED] += int((~known).sum())
     covariances = np.where(known[:, None, None], covariances, default_covariances(points, noise))
     turn = rotation(frames.mounting[2])
     turned = turn @ covariances @ turn.T
@@ -213,8 +223,9 @@ def default_covariances(points: Array, noise: NoiseSettings) -> Array:
     Along the ray it is `(sigma_range + sigma_range_growth r)^2`, across it `(r sigma_bearing)^2`.
     """
     ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
-    along = (noise.sigma_range + noise.sigma_range_growth * ranges) ** 2
-    across = (np.maximum(ranges, MIN_RANGE_OF_BEARING) * noise.sigma_bearing) ** 2
+    begin, growth, bearing = noise.sigmas
+    along = (begin + growth * ranges) ** 2
+    across = (np.maximum(ranges, MIN_RANGE_OF_BEARING) * bearing) ** 2
     return polar_covariances(bearings, along, across)
 
 

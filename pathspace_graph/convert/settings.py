@@ -19,6 +19,10 @@ DEFAULT_LABELS: Final = ("left=0", "right=1")
 """Numbers mean these labels where nothing else is said."""
 SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)
 """A twist has these standard deviations (m/s, m/s, rad/s) where nothing is known of them."""
+GROWTH: Final = "sigma_range_growth"
+DETECTION_SIGMAS: Final = ("sigma_range", GROWTH, "sigma_bearing")
+SIGMA_DETECTIONS: Final = (0.05, 0.012, pi / 200.0)
+"""Noise of detections (m, m/m, rad) where nothing is known of it."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +33,13 @@ class NoiseSettings:
     """Each sample of [vx, vy, wz] has these standard deviations (m/s, m/s, rad/s), white from sample to
     sample. Without them they are 0.25, 0.12 and 0.035, or what a data set states of itself. The covariance in
     a message is not used, since it mostly is that of a filter's state, which is not white."""
-    sigma_range: float = 0.05
-    """A detection without a covariance has this standard deviation of its range at range 0 (m)."""
-    sigma_range_growth: float = 0.012
-    """The standard deviation of the range grows by this with the range (m/m)."""
-    sigma_bearing: float = pi / 200.0
-    """A detection without a covariance has this standard deviation of its bearing (rad)."""
+    sigma_range: float | None = None
+    """Standard deviation of the range at range 0 (m) of a detection without a covariance. Where none of these
+    three is stated, they are measured, and without enough cones 0.05, 0.012 and 0.0157."""
+    sigma_range_growth: float | None = None
+    """Growth of the standard deviation of the range with the range (m/m)."""
+    sigma_bearing: float | None = None
+    """Standard deviation of the bearing (rad) of a detection without a covariance."""
     replace_covariances: bool = False
     """All detections have the covariance by these standard deviations, also where the record has another."""
 
@@ -42,8 +47,26 @@ class NoiseSettings:
         sigmas = self.sigma_odometry
         if sigmas is not None and (len(sigmas) != 3 or not all(0 < sigma < inf for sigma in sigmas)):
             raise SettingsError(f"--sigma-odometry: expected three positive numbers, found {sigmas}")
-        check_numbers(self, "convert", ("sigma_range", "sigma_bearing"), "a positive number")
-        check_numbers(self, "convert", ("sigma_range_growth",), "a number of at least 0")
+        given = [name for name, own in zip(DETECTION_SIGMAS, self._own, strict=True) if own is not None]
+        check_numbers(self, "convert", [name for name in given if name != GROWTH], "a positive number")
+        check_numbers(self, "convert", [name for name in given if name == GROWTH], "a number of at least 0")
+
+    @property
+    def _own(self) -> tuple[float | None, ...]:
+        return self.sigma_range, self.sigma_range_growth, self.sigma_bearing
+
+    @property
+    def sigmas(self) -> tuple[float, ...]:
+        """Returns the standard deviation of the range at range 0 (m), its growth (m/m), and that of the bearing
+        (rad)."""
+        return tuple(
+            default if own is None else own for own, default in zip(self._own, SIGMA_DETECTIONS, strict=True)
+        )
+
+    @property
+    def states_detections(self) -> bool:
+        """Returns whether the noise of the detections is stated here."""
+        return any(own is not None for own in self._own)
 
 
 @dataclass(frozen=True)

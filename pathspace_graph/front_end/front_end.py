@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import inf
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.motion import MeasuredMotion
@@ -18,9 +20,9 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .gate import Admitted, Gate
 from .log_odometry import LogOdometry, chained
 from .motion import MotionCheck
+from .noise import NoiseLearner
 from .sides import SideJudge
 
-Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 SWAPPED: Final = {
     True: "the cones on the left have the colour of the right boundary: the colours are swapped, the track "
@@ -47,6 +49,8 @@ class Reading:
     """(m,) The flag is set when a detection lies where the cycles just before had one."""
     sensor_doubted: bool = False
     """The flag is set once the readings so far contradict the prior of the sensor's yaw or latency."""
+    measured: MapperSettings | None = None
+    """Settings with the priors of the calibrations, in a cycle in which they were measured."""
     notice: str = ""
     """This says what the labels mean from now on, where that has changed."""
 
@@ -54,11 +58,15 @@ class Reading:
 class FrontEnd:
     """Judges the readings of each cycle by those of the cycles before, without any map."""
 
-    def __init__(self, settings: MapperSettings, odometry_sigma: Array) -> None:
-        """Keeps the settings, and the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
+    def __init__(self, settings: MapperSettings, noise: KnownNoise) -> None:
+        """Keeps the settings, and what is known of the noise."""
+        self.noise = NoiseLearner(noise, settings.noise)
+        """It measures noise that nobody has stated."""
         self.gate = Gate(settings.limits)
         """It refuses cycles that no estimator can use."""
-        self._motion = MotionCheck(odometry_sigma, settings.motion)
+        self._motion = MotionCheck(self.noise.twist_sigma, settings.motion)
+        self._settings = settings
+        self._begun = False
         self._calibration = settings.calibration
         self._sensor_doubted = False
         self._sides = SideJudge(settings.sides, settings.path)
@@ -80,16 +88,37 @@ class FrontEnd:
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Returns the judged readings of a cycle: the twists since the last one, and its detections."""
-        motion = self._motion.update(odometry, detections)
+        noise, twist = self.noise, odometry.twist[-1] if len(odometry.t) else np.zeros(3)
+        checked = noise.for_check(detections, twist)
+        motion = self._motion.update(odometry, checked, may_doubt=noise.is_settled)
         sides = self._sides
         swapped, colourless = sides.swapped, sides.colourless
-        judged = sides.update(self._motion.pose, motion.twists, detections)
+        labels = sides.update(self._motion.pose, motion.twists, checked).labels
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
+        judged = replace(noise.for_map(detections), labels=labels)
         self._sensor_doubted = self._sensor_doubted or self._motion.errors.contradict(self._calibration)
         return Reading(
-            motion, judged, self._motion.seen_again, self._sensor_doubted, notice="; ".join(notices)
+            motion,
+            judged,
+            self._motion.seen_again,
+            self._sensor_doubted and not noise.of_detections,
+            self._measured(odometry, replace(detections, labels=labels), motion),
+            notice="; ".join(notices),
         )
+
+    def _measured(
+        self, odometry: Odometry, detections: Detections, motion: MeasuredMotion
+    ) -> MapperSettings | None:
+        """Learns the noise from a cycle; returns settings with new priors where there are any."""
+        fresh = self.noise.observe(odometry, detections, motion, self._motion.pose)
+        if fresh:
+            self._motion.believe(self.noise.twist_sigma)
+        if self._begun and not fresh:
+            return None
+        self._begun = True
+        settings = self.noise.calibrated(self._settings)
+        return None if settings == self._settings else settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,17 +133,29 @@ class JudgedLog:
     """Here the priors of the sensor are wide, if the readings contradict them."""
 
 
-def judge_log(log: Log, odometry_sigma: Array, settings: MapperSettings) -> JudgedLog:
+def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLog:
     """Returns a log as the front end gives it to an estimator of whole logs.
 
-    odometry_sigma (3,) is the standard deviation of one measured twist (m/s, m/s, rad/s). A cycle that an
-    online estimator would refuse is a ReadingError.
+    Noise that is not known is measured on the whole log first. A cycle that an online estimator would refuse
+    is a ReadingError.
     """
-    front_end = FrontEnd(settings, odometry_sigma)
+    front_end = FrontEnd(settings, noise)
+    if front_end.noise.is_learning:
+        front_end = FrontEnd(settings, replace(noise, measured=measure_log(log)))
     admitted = (front_end.admit(odometry, cycle) for odometry, cycle in split_odometry(log))
     readings = [front_end.update(cycle.odometry, cycle.detections) for cycle in admitted]
     motions = [reading.motion for reading in readings]
-    chain = chained([cycle.t for cycle in log.cycles], motions, settings.odometry)
-    if readings[-1].sensor_doubted:
+    settings = readings[0].measured or settings
+    if readings[-1].sensor_doubted and settings.calibration.doubt < inf:
         settings = replace(settings, calibration=settings.calibration.widened())
+    chain = chained([cycle.t for cycle in log.cycles], motions, settings.odometry)
     return JudgedLog(chain, [reading.detections for reading in readings], settings)
+
+
+def measure_log(log: Log) -> MeasuredNoise | None:
+    """Returns the noise of a whole log and the constant errors of its sensor, by its readings alone."""
+    unknown = KnownNoise(log.odometry_sigma, odometry_stated=False, detections_stated=False)
+    front_end = FrontEnd(MapperSettings(), unknown)
+    for odometry, detections in split_odometry(log):
+        front_end.update(odometry, detections)
+    return front_end.noise.now()

@@ -36,8 +36,10 @@ class LogOdometry:
     """The chain has P - 1 intervals, one from each cycle's pose to the next."""
     twists: Array
     """(P, 3) These twists were in force at the cycles, in m/s, m/s and rad/s."""
+    calibration_mean: Array
+    """(2,) Prior mean of the calibration: scale error (-), yaw-rate bias (rad/s)."""
     calibration_sigma: Array
-    """(2,) The calibration (scale error [-], yaw-rate bias [rad/s]) has this prior standard deviation."""
+    """(2,) Its prior standard deviation."""
     bias: BiasMeasurement | None = None
     """The vehicle has measured this bias of the yaw rate at rest, where it stood."""
 
@@ -60,7 +62,8 @@ class LogOdometry:
 
     def prior_cost(self, first: Array, calibration: Array) -> float:
         """Returns the cost of the priors on the first pose (3,) and on the calibration (2,)."""
-        off, whitened = first - self.first, calibration / self.calibration_sigma
+        off = first - self.first
+        whitened = (calibration - self.calibration_mean) / self.calibration_sigma
         cost = 0.5 * float(off @ self.first_information @ off + whitened @ whitened)
         return cost + sum(0.5 * float((rows.residual**2).sum()) for rows in self._measured_bias(calibration))
 
@@ -71,7 +74,9 @@ class LogOdometry:
         return [
             odometry_rows(start, terms, owners(start)),
             _prior(pose_key(0), root, first - self.first),
-            _prior(CALIBRATION_KEY, np.diag(1.0 / self.calibration_sigma), calibration),
+            _prior(
+                CALIBRATION_KEY, np.diag(1.0 / self.calibration_sigma), calibration - self.calibration_mean
+            ),
             *self._measured_bias(calibration),
         ]
 
@@ -99,6 +104,7 @@ def chained(
         first_information=np.linalg.inv(steps[0].covariance + np.diag(settings.sigmas_start) ** 2),
         odometry=OdometryChain(steps[1:]),
         twists=np.array([step.twist for step in steps]),
+        calibration_mean=np.array(settings.calibration),
         calibration_sigma=np.array(settings.sigmas_calibration),
         bias=mean_bias([motion.bias for motion in motions if motion.bias is not None]),
     )
@@ -116,17 +122,12 @@ def mean_bias(measured: Sequence[BiasMeasurement]) -> BiasMeasurement | None:
 # --- calibrations ----------------------------------------------------------------------------------------
 
 
-def no_errors(settings: CalibrationSettings) -> Array:
-    """Returns the calibration of odometry and sensor, (2,) or (7,), that corrects nothing."""
-    return np.zeros(CALIBRATION_SIZE + len(settings.sigmas))
-
-
 def sensor_prior(variables: Variables, settings: CalibrationSettings) -> list[Rows]:
-    """Returns the rows `b / sigma` of the sensor's calibration b, or none where it is not estimated."""
+    """Returns the rows `(b - mean) / sigma` of the sensor's calibration b, or none where it is not estimated."""
     if len(variables.sensor) == 0:
         return []
     root = np.diag(1.0 / np.array(settings.sigmas))
-    return [_prior(SENSOR_KEY, root, variables.sensor)]
+    return [_prior(SENSOR_KEY, root, variables.sensor - settings.means)]
 
 
 def sensor_prior_cost(variables: Variables, settings: CalibrationSettings) -> float:

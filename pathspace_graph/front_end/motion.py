@@ -59,8 +59,16 @@ class MotionCheck:
         self._rest = Rest(sigma, settings)
         self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
 
-    def update(self, odometry: Odometry, detections: Detections) -> MeasuredMotion:
-        """Returns the motion since the last cycle."""
+    def believe(self, sigma: Array) -> None:
+        """Takes other standard deviations (3,) of a twist (m/s, m/s, rad/s) from now on."""
+        self.sigma = sigma
+        self._rest.believe(sigma)
+
+    def update(self, odometry: Odometry, detections: Detections, may_doubt: bool = True) -> MeasuredMotion:
+        """Returns the motion since the last cycle.
+
+        Unless it `may_doubt`, odometry that is there is believed: then the detections' noise is not known.
+        """
         t, measured = detections.t, detections.points_vehicle
         motion = self._integrate(odometry, t)
         columns = by_errors(measured, motion.odometry.twist)
@@ -71,7 +79,7 @@ class MotionCheck:
         distrusted = t - self._doubted_at < self.settings.distrust
         self._limit = self.settings.doubt_again if distrusted else self.settings.doubt
         self._matched = None
-        motion = self._checked(motion, detections, variances)
+        motion = self._checked(motion, detections, variances, may_doubt)
         if motion.doubted:
             self._doubted_at = t
         if not motion.fault and self._rest.update(odometry, t):
@@ -143,7 +151,9 @@ class MotionCheck:
 
     # --- the check ---------------------------------------------------------------------------------------
 
-    def _checked(self, motion: MeasuredMotion, detections: Detections, variances: Array) -> MeasuredMotion:
+    def _checked(
+        self, motion: MeasuredMotion, detections: Detections, variances: Array, may_doubt: bool
+    ) -> MeasuredMotion:
         """Returns the motion, or that of the detections where they contradict it, or where it is missing."""
         settings = self.settings
         if self._t is None or detections.t <= self._t:
@@ -164,6 +174,8 @@ class MotionCheck:
                 self._misfit += settings.misfit_gain * (found.misfit - self._misfit)
                 self.errors.update(difference, dt)
                 return motion
+        if not (may_doubt or failed):
+            return motion
         best = self._best(detections, variances, (compose(self.pose, going_on), predicted), dt)
         if failed or (best is not None and self._is_contradicted(motion, predicted, best)):
             return self._replaced(motion, best, going_on, dt)

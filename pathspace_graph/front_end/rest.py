@@ -19,12 +19,15 @@ class Rest:
         """Keeps the settings, and the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
         self.settings = settings
         self.sigma = sigma
-        self._fastest = settings.rest_speed + settings.rest_sigmas * sigma[0]  # as one reading may be at rest
         self._since: float | None = None
         self._sum: Array = np.zeros(3)
         self._count = 0
         self._measured_since = 0.0
         self._rate_sum, self._rate_count = 0.0, 0
+
+    def believe(self, sigma: Array) -> None:
+        """Takes other standard deviations (3,) of a twist (m/s, m/s, rad/s) from now on."""
+        self.sigma = sigma
 
     def update(self, odometry: Odometry, t: float) -> bool:
         """Returns whether the vehicle has stood for long enough at t (s), by the twists since the last cycle.
@@ -34,7 +37,7 @@ class Rest:
         twists = odometry.twist[1:] if len(odometry.twist) > 1 else odometry.twist  # the first one is held
         if (
             len(twists) == 0
-            or twists[:, 0].min() > self._fastest
+            or twists[:, 0].min() > self.settings.rest_speed + self.settings.rest_sigmas * self.sigma[0]
             or not self._is_still(twists.mean(axis=0), len(twists))
         ):
             self.end()

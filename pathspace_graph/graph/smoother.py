@@ -30,7 +30,6 @@ from .keys import (
     CALIBRATION_KEY,
     POINT,
     POSE,
-    SENSOR_KEY,
     are_poses,
     indices,
     name,
@@ -63,28 +62,35 @@ class FixedLagSmoother(WindowSystem[M_co]):
     # --- new variables and factors -----------------------------------------------------------------------
 
     def _begin_calibration(self) -> None:
-        own = (CALIBRATION_KEY, self.settings.sigma_calibration), (SENSOR_KEY, self.settings.sigma_sensor)
-        for key, sigma in own:
-            if len(sigma):
-                keys, zero = np.array([key]), np.zeros(len(sigma))
-                self.variables.insert(keys, zero)
-                self.prior.push_back(jacobian_factor(keys, np.diag(1.0 / np.array(sigma)), zero))
+        self.variables.insert_calibrations(self.calibration_prior[0])
+        self.prior = graph_of(self.prior, *self._calibration_factors(*self.calibration_prior))
 
-    def widen_calibrations(self, sigma: Array) -> None:
-        """Gives the priors of the calibrations other standard deviations, (2,) or (7,).
+    def believe_calibrations(self, mean: Array, sigma: Array) -> None:
+        """Give the priors of the calibrations other means and standard deviations, (2,) or (7,).
 
         Calibrations are never eliminated, so their priors are terms of the sum, and are exchanged exactly.
         """
-        if (sigma == self.calibration_sigma).all():
+        before = self.calibration_prior
+        if (mean == before[0]).all() and (sigma == before[1]).all():
             return
-        keys, zero = self.variables.calibration_keys, np.zeros(len(sigma))
-        before, after = (
-            jacobian_factor(keys, np.diag(1.0 / one), zero) for one in (self.calibration_sigma, sigma)
-        )
-        self.calibration_sigma, self.epoch = sigma, self.epoch + 1
-        self.prior = graph_of(self.prior, after, before.negate())
+        after = self._calibration_factors(mean, sigma)
+        negative = [factor.negate() for factor in self._calibration_factors(*before)]
+        self.calibration_prior, self.epoch = (mean, sigma), self.epoch + 1
+        self.prior = graph_of(self.prior, *after, *negative)
         if self.submaps is not None:
-            self.submaps.first = graph_of(self.submaps.first, after, before.negate())
+            self.submaps.first = graph_of(self.submaps.first, *after, *negative)
+
+    def _calibration_factors(self, mean: Array, sigma: Array) -> list[gtsam.GaussianConditional]:
+        """Return the factor `(b - mean) / sigma` of the calibration of the odometry, and of the sensor."""
+        factors = []
+        for key in self.variables.calibration_keys:
+            keys = np.array([key])
+            entries = self.variables.layout.entries(keys)
+            root = np.diag(1.0 / sigma[entries])
+            factors.append(
+                jacobian_factor(keys, root, root @ (mean[entries] - self.variables.reference[entries]))
+            )
+        return factors
 
     def measure_bias(self, value: float, sigma: float) -> None:
         """Adds a measurement of the yaw rate's bias (rad/s), which a vehicle at rest makes."""

@@ -52,12 +52,13 @@ class SmootherSettings:
     heading by the second (rad)."""
     keyframe_interval: float
     """The keyframes of the submaps are this length of path (m) apart."""
-    sigma_calibration: tuple[float, float]
-    """These are the prior sigmas of the calibration: scale error (-) and bias of the yaw rate (rad/s)."""
+    sigmas_calibrations: tuple[float, ...]
+    """Prior standard deviations of the calibrations: scale error (-) and yaw-rate bias (rad/s) of the
+    odometry, and five of the sensor where they are estimated."""
+    calibrations: tuple[float, ...] = ()
+    """Prior means of the same; zero by default."""
     max_poses: int = 400
     """The window holds at most this number of poses."""
-    sigma_sensor: tuple[float, ...] = ()
-    """These are the prior sigmas of the sensor's calibration, none where it is not estimated."""
     relative: bool = False
     """While the loop is open, each part of the map is known in the frame of a pose beside it. The rows of the
     map must not change under a rigid motion of all variables."""
@@ -112,8 +113,12 @@ class WindowSystem(Generic[M_co]):
         """These hold the prior in submaps, while the loop is open and the user gave no factors on poses."""
         self.last_step: FactoredSystem | None = None
         """The last Gauss-Newton step solved this damped system; it is None before the first step."""
-        self.calibration_sigma: Array = np.array([*settings.sigma_calibration, *settings.sigma_sensor])
-        """The priors of the calibrations have these standard deviations, (2,) or (7,)."""
+        sigmas = np.array(settings.sigmas_calibrations)
+        self.calibration_prior: tuple[Array, Array] = (
+            np.resize(settings.calibrations or 0.0, len(sigmas)),
+            sigmas,
+        )
+        """Means and standard deviations of the priors of the calibrations, (2,) or (7,)."""
         self.held: HeldMap | None = None
         """This is what was known of a closed map when its gauge was held; it is None before."""
         self.epoch = 0

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import InputError
 from pathspace_graph.labels import NAMES, label_from_name
 
+from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise
+
 from .csv_table import FloatArray, Table, read_table
 from .files import atomic_folder
 from .limits import (
@@ -31,6 +33,7 @@ from .limits import (
     shown,
 )
 from .manifest import verified
+from .noise import noise_from_toml, noise_to_toml
 from .parsing import parse_toml, read_text
 
 IntArray = NDArray[np.int_]
@@ -143,8 +146,19 @@ class Log:
     """This is known of the sensor."""
     source: Mapping[str, str] = field(default_factory=dict)
     """These free texts say where the log comes from."""
+    odometry_stated: bool = True
+    """Whether somebody has stated the noise of the odometry; otherwise it was measured or assumed."""
+    detections_stated: bool = True
+    """Whether somebody has stated the covariances of the detections."""
+    measured: MeasuredNoise | None = None
+    """Noise and constant errors of the sensor, as the readings themselves show them."""
     truth: Truth | None = None
     """This is the truth where there is any."""
+
+    @property
+    def noise(self) -> KnownNoise:
+        """Return what is known of the noise before the drive."""
+        return KnownNoise(self.odometry_sigma, self.odometry_stated, self.detections_stated, self.measured)
 
 
 def read_log(folder: Path | str) -> Log:
@@ -170,6 +184,7 @@ def _read_log(folder: Path) -> Log:
         odometry_sigma=_odometry_sigma(folder / LOG_FILE, header),
         sensor=_sensor_info(folder / LOG_FILE, header),
         source={key: str(value) for key, value in _section(folder / LOG_FILE, header, "source").items()},
+        **noise_from_toml(folder / LOG_FILE, _section(folder / LOG_FILE, header, "noise")),
         truth=_read_truth(folder, len(table), _true_calibration(folder / LOG_FILE, header)),
     )
 
@@ -350,6 +365,7 @@ def _toml(log: Log) -> str:
     sensor = {"range_max": log.sensor.range_max, "fov": log.sensor.fov, "rate": log.sensor.rate}
     lines = [f'format = "{FORMAT}"', "", "[odometry]", f"sigma = [{sigma}]", "", "[sensor]"]
     lines += [f"{name} = {float(value)!r}" for name, value in sensor.items() if value is not None]
+    lines += noise_to_toml(log.odometry_stated, log.detections_stated, log.measured)
     lines += ["", "[source]"]
     lines += [f"{_toml_text(key)} = {_toml_text(value)}" for key, value in log.source.items()]
     if log.truth is not None and log.truth.calibration is not None:

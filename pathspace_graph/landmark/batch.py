@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.graph.keys import POSE
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import BatchRun
 from pathspace_graph.laps import LapCounter
-from pathspace_graph.mapping.prediction import odometry_noise
+from pathspace_graph.mapping.prediction import known_noise
 from pathspace_graph.run import settings_dict, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -31,9 +32,11 @@ NAME: Final = "landmark-batch"
 class LandmarkBatch:
     """Maps cones as points with all poses of a log; the start is the online run of `LandmarkFixedLag`."""
 
-    def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
         self.settings = settings or MapperSettings()
-        self.odometry_sigma = odometry_noise(odometry_sigma)
+        self.noise = known_noise(odometry_sigma)
 
     def solve(self, log: Log) -> BatchRun:
         """Solves a log: associate, optimize, merge and remove landmarks, until the associations stay.
@@ -45,8 +48,8 @@ class LandmarkBatch:
 
     def _solve(self, log: Log) -> BatchRun:
         settings = self.settings.landmark
-        system = LandmarkSystem.of_log(log, self.settings, self.odometry_sigma)
-        system, state = start_online(log, system, self.odometry_sigma)
+        system = LandmarkSystem.of_log(log, self.settings, self.noise)
+        system, state = start_online(log, system, self.noise)
         system.optimize(state)
         rounds, converged = 0, False
         while not converged and rounds < settings.max_rounds:
@@ -81,14 +84,12 @@ class LandmarkBatch:
         )
 
 
-def start_online(
-    log: Log, system: LandmarkSystem, odometry_sigma: Array
-) -> tuple[LandmarkSystem, LandmarkState]:
+def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[LandmarkSystem, LandmarkState]:
     """Returns the last map of the online run, with each pose and association as it left the window.
 
     The problem is returned with the priors of the calibrations as the online run believed them in the end.
     """
-    online, detections = LandmarkFixedLag(system.settings, odometry_sigma), system.detections
+    online, detections = LandmarkFixedLag(system.settings, noise), system.detections
     smoother, track = online.smoother, online.smoother.map
     poses = np.zeros((len(log.cycles), POSE))
     landmark = np.full(len(detections), UNASSOCIATED, np.intp)

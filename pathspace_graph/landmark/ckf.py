@@ -27,8 +27,9 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
-from pathspace_graph.mapping.prediction import odometry_noise
+from pathspace_graph.mapping.prediction import known_noise
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
@@ -46,10 +47,13 @@ class LandmarkCkf:
     `odometry_sigma` (3,) is the standard deviation of a twist reading (m/s, m/s, rad/s).
     """
 
-    def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
         self.settings = settings or MapperSettings()
-        self.odometry_sigma = odometry_noise(odometry_sigma)
-        self.front_end = FrontEnd(self.settings, self.odometry_sigma)
+        noise = known_noise(odometry_sigma)
+        self.odometry_sigma = noise.odometry
+        self.front_end = FrontEnd(self.settings, noise)
         """It judges the readings of each cycle."""
         self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
         """This is the state `x = [pose | calibration | landmarks]`."""

@@ -15,10 +15,11 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import (
     doubt_calibrations,
-    odometry_noise,
+    known_noise,
     predict,
     smoother_settings,
     vehicle_state,
@@ -45,10 +46,13 @@ class LandmarkFixedLag:
     place of a curve. `odometry_sigma` (3,) is the standard deviation of a twist reading (m/s, m/s, rad/s).
     """
 
-    def __init__(self, settings: MapperSettings | None = None, odometry_sigma: Array | None = None) -> None:
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
         self.settings = settings or MapperSettings()
-        self.odometry_sigma = odometry_noise(odometry_sigma)
-        self.front_end = FrontEnd(self.settings, self.odometry_sigma)
+        noise = known_noise(odometry_sigma)
+        self.odometry_sigma = noise.odometry
+        self.front_end = FrontEnd(self.settings, noise)
         """It judges the readings of each cycle."""
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), LandmarkMap(self.settings))
         """This holds the variables, the window and its prior."""
@@ -88,7 +92,9 @@ class LandmarkFixedLag:
         for _ in range(self.settings.steps_grown if created else self.settings.steps):
             self.smoother.step()
         if not self.closed:
-            self.believed = doubt_calibrations(self.smoother, self.believed, reading.sensor_doubted)
+            self.believed = doubt_calibrations(
+                self.smoother, self.believed, reading.sensor_doubted, reading.measured
+            )
         watch.lap("update")
         self._close()
         watch.lap("close")

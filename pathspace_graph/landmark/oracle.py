@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.front_end.log_odometry import no_errors
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from pathspace_graph.settings.mapper import MapperSettings
@@ -58,7 +58,7 @@ def solve_landmarks(
     """
     settings = settings or MapperSettings()
     settings = replace(settings, gate=replace(settings.gate, huber=np.inf))
-    system = LandmarkSystem.of_log(log, settings, log.odometry_sigma)
+    system = LandmarkSystem.of_log(log, settings, KnownNoise(log.odometry_sigma))
     state = start_oracle(system, associations)
     system.optimize(state)
     return LandmarkSolution(
@@ -79,7 +79,7 @@ def start_oracle(system: LandmarkSystem, associations: Ints) -> LandmarkState:
     detections, rows = system.detections, np.flatnonzero(associations >= 0)
     numbers, first, landmark = np.unique(associations[rows], return_index=True, return_inverse=True)
     detections.take(rows, numbers[landmark])
-    calibration = no_errors(system.settings.calibration)
+    calibration = np.array(system.settings.calibrations)
     poses = system.chain.dead_reckoned(calibration[:CALIBRATION_SIZE])
     points = to_map(detections.point[rows[first]], poses[detections.cycle[rows[first]]])
     labels = detections.label[rows]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.noise import huber_loss
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry, sensor_prior, sensor_prior_cost
@@ -37,9 +38,9 @@ class LandmarkSystem:
     settings: MapperSettings
 
     @classmethod
-    def of_log(cls, log: Log, settings: MapperSettings, odometry_sigma: Array) -> LandmarkSystem:
-        """Returns the problem of a log without any association; `odometry_sigma` (3,) is that of a twist."""
-        judged = judge_log(log, odometry_sigma, settings)
+    def of_log(cls, log: Log, settings: MapperSettings, noise: KnownNoise) -> LandmarkSystem:
+        """Returns the problem of a log without any association; `noise` is what is known before."""
+        judged = judge_log(log, noise, settings)
         twists = judged.chain.twists
         return cls(LandmarkDetections.of(judged.cycles, twists=twists), judged.chain, judged.settings)
 

@@ -313,7 +313,8 @@ class Search:
         points = np.concatenate([one.points_vehicle for one in self._seen])
         rows = np.flatnonzero(np.isin(labels, BOUNDARIES))
         rows = rows[:: max(-(-len(rows) // self.settings.finding.readings), 1)]
-        return Sightings(rows, labels[rows], to_map(points[rows], np.array(self._poses)[cycles[rows]]))
+        placed = to_map(points[rows], np.array(self._poses)[cycles[rows]])
+        return Sightings.of_points(rows, labels[rows], placed)
 
     # --- hypotheses --------------------------------------------------------------------------------------
 

@@ -66,7 +66,7 @@ class Stretch:
         """Returns the cones as the registration takes them."""
         labels = np.repeat(list(self.cones), [len(cones) for cones in self.cones.values()])
         points = np.concatenate(list(self.cones.values()))
-        return Sightings(np.arange(len(points)), labels, points)
+        return Sightings.of_points(np.arange(len(points)), labels, points)
 
 
 def recognize(smoother: CurveSmoother) -> RecognizedPlace | None:

@@ -110,14 +110,14 @@ class TrackLoop:
         """Returns why an estimate is not good though the detections agree with it, or an empty string."""
         if self._boundaries_cross:
             return "the two boundaries of the map cross"
-        if not self.closed and self._believed != self.settings:
-            return "the drive contradicts the calibration, which is being learned"
         return ""
 
     def doubt_calibrations(self, reading: Reading) -> None:
         """Widens the priors of calibrations that the drive contradicts, while the loop is open."""
         if not self.closed:
-            self._believed = doubt_calibrations(self._smoother, self._believed, reading.sensor_doubted)
+            self._believed = doubt_calibrations(
+                self._smoother, self._believed, reading.sensor_doubted, reading.measured
+            )
 
     # --- the batch of the open lap -----------------------------------------------------------------------
 

@@ -62,7 +62,10 @@ class Belief:
         """
         sigmas = np.array([settings.sigma_start, settings.sigma_start, settings.sigma_start_heading])
         calibration = np.array([settings.sigma_scale, settings.sigma_bias, *sensor.widened().sigmas])
-        return cls(np.zeros(POSE), np.diag(sigmas**2), calibration)
+        belief = cls(np.zeros(POSE), np.diag(sigmas**2), calibration)
+        known = np.array([*settings.calibration, *sensor.means])
+        belief.mean[POSE : POSE + len(known)] = known
+        return belief
 
     @property
     def pose(self) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrate_twists
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, SENSOR_KEY, pose_key
 from pathspace_graph.graph.smoother import FixedLagSmoother
@@ -24,12 +25,21 @@ from .path import DrivenPath
 Array = NDArray[np.float64]
 
 
-def odometry_noise(sigma: Array | None) -> Array:
-    """Returns the standard deviations (3,) of a twist as a copy; without any, those of the simulator.
+def known_noise(sigma: Array | KnownNoise | None) -> KnownNoise:
+    """Return what is known of the noise before a drive.
 
-    They are in m/s, m/s and rad/s. Anything but three positive numbers is a SettingsError.
+    An array (3,) states the standard deviations of a twist (m/s, m/s, rad/s). Without any, those of the
+    simulator are assumed until others are measured. Anything but three positive numbers is a SettingsError.
     """
-    noise = np.array(ODOMETRY_SIGMA if sigma is None else sigma, float)
+    if isinstance(sigma, KnownNoise):
+        return replace(sigma, odometry=_checked(sigma.odometry))
+    if sigma is None:
+        return KnownNoise(np.array(ODOMETRY_SIGMA), odometry_stated=False)
+    return KnownNoise(_checked(sigma))
+
+
+def _checked(sigma: Array) -> Array:
+    noise = np.array(sigma, float)
     if noise.shape != (POSE,) or not ((noise > 0.0) & (noise < np.inf)).all():
         raise SettingsError(f"odometry_sigma: expected {POSE} positive numbers, found {noise.tolist()}")
     return noise
@@ -60,17 +70,18 @@ def predict(
 def doubted(mean: Array, variance: Array, settings: MapperSettings) -> MapperSettings:
     """Returns the settings, with wide priors of the calibrations if the drive contradicts one of them.
 
-    mean m and variance v, (2,) or (7,), are those of the calibrations. If a prior with standard deviation
-    sigma is right, then m had the variance `sigma^2 - v` before the drive. The priors that are contradicted
-    most become wide, those of the odometry or those of the sensor. So a prior has a heavy tail, as that of a
-    mixture of two Gaussians.
+    mean m and variance v, (2,) or (7,), are those of the calibrations. If a prior with mean p and standard
+    deviation sigma is right, then m - p had the variance `sigma^2 - v` before the drive. The priors that are
+    contradicted most become wide, those of the odometry or those of the sensor. So a prior has a heavy tail,
+    as that of a mixture of two Gaussians.
     """
     sigma = np.array(settings.sigmas_calibrations)
     limits = np.full(len(sigma), settings.calibration.doubt)
     limits[:CALIBRATION_SIZE] = settings.odometry.doubt
     spread = sigma**2 - variance
     shown = spread > np.finfo(np.float32).eps * sigma**2  # the drive says something at all
-    square = np.where(shown, mean**2 / np.where(shown, spread, 1.0), 0.0) / limits**2
+    off = mean - settings.calibrations
+    square = np.where(shown, off**2 / np.where(shown, spread, 1.0), 0.0) / limits**2
     most = int(np.argmax(square))
     if square[most] <= 1.0:
         return settings
@@ -80,25 +91,36 @@ def doubted(mean: Array, variance: Array, settings: MapperSettings) -> MapperSet
 
 
 def doubt_calibrations(
-    smoother: FixedLagSmoother[MapRows], settings: MapperSettings, sensor_doubted: bool
+    smoother: FixedLagSmoother[MapRows],
+    settings: MapperSettings,
+    sensor_doubted: bool,
+    measured: MapperSettings | None = None,
 ) -> MapperSettings:
     """Widens the priors of calibrations where the drive so far contradicts them.
 
     Where the front end says that the prior of the sensor is doubted, it becomes wide at once, before other
-    variables have taken the sensor's errors over.
+    variables have taken the sensor's errors over. Where it has measured the sensor's errors, the priors are
+    those of the settings `measured`.
     It returns the settings with the priors as they are then. It is for an open loop: the prior of a closed
     one is linearized where the calibration was then, and is surer of it than it may be.
     """
+    if measured is not None:
+        settings = replace(settings, odometry=measured.odometry, calibration=measured.calibration)
+        _believe(smoother, settings)
     if sensor_doubted and settings.calibration.doubt < inf:
         settings = replace(settings, calibration=settings.calibration.widened())
-        smoother.widen_calibrations(np.array(settings.sigmas_calibrations))
+        _believe(smoother, settings)
     if smoother.last_step is None or smoother.next_cycle % settings.odometry.doubt_cycles:
         return settings
     variables = smoother.variables
     variance = np.diag(smoother.last_covariance(variables.calibration_keys))
     found = doubted(variables.calibrations, variance, settings)
-    smoother.widen_calibrations(np.array(found.sigmas_calibrations))
+    _believe(smoother, found)
     return found
+
+
+def _believe(smoother: FixedLagSmoother[MapRows], settings: MapperSettings) -> None:
+    smoother.believe_calibrations(np.array(settings.calibrations), np.array(settings.sigmas_calibrations))
 
 
 def vehicle_state(smoother: FixedLagSmoother[MapRows]) -> VehicleState:
@@ -117,7 +139,7 @@ def smoother_settings(settings: MapperSettings) -> SmootherSettings:
         max_poses=settings.max_poses,
         tolerances=(settings.relinearize.point, settings.relinearize.heading),
         keyframe_interval=settings.closing.keyframe_interval,
-        sigma_calibration=settings.odometry.sigmas_calibration,
-        sigma_sensor=settings.calibration.sigmas,
+        sigmas_calibrations=settings.sigmas_calibrations,
+        calibrations=settings.calibrations,
         relative=True,
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import to_map, wrap_angle
+from pathspace_graph.factors.se2 import rotations, to_map, wrap_angle
 from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.spline.boundary import Boundary
 
@@ -18,6 +18,7 @@ from .state import State
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +52,25 @@ class Sightings:
     """(m,) Each detection has this label."""
     points: Array
     """(m, 2) Each detection is at this point in m, map frame."""
+    covariances: Array
+    """(m, 2, 2) Each detection has this covariance in m^2, map frame."""
+    explained: BoolArray
+    """(m,) Whether the newest curves explain the detection: only these can contradict a place."""
 
     def where(self, chosen: IntArray) -> Sightings:
         """Returns some of the detections, by index."""
-        return Sightings(self.rows[chosen], self.labels[chosen], self.points[chosen])
+        return Sightings(
+            self.rows[chosen],
+            self.labels[chosen],
+            self.points[chosen],
+            self.covariances[chosen],
+            self.explained[chosen],
+        )
+
+    @classmethod
+    def of_points(cls, rows: IntArray, labels: IntArray, points: Array) -> Sightings:
+        """Return sightings that all count the same, by the least deviation of the registration."""
+        return cls(rows, labels, points, np.zeros((len(rows), 2, 2)), np.ones(len(rows), bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +83,10 @@ class Matches:
     """(m,) Each detection has this label."""
     u: Array
     """(m,) Each detection has its foot point at this parameter."""
-    inlier: NDArray[np.bool_]
+    inlier: BoolArray
     """(m,) The flag is set when the detection is within `inlier_distance` of the curve."""
+    explained: BoolArray
+    """(m,) Whether the newest curves explain the detection."""
     hessian: Array
     """(3, 3) This is the information about the motion, from the detections within reach."""
     negative_gradient: Array
@@ -195,8 +213,11 @@ def _recent(track: CurveMap, times: Sequence[float], seconds: float) -> Sighting
     detections, variables, stamps = track.detections, track.variables, np.asarray(times)
     rows = np.flatnonzero(stamps[detections.cycle - variables.first_cycle] > stamps[-1] - seconds)
     rows = rows[np.isin(detections.label[rows], list(track.state.boundaries))]
-    points = to_map(detections.point[rows], variables.poses_at(detections.cycle[rows]))
-    return Sightings(rows, detections.label[rows], points)
+    poses = variables.poses_at(detections.cycle[rows])
+    turn = rotations(poses[:, 2])
+    covariances = turn @ detections.covariance[rows] @ turn.transpose(0, 2, 1)
+    points, used = to_map(detections.point[rows], poses), detections.used[rows]
+    return Sightings(rows, detections.label[rows], points, covariances, used)
 
 
 def _reaches(settings: ClosingSettings) -> Iterator[float]:
@@ -223,15 +244,18 @@ def _match(
         foot = boundary.find(state.control_points(label), moved[own], low, high)
         used = foot.interior & (np.abs(foot.distance) < reach)
         n, arm = foot.normal_unit[used], moved[own[used]] - motion.centre - motion.vector[:2]
-        jacobian = by_motion(n, arm) / settings.sigma_reading
+        sigma = np.sqrt(
+            np.einsum("mi,mij,mj->m", n, seen.covariances[own[used]], n) + settings.sigma_reading**2
+        )
+        jacobian = by_motion(n, arm) / sigma[:, None]
         hessian += jacobian.T @ jacobian
-        negative_gradient -= jacobian.T @ foot.distance[used] / settings.sigma_reading
+        negative_gradient -= jacobian.T @ (foot.distance[used] / sigma)
         matched.append(own[foot.interior])
         u.append(foot.u[foot.interior])
         inlier.append(np.abs(foot.distance[foot.interior]) < settings.inlier_distance)
     inside, parameters, inliers = np.concatenate(matched), np.concatenate(u), np.concatenate(inlier)
     rows, labels = seen.rows[inside], seen.labels[inside]
-    return Matches(rows, labels, parameters, inliers, hessian, negative_gradient)
+    return Matches(rows, labels, parameters, inliers, seen.explained[inside], hessian, negative_gradient)
 
 
 def by_motion(normals: Array, arms: Array) -> Array:
@@ -256,8 +280,13 @@ def sigma_of_information(information: Array) -> float:
 
 
 def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bool:
-    """Returns whether nearly all of enough detections are inliers, on a long stretch of every boundary."""
-    count, inliers = len(matches.rows), int(matches.inlier.sum())
+    """Returns whether nearly all of enough detections are inliers, on a long stretch of every boundary.
+
+    Detections that the newest curves do not explain are clutter, of another stretch of the road, or ahead of
+    all that was mapped yet: where they are no inliers, they say nothing.
+    """
+    asked = matches.explained
+    count, inliers = int(asked.sum()), int(matches.inlier[asked].sum())
     if count < settings.min_readings or inliers < settings.inlier_share * count:
         return False
     on_each = [matches.inliers(label)[1] for label in labels]

@@ -22,10 +22,11 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.association import associate, associate_late
 from pathspace_graph.loop.closing import apply_correspondences, optimize_loop, simplify
 from pathspace_graph.loop.track_loop import TrackLoop
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import (
-    odometry_noise,
+    known_noise,
     predict,
     smoother_settings,
 )
@@ -59,12 +60,13 @@ class FixedLagMapper(MapperEstimate):
     def __init__(
         self,
         settings: MapperSettings | None = None,
-        odometry_sigma: Array | None = None,
+        odometry_sigma: Array | KnownNoise | None = None,
         solver: Solver | None = None,
     ) -> None:
         self.settings = settings or MapperSettings()
-        self.odometry_sigma = odometry_noise(odometry_sigma)
-        self.front_end = FrontEnd(self.settings, self.odometry_sigma)
+        noise = known_noise(odometry_sigma)
+        self.odometry_sigma = noise.odometry
+        self.front_end = FrontEnd(self.settings, noise)
         """It judges the readings of each cycle."""
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), CurveMap(self.settings))
         """The smoother holds the variables, the factors of the window, and the prior."""

@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.gtsam_factors import pose_array
 from pathspace_graph.graph.gaussian import factors_of, keys_of
 from pathspace_graph.graph.keys import POSE, SENSOR_KEY, are_poses, control_keys, indices, pose_key
@@ -35,7 +36,7 @@ breaks."""
 
 
 def incremental_fixed_lag(
-    settings: MapperSettings | None = None, odometry_sigma: Array | None = None
+    settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
 ) -> FixedLagMapper:
     """Returns a `FixedLagMapper` whose window is solved by GTSAM's smoother; it takes no user factors."""
     settings = settings or MapperSettings()

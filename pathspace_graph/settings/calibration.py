@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import inf
+from typing import Literal
 
 from .checked import Positive
 
@@ -17,6 +18,7 @@ class CalibrationSettings(Positive):
     """
 
     UNLIMITED = ("doubt",)
+    SIGNED = ("yaw", "lateral", "latency", "range_scale", "range_bias")
 
     sensor: bool = True
     """The sensor's constant errors are estimated along with the map."""
@@ -30,6 +32,19 @@ class CalibrationSettings(Positive):
     """This is the standard deviation of the scale error of the ranges (-)."""
     sigma_range_bias: float = 0.005
     """This is the standard deviation of the bias of the ranges (m)."""
+    yaw: float = 0.0
+    """Known yaw of the sensor, positive to the left (rad): the mean of its prior."""
+    lateral: float = 0.0
+    """Known lateral offset of the sensor, positive to the left (m)."""
+    latency: float = 0.0
+    """Known age of detections at their stamps (s); negative where they are newer."""
+    range_scale: float = 0.0
+    """Known scale error of the ranges (-)."""
+    range_bias: float = 0.0
+    """Known bias of the ranges (m)."""
+    trust: Literal["odometry", "ranges"] | None = None
+    """Which of the two sets the size of the map where ranges and speeds disagree: only their ratio can be
+    seen. By default the smoother one."""
     doubt: float = 4.0
     """The drive contradicts a prior by this number of standard deviations. It is infinite where the priors
     always hold."""
@@ -46,6 +61,12 @@ class CalibrationSettings(Positive):
             self.sigma_range_scale,
             self.sigma_range_bias,
         )
+        return own if self.sensor else ()
+
+    @property
+    def means(self) -> tuple[float, ...]:
+        """Returns the known errors (5,) in the order of `factors.sensor:SENSOR`, or none."""
+        own = (self.yaw, self.lateral, self.latency, self.range_scale, self.range_bias)
         return own if self.sensor else ()
 
     def widened(self) -> CalibrationSettings:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from math import inf
+from math import inf, isfinite
 from typing import ClassVar
 
 from pathspace_graph.errors import SettingsError
@@ -14,6 +14,9 @@ class Positive:
 
     UNLIMITED: ClassVar[tuple[str, ...]] = ()
     """These numbers may be infinite, which means that there is no limit."""
+
+    SIGNED: ClassVar[tuple[str, ...]] = ()
+    """These numbers may have either sign."""
 
     prefix: ClassVar[str]
     """This stands before the names of the settings on the command line."""
@@ -28,6 +31,10 @@ class Positive:
         for entry in fields(self):  # type: ignore[arg-type]  # every heir is a dataclass
             value = getattr(self, entry.name)
             if isinstance(value, bool) or not isinstance(value, int | float):
+                continue
+            if entry.name in self.SIGNED:
+                if not isfinite(value):
+                    raise SettingsError(f"{self.prefix}{entry.name}: expected a number, found {value}")
                 continue
             if not value > 0:
                 raise SettingsError(f"{self.prefix}{entry.name}: expected a positive number, found {value}")

@@ -149,7 +149,12 @@ class OdometrySettings(Positive):
     """Describes the constant errors of the odometry, which are estimated along with the map."""
 
     UNLIMITED = ("doubt",)
+    SIGNED = ("scale", "bias")
 
+    scale: float = 0.0
+    """Known scale error of the speeds (-): the mean of its prior."""
+    bias: float = 0.0
+    """Known bias of the yaw rate (rad/s)."""
     sigma_scale: float = 0.005
     """This is the standard deviation of the scale error of the speeds (-)."""
     sigma_bias: float = 0.002
@@ -177,6 +182,11 @@ class OdometrySettings(Positive):
     def sigmas_calibration(self) -> tuple[float, float]:
         """Returns the standard deviations of the scale error (-) and of the yaw-rate bias (rad/s)."""
         return self.sigma_scale, self.sigma_bias
+
+    @property
+    def calibration(self) -> tuple[float, float]:
+        """Returns the known scale error (-) and yaw-rate bias (rad/s)."""
+        return self.scale, self.bias
 
     @property
     def sigmas_start(self) -> tuple[float, float, float]:
@@ -229,6 +239,9 @@ class MapperSettings(Positive):
     sigma_step: float = 0.5
     """A control point moves this far freely in a step (m): this damps sliding along the curve, and leaves the
     optimum where it is."""
+    noise: Literal["measured", "stated"] | None = None
+    """Noise of odometry and detections that is used: what the log states, or what is measured in the drive.
+    By default what is stated, and measured where nothing is."""
     limits: LimitSettings = field(default_factory=LimitSettings)
     """These settings say what a perception cycle may hold."""
     spline: SplineSettings = field(default_factory=SplineSettings)
@@ -275,6 +288,11 @@ class MapperSettings(Positive):
     """These settings describe the paper's filters."""
     centerline: CenterlineSettings = field(default_factory=CenterlineSettings)
     """These settings describe the estimators of a centre line with a width."""
+
+    @property
+    def calibrations(self) -> tuple[float, ...]:
+        """Returns the priors' means, (2,) or (7,), of odometry and sensor."""
+        return (*self.odometry.calibration, *self.calibration.means)
 
     @property
     def sigmas_calibrations(self) -> tuple[float, ...]:

@@ -30,7 +30,7 @@ IntArray = NDArray[np.intp]
 # --- poses that come and go ------------------------------------------------------------------------------
 
 SETTINGS = SmootherSettings(
-    lag=2.0, tolerances=(1e-9, 1e-9), keyframe_interval=1e9, sigma_calibration=(0.25, 0.5)
+    lag=2.0, tolerances=(1e-9, 1e-9), keyframe_interval=1e9, sigmas_calibrations=(0.25, 0.5)
 )
 ODOMETRY = integrate_twists(np.full(4, 0.25), np.tile([8.0, 0.1, 0.4], (4, 1)), np.array([0.2, 0.1, 0.05]))
 

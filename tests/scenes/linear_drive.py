@@ -121,7 +121,7 @@ class LinearDrive:
             lag=float(self.lag),
             tolerances=(self.tolerance, self.tolerance),
             keyframe_interval=1e9,
-            sigma_calibration=(float(SIGMA_CALIBRATION[0]), float(SIGMA_CALIBRATION[1])),
+            sigmas_calibrations=(float(SIGMA_CALIBRATION[0]), float(SIGMA_CALIBRATION[1])),
         )
         self.track = LinearTrack(self.seed)
         self.smoother = FixedLagSmoother(settings, self.track)

@@ -1,0 +1,108 @@
+"""Noise of odometry and detections as it was measured on a drive, and what an estimator takes of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .sensor import SENSOR_SIZE, by_sensor
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RayNoise:
+    """Error of a detection in one direction, along the ray or across it.
+
+    Its standard deviation is `sigma[0] + sigma[1] r` at range r. Two errors of one cone that are dt apart
+    have the correlation `share exp(-dt / time)`.
+    """
+
+    sigma: Array
+    """(2,) Standard deviation at range 0 (m), and its growth with the range (m/m)."""
+    share: float = 0.0
+    """Share of the variance that stays with a cone for a while."""
+    time: float = 1.0
+    """Correlation time of that share, s."""
+
+    def sigmas(self, ranges: Array) -> Array:
+        """Return the standard deviation (m,) of single detections at ranges (m,), in m."""
+        return np.asarray(self.sigma[0] + self.sigma[1] * ranges)
+
+    def inflation(self, count: int, period: float) -> float:
+        """Return the variance of the mean of `count` errors of one cone by that of independent ones.
+
+        Detections are `period` (s) apart: `1 + 2 sum_k (1 - k / count) share exp(-k period / time)`.
+        """
+        k = np.arange(1, max(count, 1))
+        return float(1.0 + 2.0 * self.share * ((1.0 - k / count) * np.exp(-k * period / self.time)).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredNoise:
+    """Noise of odometry and detections, measured from nothing but the readings of a drive."""
+
+    odometry: Array
+    """(3,) White noise of a twist from sample to sample: m/s, m/s, rad/s, one sigma."""
+    drift: Array
+    """(3,) Slow part of the odometry's error as a random walk of the pose: m, m and rad by root of s."""
+    interval: float
+    """Time between two twists, s."""
+    along: RayNoise | None = None
+    """Noise along the ray; None where too few cones were seen often enough."""
+    across: RayNoise | None = None
+    """Noise across the ray, as `along`."""
+    count: int = 1
+    """Number of detections of one cone, median."""
+    period: float = 0.1
+    """Time between two perception cycles, s."""
+    per_cycle: float = 1.0
+    """Number of cones seen in a cycle, mean."""
+    sensor: Array = field(default_factory=lambda: np.zeros(SENSOR_SIZE))
+    """(5,) Constant errors of the sensor (`factors.sensor:SENSOR`), while the odometry's scale is held."""
+    sensor_sigma: Array = field(default_factory=lambda: np.full(SENSOR_SIZE, np.inf))
+    """(5,) Their standard deviations; infinite where nothing was measured."""
+    seconds: float = 0.0
+    """Time of driving that was measured on, s."""
+
+    @property
+    def twist_sigma(self) -> Array:
+        """Return the white noise (3,) of a twist with the effect of white noise and slow part together."""
+        return np.asarray(np.hypot(self.odometry, self.drift / np.sqrt(self.interval)))
+
+    def covariances(self, points: Array, *, inflated: bool) -> Array | None:
+        """Return the covariances (m, 2, 2) of detections at points (m, 2), vehicle frame; None if unknown.
+
+        If `inflated`, they are so large that sightings of one cone count as independent ones.
+        """
+        if self.along is None or self.across is None:
+            return None
+        ranges = np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)
+        factors = [
+            one.inflation(self.count, self.period) if inflated else 1.0 for one in (self.along, self.across)
+        ]
+        along = factors[0] * self.along.sigmas(ranges) ** 2
+        across = factors[1] * self.across.sigmas(ranges) ** 2
+        ray = points / ranges[:, None]
+        outer = ray[:, :, None] * ray[:, None, :]
+        return np.asarray(across[:, None, None] * np.eye(2) + (along - across)[:, None, None] * outer)
+
+    def corrected(self, points: Array, twist: Array) -> Array:
+        """Return detections at points (m, 2), vehicle frame, without the constant errors of the sensor."""
+        return np.asarray(points + by_sensor(points, np.tile(twist, (len(points), 1))) @ self.sensor)
+
+
+@dataclass(frozen=True, eq=False)
+class KnownNoise:
+    """What is known of the noise before a drive."""
+
+    odometry: Array
+    """(3,) Standard deviation of a twist (m/s, m/s, rad/s): stated, or assumed where it is not."""
+    odometry_stated: bool = True
+    """Whether somebody has stated it."""
+    detections_stated: bool = True
+    """Whether the covariances of the detections were stated."""
+    measured: MeasuredNoise | None = None
+    """What was measured on this drive as a whole, or on an earlier one."""

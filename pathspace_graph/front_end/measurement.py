@@ -1,0 +1,283 @@
+"""Measurement of noise and sensor errors from odometry and detections alone, without a map.
+
+Cones stand still. Over a few seconds odometry is good enough to lay the sightings of one cone on each other.
+What is left depends on range, motion and time: constant errors of the sensor shift all sightings by known
+derivatives, noise scatters them, and errors that stay with a cone scatter its sightings together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
+from pathspace_graph.factors.noise import huber_weights
+from pathspace_graph.factors.se2 import left_of, rotations, to_map
+from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor
+
+from .sightings import MAD, MIN_SPEED_SHARE, Sightings, TwistRecord
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+
+DRIFT: Final = np.array([0.012, 0.006, 0.0017])
+"""Least slow part of any odometry (m, m, rad by root of s): a heading drifts by 0.8 degrees in a minute. A
+drive without a loop cannot show less, since detections are noisy."""
+PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02])
+"""Weak priors of the sensor's errors (rad, m, s, -, m) and of the yaw rate's bias (rad/s), one sigma."""
+FIRST_ALONG: Final = (0.1, 0.04)
+FIRST_ACROSS: Final = (0.05, 0.016)
+"""Noise that the iteration begins with: m and m/m, then m and rad."""
+ROUNDS: Final = 5
+"""Number of times that errors, noise and weights are found in turn."""
+HUBER: Final = 2.0
+MIN_COUNT: Final = 5
+"""A cone counts with this number of sightings."""
+MIN_ROWS: Final = 60
+"""Noise of detections is told from this number of sightings with a reference."""
+NEAR: Final = 0.6
+"""The reference of a sighting are those of the same cone from less than this share of its range."""
+NEAR_TIME: Final = 6.0
+"""They are at most this time (s) away, for which odometry is trusted."""
+BINS: Final = 8
+TIMES: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+"""Correlation times that are tried (s)."""
+LAGS: Final = (0.05, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)
+"""Edges of the lags at which correlation is measured (s)."""
+FIRST_SHARE: Final = 0.5
+"""Share of a cone's error that stays with it, as long as hardly any cone says otherwise."""
+FIRST_CONES: Final = 8.0
+"""That counts as much as this number of cones."""
+LEAST: Final = (0.02, 0.002)
+"""Least noise along the ray (m) and across it (rad): a cone is no point."""
+
+
+# --- errors of the sensor --------------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class _Cones:
+    """Sightings of cones seen often enough, sorted by cone, with their linear model `p + A b` in the map."""
+
+    table: Sightings
+    begins: IntArray
+    ranges: Array
+    ray: Array
+    """(n, 2) Unit vector along the ray, map frame."""
+    side: Array
+    points: Array
+    columns: Array
+    """(n, 2, 6) Derivatives by the sensor's errors and by the bias of the yaw rate."""
+
+    def sums(self, values: Array) -> Array:
+        """Return the sum of values (n, ...) over each cone."""
+        return np.asarray(np.add.reduceat(values, self.begins, axis=0))
+
+    def spread(self, values: Array) -> Array:
+        """Return values (c, ...) of the cones for each of their sightings."""
+        return np.repeat(values, np.diff(np.append(self.begins, len(self.ranges))), axis=0)
+
+
+def _cones(sightings: Sightings) -> _Cones | None:
+    speed = np.hypot(sightings.twist[:, 0], sightings.twist[:, 1])
+    moving = speed > MIN_SPEED_SHARE * np.median(speed) if len(speed) else np.zeros(0, bool)
+    count = np.bincount(sightings.cone[moving]) if moving.any() else np.zeros(1, np.intp)
+    chosen = np.flatnonzero(moving)
+    chosen = chosen[count[sightings.cone[chosen]] >= MIN_COUNT]
+    if len(chosen) < MIN_ROWS:
+        return None
+    table = sightings.where(chosen[np.argsort(sightings.cone[chosen], kind="stable")])
+    begins = np.flatnonzero(np.diff(table.cone, prepend=-1))
+    ranges = np.maximum(np.hypot(*table.point.T), np.finfo(float).tiny)
+    turn = rotations(table.pose[:, 2])
+    ray = np.einsum("nij,nj->ni", turn, table.point / ranges[:, None])
+    points = to_map(table.point, table.pose)
+    turning = table.by_bias[:, :2] + table.by_bias[:, 2:] * left_of(points - table.pose[:, :2])
+    sensor = np.einsum("nij,njk->nik", turn, by_sensor(table.point, table.twist))
+    columns = np.concatenate([sensor, turning[:, :, None]], axis=2)
+    return _Cones(table, begins, ranges, ray, left_of(ray), points, columns)
+
+
+def _information(cones: _Cones, along: RayNoise, across: RayNoise, weights: Array) -> Array:
+    """Return the information (n, 2, 2) of each sighting, map frame."""
+    by_ray = cones.ray[:, :, None] * cones.ray[:, None, :] / (along.sigmas(cones.ranges) ** 2)[:, None, None]
+    by_side = cones.side[:, :, None] * cones.side[:, None, :]
+    by_side /= (across.sigmas(cones.ranges) ** 2)[:, None, None]
+    return np.asarray((by_ray + by_side) * weights[:, None, None])
+
+
+def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array]:
+    """Return errors b (6,), their covariance, and what is left (n, 2) of each sighting about its cone.
+
+    The places of the cones are eliminated: they are the weighted means of `p + A b`.
+    """
+    total = np.linalg.inv(cones.sums(information))
+    mean_columns = total @ cones.sums(information @ cones.columns)
+    mean_points = (total @ cones.sums(information @ cones.points[:, :, None]))[:, :, 0]
+    columns = cones.columns - cones.spread(mean_columns)
+    points = cones.points - cones.spread(mean_points)
+    weighted = information @ columns
+    normal = np.einsum("nik,nil->kl", columns, weighted) + np.diag(PRIOR**-2)
+    covariance = np.linalg.inv(normal)
+    errors = -covariance @ np.einsum("nik,ni->k", weighted, points)
+    return errors, covariance, points + columns @ errors
+
+
+# --- noise of the detections -----------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class _Residuals:
+    """What is left of far sightings about nearer ones of the same cone, after the constant errors."""
+
+    rows: IntArray
+    offsets: Array
+    """(k, 2) Along the ray and across it, m."""
+    reference: Array
+    """(k, 2) Variance of the reference and of the odometry in between, along and across (m^2)."""
+
+
+def _residuals(cones: _Cones, errors: Array, noise: tuple[RayNoise, RayNoise], odometry: Array) -> _Residuals:
+    """Return the residuals of sightings against nearer ones; `odometry` is drift (3,) by root of s."""
+    i, j = _pairs(cones)
+    t, ranges = cones.table.t, cones.ranges
+    near = (ranges[j] < NEAR * ranges[i]) & (np.abs(t[j] - t[i]) < NEAR_TIME)
+    i, j = i[near], j[near]
+    rows, begins, counts = np.unique(i, return_index=True, return_counts=True)
+    enough = counts >= 2
+    if not enough.any():
+        return _Residuals(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2)))
+    points = cones.points + cones.columns @ errors
+    variance = 0.5 * (noise[0].sigmas(ranges) ** 2 + noise[1].sigmas(ranges) ** 2)
+    weight = 1.0 / variance[j]
+    total = np.add.reduceat(weight, begins)
+    mean = np.add.reduceat(weight[:, None] * points[j], begins) / total[:, None]
+    stay = 0.5 * (noise[0].share + noise[1].share)
+    lag = np.add.reduceat(weight * np.abs(t[j] - t[i]), begins) / total
+    spread = counts / total * np.maximum(1.0 / counts, stay)
+    off = points[rows] - mean
+    offsets = np.stack([(off * cones.ray[rows]).sum(axis=1), (off * cones.side[rows]).sum(axis=1)], axis=1)
+    drifted = np.stack(
+        [odometry[0] ** 2 * lag, (odometry[1] ** 2 + (odometry[2] * ranges[rows]) ** 2) * lag], 1
+    )
+    reference = spread[:, None] + drifted
+    return _Residuals(rows[enough], offsets[enough], reference[enough])
+
+
+def _pairs(cones: _Cones) -> tuple[IntArray, IntArray]:
+    """Return all pairs of rows of the same cone."""
+    counts = np.diff(np.append(cones.begins, len(cones.ranges)))
+    repeats = np.repeat(counts, counts)
+    i = np.repeat(np.arange(len(cones.ranges)), repeats)
+    starts = np.repeat(np.repeat(cones.begins, counts), repeats)
+    ends = np.cumsum(repeats)
+    j = starts + np.arange(len(i)) - np.repeat(ends - repeats, repeats)
+    return i, j
+
+
+def _ray_noise(cones: _Cones, left: _Residuals, axis: int) -> RayNoise:
+    """Return the noise along (axis 0) or across (axis 1) the ray by range, and how long it stays."""
+    ranges, off, reference = cones.ranges[left.rows], left.offsets[:, axis], left.reference[:, axis]
+    order = np.argsort(ranges)
+    bins = np.array_split(order, max(min(BINS, len(order) // (MIN_ROWS // 2)), 2))
+    middle = np.array([ranges[one].mean() for one in bins])
+    scatter = np.array([(MAD * np.median(np.abs(off[one]))) ** 2 for one in bins])
+    known = np.array([reference[one].mean() for one in bins])
+    sigma = np.sqrt(np.maximum(scatter - known, 0.25 * scatter))
+    (begin, growth), _ = nnls(
+        np.stack([np.ones(len(middle)), middle], axis=1) / sigma[:, None], np.ones(len(sigma))
+    )
+    least = LEAST[0], 0.0
+    if axis == 1:
+        least = 0.0, LEAST[1]
+    found = RayNoise(np.maximum([begin, growth], least))
+    share, time = _staying(cones, left, axis, found)
+    count = len(np.unique(cones.table.cone[left.rows]))
+    share = (count * share + FIRST_CONES * FIRST_SHARE) / (count + FIRST_CONES)
+    return replace(found, share=share, time=time)
+
+
+def _staying(cones: _Cones, left: _Residuals, axis: int, noise: RayNoise) -> tuple[float, float]:
+    """Return share and correlation time (s) of the errors of a cone that stay with it."""
+    sigma = noise.sigmas(cones.ranges[left.rows])
+    whitened = np.clip(left.offsets[:, axis] / sigma, -3.0, 3.0)
+    own = left.reference[:, axis] / sigma**2
+    cone, t = cones.table.cone[left.rows], cones.table.t[left.rows]
+    begins = np.flatnonzero(np.diff(cone, prepend=-1))
+    counts = np.diff(np.append(begins, len(cone)))
+    repeats = np.repeat(counts, counts)
+    i = np.repeat(np.arange(len(cone)), repeats)
+    j = np.repeat(np.repeat(begins, counts), repeats) + np.arange(len(i))
+    j -= np.repeat(np.cumsum(repeats) - repeats, repeats)
+    lag = t[j] - t[i]
+    place = np.digitize(lag, LAGS) - 1
+    product = whitened[i] * whitened[j] - np.sqrt(own[i] * own[j])
+    scale = max(float((whitened**2 - own).mean()), 0.25)
+    lags, correlations, weights = [], [], []
+    for k in range(len(LAGS) - 1):
+        inside = place == k
+        if inside.sum() >= MIN_ROWS // 2:
+            lags.append(float(lag[inside].mean()))
+            correlations.append(float(product[inside].mean()) / scale)
+            weights.append(float(np.sqrt(inside.sum())))
+    if not lags:
+        return 0.0, 1.0
+    best = (np.inf, 0.0, 1.0)
+    for time in TIMES:
+        model = np.exp(-np.array(lags) / time)
+        share = float(
+            np.clip(
+                (np.array(weights) * model) @ correlations / ((np.array(weights) * model) @ model), 0.0, 1.0
+            )
+        )
+        misfit = float((np.array(weights) * (np.array(correlations) - share * model) ** 2).sum())
+        best = min(best, (misfit, share, time))
+    return best[1], best[2]
+
+
+# --- all of it -------------------------------------------------------------------------------------------
+
+
+def measure(sightings: Sightings, twists: TwistRecord) -> MeasuredNoise | None:
+    """Return the noise that the readings so far show; None where not even the odometry's is known."""
+    white = twists.white()
+    if white is None:
+        return None
+    sigma, interval = white
+    found = MeasuredNoise(sigma, DRIFT.copy(), interval)
+    cones = _cones(sightings)
+    if cones is None:
+        return found
+    stamps = np.unique(sightings.t)
+    period = float(np.median(np.diff(stamps)))
+    walk = np.hypot(DRIFT, sigma * np.sqrt(interval))
+    noise = RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))
+    weights = np.ones(len(cones.ranges))
+    for _ in range(ROUNDS):
+        errors, covariance, off = _solve(cones, _information(cones, *noise, weights))
+        square = ((off * cones.ray).sum(axis=1) / noise[0].sigmas(cones.ranges)) ** 2
+        square += ((off * cones.side).sum(axis=1) / noise[1].sigmas(cones.ranges)) ** 2
+        weights = huber_weights(np.sqrt(square), HUBER) ** 2
+        left = _residuals(cones, errors, noise, walk)
+        if len(left.rows) < MIN_ROWS:
+            return found
+        noise = _ray_noise(cones, left, 0), _ray_noise(cones, left, 1)
+    per_cone = np.diff(np.append(cones.begins, len(cones.ranges)))
+    count = int(np.median(per_cone))
+    stays = max(one.inflation(count, period) for one in noise)
+    return replace(
+        found,
+        along=noise[0],
+        across=noise[1],
+        count=count,
+        period=period,
+        per_cycle=len(sightings.t) / len(stamps),
+        sensor=errors[:SENSOR_SIZE],
+        sensor_sigma=np.sqrt(stays * np.diag(covariance))[:SENSOR_SIZE],
+        seconds=float(np.sum(np.minimum(np.diff(np.unique(cones.table.t)), 1.0))),
+    )

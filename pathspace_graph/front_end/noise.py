@@ -1,0 +1,139 @@
+"""Noise that is used in a drive: what the log states, or what the drive itself has shown so far."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise
+from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.mapping.motion import MeasuredMotion
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .measurement import measure
+from .sightings import ConeFollower, TwistRecord
+
+Array = NDArray[np.float64]
+
+FIRST: Final = 8.0
+"""Driving time (s) after which noise is measured first."""
+AGAIN: Final = 1.5
+"""It is measured again each time that the driving time has grown by this factor."""
+MIN_SPEED: Final = 0.3
+"""Driving is faster than this (m/s)."""
+REFERENCE_RANGE: Final = 10.0
+"""Ranges are compared with speeds by their noise at this range (m)."""
+
+
+class NoiseLearner:
+    """Measures the noise of a drive as it goes on, never reading ahead."""
+
+    def __init__(self, known: KnownNoise, use: str | None) -> None:
+        """Keep what is known before the drive; `use` is `MapperSettings.noise`."""
+        self.known = known
+        self.of_odometry = use == "measured" or (use is None and not known.odometry_stated)
+        """The noise of the odometry is the measured one."""
+        self.of_detections = use == "measured" or (use is None and not known.detections_stated)
+        """The noise of the detections, and the constant errors of the sensor, are the measured ones."""
+        self.measured = known.measured
+        """What was measured so far, or by an earlier look at the whole drive."""
+        self._follower, self._twists = ConeFollower(), TwistRecord()
+        self._driven, self._due = 0.0, FIRST
+        self._t: float | None = None
+
+    @property
+    def is_learning(self) -> bool:
+        """Return whether the drive is still needed to know its noise."""
+        return (self.of_odometry or self.of_detections) and self.known.measured is None
+
+    @property
+    def is_settled(self) -> bool:
+        """Return whether the noise of the detections is known, stated or measured."""
+        return not self.of_detections or (self.measured is not None and self.measured.along is not None)
+
+    @property
+    def twist_sigma(self) -> Array:
+        """Return the standard deviation (3,) of a twist."""
+        if self.of_odometry and self.measured is not None:
+            return self.measured.twist_sigma
+        return self.known.odometry
+
+    def observe(
+        self, odometry: Odometry, detections: Detections, motion: MeasuredMotion, pose: Array
+    ) -> bool:
+        """Learn from a cycle at a pose (3,) of the front end; return whether the noise was measured anew."""
+        if not self.is_learning:
+            return False
+        self._twists.add(odometry)
+        self._follower.add(detections, pose, motion.odometry.twist)
+        if self._t is not None and np.hypot(*motion.odometry.twist[:2]) > MIN_SPEED:
+            self._driven += min(detections.t - self._t, 1.0)
+        self._t = detections.t
+        if self._driven < self._due:
+            return False
+        self._due = AGAIN * self._driven
+        self.measured = self.now() or self.measured
+        return self.measured is not None
+
+    def now(self) -> MeasuredNoise | None:
+        """Return what the drive so far shows."""
+        return measure(self._follower.sightings, self._twists)
+
+    def for_check(self, detections: Detections, twist: Array) -> Detections:
+        """Return detections for comparisons over a few cycles: single errors, constant ones taken out."""
+        if not self.of_detections or self.measured is None or self.measured.along is None:
+            return detections
+        points = self.measured.corrected(detections.points_vehicle, twist)
+        covariances = self.measured.covariances(detections.points_vehicle, inflated=False)
+        assert covariances is not None
+        return replace(detections, points_vehicle=points, covariances=covariances)
+
+    def for_map(self, detections: Detections) -> Detections:
+        """Return detections whose covariances say what each adds to the others of its cone."""
+        if not self.of_detections or self.measured is None:
+            return detections
+        covariances = self.measured.covariances(detections.points_vehicle, inflated=True)
+        return detections if covariances is None else replace(detections, covariances=covariances)
+
+    def calibrated(self, settings: MapperSettings) -> MapperSettings:
+        """Return settings with measured priors of the calibrations, where the old ones are contradicted.
+
+        An error b is contradicted where `|b - m| > doubt hypot(sigma, sigma_prior)`. Then all errors of the
+        sensor have the measured priors. Of ranges and speeds only the ratio can be seen: the scale of one is
+        held, that of the other is what was measured.
+        """
+        measured, sensor = self.measured, settings.calibration
+        if not self.of_detections or measured is None or measured.along is None or not sensor.sensor:
+            return settings
+        off = np.abs(measured.sensor - sensor.means)
+        if not (off > sensor.doubt * np.hypot(measured.sensor_sigma, sensor.sigmas)).any():
+            return settings
+        values = dict(zip(SENSOR, measured.sensor.tolist(), strict=True))
+        sigmas = dict(zip(SENSOR, np.maximum(measured.sensor_sigma, sensor.sigmas).tolist(), strict=True))
+        scale = values["range_scale"]
+        if self.trusts_odometry(settings):
+            odometry = settings.odometry
+        else:
+            wide = replace(settings.odometry, scale=-scale / (1.0 + scale), doubt=inf)
+            odometry = replace(wide, sigma_scale=max(sigmas["range_scale"], wide.sigma_scale))
+            values["range_scale"], sigmas["range_scale"] = sensor.range_scale, sensor.sigma_range_scale
+        priors = values | {f"sigma_{name}": sigma for name, sigma in sigmas.items()}
+        return replace(settings, odometry=odometry, calibration=replace(sensor, doubt=inf, **priors))
+
+    def trusts_odometry(self, settings: MapperSettings) -> bool:
+        """Return whether the odometry sets the size of the map, by default where it is the smoother one.
+
+        Over a second it errs by the random walk of its poses, the ranges by the mean over their detections.
+        """
+        measured, trust = self.measured, settings.calibration.trust
+        if trust is not None or measured is None or measured.along is None:
+            return trust == "odometry"
+        walk = measured.twist_sigma[0] * np.sqrt(measured.interval)
+        sigma = float(measured.along.sigmas(np.array([REFERENCE_RANGE]))[0])
+        stays = measured.along.inflation(measured.count, measured.period)
+        return bool(walk < sigma * np.sqrt(stays * measured.period / measured.per_cycle))

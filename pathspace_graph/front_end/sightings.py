@@ -1,0 +1,203 @@
+"""Sightings of cones, followed by dead reckoning, and the twists of a drive: what noise is measured from."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, fields
+from math import comb
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.io.log import Detections, Odometry
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+
+MAD: Final = 1.4826
+"""Standard deviation of a Gaussian by its median absolute deviation."""
+MOST_TWISTS: Final = 4000
+MOST_SIGHTINGS: Final = 20000
+"""Numbers of newest twists and sightings that are kept."""
+MIN_SPEED_SHARE: Final = 0.3
+"""A vehicle slower than this share of its median speed says little of noise in motion."""
+MIN_TWISTS: Final = 30
+"""White noise is told from this number of twists."""
+MAX_RANGE: Final = 30.0
+"""Sightings farther than this (m) are not followed: they are hardly ever seen near later."""
+MAX_AGE: Final = 3.0
+"""A cone that was not seen for this time (s) is another one when it is seen again."""
+GATE: Final = (0.4, 0.06, 1.5)
+"""A sighting belongs to the nearest cone within `min(a + b r, c)`, in m."""
+
+
+@dataclass(eq=False)
+class Sightings:
+    """Columns of sightings of cones, in order of time."""
+
+    cone: IntArray
+    """(n,) Number of the cone."""
+    t: Array
+    """(n,) Stamp (s)."""
+    point: Array
+    """(n, 2) Detection as measured (m), vehicle frame."""
+    twist: Array
+    """(n, 3) Twist of the vehicle then: m/s, m/s, rad/s."""
+    pose: Array
+    """(n, 3) Pose of the vehicle by dead reckoning."""
+    by_bias: Array
+    """(n, 3) Derivative of that pose by the bias of the yaw rate."""
+
+    @classmethod
+    def none(cls) -> Sightings:
+        """Return a table without rows."""
+        empty = np.zeros(0)
+        return cls(
+            empty.astype(np.intp), empty, empty.reshape(0, 2), *(empty.reshape(0, 3) for _ in range(3))
+        )
+
+    def where(self, rows: IntArray | BoolArray | slice) -> Sightings:
+        """Return some of the rows."""
+        return Sightings(*(getattr(self, column.name)[rows] for column in fields(self)))
+
+    @classmethod
+    def stacked(cls, tables: list[Sightings]) -> Sightings:
+        """Return the rows of several tables, one after the other."""
+        return cls(*(np.concatenate([getattr(one, column.name) for one in tables]) for column in fields(cls)))
+
+
+class ConeFollower:
+    """Tells which detections are of one cone, by dead reckoning, and keeps them as sightings."""
+
+    def __init__(self) -> None:
+        self._points: Array = np.zeros((0, 2))
+        self._labels: IntArray = np.zeros(0, np.intp)
+        self._nearest: Array = np.zeros(0)  # least range at which each cone was seen (m)
+        self._last: Array = np.zeros(0)
+        self._cones: IntArray = np.zeros(0, np.intp)
+        self._count = 0
+        self._by_bias: Array = np.zeros(3)
+        self._pose: Array | None = None
+        self._t = 0.0
+        self._tables: deque[Sightings] = deque()
+        self._kept = 0
+
+    def add(self, detections: Detections, pose: Array, twist: Array) -> None:
+        """Add the detections of a cycle, made from a pose (3,) by dead reckoning at a twist (3,)."""
+        self._follow_bias(detections.t, pose)
+        keep = self._last > detections.t - MAX_AGE
+        self._points, self._labels, self._nearest = (
+            self._points[keep],
+            self._labels[keep],
+            self._nearest[keep],
+        )
+        self._last, self._cones = self._last[keep], self._cones[keep]
+        ranges = np.hypot(*detections.points_vehicle.T)
+        order = np.argsort(ranges, kind="stable")
+        order = order[ranges[order] < MAX_RANGE]
+        points = to_map(detections.points_vehicle[order], pose[None])
+        rows, cones = self._assign(points, detections.labels[order], ranges[order], detections.t)
+        count = len(rows)
+        table = Sightings(
+            cones,
+            np.full(count, detections.t),
+            detections.points_vehicle[order[rows]],
+            np.tile(twist, (count, 1)),
+            np.tile(pose, (count, 1)),
+            np.tile(self._by_bias, (count, 1)),
+        )
+        self._tables.append(table)
+        self._kept += count
+        while self._kept > MOST_SIGHTINGS:
+            self._kept -= len(self._tables.popleft().t)
+
+    @property
+    def sightings(self) -> Sightings:
+        """Return all sightings that are kept."""
+        return Sightings.stacked([Sightings.none(), *self._tables])
+
+    def _follow_bias(self, t: float, pose: Array) -> None:
+        """Carry the derivative of the pose by the yaw rate's bias on: `d theta = -dt`, and what follows."""
+        if self._pose is not None:
+            moved, turned = pose[:2] - self._pose[:2], self._by_bias[2]
+            middle = turned - 0.5 * (t - self._t)
+            self._by_bias = self._by_bias + np.array([-moved[1] * middle, moved[0] * middle, -(t - self._t)])
+        self._pose, self._t = pose.copy(), t
+
+    def _assign(self, points: Array, labels: IntArray, ranges: Array, t: float) -> tuple[IntArray, IntArray]:
+        """Return which detections (m,), nearest first, are sightings, and of which cones.
+
+        Of several detections at one cone the nearest to the vehicle counts.
+        """
+        gates = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
+        place, near = _nearest(points, labels, self._points, self._labels, gates)
+        known, first = np.unique(place[near], return_index=True)
+        rows = np.flatnonzero(near)[first]
+        weight = np.where(ranges[rows] <= self._nearest[known], 0.5, 0.15)
+        self._points[known] += weight[:, None] * (points[rows] - self._points[known])
+        self._nearest[known] = np.minimum(self._nearest[known], ranges[rows])
+        self._last[known] = t
+        new = np.flatnonzero(~near)
+        apart = np.hypot(*(points[new][:, None] - points[new][None]).transpose(2, 0, 1))
+        same = (apart < gates[new]) & (labels[new][:, None] == labels[new])
+        new = new[~np.tril(same, -1).any(axis=1)]
+        cones = self._count + np.arange(len(new))
+        self._count += len(new)
+        self._points = np.concatenate([self._points, points[new]])
+        self._labels = np.concatenate([self._labels, labels[new]])
+        self._nearest = np.concatenate([self._nearest, ranges[new]])
+        self._last = np.concatenate([self._last, np.full(len(new), t)])
+        found = np.concatenate([self._cones[known], cones])
+        self._cones = np.concatenate([self._cones, cones])
+        return np.concatenate([rows, new]), found
+
+
+def _nearest(
+    points: Array, labels: IntArray, known: Array, known_labels: IntArray, gates: Array
+) -> tuple[IntArray, BoolArray]:
+    """Return the nearest known cone of the same label to each point (m, 2), and whether it is in its gate."""
+    if len(known) == 0:
+        return np.zeros(len(points), np.intp), np.zeros(len(points), bool)
+    distance = np.hypot(*(points[:, None] - known).transpose(2, 0, 1))
+    distance[labels[:, None] != known_labels] = np.inf
+    nearest = distance.argmin(axis=1)
+    return nearest, distance[np.arange(len(points)), nearest] < gates
+
+
+class TwistRecord:
+    """Keeps the newest twists that were measured while the vehicle drove."""
+
+    def __init__(self) -> None:
+        self._t: deque[float] = deque(maxlen=MOST_TWISTS)
+        self._twists: deque[Array] = deque(maxlen=MOST_TWISTS)
+
+    def add(self, odometry: Odometry) -> None:
+        """Add twists; one that only repeats the one before is held, and not measured."""
+        for t, twist in zip(odometry.t.tolist(), odometry.twist, strict=True):
+            if not self._twists or (t > self._t[-1] and (twist != self._twists[-1]).any()):
+                self._t.append(t)
+                self._twists.append(twist.copy())
+
+    def white(self) -> tuple[Array, float] | None:
+        """Return the white noise (3,) of a twist, and the time between two twists (s).
+
+        It is the least median absolute difference of second to fourth order over that of white noise,
+        `sqrt(binomial(2 k, k))`: the higher the order, the less of the motion itself is in it.
+        """
+        if len(self._t) < MIN_TWISTS:
+            return None
+        t, twists = np.array(self._t), np.array(self._twists)
+        speeds = np.hypot(twists[:, 0], twists[:, 1])
+        drives = speeds > MIN_SPEED_SHARE * np.median(speeds)
+        orders = []
+        for k in (2, 3, 4):
+            inside = np.lib.stride_tricks.sliding_window_view(drives, k + 1).all(axis=1)
+            if inside.sum() >= MIN_TWISTS // 2:
+                differences = np.abs(np.diff(twists, k, axis=0)[inside])
+                orders.append(MAD * np.median(differences, axis=0) / np.sqrt(comb(2 * k, k)))
+        if not orders:
+            return None
+        return np.min(orders, axis=0), float(np.median(np.diff(t)))
