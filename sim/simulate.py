@@ -82,6 +82,7 @@ def _perceive(
     lap = track.centre_line.length
     sensor = FaultySensor(cones, track.cone_labels, driven, lap, faults.sensor, colour_rng)
     stamps = np.arange(int(driven.t[-1] * settings.sensor.rate) + 1) / settings.sensor.rate
+    stamps = stamps[stamps - faults.sensor.latency <= driven.t[-1]]
     poses = _poses_at(driven, np.maximum(stamps - faults.sensor.latency, 0.0))
     cycles: list[Detections] = []
     associations: list[IntArray] = []
