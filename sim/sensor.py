@@ -48,6 +48,15 @@ class OdometryNoise:
         check_numbers(self, "odometry", ("scale", "gyro_bias"), "a number of at least 0")
         check_numbers(self, "odometry", ("slow_time",), "a positive number")
 
+    def drift_sigmas(self, dt: float) -> FloatArray:
+        """Returns the standard deviations (3,) of white noise that drifts as much, of readings `dt` s apart.
+
+        It has the spectrum of the noise at frequency 0: `white^2 + slow^2 (1 + rho) / (1 - rho)`, where
+        `rho = exp(-dt / slow_time)`.
+        """
+        rho = np.exp(-dt / self.slow_time)
+        return np.asarray(np.hypot(self.white, np.sqrt((1.0 + rho) / (1.0 - rho)) * np.array(self.slow)))
+
 
 @dataclass(frozen=True)
 class SensorSettings:
@@ -92,7 +101,10 @@ class SensorSettings:
     slow_time: float = field(default=5.0, repr=False)
     """Correlation time of the slow errors of a cone (s)."""
     duplicates: float = field(default=0.0, repr=False)
-    """Probability that a second camera detects a detected cone in the same cycle, with errors of its own."""
+    """Probability that a second camera detects a detected cone in the overlap of the fields in the same
+    cycle, with errors of its own (-)."""
+    overlap: tuple[float, float] = field(default=(0.0, float(np.pi)), repr=False)
+    """Least and greatest bearing of the overlap, on both sides (rad)."""
     dropped_cycles: float = field(default=0.0, repr=False)
     """Share of the cycles in which nothing is detected."""
 
@@ -107,6 +119,9 @@ class SensorSettings:
         check_numbers(self, "sensor", shares, "a number in [0, 1]")
         shares_of_errors = ("slow_range", "slow_bearing", "duplicates", "dropped_cycles")
         check_numbers(self, "sensor", shares_of_errors, "a number in [0, 1]")
+        least, greatest = self.overlap
+        if not 0.0 <= least < greatest:
+            raise SettingsError(f"sensor.overlap: expected 0 <= least < greatest, found {self.overlap}")
         if len(self.range_bias_at) != len(self.range_bias_values) or not np.all(
             np.diff(self.range_bias_at) > 0
         ):
@@ -204,13 +219,14 @@ class ConeSensor:
         flipped = (colour < settings.wrong_colour) & (labels != UNKNOWN)
         labels = np.where(flipped, LEFT + RIGHT - labels, labels)
         hit = chance < settings.detection_probabilities(ranges)
+        overlap = np.digitize(np.abs(bearings), settings.overlap) == 1
+        rows = np.stack([hit, hit & overlap & (again < settings.duplicates)])
         ranges = (1.0 + scale) * ranges + bias + settings.range_biases(ranges)
         errors = self._errors(np.stack([first, second]), cones)
         ranges = ranges + settings.range_sigmas(ranges) * errors[:, 0]
         bearings = bearings + settings.bearing_sigma * errors[:, 1]
-        # rows of the first camera, then those of the second
-        camera, index = np.nonzero(np.stack([hit, hit & (again < settings.duplicates)]))
-        return ranges[camera, index], bearings[camera, index], labels[index], cones[index]
+        index = np.nonzero(rows)[1]
+        return ranges[rows], bearings[rows], labels[index], cones[index]
 
     def _errors(self, white: FloatArray, cones: IntArray) -> FloatArray:
         """Returns errors (2, 2, m) of unit variance by camera, range or bearing, and cone, from white noise.
