@@ -24,8 +24,9 @@ _RULE: Final = "─╭╮╰╯"
 def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
     """Returns the command, made from its options, or None where its help was asked for and printed.
 
-    It raises a SettingsError on bad usage.
+    A command whose defaults depend on its options gives them in `start`. Bad usage is a SettingsError.
     """
+    start = getattr(command, "start", None)
     for word in arguments:
         if word.lstrip("+-").isdecimal() and len(word) > len(str(MAX_INTEGER)) + 1:
             raise SettingsError(f"{program}: expected whole numbers up to {MAX_INTEGER}, found {shown(word)}")
@@ -34,7 +35,9 @@ def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
     complaint = io.StringIO()
     try:
         with redirect_stderr(complaint):
-            return tyro.cli(command, prog=program, args=arguments)
+            return tyro.cli(
+                command, prog=program, args=arguments, default=start(arguments) if start else None
+            )
     except SystemExit as end:
         if not end.code:
             return None

@@ -67,7 +67,8 @@ def measure_odometry(
     driven: Drive, lap: float, noise: OdometryNoise, faults: OdometryFaults, rng: Generator
 ) -> tuple[Odometry, FloatArray]:
     """Returns the measured twists, and the scale error (-) and the bias (rad/s) that they have (2,)."""
-    measured, calibration = measure_twists(_slipping(driven, faults), noise, rng)
+    dt = float(driven.t[:2][-1])
+    measured, calibration = measure_twists(_slipping(driven, faults), dt, noise, rng)
     bias = np.array([0.0, 0.0, faults.yaw_rate_bias])
     measured = measured + bias if faults.yaw_rate_bias else measured
     begin = time_at(driven, faults.zero_at * lap)
@@ -123,8 +124,11 @@ class FaultySensor:
 
         The pose is the vehicle's at the time of the image, which a late sensor stamps with a later `t`.
         """
-        detections, cones = self._sensor.detect(t, mounted(pose, self._faults))
-        detections = with_colours_lost(with_range_errors(detections, self._faults), self._faults, self._rng)
+        faults = self._faults
+        detections, cones = self._sensor.detect(
+            t, mounted(pose, faults), faults.range_scale, faults.range_bias
+        )
+        detections = with_colours_lost(detections, faults, self._rng)
         kept = np.full(len(cones), not _is_inside(np.array(t), self._dropout))
         if _is_inside(np.array(t), self._blind):
             kept &= ~np.isin(cones, self._unseen) | (cones == FALSE_POSITIVE)
@@ -137,16 +141,6 @@ def mounted(pose: FloatArray, faults: SensorFaults) -> FloatArray:
     return np.array(
         [x - np.sin(theta) * faults.lateral, y + np.cos(theta) * faults.lateral, theta + faults.yaw]
     )
-
-
-def with_range_errors(detections: Detections, faults: SensorFaults) -> Detections:
-    """Returns detections at ranges `(1 + range_scale) r + range_bias`; their covariances stay."""
-    if not (faults.range_scale or faults.range_bias):
-        return detections
-    points = detections.points_vehicle
-    ranges = np.maximum(np.linalg.norm(points, axis=1), np.finfo(float).tiny)
-    factors = 1.0 + faults.range_scale + faults.range_bias / ranges
-    return replace(detections, points_vehicle=points * factors[:, None])
 
 
 def with_colours_lost(detections: Detections, faults: SensorFaults, rng: Generator) -> Detections:

@@ -15,7 +15,8 @@ class SensorFaults:
     """Describes a cone detector that is late, badly mounted, badly scaled, colour-blind or out of order."""
 
     latency: float = 0.0
-    """Each cycle shows the cones as they were seen this long before its stamp (s)."""
+    """Each cycle shows the cones as they were seen this long before its stamp (s), or after it where this is
+    negative."""
     yaw: float = 0.0
     """The sensor is turned to the left by this angle (rad), which its detections do not account for."""
     lateral: float = 0.0
@@ -38,10 +39,10 @@ class SensorFaults:
     """The cones of this side are not detected there."""
 
     def __post_init__(self) -> None:
-        at_least_0 = ("latency", "dropout", "dropout_at", "blind", "blind_at")
+        at_least_0 = ("dropout", "dropout_at", "blind", "blind_at")
         check_numbers(self, "faults.sensor", at_least_0, "a number of at least 0")
         check_numbers(self, "faults.sensor", ("colourless",), "a number in [0, 1]")
-        _check_finite(self, "faults.sensor", ("yaw", "lateral", "range_bias"))
+        _check_finite(self, "faults.sensor", ("latency", "yaw", "lateral", "range_bias"))
         if not -1.0 < self.range_scale < np.inf:
             raise SettingsError(f"faults.sensor.range_scale: expected more than -1, found {self.range_scale}")
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from pathspace_graph.errors import SettingsError, check_numbers
 from pathspace_graph.io.log import Detections, covariances_of
@@ -18,6 +19,8 @@ IntArray = NDArray[np.int_]
 
 FALSE_POSITIVE: Final = -1
 """This is the association of a detection that is of no cone."""
+CAMERAS: Final = 2
+"""This number of cameras may see a cone at once."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +35,27 @@ class OdometryNoise:
     (-)."""
     gyro_bias: float = 0.0015
     """This is the standard deviation of the bias of wz, which is drawn once for a log (rad/s)."""
+    slow: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), repr=False)
+    """Standard deviations of the slow errors of [vx, vy, wz] (m/s, m/s, rad/s), beside the white noise."""
+    slow_time: float = field(default=5.0, repr=False)
+    """Correlation time of the slow errors (s)."""
 
     def __post_init__(self) -> None:
         if len(self.white) != 3 or not all(0 < sigma < np.inf for sigma in self.white):
             raise SettingsError(f"odometry.white: expected three positive numbers, found {self.white}")
+        if len(self.slow) != 3 or not all(0 <= sigma < np.inf for sigma in self.slow):
+            raise SettingsError(f"odometry.slow: expected three numbers of at least 0, found {self.slow}")
         check_numbers(self, "odometry", ("scale", "gyro_bias"), "a number of at least 0")
+        check_numbers(self, "odometry", ("slow_time",), "a positive number")
+
+    def drift_sigmas(self, dt: float) -> FloatArray:
+        """Returns the standard deviations (3,) of white noise that drifts as much, of readings `dt` s apart.
+
+        It has the spectrum of the noise at frequency 0: `white^2 + slow^2 (1 + rho) / (1 - rho)`, where
+        `rho = exp(-dt / slow_time)`.
+        """
+        rho = np.exp(-dt / self.slow_time)
+        return np.asarray(np.hypot(self.white, np.sqrt((1.0 + rho) / (1.0 - rho)) * np.array(self.slow)))
 
 
 @dataclass(frozen=True)
@@ -75,9 +94,22 @@ class SensorSettings:
     range_bias_values: tuple[float, ...] = (0.02, 0.34)
     """The systematic error has these values at those ranges (m). Cameras typically have 0.02 m below 4 m and
     0.34 m beyond 8 m."""
+    slow_range: float = field(default=0.0, repr=False)
+    """Share of a range's variance that is in the slow error of its cone (-)."""
+    slow_bearing: float = field(default=0.0, repr=False)
+    """Share of a bearing's variance that is in the slow error of its cone (-)."""
+    slow_time: float = field(default=5.0, repr=False)
+    """Correlation time of the slow errors of a cone (s)."""
+    duplicates: float = field(default=0.0, repr=False)
+    """Probability that a second camera detects a detected cone in the overlap of the fields in the same
+    cycle, with errors of its own (-)."""
+    overlap: tuple[float, float] = field(default=(0.0, float(np.pi)), repr=False)
+    """Least and greatest bearing of the overlap, on both sides (rad)."""
+    dropped_cycles: float = field(default=0.0, repr=False)
+    """Share of the cycles in which nothing is detected."""
 
     def __post_init__(self) -> None:
-        positive = ("rate", "range_max", "bearing_sigma", "range_sigma", "fov")
+        positive = ("rate", "range_max", "bearing_sigma", "range_sigma", "fov", "slow_time")
         check_numbers(self, "sensor", positive, "a positive number")
         at_least_0 = ("range_min", "range_sigma_growth", "detection_falloff", "false_positives")
         check_numbers(self, "sensor", at_least_0, "a number of at least 0")
@@ -85,6 +117,11 @@ class SensorSettings:
             raise SettingsError("sensor: expected fov <= 2 pi rad and range_min < range_max")
         shares = ("detection_probability", "blind_fraction", "wrong_colour")
         check_numbers(self, "sensor", shares, "a number in [0, 1]")
+        shares_of_errors = ("slow_range", "slow_bearing", "duplicates", "dropped_cycles")
+        check_numbers(self, "sensor", shares_of_errors, "a number in [0, 1]")
+        least, greatest = self.overlap
+        if not 0.0 <= least < greatest:
+            raise SettingsError(f"sensor.overlap: expected 0 <= least < greatest, found {self.overlap}")
         if len(self.range_bias_at) != len(self.range_bias_values) or not np.all(
             np.diff(self.range_bias_at) > 0
         ):
@@ -107,39 +144,68 @@ class SensorSettings:
         return np.clip(self.detection_probability - self.detection_falloff * ranges, 0.0, 1.0)
 
 
-def measure_twists(twists: FloatArray, noise: OdometryNoise, rng: Generator) -> tuple[FloatArray, FloatArray]:
+def measure_twists(
+    twists: FloatArray, dt: float, noise: OdometryNoise, rng: Generator
+) -> tuple[FloatArray, FloatArray]:
     """Returns measured twists (N, 3), and the scale error (-) and the bias (rad/s) that they have (2,).
 
-    They are `(1 + scale) [vx, vy]` and `wz + bias`, each plus white noise.
+    They are `(1 + scale) [vx, vy]` and `wz + bias`, each plus white noise and a slow error; they are `dt` s
+    apart.
     """
     scale = noise.scale * rng.standard_normal()
     bias = noise.gyro_bias * rng.standard_normal()
     white = rng.standard_normal(twists.shape) * np.array(noise.white)
     factors = np.array([1.0 + scale, 1.0 + scale, 1.0])
-    return np.asarray(twists * factors + np.array([0.0, 0.0, bias]) + white), np.array([scale, bias])
+    measured = np.asarray(twists * factors + np.array([0.0, 0.0, bias]) + white)
+    if any(noise.slow):
+        measured += gauss_markov(twists.shape, dt / noise.slow_time, rng) * np.array(noise.slow)
+    return measured, np.array([scale, bias])
+
+
+def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> FloatArray:
+    """Returns stationary first-order Gauss-Markov processes of unit variance along the first axis.
+
+    `step` is that from sample to sample by the correlation time, so neighbours correlate by `exp(-step)`.
+    """
+    rho = np.exp(-step)
+    drawn = rng.standard_normal(shape)
+    drawn[1:] *= np.sqrt(1.0 - rho**2)
+    return np.asarray(lfilter([1.0], [1.0, -rho], drawn, axis=0))
 
 
 class ConeSensor:
     """Detects the cones of one log, some of which it never sees."""
 
     def __init__(self, cones: FloatArray, labels: IntArray, settings: SensorSettings, rng: Generator) -> None:
-        blind_rng, self._cone_rng, self._false_rng = rng.spawn(3)
+        blind_rng, self._cone_rng, self._false_rng, self._slow_rng, self._second_rng, self._drop_rng = (
+            rng.spawn(6)
+        )
         self._cones, self._labels, self._settings = cones, labels, settings
         count = round(settings.blind_fraction * len(cones))
         self.blind: IntArray = np.sort(blind_rng.permutation(len(cones))[:count])
         self._seen = np.setdiff1d(np.arange(len(cones)), self.blind)
+        self._slow = self._slow_rng.standard_normal((CAMERAS, 2, len(cones)))
 
-    def detect(self, t: float, pose: FloatArray) -> tuple[Detections, IntArray]:
-        """Returns a perception cycle from a pose [x, y, theta], and the true cone of each detection (m,)."""
-        ranges, bearings, labels, cones = self._detect_cones(pose)
+    def detect(
+        self, t: float, pose: FloatArray, scale: float = 0.0, bias: float = 0.0
+    ) -> tuple[Detections, IntArray]:
+        """Returns a perception cycle from a pose [x, y, theta], and the true cone of each detection (m,).
+
+        A range r reads `(1 + scale) r + bias`, beside its systematic and its random error.
+        """
+        ranges, bearings, labels, cones = self._detect_cones(pose, scale, bias)
         false_ranges, false_bearings, false_labels = self._false_positives()
         ranges = np.concatenate([ranges, false_ranges])
         bearings = np.concatenate([bearings, false_bearings])
         points, covariances = _cartesian(ranges, bearings, self._settings)
-        detections = Detections(t, points, covariances, np.concatenate([labels, false_labels]))
-        return detections, np.concatenate([cones, np.full(len(false_ranges), FALSE_POSITIVE)])
+        labels = np.concatenate([labels, false_labels])
+        cones = np.concatenate([cones, np.full(len(false_ranges), FALSE_POSITIVE)])
+        kept = slice(0 if self._drop_rng.random() < self._settings.dropped_cycles else None)
+        return Detections(t, points[kept], covariances[kept], labels[kept]), cones[kept]
 
-    def _detect_cones(self, pose: FloatArray) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+    def _detect_cones(
+        self, pose: FloatArray, scale: float, bias: float
+    ) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
         settings, rng = self._settings, self._cone_rng
         ranges, bearings = _polar(self._cones[self._seen], pose)
         inside = (ranges <= settings.range_max) & (ranges >= settings.range_min)
@@ -147,13 +213,33 @@ class ConeSensor:
         cones, ranges, bearings = self._seen[inside], ranges[inside], bearings[inside]
         # every cone in the field draws the same numbers, so that one setting doesn't shift another's
         chance, colour = rng.random((2, len(cones)))
-        noise = rng.standard_normal((2, len(cones)))
+        first = rng.standard_normal((2, len(cones)))
+        second, again = self._second_rng.standard_normal((2, len(cones))), self._second_rng.random(len(cones))
         labels = self._labels[cones]
         flipped = (colour < settings.wrong_colour) & (labels != UNKNOWN)
         labels = np.where(flipped, LEFT + RIGHT - labels, labels)
         hit = chance < settings.detection_probabilities(ranges)
-        measured = ranges + settings.range_biases(ranges) + settings.range_sigmas(ranges) * noise[0]
-        return measured[hit], (bearings + settings.bearing_sigma * noise[1])[hit], labels[hit], cones[hit]
+        overlap = np.digitize(np.abs(bearings), settings.overlap) == 1
+        rows = np.stack([hit, hit & overlap & (again < settings.duplicates)])
+        ranges = (1.0 + scale) * ranges + bias + settings.range_biases(ranges)
+        errors = self._errors(np.stack([first, second]), cones)
+        ranges = ranges + settings.range_sigmas(ranges) * errors[:, 0]
+        bearings = bearings + settings.bearing_sigma * errors[:, 1]
+        index = np.nonzero(rows)[1]
+        return ranges[rows], bearings[rows], labels[index], cones[index]
+
+    def _errors(self, white: FloatArray, cones: IntArray) -> FloatArray:
+        """Returns errors (2, 2, m) of unit variance by camera, range or bearing, and cone, from white noise.
+
+        Each cone's slow errors are Gauss-Markov processes that go on while it is not seen.
+        """
+        settings = self._settings
+        share = np.array([settings.slow_range, settings.slow_bearing])[:, None]
+        errors = np.sqrt(1.0 - share) * white + np.sqrt(share) * self._slow[:, :, cones]
+        rho = np.exp(-1.0 / (settings.rate * settings.slow_time))
+        drawn = self._slow_rng.standard_normal(self._slow.shape)
+        self._slow = rho * self._slow + np.sqrt(1.0 - rho**2) * drawn
+        return np.asarray(errors)
 
     def _false_positives(self) -> tuple[FloatArray, FloatArray, IntArray]:
         """Draws detections of nothing, uniform over the area of the field, with either boundary's label."""

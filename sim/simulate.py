@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.log import Detections, Log, SensorInfo, Truth
+from pathspace_graph.io.log import SENSOR, Detections, Log, SensorInfo, Truth
 
 from .disturbance import FaultySensor, colours, measure_odometry, put_down, turned_round
-from .faults import Faults
+from .faults import Faults, SensorFaults
 from .sensor import ConeSensor, OdometryNoise, SensorSettings
 from .track import Track, to_map_frame
 from .vehicle import Drive, VehicleSettings, drive, integrate
@@ -57,20 +57,45 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     driven = put_down(drive(track, settings.laps, settings.vehicle, wander_rng), lap, faults.vehicle)
     odometry, calibration = measure_odometry(driven, lap, settings.odometry, faults.odometry, odometry_rng)
     cycles, associations = _perceive(track, driven, settings, *sensor_rngs)
-    truth = replace(_truth(track, driven, cycles, associations), calibration=calibration)
+    truth = replace(
+        _truth(track, driven, cycles, associations),
+        calibration=calibration,
+        sensor=_constant_errors(faults.sensor),
+        noise=_noise(settings),
+    )
     return Log(
         odometry=odometry,
         cycles=tuple(cycles),
-        odometry_sigma=np.array(settings.odometry.white),
+        odometry_sigma=np.hypot(settings.odometry.white, settings.odometry.slow),
         sensor=SensorInfo(settings.sensor.range_max, settings.sensor.fov, settings.sensor.rate),
         source=_source(track, settings, seed),
         truth=truth,
     )
 
 
+def _constant_errors(faults: SensorFaults) -> FloatArray | None:
+    """Returns the errors (5,) that stay, in the order of `io.log:SENSOR`, or None where there are none."""
+    errors = np.array([getattr(faults, name) for name in SENSOR])
+    return errors if errors.any() else None
+
+
+def _noise(settings: SimulationSettings) -> FloatArray | None:
+    """Returns the noise (6,) in the order of `io.log:NOISE`, or None where all of it is white."""
+    odometry, sensor = settings.odometry, settings.sensor
+    if not (any(odometry.slow) or sensor.slow_range or sensor.slow_bearing):
+        return None
+    drift = odometry.drift_sigmas(1.0 / settings.vehicle.rate)
+    return np.array([*drift, sensor.slow_range, sensor.slow_bearing, sensor.slow_time])
+
+
 def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, str]:
-    """Returns what the log says of its making, with its faults where it has any."""
+    """Returns what the log says of its making, with its faults and slow errors where it has any."""
     source = {"track": track.name, "seed": str(seed), "settings": repr(settings)}
+    for group in ("odometry", "sensor"):
+        part = getattr(settings, group)
+        changed = [entry.name for entry in fields(part) if not entry.repr]
+        changed = [name for name in changed if getattr(part, name) != getattr(type(part)(), name)]
+        source |= {f"{group}.{name}": str(getattr(part, name)) for name in changed}
     return source if settings.faults == Faults() else source | {"faults": repr(settings.faults)}
 
 
@@ -82,6 +107,7 @@ def _perceive(
     lap = track.centre_line.length
     sensor = FaultySensor(cones, track.cone_labels, driven, lap, faults.sensor, colour_rng)
     stamps = np.arange(int(driven.t[-1] * settings.sensor.rate) + 1) / settings.sensor.rate
+    stamps = stamps[stamps - faults.sensor.latency <= driven.t[-1]]
     poses = _poses_at(driven, np.maximum(stamps - faults.sensor.latency, 0.0))
     cycles: list[Detections] = []
     associations: list[IntArray] = []

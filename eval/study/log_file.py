@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import InputError
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth
 
-_TRUTH: Final = ("pose_t", "poses", "cones", "cone_labels", "associations", "calibration")
+_TRUTH: Final = {
+    name: name for name in ("pose_t", "poses", "cones", "cone_labels", "associations", "calibration")
+} | {"sensor": "true_sensor", "noise": "true_noise"}
 _SENSOR: Final = ("range_max", "fov", "rate")
 _DIGEST_BYTES: Final = hashlib.sha256().digest_size
 _ERRORS: Final = (OSError, ValueError, LookupError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error)
@@ -39,7 +41,7 @@ def write_log_file(file: Path, log: Log) -> None:
         "source": np.array(json.dumps(dict(log.source))),
     }
     if log.truth is not None:
-        known = {name: getattr(log.truth, name) for name in _TRUTH}
+        known = {array: getattr(log.truth, name) for name, array in _TRUTH.items()}
         arrays |= {name: value for name, value in known.items() if value is not None}
     archive = io.BytesIO()
     np.savez(archive, **arrays)
@@ -66,7 +68,7 @@ def _log(arrays: dict[str, NDArray[Any]]) -> Log:
     points, covariances, labels = (np.split(arrays[name], at) for name in ("points", "covariances", "labels"))
     cycles = zip(arrays["cycle_t"].tolist(), points, covariances, labels, strict=bool(len(arrays["cycle_t"])))
     sensor = [None if np.isnan(value) else value for value in arrays["sensor"].tolist()]
-    truth = {name: arrays[name] for name in _TRUTH if name in arrays}
+    truth = {name: arrays[array] for name, array in _TRUTH.items() if array in arrays}
     return Log(
         Odometry(arrays["odometry_t"], arrays["odometry_twist"]),
         tuple(Detections(*cycle) for cycle in cycles),

@@ -15,6 +15,7 @@ from pathspace_graph.eval.harness.attempts import known_estimators
 from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.io.limits import MAX_VARIANTS, shown
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.presets import PLAIN, PRESETS, preset
 from pathspace_graph.sim.simulate import SimulationSettings
 
 from .column import column_of
@@ -22,6 +23,8 @@ from .overrides import Overrides, override
 
 DEFAULT: Final = "default"
 """This variant overrides nothing, and it is part of every study."""
+PRESET: Final = "preset"
+"""A noise names the preset of a group in this entry of it, as in `sensor.preset = "camera"`."""
 ALL: Final = "all"
 """This name stands for all known estimators."""
 
@@ -117,9 +120,11 @@ class Study:
 
     def simulation(self, noise: str) -> SimulationSettings:
         """Returns the settings of the drives under a named noise."""
-        if "laps" in self.noise[noise]:
+        overrides = dict(self.noise[noise])
+        if "laps" in overrides:
             raise SettingsError(f"noise.{noise}.laps: expected laps as a key of the study itself")
-        return replace(override(SimulationSettings(), self.noise[noise], f"noise.{noise}"), laps=self.laps)
+        chosen = {group: overrides.pop(f"{group}.{PRESET}", PLAIN) for group in PRESETS}
+        return replace(override(preset(chosen), overrides, f"noise.{noise}"), laps=self.laps)
 
     @property
     def points(self) -> dict[str, MapperSettings]:
@@ -144,8 +149,9 @@ class Study:
 
     @property
     def varied_noise(self) -> tuple[str, ...]:
-        """Returns the dotted settings of the simulation that any noise overrides."""
-        return tuple(dict.fromkeys(name for overrides in self.noise.values() for name in overrides))
+        """Returns the dotted settings of the simulation that any noise overrides, without presets."""
+        names = dict.fromkeys(name for overrides in self.noise.values() for name in overrides)
+        return tuple(name for name in names if not name.endswith(f".{PRESET}"))
 
     def _named(self) -> dict[str, MapperSettings]:
         points = {DEFAULT: MapperSettings()}

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry

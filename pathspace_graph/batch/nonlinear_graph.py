@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.se2 import rotation, to_map
-from pathspace_graph.factors.sensor import SENSOR_SIZE
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.keys import CALIBRATION_KEY, POINT, POSE, pose_key, pose_keys
 from pathspace_graph.graph.odometry import odometry_factor

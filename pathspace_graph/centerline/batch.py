@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.batch.nonlinear_graph import drive_factors
 from pathspace_graph.batch.start import CurveMapper
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.gtsam_factors import pose_array
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.graph.keys import pose_key
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import BatchRun

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from rich.console import Console
+from tyro import MISSING
 from tyro.conf import arg
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import LOG_FILE, Log, write_log
 from pathspace_graph.progress import progress
+from pathspace_graph.sim.presets import PRESETS, preset
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
 from pathspace_graph.sim.track_files import read_track
@@ -32,10 +36,23 @@ class Simulate:
     """Where no track file is given, a Formula Student track is generated from this seed."""
     seed: int = 0
     """The drive's wander and all noise are drawn from this seed."""
+    sensor: Literal["plain", "camera"] = "plain"
+    """Preset of `--sensor.*` and `--faults.sensor.*`, each of which can still be set."""
+    odometry: Literal["plain", "ins"] = "plain"
+    """Preset of `--odometry.*` and `--vehicle.rate`, each of which can still be set."""
     settings: Annotated[SimulationSettings, arg(name="")] = field(default_factory=SimulationSettings)
     """These settings describe the drive."""
     generator: TrackGeneratorSettings = field(default_factory=TrackGeneratorSettings)
     """These settings are the rules of a generated track."""
+
+    @classmethod
+    def start(cls, arguments: Sequence[str]) -> Simulate:
+        """Returns the command with the presets among its arguments, before any other option is set."""
+        words = [word for argument in arguments for word in argument.split("=", 1)]
+        pairs = ((word.removeprefix("--"), value) for word, value in pairwise(words))
+        # a wrong name is refused with the other options
+        names = {group: value for group, value in pairs if value in PRESETS.get(group, {})}
+        return cls(out=MISSING, settings=preset(names))
 
     def run(self) -> None:
         """Simulates and writes."""

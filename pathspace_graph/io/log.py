@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.labels import NAMES, label_from_name
-
 from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise
+from pathspace_graph.labels import NAMES, label_from_name
 
 from .csv_table import FloatArray, Table, read_table
 from .files import atomic_folder
@@ -57,6 +56,13 @@ FILES: Final = (
 
 CALIBRATION: Final = ("scale", "bias")
 """The true calibration of the odometry has these names in the log's header."""
+
+SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")
+"""The true constant errors of the sensor have these names in the log's header."""
+NOISE: Final = ("sigma_vx", "sigma_vy", "sigma_wz", "slow_range", "slow_bearing", "slow_time")
+"""The true noise has these names in the log's header, where it is not white as the log states it."""
+_TRUE_ERRORS: Final = {"calibration": CALIBRATION, "sensor": SENSOR, "noise": NOISE}
+"""These fields of the truth are in the log's header, by the names of their entries."""
 
 MAX_HOLD: Final = 1.0
 """The last twist may be held for this time (s); a perception cycle later than that has no odometry."""
@@ -129,6 +135,13 @@ class Truth:
     calibration: FloatArray | None = None
     """The odometry truly has this calibration (2,): scale error of the speeds (-), bias of the yaw rate
     (rad/s). None means not known."""
+    sensor: FloatArray | None = None
+    """Constant errors of the sensor (5,): yaw (rad), lateral offset (m), age of detections at their stamps
+    (s), scale error (-) and bias (m) of ranges. None means not known, or none."""
+    noise: FloatArray | None = None
+    """Noise that is not white (6,): the sigmas of white noise of a twist that drifts as much (m/s, m/s,
+    rad/s), the shares of a range's and a bearing's variance that stay with a cone (-), and the correlation
+    time of those (s). None means not known, or white."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +198,7 @@ def _read_log(folder: Path) -> Log:
         sensor=_sensor_info(folder / LOG_FILE, header),
         source={key: str(value) for key, value in _section(folder / LOG_FILE, header, "source").items()},
         **noise_from_toml(folder / LOG_FILE, _section(folder / LOG_FILE, header, "noise")),
-        truth=_read_truth(folder, len(table), _true_calibration(folder / LOG_FILE, header)),
+        truth=_read_truth(folder, len(table), _true_errors(folder / LOG_FILE, header)),
     )
 
 
@@ -240,16 +253,18 @@ def _sensor_info(file: Path, header: dict[str, Any]) -> SensorInfo:
     return SensorInfo(**values)
 
 
-def _true_calibration(file: Path, header: dict[str, Any]) -> FloatArray | None:
+def _true_errors(file: Path, header: dict[str, Any]) -> dict[str, FloatArray]:
+    """Returns the true calibration, errors of the sensor and noise, those of them that the header has."""
     section = _section(file, header, "truth")
-    if not section:
-        return None
-    values = [section.get(name) for name in CALIBRATION]
-    if not all(_is_number(value) for value in values):
-        raise InputError(
-            file, f"expected numbers as [truth] {' and '.join(CALIBRATION)}, found {shown(values)}"
-        )
-    return np.array(values, dtype=float)
+    found = {}
+    for field_name, names in _TRUE_ERRORS.items():
+        values = [section.get(name) for name in names]
+        if section and (names == CALIBRATION or any(name in section for name in names)):
+            if not all(_is_number(value) for value in values):
+                expected = f"{', '.join(names[:-1])} and {names[-1]}"
+                raise InputError(file, f"expected numbers as [truth] {expected}, found {shown(values)}")
+            found[field_name] = np.array(values, dtype=float)
+    return found
 
 
 def _is_number(value: object) -> bool:
@@ -323,14 +338,14 @@ def _labels(table: Table) -> IntArray:
     return np.array([label_from_name(name) for name in table.columns["label"]], dtype=int)
 
 
-def _read_truth(folder: Path, detection_count: int, calibration: FloatArray | None) -> Truth | None:
+def _read_truth(folder: Path, detection_count: int, errors: dict[str, FloatArray]) -> Truth | None:
     files = (folder / TRUTH_POSES_FILE, folder / TRUTH_CONES_FILE, folder / TRUTH_ASSOCIATIONS_FILE)
-    if calibration is None and not any(file.exists() for file in files):
+    if not errors and not any(file.exists() for file in files):
         return None
     pose_t, poses = _read_truth_poses(files[0])
     cones, cone_labels = _read_truth_cones(files[1])
     associations = _read_associations(files[2], detection_count, len(cones))
-    return Truth(pose_t, poses, cones, cone_labels, associations, calibration)
+    return Truth(pose_t, poses, cones, cone_labels, associations, **errors)
 
 
 def _read_truth_poses(file: Path) -> tuple[FloatArray, FloatArray]:
@@ -368,10 +383,11 @@ def _toml(log: Log) -> str:
     lines += noise_to_toml(log.odometry_stated, log.detections_stated, log.measured)
     lines += ["", "[source]"]
     lines += [f"{_toml_text(key)} = {_toml_text(value)}" for key, value in log.source.items()]
-    if log.truth is not None and log.truth.calibration is not None:
-        lines += ["", "[truth]"]
-        values = zip(CALIBRATION, log.truth.calibration.tolist(), strict=True)
-        lines += [f"{name} = {value!r}" for name, value in values]
+    errors = {names: getattr(log.truth, name, None) for name, names in _TRUE_ERRORS.items()}
+    known = {names: values for names, values in errors.items() if values is not None}
+    lines += ["", "[truth]"] if known else []
+    for names, values in known.items():
+        lines += [f"{name} = {value!r}" for name, value in zip(names, values.tolist(), strict=True)]
     return "\n".join(lines) + "\n"
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.front_end import FrontEnd
 from pathspace_graph.graph.keys import POINT
@@ -27,7 +28,6 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
 from pathspace_graph.mapping.prediction import known_noise
 from pathspace_graph.mapping.tentative import TentativeTracks

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.front_end import FrontEnd
 from pathspace_graph.front_end.late import at_nearest_pose
@@ -15,7 +16,6 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import (
     doubt_calibrations,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import ReadingError, SettingsError
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.front_end.gate import Admitted
 from pathspace_graph.front_end.late import at_nearest_pose
@@ -22,7 +23,6 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.association import associate, associate_late
 from pathspace_graph.loop.closing import apply_correspondences, optimize_loop, simplify
 from pathspace_graph.loop.track_loop import TrackLoop
-from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import (

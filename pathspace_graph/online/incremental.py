@@ -14,8 +14,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.gtsam_factors import pose_array
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.graph.gaussian import factors_of, keys_of
 from pathspace_graph.graph.keys import POSE, SENSOR_KEY, are_poses, control_keys, indices, pose_key
 from pathspace_graph.graph.odometry import odometry_factor

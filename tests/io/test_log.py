@@ -38,6 +38,8 @@ def small_log() -> Log:
         np.array([0, 1, 2, 0]),
         np.array([0, 1, -1] * 3),
         rng.normal(size=2),
+        rng.normal(size=5),
+        rng.normal(size=6),
     )
     source = {"track": 'a "quoted" \\ name\n', "Umlaut": "Zürich \x7f"}
     sensor = SensorInfo(range_max=15.0, fov=1.9)
@@ -61,7 +63,7 @@ def assert_same(a: Log, b: Log) -> None:
     if a.truth is None or b.truth is None:
         assert a.truth is b.truth
         return
-    for name in ("pose_t", "poses", "cones", "cone_labels", "associations", "calibration"):
+    for name in ("pose_t", "poses", "cones", "cone_labels", "associations", "calibration", "sensor", "noise"):
         np.testing.assert_array_equal(getattr(a.truth, name), getattr(b.truth, name))
 
 
@@ -226,6 +228,12 @@ BAD_ROWS = [
         'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1, 1]\n[truth]\nscale = 0.1\n',
         None,
         "[truth] scale and bias",
+    ),
+    (
+        "log.toml",
+        'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1, 1]\n[truth]\nscale = 0\nbias = 0\nyaw = 1\n',
+        None,
+        "[truth] yaw, lateral, latency, range_scale and range_bias",
     ),
     ("log.toml", 'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1]\n', None, "three positive"),
     ("log.toml", 'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 0, 1]\n', None, "three positive"),

@@ -116,7 +116,7 @@ def test_odometry_errors() -> None:
     twists = np.tile([10.0, 0.0, 0.5], (5000, 1))
     scales, biases = [], []
     for seed in range(60):
-        measured, calibration = measure_twists(twists, OdometryNoise(), np.random.default_rng(seed))
+        measured, calibration = measure_twists(twists, 0.02, OdometryNoise(), np.random.default_rng(seed))
         error = measured - twists
         np.testing.assert_allclose(error[:, 0].mean() / 10.0, calibration[0], atol=5 * 0.025 / np.sqrt(5000))
         np.testing.assert_allclose(error[:, 2].mean(), calibration[1], atol=5 * 0.035 / np.sqrt(5000))

@@ -2,20 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.limit import Limit, fit_rmse, landmark_rmse, limit, solve_oracle_landmarks
+from pathspace_graph.eval.metrics.limit import (
+    Limit,
+    fit_rmse,
+    landmark_rmse,
+    limit,
+    solve_oracle_landmarks,
+    with_true_noise,
+    without_sensor_errors,
+)
 from pathspace_graph.eval.metrics.table1 import root_mean_square
 from pathspace_graph.eval.metrics.trajectory import ate
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.landmark.oracle import solve_landmarks
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
+from pathspace_graph.sim.faults import Faults, SensorFaults
+from pathspace_graph.sim.presets import preset
+from pathspace_graph.sim.sensor import SensorSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.vehicle import VehicleSettings
 from pathspace_graph.spline.bspline import BSpline
+
+from ...scenes.drives import bean_track
 
 Array = NDArray[np.float64]
 
@@ -197,3 +215,74 @@ def test_a_log_without_truth_has_no_limit() -> None:
     told = Truth(log.truth.pose_t, log.truth.poses, log.truth.cones, log.truth.cone_labels)
     with pytest.raises(ValueError, match="associations"):
         solve_oracle_landmarks(Log(log.odometry, log.cycles, log.odometry_sigma, truth=told))
+
+
+# --- what else the batch is told -------------------------------------------------------------------------
+
+
+def normalized_error(log: Log) -> tuple[float, int]:
+    """The squared error of the told landmarks by their joint covariance, and its degrees of freedom."""
+    solution = solve_oracle_landmarks(log, with_covariance=True)
+    assert log.truth is not None and solution.covariance is not None
+    errors = (solution.landmarks - log.truth.cones[solution.landmark_ids]).ravel()
+    return float(errors @ np.linalg.solve(solution.covariance, errors)), len(errors)
+
+
+@pytest.mark.parametrize("latency", [-0.12, 0.1])
+def test_told_the_errors_of_the_sensor_the_batch_errs_by_its_noise_only(latency: float) -> None:
+    faults = SensorFaults(latency=latency, yaw=-0.0175, lateral=0.1, range_scale=0.08, range_bias=-0.19)
+    settings, found = SimulationSettings(laps=1, faults=Faults(sensor=faults)), []
+    for seed in range(4):
+        log = simulate(bean_track(), settings, seed)
+        found.append(normalized_error(log))
+        assert log.truth is not None
+        untold = replace(log, truth=replace(log.truth, sensor=None))
+        assert normalized_error(untold)[0] > 3.0 * found[-1][0]
+    error, freedom = np.sum(found, axis=0)
+    assert error / freedom == pytest.approx(1.0, abs=4 * np.sqrt(2 / freedom))
+
+
+def test_detections_without_noise_are_exact_without_the_errors_of_the_sensor() -> None:
+    """Each told detection, from the true pose at its told stamp, lies on its cone."""
+    faults = SensorFaults(latency=-0.12, yaw=-0.0175, lateral=0.1, range_scale=0.08, range_bias=-0.19)
+    sensor = SensorSettings(range_sigma=1e-9, range_sigma_growth=0.0, bearing_sigma=1e-9, false_positives=0.0)
+    vehicle = VehicleSettings(rate=100.0)
+    settings = SimulationSettings(laps=1, sensor=sensor, vehicle=vehicle, faults=Faults(sensor=faults))
+    log = simulate(bean_track(), settings, 0)
+    assert log.truth is not None and log.truth.associations is not None
+    told, associations = without_sensor_errors(log, log.truth.associations)
+    cones = np.split(associations, np.cumsum([len(cycle.labels) for cycle in told.cycles])[:-1])
+    assert len(told.cycles) == len(log.cycles)
+    for cycle, seen in zip(told.cycles, cones, strict=True):
+        k = int(np.argmin(np.abs(log.truth.pose_t - cycle.t)))
+        assert log.truth.pose_t[k] == pytest.approx(cycle.t, abs=1e-9)
+        points = to_map(cycle.points_vehicle, np.tile(log.truth.poses[k], (len(seen), 1)))
+        np.testing.assert_allclose(points, log.truth.cones[seen], atol=1e-6)
+
+
+def test_two_sightings_of_a_cone_are_worth_less_by_their_correlation() -> None:
+    """Seen along x at 0 s and 2 s: variances are multiplied by 1 + share exp(-2 / time)."""
+    cycles = tuple(
+        Detections(t, np.array([[4.0, 0.0]]), np.diag([0.09, 0.04])[None], np.array([LEFT]))
+        for t in (0.0, 2.0)
+    )
+    noise = np.array([0.5, 0.4, 0.3, 0.2, 0.8, 4.0])
+    truth = Truth(np.zeros(0), np.zeros((0, 3)), np.array([[4.0, 0.0]]), np.array([LEFT]), noise=noise)
+    log = Log(Odometry(np.array([0.0, 2.0]), np.zeros((2, 3))), cycles, SIGMA, truth=truth)
+    told = with_true_noise(log, np.zeros(2, dtype=int))
+    np.testing.assert_array_equal(told.odometry_sigma, [0.5, 0.4, 0.3])
+    expected = np.diag([0.09 * (1.0 + 0.2 * np.exp(-0.5)), 0.04 * (1.0 + 0.8 * np.exp(-0.5))])
+    for cycle in told.cycles:
+        np.testing.assert_allclose(cycle.covariances[0], expected)
+
+
+def test_told_the_noise_the_batch_is_better_than_told_that_it_is_white() -> None:
+    settings = replace(preset({"sensor": "camera", "odometry": "ins"}), laps=2)
+    told, white = [], []
+    for seed in range(4):
+        log = simulate(bean_track(), settings, seed)
+        assert log.truth is not None
+        told.append(landmark_rmse(solve_oracle_landmarks(log), log.truth))
+        plain = replace(log, truth=replace(log.truth, noise=None))
+        white.append(landmark_rmse(solve_oracle_landmarks(plain), log.truth))
+    assert np.mean(told) < np.mean(white)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from pathspace_graph.eval.study.overrides import as_type, leaves, override
 from pathspace_graph.eval.study.run import make_plan
 from pathspace_graph.eval.study.study import Baseline, Study, known_estimators
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.presets import CAMERA, CAMERA_FAULTS, INS, INS_RATE
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.vehicle import VehicleSettings
@@ -167,11 +169,24 @@ def test_a_study_is_found_by_name_or_refused_with_the_nearest() -> None:
         find_study(Path("degre"))
 
 
+def test_a_noise_names_presets_and_overrides_them() -> None:
+    noise = {"sensor": {"preset": "camera", "range_max": 30.0}, "odometry": {"preset": "ins"}}
+    study = study_from({"tracks": [0], "noise": {"camera": noise}})
+    simulation = study.simulation("camera")
+    assert simulation.sensor == replace(CAMERA, range_max=30.0)
+    assert (simulation.odometry, simulation.vehicle.rate) == (INS, INS_RATE)
+    assert simulation.faults.sensor == CAMERA_FAULTS
+    assert study.varied_noise == ("sensor.range_max",)
+    with pytest.raises(SettingsError, match=r"sensor: expected a known preset.*'camra'"):
+        study_from({"tracks": [0], "noise": {"camera": {"sensor.preset": "camra"}}})
+
+
 def test_the_studies_listed_are_the_files_on_disk_and_are_shipped() -> None:
     on_disk = {file.stem for file in (ROOT / "eval" / "studies").glob("*.toml")}
     assert set(shipped_studies()) == on_disk
     assert on_disk == {
         "batch",
+        "camera",
         "centerline",
         "closing",
         "covariance",
