@@ -57,8 +57,7 @@ class NoiseSettings:
 
     @property
     def sigmas(self) -> tuple[float, ...]:
-        """Returns the standard deviation of the range at range 0 (m), its growth (m/m), and that of the bearing
-        (rad)."""
+        """Returns sigmas of the range at range 0 (m), of its growth (m/m), and of the bearing (rad)."""
         return tuple(
             default if own is None else own for own, default in zip(self._own, SIGMA_DETECTIONS, strict=True)
         )

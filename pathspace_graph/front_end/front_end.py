@@ -19,10 +19,13 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
 from .log_odometry import LogOdometry, chained
+from .measurement import measure
 from .motion import MotionCheck
 from .noise import NoiseLearner
 from .sides import SideJudge
+from .sightings import SeenCycle, TwistRecord
 
+Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 SWAPPED: Final = {
     True: "the cones on the left have the colour of the right boundary: the colours are swapped, the track "
@@ -107,6 +110,11 @@ class FrontEnd:
             notice="; ".join(notices),
         )
 
+    @property
+    def pose(self) -> Array:
+        """Returns a copy of the newest pose (3,) by odometry alone."""
+        return self._motion.pose.copy()
+
     def _measured(
         self, odometry: Odometry, detections: Detections, motion: MeasuredMotion
     ) -> MapperSettings | None:
@@ -155,7 +163,10 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
 def measure_log(log: Log) -> MeasuredNoise | None:
     """Returns the noise of a whole log and the constant errors of its sensor, by its readings alone."""
     unknown = KnownNoise(log.odometry_sigma, odometry_stated=False, detections_stated=False)
-    front_end = FrontEnd(MapperSettings(), unknown)
+    front_end, twists, cycles = FrontEnd(MapperSettings(), unknown), TwistRecord(), []
     for odometry, detections in split_odometry(log):
-        front_end.update(odometry, detections)
-    return front_end.noise.now()
+        twists.add(odometry)
+        reading = front_end.update(odometry, detections)
+        labelled = replace(detections, labels=reading.detections.labels)
+        cycles.append(SeenCycle(labelled, front_end.pose, reading.motion.odometry.twist))
+    return measure(cycles, twists, None)

@@ -122,7 +122,7 @@ def mean_bias(measured: Sequence[BiasMeasurement]) -> BiasMeasurement | None:
 
 
 def sensor_prior(variables: Variables, settings: CalibrationSettings) -> list[Rows]:
-    """Returns the rows `(b - mean) / sigma` of the sensor's calibration b, or none where it is not estimated."""
+    """Returns the rows `(b - mean) / sigma` of the sensor's calibration b; none where it is not estimated."""
     if len(variables.sensor) == 0:
         return []
     root = np.diag(1.0 / np.array(settings.sigmas))

@@ -7,6 +7,7 @@ derivatives, noise scatters them, and errors that stay with a cone scatter its s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -19,7 +20,7 @@ from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotations, to_map
 from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor
 
-from .sightings import MAD, MIN_SPEED_SHARE, Sightings, TwistRecord
+from .sightings import MAD, MIN_SPEED_SHARE, SeenCycle, Sightings, TwistRecord, follow
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -33,8 +34,12 @@ PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02])
 FIRST_ALONG: Final = (0.1, 0.04)
 FIRST_ACROSS: Final = (0.05, 0.016)
 """Noise that the iteration begins with: m and m/m, then m and rad."""
+PASSES: Final = 3
+"""Number of times that cones are followed."""
 ROUNDS: Final = 5
 """Number of times that errors, noise and weights are found in turn."""
+STRETCH: Final = 3.0
+"""Time (s) over which errors of the odometry are alike."""
 HUBER: Final = 2.0
 MIN_COUNT: Final = 5
 """A cone counts with this number of sightings."""
@@ -111,10 +116,11 @@ def _information(cones: _Cones, along: RayNoise, across: RayNoise, weights: Arra
     return np.asarray((by_ray + by_side) * weights[:, None, None])
 
 
-def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array]:
-    """Return errors b (6,), their covariance, and what is left (n, 2) of each sighting about its cone.
+def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Array]:
+    """Return errors b (6,), their covariance twice, and what is left (n, 2) of each sighting about its cone.
 
-    The places of the cones are eliminated: they are the weighted means of `p + A b`.
+    The places of the cones are eliminated: they are the weighted means of `p + A b`. The covariances are that
+    of independent sightings, and `_clustered`.
     """
     total = np.linalg.inv(cones.sums(information))
     mean_columns = total @ cones.sums(information @ cones.columns)
@@ -125,7 +131,23 @@ def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array]:
     normal = np.einsum("nik,nil->kl", columns, weighted) + np.diag(PRIOR**-2)
     covariance = np.linalg.inv(normal)
     errors = -covariance @ np.einsum("nik,ni->k", weighted, points)
-    return errors, covariance, points + columns @ errors
+    off = points + columns @ errors
+    scores = cones.sums(np.einsum("nik,ni->nk", weighted, off))
+    return errors, covariance, _clustered(cones, scores, covariance), off
+
+
+def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:
+    """Return the covariance (6, 6) of the errors by how much the stretches of the drive disagree.
+
+    With the scores g (c, 6) of the cones summed over stretches of `STRETCH` seconds it is `P (sum g g') P`
+    (White's estimator for clusters). Errors of the odometry, which all cones share, are in it.
+    """
+    middle = cones.sums(cones.table.t) / np.diff(np.append(cones.begins, len(cones.ranges)))
+    _, stretch = np.unique(np.floor(middle / STRETCH), return_inverse=True)
+    count = int(stretch.max()) + 1
+    summed = np.zeros((count, scores.shape[1]))
+    np.add.at(summed, stretch, scores)
+    return np.asarray(covariance @ (summed.T @ summed) @ covariance * count / max(count - 1, 1))
 
 
 # --- noise of the detections -----------------------------------------------------------------------------
@@ -243,23 +265,37 @@ def _staying(cones: _Cones, left: _Residuals, axis: int, noise: RayNoise) -> tup
 # --- all of it -------------------------------------------------------------------------------------------
 
 
-def measure(sightings: Sightings, twists: TwistRecord) -> MeasuredNoise | None:
-    """Return the noise that the readings so far show; None where not even the odometry's is known."""
+def measure(
+    cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None
+) -> MeasuredNoise | None:
+    """Return the noise that the readings show; None where not even the odometry's is known.
+
+    Cones are followed again with the errors that were found, from those `known` already on.
+    """
     white = twists.white()
     if white is None:
         return None
     sigma, interval = white
     found = MeasuredNoise(sigma, DRIFT.copy(), interval)
+    if known is not None:
+        found = replace(found, sensor=known.sensor)
+    for _ in range(PASSES if known is None or known.along is None else 1):
+        found = _measured(follow(cycles, found.sensor), found)
+    return found
+
+
+def _measured(sightings: Sightings, found: MeasuredNoise) -> MeasuredNoise:
+    """Return the noise with that of the detections, and the errors of the sensor, if enough cones show it."""
     cones = _cones(sightings)
     if cones is None:
         return found
     stamps = np.unique(sightings.t)
     period = float(np.median(np.diff(stamps)))
-    walk = np.hypot(DRIFT, sigma * np.sqrt(interval))
+    walk = np.hypot(DRIFT, found.odometry * np.sqrt(found.interval))
     noise = RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))
     weights = np.ones(len(cones.ranges))
     for _ in range(ROUNDS):
-        errors, covariance, off = _solve(cones, _information(cones, *noise, weights))
+        errors, covariance, clustered, off = _solve(cones, _information(cones, *noise, weights))
         square = ((off * cones.ray).sum(axis=1) / noise[0].sigmas(cones.ranges)) ** 2
         square += ((off * cones.side).sum(axis=1) / noise[1].sigmas(cones.ranges)) ** 2
         weights = huber_weights(np.sqrt(square), HUBER) ** 2
@@ -278,6 +314,6 @@ def measure(sightings: Sightings, twists: TwistRecord) -> MeasuredNoise | None:
         period=period,
         per_cycle=len(sightings.t) / len(stamps),
         sensor=errors[:SENSOR_SIZE],
-        sensor_sigma=np.sqrt(stays * np.diag(covariance))[:SENSOR_SIZE],
+        sensor_sigma=np.sqrt(np.maximum(stays * np.diag(covariance), np.diag(clustered)))[:SENSOR_SIZE],
         seconds=float(np.sum(np.minimum(np.diff(np.unique(cones.table.t)), 1.0))),
     )

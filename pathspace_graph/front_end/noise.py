@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 from math import inf
 from typing import Final
@@ -9,14 +10,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .measurement import measure
-from .sightings import ConeFollower, TwistRecord
+from .sightings import SeenCycle, TwistRecord
 
 Array = NDArray[np.float64]
 
@@ -24,6 +25,8 @@ FIRST: Final = 8.0
 """Driving time (s) after which noise is measured first."""
 AGAIN: Final = 1.5
 """It is measured again each time that the driving time has grown by this factor."""
+MOST_CYCLES: Final = 300
+"""It is measured on this number of newest cycles, which bounds its time."""
 MIN_SPEED: Final = 0.3
 """Driving is faster than this (m/s)."""
 REFERENCE_RANGE: Final = 10.0
@@ -42,7 +45,8 @@ class NoiseLearner:
         """The noise of the detections, and the constant errors of the sensor, are the measured ones."""
         self.measured = known.measured
         """What was measured so far, or by an earlier look at the whole drive."""
-        self._follower, self._twists = ConeFollower(), TwistRecord()
+        self._cycles: deque[SeenCycle] = deque(maxlen=MOST_CYCLES)
+        self._twists = TwistRecord()
         self._driven, self._due = 0.0, FIRST
         self._t: float | None = None
 
@@ -70,19 +74,15 @@ class NoiseLearner:
         if not self.is_learning:
             return False
         self._twists.add(odometry)
-        self._follower.add(detections, pose, motion.odometry.twist)
+        self._cycles.append(SeenCycle(detections, pose.copy(), motion.odometry.twist))
         if self._t is not None and np.hypot(*motion.odometry.twist[:2]) > MIN_SPEED:
             self._driven += min(detections.t - self._t, 1.0)
         self._t = detections.t
         if self._driven < self._due:
             return False
         self._due = AGAIN * self._driven
-        self.measured = self.now() or self.measured
+        self.measured = measure(self._cycles, self._twists, self.measured) or self.measured
         return self.measured is not None
-
-    def now(self) -> MeasuredNoise | None:
-        """Return what the drive so far shows."""
-        return measure(self._follower.sightings, self._twists)
 
     def for_check(self, detections: Detections, twist: Array) -> Detections:
         """Return detections for comparisons over a few cycles: single errors, constant ones taken out."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from math import comb
 from typing import Final
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.io.log import Detections, Odometry
 
 Array = NDArray[np.float64]
@@ -20,8 +22,7 @@ BoolArray = NDArray[np.bool_]
 MAD: Final = 1.4826
 """Standard deviation of a Gaussian by its median absolute deviation."""
 MOST_TWISTS: Final = 4000
-MOST_SIGHTINGS: Final = 20000
-"""Numbers of newest twists and sightings that are kept."""
+"""Number of newest twists that are kept."""
 MIN_SPEED_SHARE: Final = 0.3
 """A vehicle slower than this share of its median speed says little of noise in motion."""
 MIN_TWISTS: Final = 30
@@ -69,10 +70,33 @@ class Sightings:
         return cls(*(np.concatenate([getattr(one, column.name) for one in tables]) for column in fields(cls)))
 
 
-class ConeFollower:
-    """Tells which detections are of one cone, by dead reckoning, and keeps them as sightings."""
+@dataclass(frozen=True, eq=False)
+class SeenCycle:
+    """A perception cycle where dead reckoning has placed it."""
 
-    def __init__(self) -> None:
+    detections: Detections
+    """Detections as measured."""
+    pose: Array
+    """(3,) Pose of the vehicle by dead reckoning."""
+    twist: Array
+    """(3,) Twist of the vehicle: m/s, m/s, rad/s."""
+
+
+def follow(cycles: Iterable[SeenCycle], errors: Array) -> Sightings:
+    """Return the sightings of cones in the cycles, in order of time.
+
+    Sightings are told to be of one cone after the constant errors of the sensor (5,), as far as they are
+    known, are taken out. What is returned is as measured.
+    """
+    follower = _Follower(errors)
+    return Sightings.stacked([Sightings.none(), *(follower.add(cycle) for cycle in cycles)])
+
+
+class _Follower:
+    """Holds the cones that were seen in the last seconds, by dead reckoning."""
+
+    def __init__(self, errors: Array) -> None:
+        self._errors = errors
         self._points: Array = np.zeros((0, 2))
         self._labels: IntArray = np.zeros(0, np.intp)
         self._nearest: Array = np.zeros(0)  # least range at which each cone was seen (m)
@@ -82,11 +106,10 @@ class ConeFollower:
         self._by_bias: Array = np.zeros(3)
         self._pose: Array | None = None
         self._t = 0.0
-        self._tables: deque[Sightings] = deque()
-        self._kept = 0
 
-    def add(self, detections: Detections, pose: Array, twist: Array) -> None:
-        """Add the detections of a cycle, made from a pose (3,) by dead reckoning at a twist (3,)."""
+    def add(self, cycle: SeenCycle) -> Sightings:
+        """Return the sightings of a cycle."""
+        detections, pose = cycle.detections, cycle.pose
         self._follow_bias(detections.t, pose)
         keep = self._last > detections.t - MAX_AGE
         self._points, self._labels, self._nearest = (
@@ -98,26 +121,19 @@ class ConeFollower:
         ranges = np.hypot(*detections.points_vehicle.T)
         order = np.argsort(ranges, kind="stable")
         order = order[ranges[order] < MAX_RANGE]
-        points = to_map(detections.points_vehicle[order], pose[None])
+        measured = detections.points_vehicle[order]
+        corrected = measured + by_sensor(measured, np.tile(cycle.twist, (len(order), 1))) @ self._errors
+        points = to_map(corrected, pose[None])
         rows, cones = self._assign(points, detections.labels[order], ranges[order], detections.t)
         count = len(rows)
-        table = Sightings(
+        return Sightings(
             cones,
             np.full(count, detections.t),
-            detections.points_vehicle[order[rows]],
-            np.tile(twist, (count, 1)),
+            measured[rows],
+            np.tile(cycle.twist, (count, 1)),
             np.tile(pose, (count, 1)),
             np.tile(self._by_bias, (count, 1)),
         )
-        self._tables.append(table)
-        self._kept += count
-        while self._kept > MOST_SIGHTINGS:
-            self._kept -= len(self._tables.popleft().t)
-
-    @property
-    def sightings(self) -> Sightings:
-        """Return all sightings that are kept."""
-        return Sightings.stacked([Sightings.none(), *self._tables])
 
     def _follow_bias(self, t: float, pose: Array) -> None:
         """Carry the derivative of the pose by the yaw rate's bias on: `d theta = -dt`, and what follows."""
