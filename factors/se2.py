@@ -25,6 +25,12 @@ def rotations(theta: Array) -> Array:
     return np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
 
 
+def rotated(covariances: Array, theta: Array) -> Array:
+    """Return `R K R'` (m, 2, 2) of covariances K (m, 2, 2), with R(theta) of each angle (m,)."""
+    turn = rotations(theta)
+    return np.asarray(turn @ covariances @ turn.transpose(0, 2, 1))
+
+
 def left_of(vectors: Array) -> Array:
     """Returns vectors (n, 2) turned by a quarter to the left: (x, y) becomes (-y, x)."""
     return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)

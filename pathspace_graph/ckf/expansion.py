@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import rotation, to_map
+from pathspace_graph.factors.se2 import rotated, rotation, to_map
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.candidates import SIDES, Candidates, End, chain
@@ -46,10 +46,10 @@ class Expansion:
     def observe(self, state: CurveState, detections: Detections) -> None:
         """Adds all detections of a cycle to the tracks, and newly confirmed ones to the observed cones."""
         points = to_map(detections.points_vehicle, state.pose[None])
-        variances = np.trace(detections.covariances, axis1=1, axis2=2)
+        covariances = rotated(detections.covariances, np.full(len(points), state.pose[2]))
         for label, tentative in self.tentative.items():
             own = detections.labels == label
-            tentative.add(points[own], variances[own], detections.t)
+            tentative.add(points[own], covariances[own], detections.t)
             known, radius = self.observed[label], self.settings.growth.merge_radius
             for point in tentative.points[tentative.confirmed()]:
                 if not known or np.hypot(*(np.array(known[-RECENT:]) - point).T).min() > radius:

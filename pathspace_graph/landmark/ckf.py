@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pathspace_graph.factors.measured_noise import KnownNoise
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.front_end.front_end import FrontEnd
 from pathspace_graph.graph.keys import POINT
 from pathspace_graph.io.log import Detections, Odometry
@@ -129,11 +129,11 @@ class LandmarkCkf:
         It is placed at the nearest detection of this cycle, and the track is kept if there is none.
         """
         points = to_map(detections.points_vehicle, self.belief.pose[None])
-        variances = np.trace(detections.covariances, axis1=1, axis2=2)
+        covariances = rotated(detections.covariances, np.full(len(points), self.belief.pose[2]))
         chosen = [np.zeros(0, np.intp)]
         for label, tentative in self.tentative.items():
             rows = np.flatnonzero(new & (detections.labels == label))
-            tentative.add(points[rows], variances[rows], detections.t)
+            tentative.add(points[rows], covariances[rows], detections.t)
             confirmed = np.flatnonzero(tentative.counts >= self.settings.ckf.sightings)
             offset = points[rows][:, None] - tentative.points[confirmed][None]
             distance = np.hypot(offset[..., 0], offset[..., 1])

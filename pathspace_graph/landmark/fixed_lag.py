@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.measured_noise import KnownNoise
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.front_end.front_end import FrontEnd
 from pathspace_graph.front_end.late import at_nearest_pose
 from pathspace_graph.graph.smoother import FixedLagSmoother
@@ -126,8 +126,9 @@ class LandmarkFixedLag:
         rows = new.start + np.flatnonzero(detections.landmark[new] == UNASSOCIATED)
         for label, tentative in self.tentative.items():
             own = rows[detections.label[rows] == label]
-            points = to_map(detections.point[own], self.smoother.variables.poses_at(detections.cycle[own]))
-            tentative.add(points, np.trace(detections.covariance[own], axis1=1, axis2=2), t)
+            poses = self.smoother.variables.poses_at(detections.cycle[own])
+            covariances = rotated(detections.covariance[own], poses[:, 2])
+            tentative.add(to_map(detections.point[own], poses), covariances, t)
             confirmed = tentative.confirmed()
             if len(confirmed):
                 self._add_landmarks(label, tentative.points[confirmed].copy())

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from pathspace_graph.factors.landmark import landmark_residuals
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.graph.elimination import Elimination
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES
@@ -115,11 +115,12 @@ class Reassociation:
         """Returns the tracks (k, 2) with enough of these detections, map frame, m; a batch forgets none."""
         detections = self.detections
         tentative = TentativeTracks(replace(self.settings.growth, forget_after=np.inf))
-        variances = np.trace(detections.covariance[rows], axis1=1, axis2=2)
+        poses = self.state.variables.poses_at(detections.cycle[rows])
+        covariances = rotated(detections.covariance[rows], poses[:, 2])
         found = [np.zeros((0, POINT))]
         for cycle in np.unique(detections.cycle[rows]):
             now = detections.cycle[rows] == cycle
-            tentative.add(self.points_map[rows[now]], variances[now], float(self.stamps[cycle]))
+            tentative.add(self.points_map[rows[now]], covariances[now], float(self.stamps[cycle]))
             confirmed = tentative.confirmed()
             found.append(tentative.points[confirmed])
             tentative.remove(confirmed)

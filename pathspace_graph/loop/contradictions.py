@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.tentative import TentativeTracks
@@ -51,11 +51,12 @@ class Contradictions:
         rows = rows[unexplained]
         if len(rows) == 0:
             return
-        points = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
-        variances = np.trace(detections.covariance[rows], axis1=1, axis2=2)
+        poses = smoother.variables.poses_at(detections.cycle[rows])
+        points = to_map(detections.point[rows], poses)
+        covariances = rotated(detections.covariance[rows], poses[:, 2])
         for label, tracks in self._tracks.items():
             own = detections.label[rows] == label
-            tracks.add(points[own], variances[own], t)
+            tracks.add(points[own], covariances[own], t)
 
     def clear(self) -> None:
         """Forgets everything, because the map or the pose was replaced."""

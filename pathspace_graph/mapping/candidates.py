@@ -52,23 +52,21 @@ class End:
 def chain(found: Candidates, settings: GrowthSettings, end: End | None) -> IntArray:
     """Returns the indices of the candidates, sorted by station, that may follow one another.
 
-    A candidate i may follow the last accepted one, or the end of the curve, if
-    `side_i <= side_last + lateral_change + lateral_rate (s_i - s_last)`. Of candidates at about the same
-    station only those nearest to the path remain: a second row behind the first belongs to another stretch of
-    the track.
+    A candidate i may follow the end of the curve if `side_i <= side_end + lateral_change + lateral_rate
+    (s_i - s_end)`; without a curve the first candidate takes the place of the end. No candidate allows the
+    next one more than that, or a row would be left for the next lane's, step by step. Of candidates at about
+    the same station only those nearest to the path remain: a second row behind the first belongs to another
+    stretch of the track.
     """
-    chosen: list[int] = []
-    last = None if end is None else (end.station, end.side)
-    in_front = in_front_row(found.stations, found.sides, settings.beside, settings.lateral_gap)
-    for i in np.flatnonzero(in_front).tolist():
-        station, side = found.stations[i], found.sides[i]
-        if last is not None:
-            room = settings.lateral_change + settings.lateral_rate * (station - last[0])
-            if side > last[1] + room:
-                continue
-        chosen.append(i)
-        last = (station, side)
-    return np.array(chosen, dtype=np.intp)
+    in_front = np.flatnonzero(
+        in_front_row(found.stations, found.sides, settings.beside, settings.lateral_gap)
+    )
+    if len(in_front) == 0:
+        return in_front
+    first = in_front[0]
+    station, side = (found.stations[first], found.sides[first]) if end is None else (end.station, end.side)
+    room = settings.lateral_change + settings.lateral_rate * (found.stations[in_front] - station)
+    return np.asarray(in_front[found.sides[in_front] <= side + room])
 
 
 def in_front_row(stations: Array, sides: Array, beside: float, gap: float) -> NDArray[np.bool_]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import rotations, to_map, wrap_angle
+from pathspace_graph.factors.se2 import rotated, to_map, wrap_angle
 from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.spline.boundary import Boundary
 
@@ -214,8 +214,7 @@ def _recent(track: CurveMap, times: Sequence[float], seconds: float) -> Sighting
     rows = np.flatnonzero(stamps[detections.cycle - variables.first_cycle] > stamps[-1] - seconds)
     rows = rows[np.isin(detections.label[rows], list(track.state.boundaries))]
     poses = variables.poses_at(detections.cycle[rows])
-    turn = rotations(poses[:, 2])
-    covariances = turn @ detections.covariance[rows] @ turn.transpose(0, 2, 1)
+    covariances = rotated(detections.covariance[rows], poses[:, 2])
     points, used = to_map(detections.point[rows], poses), detections.used[rows]
     return Sightings(rows, detections.label[rows], points, covariances, used)
 

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import move_points
+from pathspace_graph.factors.se2 import move_points, rotated
 from pathspace_graph.settings.growth import GrowthSettings
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+
+
+MERGE_CHI: Final = 2.5
+"""A detection is of a track within this number of sigmas of both together ..."""
+MERGE_MOST: Final = 2.0
+"""... and within this number of merge radii: the next cone of the row is farther away."""
+RESTORED: Final = 0.3
+"""Standard deviation of a cone that is taken back from a curve (m)."""
 
 
 class TentativeTracks:
@@ -19,34 +29,57 @@ class TentativeTracks:
         self.settings = settings
         self.points: Array = np.zeros((0, 2))
         """(n, 2) Each row is the weighted mean of a track's detections in m, map frame."""
-        self.weights: Array = np.zeros(0)
-        """(n,) Each track has this information (1/m^2): the sum of its detections' inverse variances."""
+        self.information: Array = np.zeros((0, 2, 2))
+        """(n, 2, 2) Information of each track (1/m^2): the sum of its detections' inverse covariances."""
         self.counts: IntArray = np.zeros(0, np.intp)
         """(n,) Each track has this number of detections."""
         self.last_t: Array = np.zeros(0)
         """(n,) Each track was last seen at this stamp (s)."""
 
-    def add(self, points: Array, variances: Array, t: float) -> None:
-        """Adds detections (m, 2) at t (s), each with a scalar variance (m,), to the nearest or to new tracks.
+    def add(self, points: Array, covariances: Array, t: float) -> None:
+        """Adds detections (m, 2) with covariances (m, 2, 2), seen at t (s), to their tracks or to new ones.
 
-        Tracks that were not seen for `forget_after` seconds are removed first.
+        A detection is of the track to which it is nearest, in `merge_radius` or in sigmas, whichever says
+        less: far sightings of one cone are smeared along their rays. Tracks that were not seen for
+        `forget_after` seconds are removed first.
         """
         self._keep(self.last_t > t - self.settings.forget_after)
         if len(points) == 0:
             return
-        nearest, near = nearest_within(points, self.points, self.settings.merge_radius)
+        information = np.linalg.inv(covariances)
+        nearest, near = self._nearest(points, covariances)
         for row in np.flatnonzero(near):
-            i, w = nearest[row], 1.0 / variances[row]
-            self.weights[i] += w
-            self.points[i] += (points[row] - self.points[i]) * w / self.weights[i]
+            i, own = nearest[row], information[row]
+            self.information[i] += own
+            self.points[i] += np.linalg.solve(self.information[i], own @ (points[row] - self.points[i]))
             self.counts[i] += 1
             self.last_t[i] = max(self.last_t[i], t)  # a late detection makes no track older
         new = ~near
         self.points = np.concatenate([self.points, points[new]])
-        self.weights = np.concatenate([self.weights, 1.0 / variances[new]])
+        self.information = np.concatenate([self.information, information[new]])
         self.counts = np.concatenate([self.counts, np.ones(int(new.sum()), np.intp)])
         self.last_t = np.concatenate([self.last_t, np.full(int(new.sum()), t)])
         self._keep(newest_of(self.last_t, self.settings.max_tracks))
+
+    def _nearest(self, points: Array, covariances: Array) -> tuple[IntArray, NDArray[np.bool_]]:
+        """Returns the track of each detection (m, 2), by index, and whether it has one."""
+        radius = self.settings.merge_radius
+        nearest, near = nearest_within(points, self.points, radius)
+        rest = np.flatnonzero(~near)
+        if len(self.points) == 0 or len(rest) == 0:
+            return nearest, near
+        offset = points[rest, None] - self.points
+        i, j = np.nonzero((offset**2).sum(axis=2) < (MERGE_MOST * radius) ** 2)
+        if len(i) == 0:
+            return nearest, near
+        joint = covariances[rest[i]] + np.linalg.inv(self.information[j])
+        off = offset[i, j]
+        square = np.full(offset.shape[:2], np.inf)
+        square[i, j] = (off * np.linalg.solve(joint, off[:, :, None])[:, :, 0]).sum(axis=1)
+        best = square.argmin(axis=1)
+        smeared = square[np.arange(len(rest)), best] < MERGE_CHI**2
+        nearest[rest[smeared]], near[rest[smeared]] = best[smeared], True
+        return nearest, near
 
     def confirmed(self) -> IntArray:
         """Returns the indices of the tracks with enough detections."""
@@ -54,7 +87,11 @@ class TentativeTracks:
 
     def variances(self, indices: IntArray) -> Array:
         """Returns the variance (k,) of tracks in any direction (m^2): half the trace of their covariance."""
-        return 0.5 / self.weights[indices]
+        return np.asarray(0.5 * np.trace(np.linalg.inv(self.information[indices]), axis1=1, axis2=2))
+
+    def sigmas(self, indices: IntArray) -> Array:
+        """Returns the standard deviation (k,) of tracks in their worst direction (m)."""
+        return np.asarray(np.linalg.eigvalsh(self.information[indices])[:, 0] ** -0.5)
 
     def remove(self, indices: IntArray) -> None:
         """Removes tracks by index."""
@@ -65,13 +102,15 @@ class TentativeTracks:
     def restore(self, points: Array, t: float) -> None:
         """Adds confirmed tracks at points (k, 2), last seen at t (s)."""
         self.points = np.concatenate([self.points, points])
-        self.weights = np.append(self.weights, np.ones(len(points)))
+        known = np.tile(np.eye(2) / RESTORED**2, (len(points), 1, 1))
+        self.information = np.concatenate([self.information, known])
         self.counts = np.append(self.counts, np.full(len(points), self.settings.sightings))
         self.last_t = np.append(self.last_t, np.full(len(points), t))
 
     def move(self, motion: Array) -> None:
         """Moves all tracks by a rigid motion (3,) of the map frame."""
         self.points = move_points(motion, self.points)
+        self.information = rotated(self.information, np.full(len(self.points), motion[2]))
 
     def clear(self) -> None:
         """Removes all tracks."""
@@ -79,7 +118,7 @@ class TentativeTracks:
 
     def _keep(self, keep: NDArray[np.bool_]) -> None:
         if not keep.all():
-            self.points, self.weights = self.points[keep], self.weights[keep]
+            self.points, self.information = self.points[keep], self.information[keep]
             self.counts, self.last_t = self.counts[keep], self.last_t[keep]
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.labels import BOUNDARIES, NAMES, UNKNOWN
 from pathspace_graph.mapping.candidates import SIDES, Candidates, End, chain
 from pathspace_graph.mapping.curve_map import CurveSmoother
@@ -14,8 +16,14 @@ from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
+from .corridor import crosses
+
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+
+
+NEWEST: Final = 3
+"""This number of newest cones and the end of a curve say how far it runs beside the path."""
 
 
 class Growth:
@@ -34,11 +42,12 @@ class Growth:
         detections = smoother.map.detections
         rows = np.arange(new.start, new.stop)
         rows = rows[~detections.used[rows]]
-        points = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
-        variances = np.trace(detections.covariance[rows], axis1=1, axis2=2)
+        poses = smoother.variables.poses_at(detections.cycle[rows])
+        points = to_map(detections.point[rows], poses)
+        covariances = rotated(detections.covariance[rows], poses[:, 2])
         for label in BOUNDARIES:
             own = detections.label[rows] == label
-            self.tentative[label].add(points[own], variances[own], t)
+            self.tentative[label].add(points[own], covariances[own], t)
 
     def expand(self, smoother: CurveSmoother, path_ahead: PathAhead) -> frozenset[int]:
         """Begins or extends each boundary; returns the labels of the curves that were extended."""
@@ -82,8 +91,10 @@ class Growth:
         self, smoother: CurveSmoother, label: int, path_ahead: PathAhead, end: End | None
     ) -> Candidates:
         """Returns the chain of confirmed tracks within reach, from the end of the curve if there is one."""
-        settings, indices = self.settings, self.tentative[label].confirmed()
-        points = self.tentative[label].points[indices]
+        settings, tracks = self.settings, self.tentative[label]
+        indices = tracks.confirmed()
+        indices = indices[tracks.sigmas(indices) < settings.sigma]
+        points = tracks.points[indices]
         if len(points) == 0:
             return Candidates(points, indices, np.zeros(0), np.zeros(0))
         stations, lateral = path_ahead.locate(points)
@@ -97,7 +108,28 @@ class Growth:
         if len(found.points):
             found = found.where(undisputed(smoother, label, found.points, settings.merge_radius))
         found = found.where(np.argsort(found.stations))
-        return found.where(chain(found, settings, end))
+        found = found.where(chain(found, settings, end))
+        return found if end is None else found.where(self._uncrossed(smoother, label, path_ahead, end, found))
+
+    def _uncrossed(
+        self, smoother: CurveSmoother, label: int, path_ahead: PathAhead, end: End, found: Candidates
+    ) -> IntArray:
+        """Returns the candidates, by index, up to the first that is reached only across a line.
+
+        No boundary crosses the path driven, the other boundary or itself.
+        """
+        boundaries = smoother.map.state.boundaries
+        driven = path_ahead.stations <= path_ahead.driven
+        lines = [path_ahead.points[driven]]
+        lines += [
+            np.array(one.observed[:-1] if own == label else one.observed) for own, one in boundaries.items()
+        ]
+        begin = end.position
+        for k, point in enumerate(found.points):
+            if any(len(line) > 1 and crosses(begin, point[None], line)[0] for line in lines):
+                return np.arange(k)
+            begin = point
+        return np.arange(len(found.points))
 
     def _begin(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> None:
         """Begins a curve through the first candidates, if there are at least two."""
@@ -248,12 +280,19 @@ def _relocate_poses(smoother: CurveSmoother, label: int, from_u: float) -> None:
 
 
 def _end(smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> End:
-    """Returns the confirmed end of a curve, located beside the path."""
+    """Returns the confirmed end of a curve, located beside the path.
+
+    Its distance from the path is the median of the newest cones', so that one wrong cone leads no further.
+    """
     boundary = smoother.map.state.boundaries[label]
     u = np.array([boundary.confirmed_end])
     position = boundary.evaluate(smoother.map.state.control_points(label), u)
     station, lateral = path_ahead.locate(position)
-    return End(position[0], float(station[0]), SIDES[label] * float(lateral[0]))
+    side = SIDES[label] * float(lateral[0])
+    if len(boundary.observed) >= NEWEST:
+        _, beside = path_ahead.locate(np.array(boundary.observed[-NEWEST:]))
+        side = float(np.median(np.append(SIDES[label] * beside, side)))
+    return End(position[0], float(station[0]), side)
 
 
 def _distances(points: Array) -> Array:

@@ -36,6 +36,9 @@ class GrowthSettings(Positive):
     """A boundary is extended up to this far ahead of the vehicle (m along the predicted path)."""
     sightings: int = 3
     """A tentative track is confirmed by this number of detections within `merge_radius`."""
+    sigma: float = 0.4
+    """A curve is extended through a track once it is known to this standard deviation in every direction
+    (m): a far, uncertain one waits until it was seen near."""
     merge_radius: float = 1.0
     """Detections of one label that are nearer to each other than this (m) belong to one tentative track."""
     forget_after: float = 6.0
@@ -46,7 +49,8 @@ class GrowthSettings(Positive):
     """A boundary begins with tentative tracks nearer to the driven path than this (m); circuits are up to 15
     m wide."""
     lateral_change: float = 1.5
-    """The next tentative track may be this much farther from the path than the end of the curve (m)."""
+    """The next tentative track may be this much farther from the path than the newest cones of the curve
+    (m)."""
     lateral_rate: float = 0.2
     """For each metre along the path, the next tentative track may be this much farther from the path, in
     addition to `lateral_change` (m/m)."""
