@@ -132,7 +132,7 @@ class FixedLagMapper(MapperEstimate):
         if closes:
             self._simplify()
         watch.lap("simplify")
-        jump, notice = self.loop.go_on(closes)
+        jump, notice = self.loop.go_on(closes, watch.spent)
         watch.lap("swap")
         if self.loop.is_searching:
             jump, notice = self.loop.find_back()
