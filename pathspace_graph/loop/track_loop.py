@@ -51,8 +51,6 @@ class TrackLoop:
         """(k, 3) These are the poses of the first k cycles as the closing of the loop has corrected them."""
         self.lap_seconds = float("nan")
         """The batch of the lap took this wall time (s) in its own process, once it has replaced the prior."""
-        self.batch_ends: list[int] = []
-        """In each of these cycles a batch ended: its result was taken, or it was given up."""
         self.late_cycles = 0
         """By its wall time, the slowest batch is this number of cycles late in a vehicle."""
         self.record = DriveRecord(self.settings)
@@ -65,6 +63,7 @@ class TrackLoop:
         self._known_loop = KnownLoop(smoother)
         self._search: Search | None = None
         self._lap_batch: LapBatch | None = None
+        self._batch_ends: list[int] = []
         self._boundaries_cross = False
         self._believed = self.settings  # with the priors of the calibrations as they are now
         self._settled: float | None = None  # path driven (m) when the closed map was last replaced
@@ -80,6 +79,17 @@ class TrackLoop:
     def first_kept(self) -> int | None:
         """Returns the cycle whose pose must stay in the window until the lap is solved, if there is one."""
         return self._lap_batch.first_kept if self._lap_batch else None
+
+    @property
+    def batch_ends(self) -> tuple[int, ...]:
+        """Returns the cycles in which batches ended: their result was taken, or they were given up.
+
+        A late one that is under way is going to be given up.
+        """
+        batch, ends = self._lap_batch, tuple(self._batch_ends)
+        if batch is None or self._smoother.next_cycle <= batch.due <= batch.last:
+            return ends
+        return (*ends, batch.last + 1)
 
     def may_close(self) -> bool:
         """Returns whether it is time to register the newest detections with the beginning of an open loop."""
@@ -190,7 +200,7 @@ class TrackLoop:
             given = times[batch.due - self._smoother.first_cycle] - batch.t
             self.late_cycles = max(self.late_cycles, ceil((found.seconds - given) / period))
         self._lap_batch = None
-        self.batch_ends.append(cycle)
+        self._batch_ends.append(cycle)
         return self._take(found)
 
     def _take(self, marginal: LapMarginal | str) -> tuple[Array | None, str]:
@@ -268,7 +278,7 @@ class TrackLoop:
         wait = max(min(own.cycles, cycle - first), int(own.cycles_share * cycle))
         first_kept, due = min(first + wait, cycle), cycle + wait
         last = max(due, min(due + own.late, first_kept + self.settings.max_poses - 1))
-        recorded = own.ends[len(self.batch_ends) :][:1]
+        recorded = own.ends[len(self._batch_ends) :][:1]
         lap = self.record.lap(first_kept, start, self._believed)
         due = min(max([due, *recorded]), last + 1)
         self._lap_batch = LapBatch(lap, self._smoother.times[-1], due, last)

@@ -221,7 +221,7 @@ class MapperEstimate:
 
     def batches(self) -> LapBatches:
         """Returns the cycles in which batches of the lap have ended, and how late they would have been."""
-        return LapBatches(tuple(self.loop.batch_ends), self.loop.late_cycles)
+        return LapBatches(self.loop.batch_ends, self.loop.late_cycles)
 
     # --- the estimate ------------------------------------------------------------------------------------
 

@@ -19,7 +19,9 @@ from threadpoolctl import threadpool_limits
 from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.io.log import Log
+from pathspace_graph.labels import LEFT
 from pathspace_graph.loop import drive_record
+from pathspace_graph.loop.mending import MENDED
 from pathspace_graph.loop.track_loop import LONGEST_WAIT, OWN_PRIOR
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online, split_odometry
@@ -27,6 +29,8 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.digest import digest
 from ..scenes.drives import bean_track, lap_log, map_log, noisy
+from ..scenes.holes import unseen
+from ..scenes.kidnapped import laps_log, pear_track
 
 Work = Callable[..., Any]
 PERIOD, NEVER = 0.1, -1
@@ -78,13 +82,13 @@ def with_settings(**changes: object) -> FixedLagMapper:
 
 
 def drive(mapper: FixedLagMapper, sent: list[Slow], late: int, log: Log) -> list[CycleResult]:
-    """Drives as a vehicle does; the first batch ends so many cycles after the one in which it is due."""
+    """Drives as a vehicle does; each batch ends so many cycles after the one in which it is due."""
     results = list[CycleResult]()
     with threadpool_limits(limits=1):
         for odometry, detections in split_odometry(log):
             batch = mapper.loop._lap_batch
             if late >= 0 and batch is not None and mapper.smoother.next_cycle == batch.due + late:
-                sent[0].end()
+                sent[-1].end()
             results.append(mapper.update(odometry, detections))
     return results
 
@@ -116,17 +120,35 @@ def test_where_the_stamps_jump_a_cycle_does_not_wait_for_all_that_time(sent: lis
     assert max(first, *later) < PERIOD + 1e-9 < jumped < LONGEST_WAIT
 
 
-@pytest.mark.parametrize("late", [0, 7, 15])
+@pytest.mark.parametrize("late", [0, 7, 15, NEVER])
 def test_the_recorded_cycle_replays_the_drive_to_the_bit(
     late: int, sent: list[Slow], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """That is so too where the drive has ended before its late batch has."""
+    assert_replayed(log(), late, 1, sent, monkeypatch)
+
+
+def test_a_map_is_mended_by_a_late_batch_and_replayed_to_the_bit(
+    sent: list[Slow], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drive = unseen(laps_log(pear_track()), [LEFT], 6.0, 11.0)
+    results = assert_replayed(drive, 9, 2, sent, monkeypatch)
+    assert [result.notice.startswith(MENDED) for result in results if result.notice] == [True]
+
+
+def assert_replayed(
+    log: Log, late: int, batches: int, sent: list[Slow], monkeypatch: pytest.MonkeyPatch
+) -> list[CycleResult]:
     vehicle = with_settings()
-    drive(vehicle, sent, late, log())
+    results = drive(vehicle, sent, late, log)
+    ends = vehicle.batches().ends
+    assert len(ends) == len(sent) == batches
     monkeypatch.undo()
-    again = with_settings(ends=vehicle.batches().ends)
-    result = run_online(log(), again)
-    assert result.batches is not None and result.batches.ends == vehicle.batches().ends
+    again = with_settings(ends=ends)
+    result = run_online(log, again)
+    assert result.batches is not None and result.batches.ends == ends
     assert_same(again, vehicle)
+    return results
 
 
 def assert_same(mapper: FixedLagMapper, expected: FixedLagMapper) -> None:
