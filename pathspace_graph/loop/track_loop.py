@@ -272,8 +272,11 @@ class TrackLoop:
     def _begin_batch(self, start: ClosedMap | Recurrence) -> None:
         """Sends the lap to its batch, which begins at a map that has just been closed, or at odometry.
 
-        Where a drive is replayed, the batch ends in the cycle that was recorded.
+        Where a drive is replayed, the batch ends in the cycle that was recorded. One that is under way is
+        given up, since its process would not begin this one.
         """
+        if self._lap_batch is not None:
+            self._lap_batch.give_up()
         own, first, cycle = self.settings.open_lap, self._smoother.first_cycle, self._smoother.next_cycle - 1
         wait = max(min(own.cycles, cycle - first), int(own.cycles_share * cycle))
         first_kept, due = min(first + wait, cycle), cycle + wait

@@ -218,6 +218,21 @@ def test_a_process_that_was_given_up_does_not_block_the_next_batch() -> None:
     assert drive_record._submit(sum, [1, 2]).result(120.0) == 3
 
 
+def test_a_loop_that_closes_while_a_batch_from_odometry_is_under_way_gives_that_batch_up(
+    sent: list[Slow], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given_up: list[object] = []
+    monkeypatch.setattr(drive_record, "_end_worker", lambda: given_up.append(sent[-1]))
+    mapper = with_settings()
+    for cycle in split_odometry(log()):
+        mapper.update(*cycle)
+        if sent:
+            break
+    mapper.loop._begin_batch(sent[0].lap.start)
+    assert given_up == sent[:1] and len(sent) == 2
+    assert mapper.batches().ends == ()
+
+
 @pytest.mark.parametrize("error", [ValueError("a\nb"), np.linalg.LinAlgError("c"), KeyError(3)])
 def test_what_fails_in_the_process_is_a_notice(error: Exception, sent: list[Slow]) -> None:
     mapper, notices = with_settings(), []
