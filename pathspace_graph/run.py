@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunResult, VehicleState
 
 from .health import Health
 from .labels import LEFT, RIGHT
@@ -138,6 +138,17 @@ class LookedAtEstimator(Protocol):
         """Returns a context in which nothing that is asked for changes the estimate."""
 
 
+@runtime_checkable
+class BatchingEstimator(Protocol):
+    """Describes an online estimator that has batches solved by another process while it goes on."""
+
+    def wait(self) -> None:
+        """Waits for the batch whose result the next update may take, however long that takes."""
+
+    def batches(self) -> LapBatches:
+        """Returns the cycles in which batches have ended."""
+
+
 def outline(estimator: OnlineEstimator) -> Map:
     """Returns the present map, without covariances where the estimator can give it so."""
     return estimator.outline() if isinstance(estimator, OutliningEstimator) else estimator.map()
@@ -224,6 +235,11 @@ class Stopwatch:
         """Each stage took this time (s)."""
         self._last = time.perf_counter()
 
+    @property
+    def spent(self) -> float:
+        """Returns the time (s) of all stages so far."""
+        return sum(self.laps.values())
+
     def lap(self, name: str) -> None:
         """Assigns the time since the last call to the stage `name`."""
         now = time.perf_counter()
@@ -241,6 +257,18 @@ def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
     for detections in log.cycles:
         yield log.odometry.between(since, detections.t), detections
         since = detections.t
+
+
+def timed_wait(estimator: OnlineEstimator) -> float:
+    """Waits for what the next update may take from another process, and returns the wall time (s) of that.
+
+    So the update itself waits for nothing, and a replay depends on no other process's speed.
+    """
+    if not isinstance(estimator, BatchingEstimator):
+        return 0.0
+    begin = time.perf_counter()
+    estimator.wait()
+    return time.perf_counter() - begin
 
 
 def timed_update(
@@ -268,7 +296,8 @@ def run_online(
     stood then, after the last cycle that isn't later. Each of the `observers` is shown each cycle once it is
     over, which does not count in the times of the cycles. `on_cycle` is an observer that takes the record of
     a cycle only, and `observer` one that takes its result and the outline of the map. BLAS has one thread,
-    since its threads stall small solves.
+    since its threads stall small solves. Where an update may take a result from another process, the run
+    waits for it before.
     """
     shown = [*observers]
     if on_cycle is not None:
@@ -290,7 +319,7 @@ class _Run:
     ) -> None:
         self._estimator = estimator
         self._observers = observers
-        self._observing = 0.0
+        self._observing = self._waited = 0.0
         self._snapshot_times = snapshot_times
         self._snapshots: list[Map] = []
         self._laps = LapCounter()
@@ -301,6 +330,7 @@ class _Run:
     def cycle(self, odometry: Odometry, detections: Detections) -> None:
         """Runs and times one update, records it, and shows it to the observers."""
         self._take_snapshots(before=detections.t)
+        self._waited += timed_wait(self._estimator)
         result, seconds = timed_update(self._estimator, odometry, detections)
         lap_before = self._laps.lap
         lap = self._laps.update(result.pose)
@@ -333,6 +363,8 @@ class _Run:
             snapshots=tuple(self._snapshots),
             vehicle=_vehicle_state(self._estimator) if self._records else None,
             observing=self._observing,
+            batches=self._estimator.batches() if isinstance(self._estimator, BatchingEstimator) else None,
+            waited=self._waited,
         )
 
     def _take_snapshots(self, before: float) -> None:

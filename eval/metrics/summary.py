@@ -51,6 +51,8 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
             "refused": sum(record.refused for record in result.cycles),
         },
     }
+    if result.batches is not None:
+        summary["batches"] = {**asdict(result.batches), "waited_seconds": result.waited}
     if hints:
         summary["hints"] = [asdict(hint) for hint in hints]
     events = _events(result)

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.estimators import make_online
 from pathspace_graph.io.log import Log
-from pathspace_graph.run import split_odometry, timed_update
+from pathspace_graph.run import split_odometry, timed_update, timed_wait
 from pathspace_graph.settings.mapper import MapperSettings
 
 Array = NDArray[np.float64]
@@ -65,6 +65,7 @@ class _Runner:
         if cycle is None:
             return
         try:
+            timed_wait(self._estimator)
             estimate, seconds = timed_update(self._estimator, *cycle)
         except Exception as error:  # the table reports any failure
             self._stopped = " ".join(f"{type(error).__name__}: {error}".split())

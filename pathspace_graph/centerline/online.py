@@ -11,7 +11,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import VehicleState
+from pathspace_graph.io.results import LapBatches, VehicleState
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult
 from pathspace_graph.settings.mapper import MapperSettings
@@ -42,6 +42,14 @@ class CenterlineMapper:
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """Processes one perception cycle, as `FixedLagMapper.update` does."""
         return self.boundaries.update(odometry, detections)
+
+    def wait(self) -> None:
+        """Waits for a batch, as `FixedLagMapper.wait` does."""
+        self.boundaries.wait()
+
+    def batches(self) -> LapBatches:
+        """Returns when batches of the lap have ended."""
+        return self.boundaries.batches()
 
     def map(self) -> Map:
         """Returns the edges of the ribbon, with their joint covariance."""

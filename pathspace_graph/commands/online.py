@@ -153,6 +153,9 @@ def report(result: RunResult, log: Log) -> None:
             console.print(
                 f"at {record.t:.1f} s: {record.notice}", highlight=False, soft_wrap=True, markup=False
             )
+    if result.batches is not None and result.batches.late:
+        late = f"{result.batches.late} cycle{'' if result.batches.late == 1 else 's'}"
+        console.print(f"in a vehicle the batch of the lap would have been {late} late", highlight=False)
     state = vehicle_of(result)
     for line in [] if state is None else diagnose(state, result.settings):
         console.print(line, highlight=False, soft_wrap=True, markup=False)

@@ -126,6 +126,16 @@ class VehicleState:
         return np.sqrt(np.diag(self.covariance))
 
 
+@dataclass(frozen=True)
+class LapBatches:
+    """Holds when those batches ended which another process solves while an online estimator goes on."""
+
+    ends: tuple[int, ...]
+    """In each of these cycles the result of a batch was taken, or the batch was given up."""
+    late: int
+    """By its wall time, the slowest batch is this number of cycles late in a vehicle, 0 where none is."""
+
+
 @dataclass(frozen=True, eq=False)
 class RunResult:
     """Holds what a run of an estimator over a log gives."""
@@ -158,6 +168,10 @@ class RunResult:
     NaN where the cycle doesn't count."""
     observing: float = 0.0
     """The observers took this wall time (s), which is no part of the estimator's."""
+    batches: LapBatches | None = None
+    """This says when batches of the lap have ended, where the estimator has such."""
+    waited: float = 0.0
+    """Between cycles, the run waited for batches for this wall time (s)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
 from typing import Any, cast
 
 import numpy as np
-from joblib.externals.loky import ProcessPoolExecutor
+from joblib.externals import loky
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.closure import is_worth_trying
@@ -33,6 +33,9 @@ Array = NDArray[np.float64]
 
 WORKER_IDLE = 600
 """The process that solves laps ends when it has had nothing to do for this time (s)."""
+
+LATE = "the batch of the lap was late"
+"""This says why a batch was given up that the process has not solved in time."""
 
 
 class DriveRecord:
@@ -155,48 +158,78 @@ class DriveRecord:
 class LapBatch:
     """A lap is being solved in a process of its own, while the mapper goes on."""
 
-    def __init__(self, lap: OpenLap, due: int) -> None:
+    def __init__(self, lap: OpenLap, t: float, due: int, last: int) -> None:
+        self.t = t
+        """The lap was sent in the cycle of this stamp (s)."""
         self.due = due
-        """The marginal replaces the prior in this cycle."""
+        """The marginal replaces the prior in this cycle, or in the first later one in which it is there."""
+        self.last = last
+        """It does so in this cycle at the latest."""
         self.first_kept = lap.first_kept
         """The window holds the poses from this cycle on until then."""
         self._lap = lap
         self._future: Future[LapMarginal | None] | None = None
         self.send()
 
-    def send(self) -> None:
+    def send(self) -> Future[LapMarginal | None]:
         """Hands the lap to the process, unless it has it already; a snapshot holds the lap alone."""
         if self._future is None:
             self._future = _submit(solve_lap, self._lap)
+        return self._future
 
-    def marginal(self) -> LapMarginal | str:
-        """Waits for the solution and returns it, or says why there is none."""
-        self.send()
-        assert self._future is not None
+    def wait(self) -> None:
+        """Waits for the process, however long it takes."""
+        wait([self.send()])
+
+    def give_up(self) -> None:
+        """Takes the lap from the process, which is ended if it is at it; the next lap has a new one then."""
+        future = self.send()
+        if not future.done() and not future.cancel():
+            _end_worker()
+
+    def marginal(self, timeout: float) -> LapMarginal | str | None:
+        """Returns the solution or says why there is none; it is None if it is not there after a time (s)."""
         try:
-            solved = self._future.result()
+            solved = self.send().result(timeout)
+        except TimeoutError:
+            return None
         except SingularSystemError as error:
             return str(error)
         except BrokenProcessPool:
             return "the process of the batch has died"
+        except Exception as error:  # a vehicle drives on, whatever has failed there
+            return " ".join(f"the batch of the lap has failed: {type(error).__name__}: {error}".split())
         if solved is None:
             return "the detections are against the loop"
         return solved if solved.convergence.converged else "the batch of the lap has not converged"
 
 
 def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
-    """Hands work to the process that solves laps; a new process takes the place of one that has died."""
-    try:
-        return cast("Future[Any]", _worker().submit(work, *arguments))
-    except BrokenProcessPool:
-        _worker.cache_clear()
-        return cast("Future[Any]", _worker().submit(work, *arguments))
+    """Hands work to the process that solves laps; a new process takes the place of one that has died.
+
+    Where none can be begun, the work has failed.
+    """
+    failed = cast("Future[Any]", loky.Future())
+    for _ in range(2):
+        try:
+            return cast("Future[Any]", _worker().submit(work, *arguments))
+        except Exception as error:  # it has died, or cannot be begun
+            _worker.cache_clear()
+            failure = error
+    failed.set_exception(failure)
+    return failed
 
 
 @cache
 def _worker() -> Any:
     """Returns the executor of this program, which has one process and imports no module of the program's."""
-    return ProcessPoolExecutor(max_workers=1, timeout=WORKER_IDLE)
+    return loky.ProcessPoolExecutor(max_workers=1, timeout=WORKER_IDLE)
+
+
+def _end_worker() -> None:
+    """Ends the process that solves laps, whatever it is doing, without waiting for its end."""
+    _worker().shutdown(wait=False, kill_workers=True)
+    _worker.cache_clear()
 
 
 def _nothing() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from pathspace_graph.spline.bspline import BSpline
 
 from .association import Gating
 from .crossing import boundaries_cross
-from .drive_record import DriveRecord, LapBatch
+from .drive_record import LATE, DriveRecord, LapBatch
 from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
 from .gauge import hold_gauge
 from .mending import Mending
@@ -32,6 +33,9 @@ Array = NDArray[np.float64]
 
 OWN_PRIOR = "the map goes on from the window's own prior"
 """This begins the notice of a cycle in which the batch of the lap does not replace the prior."""
+
+LONGEST_WAIT = 1.0
+"""A cycle waits for a batch no longer than this (s), however long ago the cycle before it was."""
 
 
 class TrackLoop:
@@ -47,6 +51,8 @@ class TrackLoop:
         """(k, 3) These are the poses of the first k cycles as the closing of the loop has corrected them."""
         self.lap_seconds = float("nan")
         """The batch of the lap took this wall time (s) in its own process, once it has replaced the prior."""
+        self.late_cycles = 0
+        """By its wall time, the slowest batch is this number of cycles late in a vehicle."""
         self.record = DriveRecord(self.settings)
         """This is the drive as it was measured."""
         self.mending = Mending(smoother)
@@ -57,6 +63,7 @@ class TrackLoop:
         self._known_loop = KnownLoop(smoother)
         self._search: Search | None = None
         self._lap_batch: LapBatch | None = None
+        self._batch_ends: list[int] = []
         self._boundaries_cross = False
         self._believed = self.settings  # with the priors of the calibrations as they are now
         self._settled: float | None = None  # path driven (m) when the closed map was last replaced
@@ -72,6 +79,17 @@ class TrackLoop:
     def first_kept(self) -> int | None:
         """Returns the cycle whose pose must stay in the window until the lap is solved, if there is one."""
         return self._lap_batch.first_kept if self._lap_batch else None
+
+    @property
+    def batch_ends(self) -> tuple[int, ...]:
+        """Returns the cycles in which batches ended: their result was taken, or they were given up.
+
+        A late one that is under way is going to be given up.
+        """
+        batch, ends = self._lap_batch, tuple(self._batch_ends)
+        if batch is None or self._smoother.next_cycle <= batch.due <= batch.last:
+            return ends
+        return (*ends, batch.last + 1)
 
     def may_close(self) -> bool:
         """Returns whether it is time to register the newest detections with the beginning of an open loop."""
@@ -121,10 +139,11 @@ class TrackLoop:
 
     # --- the batch of the open lap -----------------------------------------------------------------------
 
-    def go_on(self, closes: bool) -> tuple[Array | None, str]:
+    def go_on(self, closes: bool, spent: float) -> tuple[Array | None, str]:
         """Records the open lap, has it solved when it closes, and goes on from the result when it is due.
 
-        Returns the jump (3,) of the newest pose if the map was replaced, and a notice.
+        The cycle has taken the time `spent` (s) so far. Returns the jump (3,) of the newest pose if the map
+        was replaced, and a notice.
         """
         if closes:
             self._closes()
@@ -139,9 +158,14 @@ class TrackLoop:
             self._hold_gauge()
             self._try_mending()
         elif self._smoother.next_cycle - 1 >= batch.due:
-            self._lap_batch = None
-            return self._take(batch.marginal())
+            return self._end(batch, spent)
         return None, ""
+
+    def wait(self) -> None:
+        """Waits for the batch whose result the next cycle may take, however long that takes."""
+        batch = self._lap_batch
+        if batch is not None and batch.due <= self._smoother.next_cycle <= batch.last:
+            batch.wait()
 
     def resume(self) -> None:
         """Sends the lap that was being solved when a snapshot was taken, which the process has not seen."""
@@ -157,6 +181,27 @@ class TrackLoop:
             self.record.prepare()
             if self._lap_batch is None:
                 self._try_loop()
+
+    def _end(self, batch: LapBatch, spent: float) -> tuple[Array | None, str]:
+        """Takes the result of a batch that is due, waits for the next cycle, or gives the batch up.
+
+        The cycle as a whole lasts no longer than its period for that, the time since the one before it.
+        """
+        cycle, times = self._smoother.next_cycle - 1, self._smoother.times
+        period = float(np.ptp(times[-2:]))
+        found: LapMarginal | str | None = LATE
+        if cycle <= batch.last:
+            found = batch.marginal(max(min(period, LONGEST_WAIT) - spent, 0.0))
+        else:
+            batch.give_up()
+        if found is None:
+            return None, ""
+        if isinstance(found, LapMarginal) and period > 0.0:
+            given = times[batch.due - self._smoother.first_cycle] - batch.t
+            self.late_cycles = max(self.late_cycles, ceil((found.seconds - given) / period))
+        self._lap_batch = None
+        self._batch_ends.append(cycle)
+        return self._take(found)
 
     def _take(self, marginal: LapMarginal | str) -> tuple[Array | None, str]:
         """Goes on from the result of a batch, unless the present map is better."""
@@ -225,12 +270,21 @@ class TrackLoop:
         return ""
 
     def _begin_batch(self, start: ClosedMap | Recurrence) -> None:
-        """Sends the lap to its batch, which begins at a map that has just been closed, or at odometry."""
+        """Sends the lap to its batch, which begins at a map that has just been closed, or at odometry.
+
+        Where a drive is replayed, the batch ends in the cycle that was recorded. One that is under way is
+        given up, since its process would not begin this one.
+        """
+        if self._lap_batch is not None:
+            self._lap_batch.give_up()
         own, first, cycle = self.settings.open_lap, self._smoother.first_cycle, self._smoother.next_cycle - 1
         wait = max(min(own.cycles, cycle - first), int(own.cycles_share * cycle))
-        first_kept = min(first + wait, cycle)
+        first_kept, due = min(first + wait, cycle), cycle + wait
+        last = max(due, min(due + own.late, first_kept + self.settings.max_poses - 1))
+        recorded = own.ends[len(self._batch_ends) :][:1]
         lap = self.record.lap(first_kept, start, self._believed)
-        self._lap_batch = LapBatch(lap, cycle + wait)
+        due = min(max([due, *recorded]), last + 1)
+        self._lap_batch = LapBatch(lap, self._smoother.times[-1], due, last)
 
     def _try_loop(self) -> None:
         """Sends the lap to a batch from odometry where the drive says that it is over.

@@ -14,7 +14,7 @@ from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
-from pathspace_graph.io.results import VehicleState
+from pathspace_graph.io.results import LapBatches, VehicleState
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import DrivenPath
@@ -210,6 +210,18 @@ class MapperEstimate:
     def lap_seconds(self) -> float:
         """Returns the wall time (s) of the batch of the lap, once it has replaced the prior."""
         return self.loop.lap_seconds
+
+    def wait(self) -> None:
+        """Waits for the batch whose result the next update may take, however long that takes.
+
+        A replay calls this before each update, so that the same log always gives the same map. A vehicle does
+        not: there an update waits for no batch longer than the time since the cycle before.
+        """
+        self.loop.wait()
+
+    def batches(self) -> LapBatches:
+        """Returns the cycles in which batches of the lap have ended, and how late they would have been."""
+        return LapBatches(self.loop.batch_ends, self.loop.late_cycles)
 
     # --- the estimate ------------------------------------------------------------------------------------
 

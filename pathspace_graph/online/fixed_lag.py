@@ -103,6 +103,10 @@ class FixedLagMapper(MapperEstimate):
         Its detections are moved to the pose that is nearest in time (`front_end.late`), and may make the
         curves grow in the next cycle in order. The pose in the result is still the newest one.
 
+        Where another process solves the lap as a batch, the call waits for it no longer than the time since
+        the cycle before, and the map is replaced in a later cycle if need be. A replay of a log calls `wait`
+        before, so that it does not depend on how fast the machine is.
+
         `factors` are GTSAM factors of your own on poses in the window (`pose_key`, `next_pose_key`: `Pose2`),
         on control points (`control_keys`: `Point2`) and on the calibration. Each is relinearized at every
         step until one of its poses leaves the window; then it is part of the prior. A factor on control
@@ -134,7 +138,7 @@ class FixedLagMapper(MapperEstimate):
         if closes:
             self._simplify()
         watch.lap("simplify")
-        jump, notice = self.loop.go_on(closes)
+        jump, notice = self.loop.go_on(closes, watch.spent)
         watch.lap("swap")
         if self.loop.is_searching:
             jump, notice = self.loop.find_back()

@@ -153,10 +153,16 @@ class OpenLapSettings(Positive, group="open_lap"):
     has marginalized."""
     cycles: int = 20
     """The batch replaces the prior this number of cycles after the loop has closed, or as many as the window
-    holds. The update waits for it, so that the same log always gives the same map."""
+    holds."""
     cycles_share: float = 0.03
     """A long lap gives its batch more time: this share of its cycles, if that is more than `cycles`. The
     window holds more poses until then."""
+    late: int = 100
+    """A batch that is not solved by then replaces the prior once it is, and is given up where it is later
+    than this number of cycles, or where the window would hold more than `max_poses` poses."""
+    ends: tuple[int, ...] = ()
+    """In a replay, the batches replace the prior in these cycles, one after the other: those that
+    `summary.json` has as `batches.ends`. Later ones do so when they are due."""
     rough_rounds: int = 8
     """The first optimization has at most this number of rounds."""
     rounds: int = 20

@@ -15,7 +15,8 @@ from scipy.interpolate import BSpline as ScipyBSpline
 from pathspace_graph.cli import COMMANDS, main
 from pathspace_graph.commands import online as commands_online
 from pathspace_graph.io.log import Detections, Log, read_log, write_log
-from pathspace_graph.io.map import MAP_FILE, read_map
+from pathspace_graph.io.map import MAP_FILE, Map, read_map
+from pathspace_graph.io.results import LapBatches, RunResult
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
 from pathspace_graph.options import one_line
 from pathspace_graph.settings.mapper import MapperSettings
@@ -47,6 +48,17 @@ def map_folder(log_folder: Path) -> Path:
     folder = log_folder.parent / "map"
     assert main(["online", str(log_folder), "--out", str(folder)]) == 0
     return folder
+
+
+def test_a_batch_that_is_late_in_a_vehicle_is_told(
+    log_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for late, told in ((0, False), (3, True)):
+        batches = LapBatches((140,), late)
+        run = RunResult("", {}, Map(True, {}), np.zeros(0), np.zeros((0, 3)), (), 1, batches=batches)
+        commands_online.report(run, read_log(log_folder))
+        line = "in a vehicle the batch of the lap would have been 3 cycles late"
+        assert (line in capsys.readouterr().out) == told
 
 
 def names(folder: Path) -> set[str]:

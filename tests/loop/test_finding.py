@@ -24,7 +24,7 @@ from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.health import FindingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.drives import detections, map_log, true_poses
+from ..scenes.drives import detections, map_log, replay, true_poses
 from ..scenes.kidnapped import laps_log, pear_track, put_down
 
 Array = NDArray[np.float64]
@@ -81,7 +81,7 @@ def test_the_map_does_not_move_while_the_vehicle_is_lost() -> None:
     log = put_down(laps_log(pear_track()), SECOND_LAP, 30.0)
     mapper, known = mapper_of(log), list[Array]()
     for odometry, cycle in split_odometry(log):
-        result = mapper.update(odometry, cycle)
+        result = replay(mapper, odometry, cycle)
         if result.notice == FOUND:
             break
         if result.health.condition == LOST:

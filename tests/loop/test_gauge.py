@@ -18,7 +18,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
-from ..scenes.drives import bean_track
+from ..scenes.drives import bean_track, replay
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def run(laps: float, until: float) -> FixedLagMapper:
     for odometry, detections in split_odometry(log()):
         if detections.t > until:
             break
-        mapper.update(odometry, detections)
+        replay(mapper, odometry, detections)
     return mapper
 
 

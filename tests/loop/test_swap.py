@@ -22,7 +22,7 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings, PlaceSettings
 
-from ..scenes.drives import bean_track, lap_log, map_log, noisy
+from ..scenes.drives import bean_track, lap_log, map_log, noisy, replay
 
 Array = NDArray[np.float64]
 
@@ -86,9 +86,9 @@ def caught(monkeypatch: pytest.MonkeyPatch, drive: Log) -> tuple[FixedLagMapper,
     """Returns a mapper right after the swap, and the marginal that it went on from."""
     marginals: list[LapMarginal] = []
 
-    def marginal(self: LapBatch) -> LapMarginal | str:
-        solved = waits(self)
-        assert not isinstance(solved, str)
+    def marginal(self: LapBatch, timeout: float) -> LapMarginal | str | None:
+        solved = waits(self, timeout)
+        assert isinstance(solved, LapMarginal)
         marginals.append(solved)
         return solved
 
@@ -96,7 +96,7 @@ def caught(monkeypatch: pytest.MonkeyPatch, drive: Log) -> tuple[FixedLagMapper,
     monkeypatch.setattr(LapBatch, "marginal", marginal)
     mapper = FixedLagMapper()
     for odometry, detections in split_odometry(drive):
-        mapper.update(odometry, detections)
+        replay(mapper, odometry, detections)
         if marginals:
             break
     return mapper, marginals

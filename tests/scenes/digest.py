@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.front_end.gate import Gate
 
-WALL_TIMES = ("lap_seconds",)
+WALL_TIMES = ("lap_seconds", "late_cycles")
 """These attributes are times of the machine."""
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.eval.metrics.summary import lap_times, laps_of, not_mapped, summarize
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 
 from .straight_maps import line, row, truth
@@ -63,6 +63,12 @@ def test_the_health_of_a_run_is_counted_and_its_bad_stretches_are_listed() -> No
         "lost": 2,
         "stretches": [{"health": "lost", "begin": 0.1, "end": 0.2, "reason": "why"}],
     }
+
+
+def test_the_summary_says_when_batches_have_ended_and_how_long_the_run_waited_for_them() -> None:
+    assert "batches" not in summarize(RUN, log())
+    run = replace(RUN, batches=LapBatches((140, 200), 3), waited=0.25)
+    assert summarize(run, log())["batches"] == {"ends": (140, 200), "late": 3, "waited_seconds": 0.25}
 
 
 def test_true_laps_end_where_the_path_comes_round() -> None:

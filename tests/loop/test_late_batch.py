@@ -1,0 +1,295 @@
+"""A batch that is late: no cycle waits for it longer than its period, and a replay does not depend on it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from threading import Timer
+from typing import Any
+
+import numpy as np
+import pytest
+from joblib.externals import loky
+from threadpoolctl import threadpool_limits
+
+from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
+from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.io.log import Log
+from pathspace_graph.labels import LEFT
+from pathspace_graph.loop import drive_record
+from pathspace_graph.loop.mending import MENDED
+from pathspace_graph.loop.track_loop import LONGEST_WAIT, OWN_PRIOR
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.run import CycleResult, run_online, split_odometry
+from pathspace_graph.settings.mapper import MapperSettings
+
+from ..scenes.digest import digest
+from ..scenes.drives import bean_track, lap_log, map_log, noisy
+from ..scenes.holes import unseen
+from ..scenes.kidnapped import laps_log, pear_track
+
+Work = Callable[..., Any]
+PERIOD, NEVER = 0.1, -1
+LATE = f"{OWN_PRIOR}: the batch of the lap was late"
+
+
+class Slow(Future[LapMarginal | None]):
+    """A batch that is under way until it is told to end, and at once says that it is."""
+
+    def __init__(self, lap: OpenLap) -> None:
+        super().__init__()
+        self.lap = lap
+        self.timeouts: list[float] = []
+        self.set_running_or_notify_cancel()
+
+    def result(self, timeout: float | None = None) -> LapMarginal | None:
+        assert timeout is not None
+        self.timeouts.append(timeout)
+        return super().result(0.0)
+
+    def end(self) -> None:
+        self.set_result(solve_lap(self.lap))
+
+
+@pytest.fixture
+def sent(monkeypatch: pytest.MonkeyPatch) -> list[Slow]:
+    """The batches that were sent."""
+    batches: list[Slow] = []
+
+    def submit(work: Work, *arguments: Any) -> Future[Any]:
+        if work is not solve_lap:
+            return Future()
+        batches.append(Slow(*arguments))
+        return batches[-1]
+
+    monkeypatch.setattr(drive_record, "_submit", submit)
+    return batches
+
+
+@cache
+def log() -> Log:
+    return noisy(lap_log(bean_track(), overrun=60.0), seed=3)
+
+
+def with_settings(**changes: object) -> FixedLagMapper:
+    settings = MapperSettings()
+    settings = replace(settings, open_lap=replace(settings.open_lap, **changes))  # type: ignore[arg-type]
+    return FixedLagMapper(settings, log().odometry_sigma)
+
+
+def drive(mapper: FixedLagMapper, sent: list[Slow], late: int, log: Log) -> list[CycleResult]:
+    """Drives as a vehicle does; each batch ends so many cycles after the one in which it is due."""
+    results = list[CycleResult]()
+    with threadpool_limits(limits=1):
+        for odometry, detections in split_odometry(log):
+            batch = mapper.loop._lap_batch
+            if late >= 0 and batch is not None and mapper.smoother.next_cycle == batch.due + late:
+                sent[-1].end()
+            results.append(mapper.update(odometry, detections))
+    return results
+
+
+def due_cycle(results: list[CycleResult]) -> int:
+    return [result.closed for result in results].index(True) + MapperSettings().open_lap.cycles
+
+
+def test_no_cycle_waits_longer_than_its_period_and_the_swap_comes_once_the_result_is_there(
+    sent: list[Slow],
+) -> None:
+    mapper = with_settings()
+    results = drive(mapper, sent, 7, log())
+    due = due_cycle(results)
+    assert [k for k, result in enumerate(results) if result.jump is not None] == [due + 7]
+    assert mapper.batches().ends == (due + 7,)
+    (batch,) = sent
+    assert len(batch.timeouts) == 8
+    assert all(0.0 <= timeout < PERIOD + 1e-9 for timeout in batch.timeouts)
+    assert not any(result.notice for result in results)
+
+
+def test_where_the_stamps_jump_a_cycle_does_not_wait_for_all_that_time(sent: list[Slow]) -> None:
+    due = due_cycle(drive(with_settings(), sent, 0, log()))
+    sent.clear()
+    gap = replace(log(), cycles=(*log().cycles[: due + 1], *log().cycles[due + 16 :]))
+    drive(with_settings(), sent, 3, gap)
+    first, jumped, *later = sent[0].timeouts
+    assert max(first, *later) < PERIOD + 1e-9 < jumped < LONGEST_WAIT
+
+
+@pytest.mark.parametrize("late", [0, 7, 15, NEVER])
+def test_the_recorded_cycle_replays_the_drive_to_the_bit(
+    late: int, sent: list[Slow], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That is so too where the drive has ended before its late batch has."""
+    assert_replayed(log(), late, 1, sent, monkeypatch)
+
+
+def test_a_map_is_mended_by_a_late_batch_and_replayed_to_the_bit(
+    sent: list[Slow], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drive = unseen(laps_log(pear_track()), [LEFT], 6.0, 11.0)
+    results = assert_replayed(drive, 9, 2, sent, monkeypatch)
+    assert [result.notice.startswith(MENDED) for result in results if result.notice] == [True]
+
+
+def assert_replayed(
+    log: Log, late: int, batches: int, sent: list[Slow], monkeypatch: pytest.MonkeyPatch
+) -> list[CycleResult]:
+    vehicle = with_settings()
+    results = drive(vehicle, sent, late, log)
+    ends = vehicle.batches().ends
+    assert len(ends) == len(sent) == batches
+    monkeypatch.undo()
+    again = with_settings(ends=ends)
+    result = run_online(log, again)
+    assert result.batches is not None and result.batches.ends == ends
+    assert_same(again, vehicle)
+    return results
+
+
+def assert_same(mapper: FixedLagMapper, expected: FixedLagMapper) -> None:
+    assert (mapper.poses == expected.poses).all()
+    for label in expected.boundaries:
+        assert (mapper.control_points(label) == expected.control_points(label)).all()
+    keys = expected.smoother.map.state.map_keys
+    assert (mapper.smoother.covariance(keys) == expected.smoother.covariance(keys)).all()
+
+
+def test_a_slow_machine_changes_nothing_of_a_replay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its process is slower than the log by far; the run waits for it between two cycles."""
+
+    def submit(work: Work, *arguments: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        if work is solve_lap:
+            solved = replace(solve_lap(*arguments), seconds=5.0)  # type: ignore[type-var]
+            Timer(1.0, future.set_result, [solved]).start()
+        return future
+
+    expected, mapper = with_settings(), with_settings()
+    known = run_online(log(), expected)
+    monkeypatch.setattr(drive_record, "_submit", submit)
+    result = run_online(log(), mapper)
+    assert_same(mapper, expected)
+    assert result.waited > 0.1
+    assert result.batches is not None and known.batches is not None
+    assert result.batches.ends == known.batches.ends
+    assert result.cycles[result.batches.ends[0]].jump is not None
+    assert result.batches.late == pytest.approx((5.0 - 2.0) / PERIOD, abs=1)
+
+
+def test_a_batch_that_never_ends_is_given_up_and_the_window_is_the_lag_again(
+    sent: list[Slow], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended: list[bool] = []
+    monkeypatch.setattr(drive_record, "_end_worker", lambda: ended.append(True))
+    mapper = with_settings(late=12)
+    results = drive(mapper, sent, NEVER, log())
+    end = due_cycle(results) + 13
+    assert {k: result.notice for k, result in enumerate(results) if result.notice} == {end: LATE}
+    assert mapper.batches().ends == (end,)
+    assert ended == [True]
+    assert len(mapper.poses) == 31
+    replayed = with_settings(late=12, ends=(end,))
+    run_online(log(), replayed)  # waits for nothing, since the batch ends in no cycle
+    assert_same(replayed, mapper)
+
+
+def test_a_late_batch_makes_the_window_no_longer_than_the_longest(sent: list[Slow]) -> None:
+    mapper = with_settings()
+    mapper.loop.settings = replace(mapper.settings, max_poses=40)
+    sizes = []
+    for cycle in split_odometry(log()):
+        mapper.update(*cycle)
+        sizes.append(len(mapper.poses))
+    assert max(sizes) == 40
+
+
+def test_a_process_that_was_given_up_does_not_block_the_next_batch() -> None:
+    stuck = drive_record._submit(time.sleep, 600.0)
+    while not stuck.running():
+        time.sleep(0.01)
+    batch = object.__new__(drive_record.LapBatch)
+    batch._future = stuck
+    batch.give_up()
+    assert drive_record._submit(sum, [1, 2]).result(120.0) == 3
+
+
+def test_a_loop_that_closes_while_a_batch_from_odometry_is_under_way_gives_that_batch_up(
+    sent: list[Slow], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given_up: list[object] = []
+    monkeypatch.setattr(drive_record, "_end_worker", lambda: given_up.append(sent[-1]))
+    mapper = with_settings()
+    for cycle in split_odometry(log()):
+        mapper.update(*cycle)
+        if sent:
+            break
+    mapper.loop._begin_batch(sent[0].lap.start)
+    assert given_up == sent[:1] and len(sent) == 2
+    assert mapper.batches().ends == ()
+
+
+@pytest.mark.parametrize("error", [ValueError("a\nb"), np.linalg.LinAlgError("c"), KeyError(3)])
+def test_what_fails_in_the_process_is_a_notice(error: Exception, sent: list[Slow]) -> None:
+    mapper, notices = with_settings(), []
+    for cycle in split_odometry(log()):
+        if sent and not sent[0].done():
+            sent[0].set_exception(error)
+        notices.append(mapper.update(*cycle).notice)
+    told = " ".join(str(error).split())
+    assert [notice for notice in notices if notice] == [
+        f"{OWN_PRIOR}: the batch of the lap has failed: {type(error).__name__}: {told}"
+    ]
+
+
+def test_a_singular_system_says_itself_what_it_is(sent: list[Slow]) -> None:
+    mapper, notices = with_settings(), []
+    for cycle in split_odometry(log()):
+        if sent and not sent[0].done():
+            sent[0].set_exception(SingularSystemError("singular"))
+        notices.append(mapper.update(*cycle).notice)
+    assert [notice for notice in notices if notice] == [f"{OWN_PRIOR}: singular"]
+
+
+def test_where_no_process_can_be_begun_there_is_a_notice(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Executor:
+        def submit(self, *_: Any) -> Any:
+            raise OSError("out of memory")
+
+    drive_record._worker.cache_clear()
+    monkeypatch.setattr(loky, "ProcessPoolExecutor", lambda **_: Executor())
+    _, results = map_log(log())
+    assert [result.notice for result in results if result.notice] == [
+        f"{OWN_PRIOR}: the batch of the lap has failed: OSError: out of memory"
+    ]
+
+
+def test_a_late_batch_is_sent_again_by_a_restored_mapper(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    futures: list[Any] = []
+
+    def submit(work: Work, *arguments: Any) -> Any:
+        futures.append((loky.Future(), arguments))
+        return futures[-1][0]
+
+    monkeypatch.setattr(drive_record, "_submit", submit)
+    mapper, cycles = with_settings(), split_odometry(log())
+    for cycle in cycles:
+        mapper.update(*cycle)
+        batch = mapper.loop._lap_batch
+        if batch is not None and mapper.smoother.next_cycle == batch.due + 3:
+            break
+    mapper.save(tmp_path / "late.snap")
+    restored = FixedLagMapper.restore(tmp_path / "late.snap")
+    (_, lap), (_, same) = futures[-2:]
+    for future, arguments in ((futures[-2][0], lap), (futures[-1][0], same)):
+        future.set_result(solve_lap(*arguments))
+    for cycle in cycles:
+        assert mapper.update(*cycle).notice == restored.update(*cycle).notice == ""
+    assert mapper.batches().ends == restored.batches().ends == (batch.due + 3,)  # type: ignore[union-attr]
+    assert digest(restored) == digest(mapper)
