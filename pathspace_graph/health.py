@@ -53,6 +53,8 @@ class Evidence:
     """These numbers of the explained detections are."""
     unmapped: tuple[int, int] = (0, 0)
     """These numbers of other coloured detections, left and right, lie beside a gap of a closed map."""
+    rests: bool = False
+    """Whether the vehicle stands, and so has no need of detections."""
     odometry: str = ""
     """This says what is wrong with the odometry since the cycle before; it is empty where nothing is."""
 
@@ -122,7 +124,7 @@ class HealthMonitor:
         recent = self._recent
         recent.append(evidence)
         self._offered += evidence.offered
-        if evidence.offered or self._last_offered is None:
+        if evidence.offered or evidence.rests or self._last_offered is None:
             self._last_offered = evidence.t
         while recent[0].t <= evidence.t - self.settings.window:
             if self._offered - recent[0].offered < self.settings.min_offered:
@@ -132,7 +134,7 @@ class HealthMonitor:
     def _judge(self, newest: Evidence, share: float, innovation: float) -> Health:
         """Returns the health by the share of explained detections and the mean squared innovation."""
         settings = self.settings
-        lost = settings.share_lost if newest.closed else settings.open_lost
+        lost = settings.share_lost if newest.closed else 0.0  # on an open map it goes on by dead reckoning
         degraded = settings.share_degraded if newest.closed else settings.open_degraded
         blind = newest.t - (newest.t if self._last_offered is None else self._last_offered)
         if newest.sigma > settings.sigma_degraded:

@@ -22,7 +22,7 @@ from pathspace_graph.settings.front_end import MotionSettings
 
 from .gate import Newest
 from .rest import Rest
-from .scan_matching import Match, RecentDetections, match
+from .scan_matching import Match, RecentDetections, match, misfit_at
 from .sensor_errors import Difference, SensorErrors, by_errors
 
 Array = NDArray[np.float64]
@@ -177,9 +177,23 @@ class MotionCheck:
         if not (may_doubt or failed):
             return motion
         best = self._best(detections, variances, (compose(self.pose, going_on), predicted), dt)
-        if failed or (best is not None and self._is_contradicted(motion, predicted, best)):
+        denied = best is not None and self._is_contradicted(motion, predicted, best)
+        if failed or (
+            best is not None and denied and self._fits_better(best, predicted, detections, variances)
+        ):
             return self._replaced(motion, best, going_on, dt)
         return motion
+
+    def _fits_better(self, best: Match, predicted: Array, detections: Detections, variances: Array) -> bool:
+        """Returns whether detections fit badly at the predicted pose (3,), and clearly better at the match.
+
+        In a bend, a few cones may as well be laid on each other's neighbours, far from where they fit.
+        """
+        at_odometry, at_match = (
+            misfit_at(self._recent, detections.points_vehicle, variances, pose, self.settings)
+            for pose in (predicted, best.pose)
+        )
+        return at_odometry > max(self.settings.misfit_odometry, self.settings.misfit_ratio * at_match)
 
     def _best(
         self, detections: Detections, variances: Array, starts: tuple[Array, Array], dt: float

@@ -24,6 +24,8 @@ _REACHES = 3.0
 """Remembered detections farther than this many reaches have no weight."""
 _LEAST_SHARE = 1e-6
 """The pose is held where the determinant of its information, by the product of its diagonal, is larger."""
+MOST_MISFIT = 9.0
+"""A whitened square distance counts at most this much in a misfit that is compared with another."""
 _TINY = float(np.finfo(float).tiny)
 
 
@@ -130,6 +132,21 @@ def match(
         pose = pose - np.linalg.solve(regular, gradient)
     count = int(matched.sum())
     return Match(pose, information, matched, float(square @ precision) / max(count, 1))
+
+
+def misfit_at(
+    recent: RecentDetections, points_vehicle: Array, variances: Array, pose: Array, settings: MotionSettings
+) -> float:
+    """Return the mean square of the whitened distances as `match` has them, at a pose (3,) that is given.
+
+    Each counts at most `MOST_MISFIT`; it is 0 where nothing lies on earlier detections.
+    """
+    points = to_map(points_vehicle, pose[None])
+    means, weights = _means(points, recent.points, settings.reach_last)
+    matched = weights > settings.min_weight
+    variance = variances[matched] * (1.0 + 1.0 / weights[matched]) + settings.sigma_cone**2
+    square = ((points - means)[matched] ** 2).sum(axis=1) / variance
+    return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
 
 
 def _means(points: Array, recent: Array, reach: float) -> tuple[Array, Array]:

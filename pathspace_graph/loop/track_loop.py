@@ -117,7 +117,8 @@ class TrackLoop:
         evidence = Evidence(detections.t)
         if tested is not None:
             evidence = evidence_of(smoother, tested, self._known_loop, reading.seen_again)
-        self.health = self._monitor.update(replace(evidence, odometry=reading.motion.fault))
+        motion = reading.motion
+        self.health = self._monitor.update(replace(evidence, odometry=motion.fault, rests=motion.rests))
         if self.health.condition == GOOD and (caveat := self._caveat()):
             self.health = Health(DEGRADED, caveat)
         if self._known_loop.is_whole and self.record.unsolvable is None:

@@ -40,6 +40,11 @@ class MeasuredMotion:
     """This is what the vehicle has measured at rest, where it has just done so."""
 
     @property
+    def rests(self) -> bool:
+        """Return whether no twist says that the vehicle moves."""
+        return not self.twists.any()
+
+    @property
     def fault(self) -> str:
         """Returns what is wrong with the odometry in plain words; it is empty where nothing is."""
         if self.missing:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import rotated, to_map, wrap_angle
+from pathspace_graph.factors.se2 import rotated, rotation, to_map, wrap_angle
 from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.spline.boundary import Boundary
 
@@ -118,15 +118,29 @@ def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool
     return bool((same_direction & (away < drift)).any())
 
 
+def passes_start(path: DrivenPath, motion: Motion, settings: ClosingSettings) -> bool:
+    """Returns whether the newest path, moved, crosses the line at which the drive began, as it did then.
+
+    A vehicle that comes back to a later place of its beginning has not closed a lap: on a skidpad it does so
+    in each round.
+    """
+    newest = motion.apply(path.points[path.stations > path.length - settings.beginning])
+    ahead, left = ((newest - path.beginning[0, :2]) @ rotation(path.beginning[0, 2])).T
+    steps, forward = np.hypot(np.diff(ahead), np.diff(left)), np.diff(ahead)
+    crosses = (ahead[:-1] <= 0.0) & (ahead[1:] > 0.0) & (np.abs(left[1:]) < settings.start_lateral)
+    return bool((crosses & (forward > np.cos(settings.start_heading) * steps)).any())
+
+
 def register(
-    track: CurveMap, times: Sequence[float], covariance: Array, beginning: Array, settings: ClosingSettings
+    track: CurveMap, times: Sequence[float], covariance: Array, path: DrivenPath, settings: ClosingSettings
 ) -> Registration | None:
     """Registers the newest detections with the beginning of the curves; returns None if they disagree.
 
     Iterated closest points on the curves minimize `sum (n . (M p - S(u)))^2 / sigma^2 + m' P^-1 m`. The
     `covariance` P (3, 3) of the newest pose is the prior, because detections along a straight or an arc leave
     the motion free. If P is larger than what the iteration can bridge, the iteration starts from the best
-    pose of the `beginning` (k, 3), the first stretch of the drive. `times` are the stamps of the poses (s).
+    pose of the beginning of the `path`, the first stretch of the drive. `times` are the stamps of the poses
+    (s).
     """
     recent, state = _recent(track, times, settings.window), track.state
     prior = np.asarray(np.linalg.inv(covariance * settings.prior_scale**2), np.float64)
@@ -136,7 +150,9 @@ def register(
     lost = is_lost(covariance, settings)
     if lost:
         starts = [
-            v for v in _motions(state.poses[-1], beginning, settings) if v @ prior @ v < settings.start_chi2
+            v
+            for v in _motions(state.poses[-1], path.beginning, settings)
+            if v @ prior @ v < settings.start_chi2
         ]
         inliers = [
             _match(state, settings, recent, Motion(centre, v), stretches, settings.icp_reach).inlier.sum()
@@ -144,7 +160,9 @@ def register(
         ]
         vector = [vector, *starts][int(np.argmax(inliers))]
     found = refine(state, recent, Motion(centre, vector), stretches, (np.zeros(3), prior), settings)
-    if not found.agrees(list(state.boundaries), settings, lost):
+    if not found.agrees(list(state.boundaries), settings, lost) or not passes_start(
+        path, found.motion, settings
+    ):
         return None
     return Registration(found.motion, {label: found.matches.inliers(label) for label in state.boundaries})
 

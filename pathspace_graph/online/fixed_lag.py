@@ -234,8 +234,8 @@ class FixedLagMapper(MapperEstimate):
         self.smoother.carry()
         self.smoother.refresh()
         covariance = self.smoother.covariance(pose_keys(np.array([self.smoother.next_cycle - 1])))
-        beginning, settings = self.path.beginning, self.settings.closing
-        registration = register(self.smoother.map, self.smoother.times, covariance, beginning, settings)
+        settings = self.settings.closing
+        registration = register(self.smoother.map, self.smoother.times, covariance, self.path, settings)
         if registration is None:
             return False
         apply_correspondences(self.smoother, registration)

@@ -36,8 +36,6 @@ class HealthSettings(Positive):
     open_degraded: float = 0.35
     """While the loop is open, the estimate is degraded below this share. It is low, since detections of
     stretches that are not mapped yet lie beside the curves."""
-    open_lost: float = 0.15
-    """While the loop is open, the vehicle is lost below this share."""
     innovation: float = 1.2
     """The estimate is degraded where the mean squared distance of detections in use from their curve, before
     the update and in units of its variance, is larger than this; it is about 1 if the model is right."""
