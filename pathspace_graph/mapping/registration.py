@@ -149,20 +149,16 @@ def register(
     vector = np.zeros(3)
     lost = is_lost(covariance, settings)
     if lost:
-        starts = [
-            v
-            for v in _motions(state.poses[-1], path.beginning, settings)
-            if v @ prior @ v < settings.start_chi2
-        ]
+        motions = _motions(state.poses[-1], path.beginning, settings)
+        starts = [v for v in motions if v @ prior @ v < settings.start_chi2]
         inliers = [
             _match(state, settings, recent, Motion(centre, v), stretches, settings.icp_reach).inlier.sum()
             for v in [vector, *starts]
         ]
         vector = [vector, *starts][int(np.argmax(inliers))]
     found = refine(state, recent, Motion(centre, vector), stretches, (np.zeros(3), prior), settings)
-    if not found.agrees(list(state.boundaries), settings, lost) or not passes_start(
-        path, found.motion, settings
-    ):
+    agrees = found.agrees(list(state.boundaries), settings, lost)
+    if not agrees or not passes_start(path, found.motion, settings):
         return None
     return Registration(found.motion, {label: found.matches.inliers(label) for label in state.boundaries})
 
