@@ -55,7 +55,7 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     passed them, since in a hairpin the curve may have taken two of them in the wrong order.
     """
     boundary, begin = state.boundaries[label], first_parameter(state, label)
-    rows = np.flatnonzero(detections.label == label)
+    rows = sharp(np.flatnonzero(detections.label == label), detections, settings)
     points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
     used = detections.used[rows] & (detections.boundary[rows] == label)
     beside, on_curve, u = used.copy(), used.copy(), detections.u[rows].copy()
@@ -79,6 +79,16 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     if boundary.periodic:
         cones = in_order_of_drive(cones, last_lap(state, label))
     return without_folds(cones, boundary.periodic, settings.batch.cones)
+
+
+def sharp(rows: IntArray, detections: DetectionTable, settings: MapperSettings) -> IntArray:
+    """Returns the rows whose detections are certain enough to say where a cone stands.
+
+    Those of far ones are smeared over several cones. All count where hardly any is certain.
+    """
+    sigma = np.sqrt(0.5 * np.trace(detections.covariance[rows], axis1=1, axis2=2))
+    certain = rows[sigma < settings.batch.cones.sigma]
+    return certain if len(certain) >= settings.batch.cones.sharp_share * len(rows) else rows
 
 
 def cone_counts(state: State, detections: DetectionTable, settings: MapperSettings) -> list[int]:
