@@ -93,7 +93,6 @@ class Growth:
         """Returns the chain of confirmed tracks within reach, from the end of the curve if there is one."""
         settings, tracks = self.settings, self.tentative[label]
         indices = tracks.confirmed()
-        indices = indices[tracks.sigmas(indices) < settings.sigma]
         points = tracks.points[indices]
         if len(points) == 0:
             return Candidates(points, indices, np.zeros(0), np.zeros(0))
@@ -109,7 +108,19 @@ class Growth:
             found = found.where(undisputed(smoother, label, found.points, settings.merge_radius))
         found = found.where(np.argsort(found.stations))
         found = found.where(chain(found, settings, end))
+        found = found.where(self._certain(label, path_ahead, found))
         return found if end is None else found.where(self._uncrossed(smoother, label, path_ahead, end, found))
+
+    def _certain(self, label: int, path_ahead: PathAhead, found: Candidates) -> IntArray:
+        """Returns the candidates, by index, up to the first one ahead that is not known well enough.
+
+        It waits until it was seen near, and so do all behind it: in a hairpin, the row of the way back may be
+        known before the next cone of the way there. One that was passed is left out.
+        """
+        known = self.tentative[label].sigmas(found.indices) < self.settings.sigma
+        waiting = np.flatnonzero(~known & (found.stations > path_ahead.driven))
+        last = int(waiting[0]) if len(waiting) else len(known)
+        return np.flatnonzero(known[:last])
 
     def _uncrossed(
         self, smoother: CurveSmoother, label: int, path_ahead: PathAhead, end: End, found: Candidates
@@ -247,7 +258,7 @@ def count_in_order(boundary: Boundary, path_ahead: PathAhead, settings: GrowthSe
     recent = np.array(boundary.observed[first:]).reshape(-1, 2)
     if len(recent) < 3:
         return len(boundary.observed)
-    station, _ = path_ahead.since(path_ahead.driven - settings.recall).locate(recent)
+    station, _ = path_ahead.locate(recent)  # the path around a hairpin is longer than the curve inside
     passed = np.where(station <= path_ahead.driven, station, np.inf)
     later = np.minimum.accumulate(passed[::-1])[::-1]
     wrong = np.flatnonzero(passed[1:-1] > later[2:] + settings.station_margin)
