@@ -198,7 +198,7 @@ def test_enough_detections_agree_along_enough_of_both_curves(
     u = np.where(rows < count // 2, rows / (count // 2 - 1), (rows - count // 2) / (count - count // 2 - 1))
     labels = (rows >= count // 2).astype(np.intp)
     u[outliers] = 0.0
-    matches = Matches(rows, labels, span * u, inlier, np.eye(3), np.zeros(3))
+    matches = Matches(rows, labels, span * u, inlier, np.ones(count, bool), np.eye(3), np.zeros(3))
     assert agrees(matches, [LEFT, RIGHT], ClosingSettings()) is expected
 
 
@@ -218,7 +218,7 @@ def test_a_place_must_be_certain_and_less_so_after_a_long_stretch(
 ) -> None:
     """However long a straight is driven again, it tells no place along it; a lost vehicle gets no rebate."""
     rows, inlier = np.arange(30), np.ones(30, bool)
-    matches = Matches(rows, rows % 2, np.full(30, again), inlier, np.eye(3), np.zeros(3))
+    matches = Matches(rows, rows % 2, np.full(30, again), inlier, inlier, np.eye(3), np.zeros(3))
     assert is_certain(matches, np.diag([0.01, sigma**2, 1.0]), ClosingSettings(), lost) is certain
 
 

@@ -15,25 +15,30 @@ SETTINGS = GrowthSettings(sightings=3, merge_radius=1.0, forget_after=6.0)
 
 
 def tentative(*detections: tuple[float, float, float, float]) -> TentativeTracks:
-    """Sightings after readings (x, y, variance, t), one at a time."""
+    """Sightings after readings (x, y, variance, t), one at a time; the variance is the trace."""
     found = TentativeTracks(SETTINGS)
     for x, y, variance, t in detections:
-        found.add(np.array([[x, y]]), np.array([variance]), t)
+        found.add(np.array([[x, y]]), round_covariances(variance), t)
     return found
+
+
+def round_covariances(*variances: float) -> Array:
+    """Returns covariances (m, 2, 2) that are alike in all directions, of these traces."""
+    return 0.5 * np.array(variances)[:, None, None] * np.eye(2)
 
 
 def test_a_merged_sighting_is_the_weighted_mean() -> None:
     """Weights 1 and 2: a third of the way is left to the first."""
     found = tentative((0.0, 0.0, 1.0, 0.0), (0.3, -0.6, 0.5, 0.1))
     np.testing.assert_allclose(found.points, [[0.2, -0.4]], atol=1e-15)
-    assert found.weights.tolist() == [3.0]
+    np.testing.assert_allclose(found.information, [6.0 * np.eye(2)])
     assert found.counts.tolist() == [2]
     assert found.last_t.tolist() == [0.1]
 
 
 def test_two_readings_of_one_cycle_merge_one_after_the_other() -> None:
     found = tentative((0.0, 0.0, 1.0, 0.0))
-    found.add(np.array([[0.6, 0.0], [0.0, 0.3]]), np.ones(2), 0.1)
+    found.add(np.array([[0.6, 0.0], [0.0, 0.3]]), round_covariances(1.0, 1.0), 0.1)
     np.testing.assert_allclose(found.points, [[0.2, 0.1]], atol=1e-15)
     assert found.counts.tolist() == [3]
 
@@ -60,8 +65,8 @@ def test_confirmed_when_seen_three_times() -> None:
 def test_what_is_not_seen_again_is_forgotten(t: float, left: int) -> None:
     """Also in a cycle in which nothing is seen."""
     found = tentative((0.0, 0.0, 1.0, 0.0), (5.0, 0.0, 1.0, 0.2))
-    found.add(np.zeros((0, 2)), np.zeros(0), t)
-    assert len(found.points) == len(found.weights) == len(found.counts) == len(found.last_t) == left
+    found.add(np.zeros((0, 2)), np.zeros((0, 2, 2)), t)
+    assert len(found.points) == len(found.information) == len(found.counts) == len(found.last_t) == left
 
 
 def test_seeing_it_again_keeps_it() -> None:
@@ -80,17 +85,18 @@ def test_remove_and_clear() -> None:
 
 
 def test_a_rigid_motion_moves_every_track() -> None:
-    """A half turn and a shift; weights and counts stay."""
+    """A half turn and a shift; what is alike in all directions and the counts stay."""
     found = tentative((1.0, 0.0, 1.0, 0.0), (4.0, 2.0, 0.5, 0.0))
     found.move(np.array([1.0, 1.0, np.pi]))
     np.testing.assert_allclose(found.points, [[0.0, 1.0], [-3.0, -1.0]], atol=1e-12)
-    assert found.weights.tolist() == [1.0, 2.0] and found.counts.tolist() == [1, 1]
+    np.testing.assert_allclose(found.information, [2.0 * np.eye(2), 4.0 * np.eye(2)], atol=1e-12)
+    assert found.counts.tolist() == [1, 1]
 
 
 def test_of_too_many_tracks_those_stay_that_were_seen_last() -> None:
     found = TentativeTracks(GrowthSettings(max_tracks=3))
     for k, t in enumerate([0.4, 0.1, 0.3, 0.2, 0.5]):
-        found.add(np.array([[3.0 * k, 0.0]]), np.ones(1), t)
+        found.add(np.array([[3.0 * k, 0.0]]), round_covariances(1.0), t)
     assert found.points[:, 0].tolist() == [0.0, 6.0, 12.0]
     assert found.last_t.tolist() == [0.4, 0.3, 0.5]
 

@@ -23,6 +23,9 @@ from ..scenes.maps import boundary_through
 
 Array = NDArray[np.float64]
 
+ROUND = 0.005 * np.eye(2)
+"""A tentative detection has this covariance (m^2)."""
+
 
 # --- contradicting colours -------------------------------------------------------------------------------
 
@@ -103,7 +106,7 @@ def test_an_end_nearer_to_an_older_stretch_of_the_path_does_not_follow_that() ->
     confirmed, size = boundary.confirmed_end, boundary.size
     tentative.clear()
     for t in (5.0, 5.1, 5.2):
-        tentative.add(np.array([[36.0, 1.0], [32.0, 1.0], [28.0, 1.0]]), np.full(3, 0.01), t)
+        tentative.add(np.array([[36.0, 1.0], [32.0, 1.0], [28.0, 1.0]]), np.tile(ROUND, (3, 1, 1)), t)
     x = mapper.poses[-1, 0]
     points = np.array([[60.0, 3.0], [0.0, 3.0], [0.0, 0.0], [x, 0.0], [x + 7.0, 0.0]])
     stations = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
@@ -132,7 +135,7 @@ def along_x(driven: float = 0.0, begin: float = -10.0) -> PathAhead:
 def track(mapper: FixedLagMapper, *points: tuple[float, float], label: int = LEFT, times: int = 3) -> None:
     """Makes tentative tracks at points, detected so many times."""
     for k in range(times):
-        mapper.growth.tentative[label].add(np.array(points), np.full(len(points), 0.01), 0.1 * k)
+        mapper.growth.tentative[label].add(np.array(points), np.tile(ROUND, (len(points), 1, 1)), 0.1 * k)
 
 
 def grow(mapper: FixedLagMapper, path: PathAhead) -> list[tuple[float, float]]:
