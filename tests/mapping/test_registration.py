@@ -84,7 +84,10 @@ def drive(begin: float, end: float, count: int, dent: float) -> Array:
 
 
 def window(dent: float = DENT) -> Window:
-    """Returns a window whose detections lie exactly on the curves; a seventh has no colour."""
+    """Returns a window whose detections lie exactly on the curves; a seventh has no colour.
+
+    The newest curves explain all that have one.
+    """
     state = State()
     poses = drive(0.1, 1.2, POSES, dent)
     state.variables.insert(np.array([CALIBRATION_KEY]), np.zeros(2))
@@ -101,6 +104,7 @@ def window(dent: float = DENT) -> Window:
         labels = np.array([LEFT] * 3 + [RIGHT] * 3 + [UNKNOWN], np.intp)
         seen = (seen - [x, y]) @ np.array([[c, -s], [s, c]])
         track.detections.append(detections(0.1 * k, seen, labels), k)
+    track.detections.used[:] = track.detections.label != UNKNOWN
     return Window(track, [0.1 * k for k in range(POSES)], poses.copy(), dent)
 
 

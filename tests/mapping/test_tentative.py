@@ -44,12 +44,13 @@ def test_two_readings_of_one_cycle_merge_one_after_the_other() -> None:
 
 
 @pytest.mark.parametrize(("distance", "count"), [(0.99, 1), (1.01, 2)])
-def test_only_what_is_near_merges(distance: float, count: int) -> None:
-    assert len(tentative((0.0, 0.0, 1.0, 0.0), (distance, 0.0, 1.0, 0.1)).points) == count
+def test_of_what_is_known_well_only_what_is_near_merges(distance: float, count: int) -> None:
+    """Each is known to 0.22 m, so 1.01 m are more than three sigmas of both together."""
+    assert len(tentative((0.0, 0.0, 0.1, 0.0), (distance, 0.0, 0.1, 0.1)).points) == count
 
 
 def test_a_reading_goes_to_the_nearest() -> None:
-    found = tentative((0.0, 0.0, 1.0, 0.0), (1.5, 0.0, 1.0, 0.0), (0.9, 0.0, 1.0, 0.1))
+    found = tentative((0.0, 0.0, 0.1, 0.0), (1.5, 0.0, 0.1, 0.0), (0.9, 0.0, 0.1, 0.1))
     np.testing.assert_allclose(found.points, [[0.0, 0.0], [1.2, 0.0]], atol=1e-15)
     assert found.counts.tolist() == [1, 2]
 
