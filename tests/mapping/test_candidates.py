@@ -43,6 +43,19 @@ def test_one_that_is_left_out_does_not_lead_on_to_the_next() -> None:
     assert chain(found, SETTINGS, None).tolist() == [0, 3]
 
 
+@pytest.mark.parametrize(("begin", "count"), [(None, 4), (end(-4.0, 2.0), 6)], ids=["no curve", "a curve"])
+def test_no_candidate_allows_the_next_one_more(begin: End | None, count: int) -> None:
+    """A row leads away by 1.2 m from cone to cone, and only 0.8 m of them are the rate."""
+    found = candidates(*((4.0 * k, 2.0 + 1.2 * k) for k in range(8)))
+    assert chain(found, SETTINGS, begin).tolist() == list(range(count))
+
+
+def test_a_candidate_farther_out_does_not_end_the_chain() -> None:
+    """One that may not follow is left out, and the next one near the path is measured from the same end."""
+    found = candidates((4.0, 2.0), (8.0, 6.0), (12.0, 2.0), (16.0, 5.5))
+    assert chain(found, SETTINGS, end(0.0, 2.0)).tolist() == [0, 2, 3]
+
+
 @pytest.mark.parametrize(("gap", "chosen"), [(0.7, [0, 1]), (0.9, [0])])
 def test_of_those_beside_each_other_the_nearest_to_the_path_stay(gap: float, chosen: list[int]) -> None:
     assert chain(candidates((0.0, 2.0), (1.9, 2.0 + gap)), SETTINGS, None).tolist() == chosen
