@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .bspline import Floats, Ints
-from .spans import SpanPolynomials, Spans, horner
-from .stretch import Stretch, stretch_of
+from .spans import SpanPolynomials, Spans, Stretch, horner, stretch_of
 
 Bools = NDArray[np.bool_]
 

@@ -12,8 +12,8 @@ from rich.table import Table
 
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval.metrics.summary import versions
-from pathspace_graph.io.files import atomic_file
-from pathspace_graph.io.json_file import read_json, write_json
+from pathspace_graph.io.files import atomic_file, write_json
+from pathspace_graph.io.parsing import read_json
 
 from .metric import Metric
 

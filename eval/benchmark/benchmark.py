@@ -16,8 +16,7 @@ import tyro
 from rich.console import Console
 
 from pathspace_graph.errors import PathspaceError
-from pathspace_graph.io.files import atomic_file, check_file_target
-from pathspace_graph.io.json_file import write_json
+from pathspace_graph.io.files import atomic_file, check_file_target, write_json
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track

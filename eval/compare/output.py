@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from pathspace_graph.eval.figures.files import save_figures
 from pathspace_graph.eval.metrics.summary import summarize, versions
 from pathspace_graph.eval.metrics.text_table import TextTable
-from pathspace_graph.io.files import atomic_folder
-from pathspace_graph.io.json_file import write_json
+from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.io.results import write_result
 from pathspace_graph.settings.mapper import MapperSettings

@@ -13,8 +13,7 @@ import pandas as pd
 from pathspace_graph.eval.figures.files import SUFFIXES, render
 from pathspace_graph.eval.study.output import write_results
 from pathspace_graph.eval.study.study import Study
-from pathspace_graph.io.files import replacing, write_text
-from pathspace_graph.io.json_file import write_json
+from pathspace_graph.io.files import replacing, write_json, write_text
 
 from .outcome import Outcome, outcomes
 from .plot import plot_faults

@@ -12,8 +12,7 @@ from typing import Any, Final
 from pathspace_graph.eval.figures.files import save_figures
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.eval.metrics.text_table import TextTable
-from pathspace_graph.io.files import atomic_folder
-from pathspace_graph.io.json_file import write_json
+from pathspace_graph.io.files import atomic_folder, write_json
 
 from .plot import plot_laps, plot_scaling
 from .points import CONES, LAPS, READINGS, Scaling, Slope

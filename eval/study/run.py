@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Final
 from pathspace_graph.errors import InputError, OutputError
 from pathspace_graph.eval.harness.drives import Drive, NamedTrack, load_tracks, try_drive
 from pathspace_graph.eval.harness.workers import check_jobs, outcomes, workers
-from pathspace_graph.io.files import check_target, remove_manifest
-from pathspace_graph.io.json_file import read_json, to_plain, write_json
+from pathspace_graph.io.files import check_target, remove_manifest, to_plain, write_json
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.manifest import verified
+from pathspace_graph.io.parsing import read_json
 
 from .cells import Cell, Record, failed, run_cell
 from .frame import frame_of

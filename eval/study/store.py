@@ -12,9 +12,9 @@ from typing import Any, Final
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.eval.harness.drives import Drive, identity
-from pathspace_graph.io.files import replacing
-from pathspace_graph.io.json_file import read_json, to_plain, write_json
+from pathspace_graph.io.files import replacing, to_plain, write_json
 from pathspace_graph.io.log import Log
+from pathspace_graph.io.parsing import read_json
 
 from .cells import FORMAT, Cell, Record
 from .log_file import read_log_file, write_log_file

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.io.json_file import to_plain
+from pathspace_graph.io.files import to_plain
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.spline.planning import CentreLine

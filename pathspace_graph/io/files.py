@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import errno
+import json
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from pathspace_graph.errors import OutputError
 
@@ -64,6 +69,28 @@ def write_text(file: Path, text: str) -> None:
     """Writes text in UTF-8, whole or not at all; an earlier file is replaced."""
     with replacing(file) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def to_plain(value: Any) -> Any:
+    """Returns the value in the types of strict JSON.
+
+    Arrays and tuples become lists, numpy's scalars become numbers, and paths become texts. JSON has no number
+    that is not finite: NaN becomes null, since it is no value, and infinity becomes the text "inf".
+    """
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return to_plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [to_plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None if math.isnan(value) else str(value)
+    return str(value) if isinstance(value, Path) else value
+
+
+def write_json(file: Path, content: Any, indent: int | None = 2) -> None:
+    """Writes the content as strict JSON, see `to_plain`, and replaces an earlier file."""
+    write_text(file, json.dumps(to_plain(content), indent=indent, allow_nan=False) + "\n")
 
 
 def write_manifest(folder: Path) -> None:

@@ -17,9 +17,9 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
-from .json_file import read_json
 from .limits import MAX_COORDINATE, MAX_DEGREE, shown
 from .manifest import verified
+from .parsing import read_json
 
 Array = NDArray[np.float64]
 

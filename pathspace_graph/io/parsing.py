@@ -66,6 +66,11 @@ def parse_json(text: str, file: Path) -> Any:
     return content
 
 
+def read_json(file: Path, expected: str) -> Any:
+    """Returns the content of a JSON file; an InputError says that `expected` was expected where it fails."""
+    return parse_json(read_text(file, expected), file)
+
+
 def parse_toml(text: str, file: Path) -> dict[str, Any]:
     """Returns the content of TOML; an InputError names the file and, where it is known, the row."""
     try:

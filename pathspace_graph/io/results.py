@@ -16,8 +16,7 @@ from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.sensor import SENSOR
 
 from .csv_table import read_table
-from .files import atomic_folder
-from .json_file import write_json
+from .files import atomic_folder, write_json
 from .log import CALIBRATION
 from .manifest import verified
 from .map import MAP_FILE, Map, map_to_json

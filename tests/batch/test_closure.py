@@ -69,7 +69,7 @@ def test_a_closed_result_needs_evidence_in_every_respect(against: dict[str, floa
 
 def optimizer_of(log: Log) -> Optimizer:
     """Returns the optimizer of a log's batch."""
-    chain = judge_log(log, log.odometry_sigma, SETTINGS).chain
+    chain = judge_log(log, log.noise, SETTINGS).chain
     system = BatchSystem(DetectionTable.of(log.cycles), chain, SETTINGS, Biweight(SETTINGS.batch.loose_gate))
     return Optimizer(system, SETTINGS.batch)
 

@@ -36,7 +36,7 @@ def drifting() -> tuple[Log, LogOdometry]:
     log = course_log(2.6)
     twists = log.odometry.twist * [1.0 + SCALE, 1.0 + SCALE, 1.0] + [0.0, 0.0, BIAS]
     log = replace(log, odometry=replace(log.odometry, twist=twists))
-    return log, judge_log(log, log.odometry_sigma, SETTINGS).chain
+    return log, judge_log(log, log.noise, SETTINGS).chain
 
 
 # --- correspondences -------------------------------------------------------------------------------------
@@ -129,7 +129,7 @@ def test_the_curves_of_a_closed_course_stand_beside_its_path() -> None:
 def test_a_path_that_does_not_recur_is_dead_reckoned() -> None:
     cones, labels = corridor(60.0)
     log = exact_log(ahead(6.0, 5.0), cones, labels)
-    chain = judge_log(log, log.odometry_sigma, SETTINGS).chain
+    chain = judge_log(log, log.noise, SETTINGS).chain
     state = start_odometry(chain, DetectionTable.of(log.cycles), SETTINGS)
     np.testing.assert_array_equal(state.poses, chain.dead_reckoned(np.zeros(2)))
     np.testing.assert_array_equal(state.calibration, 0.0)
@@ -140,7 +140,7 @@ def test_a_path_that_does_not_recur_is_dead_reckoned() -> None:
 
 def test_a_circuit_of_21_metres_has_both_boundaries() -> None:
     log = exact_log(ahead(6.0, 5.0), *corridor(60.0, half_width=10.5))
-    chain = judge_log(log, log.odometry_sigma, SETTINGS).chain
+    chain = judge_log(log, log.noise, SETTINGS).chain
     state = start_odometry(chain, DetectionTable.of(log.cycles), SETTINGS)
     for label, y in ((LEFT, 10.5), (RIGHT, -10.5)):
         np.testing.assert_allclose(state.control_points(label)[:, 1], y, atol=1e-6)

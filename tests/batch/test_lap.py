@@ -61,7 +61,7 @@ def open_lap(settings: MapperSettings | None = None) -> OpenLap:
         splines[label] = fit_spline(cones, len(cones) // 2, periodic=True)
     return OpenLap(
         settings=settings,
-        chain=judge_log(drive, drive.odometry_sigma, settings).chain,
+        chain=judge_log(drive, drive.noise, settings).chain,
         detections=DetectionTable.of(drive.cycles),
         first_kept=len(drive.cycles) - WINDOW,
         start=ClosedMap(splines, true_poses(drive), np.zeros(2)),
@@ -178,7 +178,7 @@ def test_a_search_from_odometry_has_a_result_where_the_loop_is_driven_again(
 ) -> None:
     """The path is said to recur after a lap, or too early."""
     drive, settings = noisy(course_log(laps), seed=3), MapperSettings()
-    chain = judge_log(drive, drive.odometry_sigma, settings).chain
+    chain = judge_log(drive, drive.noise, settings).chain
     driven = find_recurrence(chain.dead_reckoned(np.zeros(2)), settings).driven
     recurrence = Recurrence(driven, lap * COURSE, 2.0 * np.pi, 1.0)
     detections, first_kept = DetectionTable.of(drive.cycles), len(drive.cycles) - WINDOW

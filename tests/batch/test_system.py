@@ -32,7 +32,7 @@ def small_system() -> tuple[BatchSystem, State]:
     """Returns an exact lap with some noise on its detections, linearized beside the optimum."""
     log = lap_log(bean_track())
     settings = own_settings(MapperSettings())
-    chain = judge_log(log, log.odometry_sigma, settings).chain
+    chain = judge_log(log, log.noise, settings).chain
     detections = DetectionTable.of(log.cycles)
     noise = np.random.default_rng(1).normal(0.0, 0.1, detections.measured.shape)
     detections.measured = detections.point = detections.measured + noise
@@ -48,7 +48,7 @@ def small_system() -> tuple[BatchSystem, State]:
 
 def test_dead_reckoning_of_an_exact_log_is_the_truth() -> None:
     log = lap_log(bean_track())
-    chain: LogOdometry = judge_log(log, log.odometry_sigma, MapperSettings()).chain
+    chain: LogOdometry = judge_log(log, log.noise, MapperSettings()).chain
     np.testing.assert_allclose(chain.dead_reckoned(np.zeros(2))[:, :2], true_poses(log)[:, :2], atol=1e-6)
 
 

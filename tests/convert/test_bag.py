@@ -48,6 +48,10 @@ def drive() -> Log:
     return Log(log.odometry.between(0.0, until), cycles, log.odometry_sigma, log.sensor)
 
 
+STATED = ("--sigma-odometry", "0.25", "0.12", "0.035")
+"""The noise of the odometry that the simulator has."""
+
+
 def convert(bag: Path, out: Path, *options: str) -> Log:
     assert main(["convert", str(bag), "--out", str(out), *TOPICS, *options]) == 0
     return read_log(out)
@@ -74,6 +78,12 @@ def assert_same_readings(log: Log, drive: Log, *, covariances: bool = True, atol
         np.testing.assert_array_equal(cycle.labels[order], made.labels[other])
         if covariances:
             np.testing.assert_allclose(cycle.covariances[order], made.covariances[other], atol=atol)
+
+
+def markers(messages: Messages, cycle: Detections) -> Any:
+    """The message of a cycle as coloured markers, which have no covariances."""
+    rows = zip(cycle.points_vehicle, cycle.labels.tolist(), strict=True)
+    return messages.markers([messages.marker(cycle.t, point, colour_of(label)) for point, label in rows])
 
 
 # --- the three kinds -------------------------------------------------------------------------------------
@@ -107,8 +117,49 @@ def test_a_drive_comes_back_from_a_bag(kind: Kind, drive: Log, tmp_path: Path) -
     bag = write_bag(tmp_path, kind, of_log(drive, Messages.cloud_of))
     log = convert(bag, tmp_path / "log")
     assert_same_readings(log, drive)
-    np.testing.assert_array_equal(log.odometry_sigma, [0.25, 0.12, 0.035])
+    assert log.detections_stated and not log.odometry_stated
+    assert log.measured is not None
+    np.testing.assert_array_equal(log.odometry_sigma, log.measured.twist_sigma)
     assert log.source["odometry"] == "/odom (nav_msgs/msg/Odometry)"
+
+
+def test_noise_that_is_stated_is_not_measured(drive: Log, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path, "mcap", of_log(drive, Messages.cloud_of))
+    log = convert(bag, tmp_path / "log", *STATED)
+    assert log.odometry_stated and log.detections_stated and log.measured is None
+    np.testing.assert_array_equal(log.odometry_sigma, [0.25, 0.12, 0.035])
+    assert "noise" not in (tmp_path / "log" / "log.toml").read_text()
+
+
+def test_noise_that_is_not_stated_is_measured_and_the_log_says_so(drive: Log, tmp_path: Path) -> None:
+    """Markers have no covariances: they get those of single detections, by the measured noise."""
+    bag = write_bag(tmp_path, "mcap", of_log(drive, markers))
+    log = convert(bag, tmp_path / "log")
+    header = (tmp_path / "log" / "log.toml").read_text()
+    assert '[noise]\nodometry = "measured"\ndetections = "measured"\n' in header
+    assert not log.odometry_stated and not log.detections_stated
+    assert log.measured is not None and log.measured.along is not None
+    np.testing.assert_array_equal(log.odometry_sigma, log.measured.twist_sigma)
+    for cycle in log.cycles:
+        expected = log.measured.covariances(cycle.points_vehicle, inflated=False)
+        assert expected is not None
+        np.testing.assert_allclose(cycle.covariances, expected, rtol=1e-12, atol=1e-15)
+
+
+def test_noise_of_detections_that_is_stated_stays_where_that_of_the_odometry_is_measured(
+    drive: Log, tmp_path: Path
+) -> None:
+    bag = write_bag(tmp_path, "mcap", of_log(drive, markers))
+    log = convert(bag, tmp_path / "log", "--sigma-bearing", "0.02")
+    assert not log.odometry_stated and log.detections_stated
+    assert (
+        '[noise]\nodometry = "measured"\ndetections = "stated"\n'
+        in (tmp_path / "log" / "log.toml").read_text()
+    )
+    points = log.cycles[0].points_vehicle
+    across = np.column_stack([-points[:, 1], points[:, 0]])  # r^2 from the sensor
+    found = np.einsum("mi,mij,mj->m", across, log.cycles[0].covariances, across)
+    np.testing.assert_allclose(found, (0.02 * np.hypot(*points.T) ** 2) ** 2, rtol=1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -118,10 +169,6 @@ def test_cones_with_covariances_come_back_from_a_bag(kind: Kind, drive: Log, tmp
 
 
 def test_markers_come_back_by_their_colour_with_the_stated_noise(drive: Log, tmp_path: Path) -> None:
-    def markers(messages: Messages, cycle: Detections) -> Any:
-        rows = zip(cycle.points_vehicle, cycle.labels.tolist(), strict=True)
-        return messages.markers([messages.marker(cycle.t, point, colour_of(label)) for point, label in rows])
-
     bag = write_bag(tmp_path, "mcap", of_log(drive, markers))
     log = convert(bag, tmp_path / "log", "--sigma-range", "0.3", "--sigma-range-growth", "0")
     assert_same_readings(log, drive, covariances=False)
@@ -132,7 +179,7 @@ def test_markers_come_back_by_their_colour_with_the_stated_noise(drive: Log, tmp
 
 def test_a_converted_bag_maps_like_the_log_that_it_was_made_from(drive: Log, tmp_path: Path) -> None:
     bag = write_bag(tmp_path, "mcap", of_log(drive, Messages.cloud_of))
-    convert(bag, tmp_path / "log")
+    convert(bag, tmp_path / "log", *STATED)
     converted = read_usable_log(tmp_path / "log", LimitSettings())
     maps = [
         run_online(log, FixedLagMapper(odometry_sigma=log.odometry_sigma)).map for log in (drive, converted)

@@ -1,20 +1,16 @@
-"""The calibrations in a batch: the prior, the keys, and a search that begins without errors."""
+"""The calibrations in a batch: the priors, and the keys."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from pathspace_graph.front_end.log_odometry import no_errors, sensor_prior, sensor_prior_cost
+from pathspace_graph.front_end.log_odometry import sensor_prior, sensor_prior_cost
 from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, control_keys, pose_keys
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.settings.calibration import CalibrationSettings
 
 KNOWN, ESTIMATED = CalibrationSettings(sensor=False), CalibrationSettings()
-
-
-def test_a_search_begins_without_errors_of_what_is_estimated() -> None:
-    np.testing.assert_array_equal(no_errors(KNOWN), np.zeros(2))
-    np.testing.assert_array_equal(no_errors(ESTIMATED), np.zeros(7))
 
 
 def test_both_calibrations_are_one_view() -> None:
@@ -36,6 +32,18 @@ def test_the_prior_counts_in_its_sigmas() -> None:
     np.testing.assert_allclose(rows.residual, 2.0)
     np.testing.assert_allclose(np.diag(rows.jacobian) * ESTIMATED.sigmas, 1.0)
     assert sensor_prior_cost(variables, ESTIMATED) == 0.5 * 5 * 4.0
+
+
+def test_the_prior_counts_from_its_mean() -> None:
+    known = CalibrationSettings(yaw=0.02, lateral=-0.3, latency=0.05, range_scale=-0.04, range_bias=0.1)
+    variables = Variables()
+    off = np.array([1.0, -2.0, 3.0, 0.0, 1.0])
+    variables.insert_calibrations(
+        np.concatenate([np.zeros(2), [0.02, -0.3, 0.05, -0.04, 0.1] + off * known.sigmas])
+    )
+    (rows,) = sensor_prior(variables, known)
+    np.testing.assert_allclose(rows.residual, off, atol=1e-12)
+    assert sensor_prior_cost(variables, known) == pytest.approx(0.5 * 15.0)
 
 
 def test_a_sensor_that_is_known_has_no_prior() -> None:

@@ -76,14 +76,14 @@ def test_a_filter_takes_the_bias_together_with_its_prior(log: Log) -> None:
     """A filter does not doubt its prior, so the estimate is the mean of both by their information."""
     filtered = CkfMapper(MapperSettings(), log.odometry_sigma)
     run_online(replace(log, cycles=tuple(c for c in log.cycles if c.t < REST)), filtered)
-    measured = judge_log(log, log.odometry_sigma, MapperSettings()).chain.bias
+    measured = judge_log(log, log.noise, MapperSettings()).chain.bias
     assert measured is not None
     share = measured.sigma**-2 / (measured.sigma**-2 + MapperSettings().odometry.sigma_bias ** -2)
     assert filtered.vehicle_state().calibration[1] == pytest.approx(share * measured.value, rel=0.15)
 
 
 def test_a_log_has_the_mean_of_all_that_was_measured_at_rest(log: Log) -> None:
-    chain = judge_log(log, log.odometry_sigma, MapperSettings()).chain
+    chain = judge_log(log, log.noise, MapperSettings()).chain
     assert chain.bias is not None
     off = np.array([0.0, chain.bias.value + chain.bias.sigma])
     at_mean = chain.prior_cost(chain.first, np.array([0.0, chain.bias.value]))

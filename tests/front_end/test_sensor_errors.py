@@ -124,9 +124,9 @@ def test_a_drive_shows_the_errors_of_its_sensor(
 
 def test_the_prior_of_a_sensor_becomes_wide_for_a_batch_where_the_drive_contradicts_it() -> None:
     turned, settings = drive(yaw=-0.03), MapperSettings()
-    judged = judge_log(turned, turned.odometry_sigma, settings)
+    judged = judge_log(turned, turned.noise, settings)
     assert judged.settings.calibration == settings.calibration.widened()
     sure = replace(settings, calibration=CalibrationSettings(doubt=np.inf))
-    assert judge_log(turned, turned.odometry_sigma, sure).settings == sure
+    assert judge_log(turned, turned.noise, sure).settings == sure
     none = replace(settings, calibration=CalibrationSettings(sensor=False))
-    assert judge_log(turned, turned.odometry_sigma, none).settings == none
+    assert judge_log(turned, turned.noise, none).settings == none

@@ -31,22 +31,24 @@ def labels_of(log: Log) -> tuple[np.ndarray, np.ndarray]:
     """The labels that the front end gives, and the true ones, of all detections of cones."""
     truth = log.truth
     assert truth is not None and truth.associations is not None
-    judged = np.concatenate([c.labels for c in judge_log(log, log.odometry_sigma, MapperSettings()).cycles])
+    judged = np.concatenate([c.labels for c in judge_log(log, log.noise, MapperSettings()).cycles])
     real = truth.associations >= 0
     return judged[real], truth.cone_labels[truth.associations[real]]
 
 
 def test_right_colours_are_left_as_they_are() -> None:
     log = drive()
-    front_end = FrontEnd(MapperSettings(), log.odometry_sigma)
+    front_end = FrontEnd(MapperSettings(), log.noise)
     for odometry, cycle in split_odometry(log):
-        assert front_end.update(odometry, cycle).detections is cycle
+        found = front_end.update(odometry, cycle).detections
+        assert found.labels is cycle.labels
+        assert found.points_vehicle is cycle.points_vehicle and found.covariances is cycle.covariances
 
 
 def test_one_wrong_colour_in_five_swaps_nothing() -> None:
     log = drive(wrong_colour=0.2)
     given = np.concatenate([cycle.labels for cycle in log.cycles])
-    judged = judge_log(log, log.odometry_sigma, MapperSettings()).cycles
+    judged = judge_log(log, log.noise, MapperSettings()).cycles
     later = slice(len(log.cycles[0].labels) * 3, None)
     np.testing.assert_array_equal(np.concatenate([c.labels for c in judged])[later], given[later])
 
@@ -70,9 +72,7 @@ def test_sides_are_told_without_colours(share: float, wrong_way: bool) -> None:
 def test_where_colours_are_common_an_unknown_one_stays_unknown() -> None:
     """The large cones of a start line have no colour, and stand beside the boundary."""
     log = drive(Faults(sensor=SensorFaults(colourless=0.4)))
-    for given, judged in zip(
-        log.cycles, judge_log(log, log.odometry_sigma, MapperSettings()).cycles, strict=True
-    ):
+    for given, judged in zip(log.cycles, judge_log(log, log.noise, MapperSettings()).cycles, strict=True):
         np.testing.assert_array_equal(given.labels, judged.labels)
 
 
@@ -101,7 +101,7 @@ def test_two_detections_of_a_new_cone_in_one_cycle_are_two_cones() -> None:
 
 def test_a_cycle_without_detections_is_possible() -> None:
     log = drive()
-    front_end = FrontEnd(MapperSettings(), log.odometry_sigma)
+    front_end = FrontEnd(MapperSettings(), log.noise)
     odometry, _ = next(split_odometry(log))
     nothing = Detections(0.0, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp))
-    assert front_end.update(odometry, nothing).detections is nothing
+    assert front_end.update(odometry, nothing).detections.labels is nothing.labels

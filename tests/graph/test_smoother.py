@@ -132,23 +132,72 @@ def test_a_window_on_a_linear_drive_is_full_batch(lag: int, seed: int) -> None:
     np.testing.assert_allclose(smoother.covariance(keys), expected, atol=1e-9 * np.abs(expected).max())
 
 
-def test_a_widened_prior_of_the_calibration_is_one_that_was_wide_from_the_start() -> None:
-    """The window, with poses marginalized before and after, is equal to that of another prior."""
-    wide = np.array([0.7, 3.0])
-    changed, other = LinearDrive(2), LinearDrive(2)
-    other.smoother.widen_calibrations(wide)
+@pytest.mark.parametrize("means", [(0.0, 0.0), (0.4, -0.9)])
+@pytest.mark.parametrize("sigmas", [(0.7, 3.0), (0.05, 0.1)], ids=["wider", "narrower"])
+def test_another_prior_of_the_calibration_is_one_that_was_known_from_the_start(
+    means: tuple[float, float], sigmas: tuple[float, float]
+) -> None:
+    """The window, with poses marginalized before and after, is that of a smoother made with the other prior.
+
+    It is the batch with that prior, too.
+    """
+    changed, other = LinearDrive(2), LinearDrive(2, means=means, sigmas=sigmas)
     for drive in (changed, other):
         drive.drive(9)
     before = changed.smoother.variables.calibration.copy()
-    changed.smoother.widen_calibrations(wide)
+    changed.smoother.believe_calibrations(np.array(means), np.array(sigmas))
     for drive in (changed, other):
         drive.drive(3)
     ours, theirs = changed.smoother, other.smoother
     assert np.abs(ours.variables.calibration - before).max() > 1e-3
-    np.testing.assert_allclose(ours.variables.values, theirs.variables.values, rtol=1e-7, atol=1e-7)
     keys = ours.variables.keys
+    np.testing.assert_allclose(ours.variables.values, theirs.variables.values, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(ours.variables.values, other.mean(keys), rtol=1e-7, atol=1e-7)
     expected = theirs.covariance(keys)
     np.testing.assert_allclose(ours.covariance(keys), expected, atol=1e-8 * np.abs(expected).max())
+    np.testing.assert_allclose(other.covariance(keys), expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_the_prior_of_a_calibration_can_be_changed_several_times_and_back() -> None:
+    """Only the newest prior counts; one that is the same changes nothing."""
+    changed, other = LinearDrive(2), LinearDrive(2)
+    for drive in (changed, other):
+        drive.drive(5)
+    for means, sigmas in (((0.4, -0.9), (0.7, 3.0)), ((0.1, 0.2), (2.0, 0.2)), ((0.0, 0.0), (0.3, 0.5))):
+        changed.smoother.believe_calibrations(np.array(means), np.array(sigmas))
+        epoch = changed.smoother.epoch
+        changed.smoother.believe_calibrations(np.array(means), np.array(sigmas))
+        assert changed.smoother.epoch == epoch
+    for drive in (changed, other):
+        drive.drive(3)
+    ours, theirs = changed.smoother.variables, other.smoother.variables
+    np.testing.assert_allclose(ours.values, theirs.values, rtol=1e-7, atol=1e-7)
+
+
+def test_the_submaps_of_an_open_loop_have_the_other_prior_of_the_calibration() -> None:
+    """They take the prior's place when the loop closes: by hand, and as a smoother made with it has them."""
+    means, sigmas = (0.4, -0.9), (0.7, 3.0)
+    changed, other = LinearDrive(2), LinearDrive(2, means=means, sigmas=sigmas)
+    for drive in (changed, other):
+        drive.drive(6)
+    changed.smoother.believe_calibrations(np.array(means), np.array(sigmas))
+    for drive in (changed, other):
+        drive.drive(3)
+    found = []
+    for drive in (changed, other):
+        submaps, variables = drive.smoother.submaps, drive.smoother.variables
+        assert submaps is not None
+        own = Layout(np.array([CALIBRATION_KEY, pose_key(0)]))
+        assert keys_of(submaps.first).tolist() == own.keys.tolist()
+        hessian, vector = normal_equations(submaps.first, own)
+        reference = np.zeros(own.size)  # of the first pose it is where that was predicted, in both
+        reference[:2] = variables.reference[:2]
+        found.append((hessian, vector + hessian @ reference))
+    for ours, theirs in zip(*found, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-12)
+    hessian, vector = found[0]
+    np.testing.assert_allclose(hessian[:2, :2], np.diag(np.array(sigmas) ** -2.0), atol=1e-12)
+    np.testing.assert_allclose(vector[:2], means / np.array(sigmas) ** 2, atol=1e-12)
 
 
 def test_covariance_is_in_the_order_of_the_keys() -> None:

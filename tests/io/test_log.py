@@ -44,7 +44,7 @@ def small_log() -> Log:
     source = {"track": 'a "quoted" \\ name\n', "Umlaut": "Zürich \x7f"}
     sensor = SensorInfo(range_max=15.0, fov=1.9)
     return Log(
-        Odometry(t, rng.normal(size=(11, 3))), cycles, np.array([0.1, 0.2, 1e-5]), sensor, source, truth
+        Odometry(t, rng.normal(size=(11, 3))), cycles, np.array([0.1, 0.2, 1e-5]), sensor, source, truth=truth
     )
 
 

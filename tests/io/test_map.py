@@ -14,7 +14,7 @@ import pytest
 from scipy.interpolate import BSpline as ScipyBSpline
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.io.json_file import write_json
+from pathspace_graph.io.files import write_json
 from pathspace_graph.io.map import (
     MAP_FILE,
     Map,

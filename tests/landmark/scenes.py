@@ -89,7 +89,7 @@ def beginning_of(log: Log, cycles: int) -> tuple[Log, NDArray[np.int_]]:
 def oracle_system(log: Log, cycles: int) -> tuple[LandmarkSystem, LandmarkState]:
     """Returns the system of the first cycles of a log with oracle associations, and its start."""
     beginning, associations = beginning_of(log, cycles)
-    system = LandmarkSystem.of_log(beginning, MapperSettings(), log.odometry_sigma)
+    system = LandmarkSystem.of_log(beginning, MapperSettings(), log.noise)
     return system, start_oracle(system, associations)
 
 

@@ -46,7 +46,7 @@ def test_the_optimum_has_no_gradient(bean: Log) -> None:
 
 def test_a_system_of_a_log_has_no_association_and_costs_nothing_at_dead_reckoning() -> None:
     log = exact_log(ahead(5.0, 1.0), np.array([[8.0, 2.0]]), np.array([LEFT]))
-    system = LandmarkSystem.of_log(log, MapperSettings(), log.odometry_sigma)
+    system = LandmarkSystem.of_log(log, MapperSettings(), log.noise)
     assert len(system.detections) == len(log.cycles)
     assert (system.detections.landmark == UNASSOCIATED).all()
     state = start_oracle(system, system.detections.landmark)
@@ -56,7 +56,7 @@ def test_a_system_of_a_log_has_no_association_and_costs_nothing_at_dead_reckonin
 
 def test_the_oracle_starts_each_landmark_at_its_first_detection_with_its_most_frequent_label() -> None:
     log = exact_log(ahead(5.0, 1.0), np.array([[8.0, 2.0]]), np.array([LEFT]))
-    system = LandmarkSystem.of_log(log, MapperSettings(), log.odometry_sigma)
+    system = LandmarkSystem.of_log(log, MapperSettings(), log.noise)
     system.detections.label[0] = UNKNOWN
     associations = np.full(len(system.detections), 7)
     associations[-1] = -1

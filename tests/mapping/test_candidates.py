@@ -43,6 +43,19 @@ def test_one_that_is_left_out_does_not_lead_on_to_the_next() -> None:
     assert chain(found, SETTINGS, None).tolist() == [0, 3]
 
 
+@pytest.mark.parametrize(("begin", "count"), [(None, 4), (end(-4.0, 2.0), 6)], ids=["no curve", "a curve"])
+def test_no_candidate_allows_the_next_one_more(begin: End | None, count: int) -> None:
+    """A row leads away by 1.2 m from cone to cone, and only 0.8 m of them are the rate."""
+    found = candidates(*((4.0 * k, 2.0 + 1.2 * k) for k in range(8)))
+    assert chain(found, SETTINGS, begin).tolist() == list(range(count))
+
+
+def test_a_candidate_farther_out_does_not_end_the_chain() -> None:
+    """One that may not follow is left out, and the next one near the path is measured from the same end."""
+    found = candidates((4.0, 2.0), (8.0, 6.0), (12.0, 2.0), (16.0, 5.5))
+    assert chain(found, SETTINGS, end(0.0, 2.0)).tolist() == [0, 2, 3]
+
+
 @pytest.mark.parametrize(("gap", "chosen"), [(0.7, [0, 1]), (0.9, [0])])
 def test_of_those_beside_each_other_the_nearest_to_the_path_stay(gap: float, chosen: list[int]) -> None:
     assert chain(candidates((0.0, 2.0), (1.9, 2.0 + gap)), SETTINGS, None).tolist() == chosen
@@ -55,11 +68,10 @@ def test_no_candidates_are_an_empty_chain() -> None:
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 30.0), st.floats(0.0, 9.0)), max_size=12), st.floats(0.0, 5.0))
-def test_every_link_of_a_chain_keeps_the_rule(places: list[tuple[float, float]], side: float) -> None:
+def test_every_candidate_of_a_chain_keeps_the_rule(places: list[tuple[float, float]], side: float) -> None:
     found = candidates(*sorted(places))
     chosen = found.where(chain(found, SETTINGS, end(-1.0, side)))
-    sides, stations = np.append(side, chosen.sides), np.append(-1.0, chosen.stations)
-    assert (np.diff(sides) <= 1.5 + 0.2 * np.diff(stations) + 1e-9).all()
+    assert (chosen.sides <= side + 1.5 + 0.2 * (chosen.stations + 1.0) + 1e-9).all()
 
 
 def test_chosen_candidates_keep_their_places_together() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.graph.smoother import FixedLagSmoother
@@ -15,7 +16,7 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import doubted, integrate_odometry, predict, smoother_settings
 from pathspace_graph.run import split_odometry
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
 
 from ..scenes.drives import DT, ODOMETRY_SIGMA, ahead, exact_log, true_poses
 
@@ -51,7 +52,7 @@ def test_every_cycle_adds_its_pose_and_extends_the_path(log: Log) -> None:
 
 
 def test_a_log_is_dead_reckoned_along_its_true_poses(log: Log) -> None:
-    odometry = judge_log(log, ODOMETRY_SIGMA, MapperSettings()).chain
+    odometry = judge_log(log, KnownNoise(ODOMETRY_SIGMA), MapperSettings()).chain
     np.testing.assert_allclose(odometry.dead_reckoned(np.zeros(2)), true_poses(log), atol=1e-9)
     assert len(odometry) == len(log.cycles) == len(odometry.stamps)
     residual, _ = odometry.terms(true_poses(log), np.zeros(2))
@@ -63,22 +64,25 @@ def test_a_calibration_frees_the_odometry_of_a_bias(log: Log) -> None:
     biased = exact_log(
         log.odometry.twist + np.array([0.0, 0.0, 0.02]), np.zeros((0, 2)), np.zeros(0, np.intp)
     )
-    odometry = judge_log(biased, ODOMETRY_SIGMA, MapperSettings()).chain
+    odometry = judge_log(biased, KnownNoise(ODOMETRY_SIGMA), MapperSettings()).chain
     poses = odometry.dead_reckoned(np.array([0.0, 0.02]))
     np.testing.assert_allclose(poses[:, 2], true_poses(log)[:, 2], atol=1e-9)
     np.testing.assert_allclose(poses, true_poses(log), atol=2 * DT**2)
 
 
-def test_the_rows_of_the_priors_have_their_cost(log: Log) -> None:
-    odometry = judge_log(log, ODOMETRY_SIGMA, MapperSettings()).chain
+@pytest.mark.parametrize("mean", [(0.0, 0.0), (-0.04, 0.01)])
+def test_the_rows_of_the_priors_have_their_cost(log: Log, mean: tuple[float, float]) -> None:
+    settings = MapperSettings(odometry=OdometrySettings(scale=mean[0], bias=mean[1]))
+    odometry = judge_log(log, KnownNoise(ODOMETRY_SIGMA), settings).chain
     rng = np.random.default_rng(0)
     first = odometry.first + np.array([1e-4, -2e-4, 1e-5])
-    calibration = odometry.calibration_sigma * rng.normal(size=2)
+    off = rng.normal(size=2)
+    calibration = mean + odometry.calibration_sigma * off
     _, *priors = odometry.rows(odometry.terms(true_poses(log), calibration), first, calibration)
     cost = 0.5 * sum(float(rows.residual @ rows.residual) for rows in priors)
     assert odometry.prior_cost(first, calibration) == pytest.approx(cost, rel=1e-9)
-    expected = 0.5 * float(((calibration / odometry.calibration_sigma) ** 2).sum())
-    assert odometry.prior_cost(odometry.first, calibration) == pytest.approx(expected, rel=1e-9)
+    assert odometry.prior_cost(odometry.first, calibration) == pytest.approx(0.5 * off @ off, rel=1e-9)
+    assert odometry.prior_cost(odometry.first, np.array(mean)) == 0.0
 
 
 # --- a prior that the drive contradicts ------------------------------------------------------------------

@@ -17,6 +17,8 @@ from pathspace_graph.mapping.registration import (
     Matches,
     Motion,
     Registration,
+    Sightings,
+    _match,
     agrees,
     is_certain,
     near_start,
@@ -84,7 +86,10 @@ def drive(begin: float, end: float, count: int, dent: float) -> Array:
 
 
 def window(dent: float = DENT) -> Window:
-    """Returns a window whose detections lie exactly on the curves; a seventh has no colour."""
+    """Returns a window whose detections lie exactly on the curves; a seventh has no colour.
+
+    The newest curves explain all that have one.
+    """
     state = State()
     poses = drive(0.1, 1.2, POSES, dent)
     state.variables.insert(np.array([CALIBRATION_KEY]), np.zeros(2))
@@ -101,6 +106,7 @@ def window(dent: float = DENT) -> Window:
         labels = np.array([LEFT] * 3 + [RIGHT] * 3 + [UNKNOWN], np.intp)
         seen = (seen - [x, y]) @ np.array([[c, -s], [s, c]])
         track.detections.append(detections(0.1 * k, seen, labels), k)
+    track.detections.used[:] = track.detections.label != UNKNOWN
     return Window(track, [0.1 * k for k in range(POSES)], poses.copy(), dent)
 
 
@@ -198,8 +204,93 @@ def test_enough_detections_agree_along_enough_of_both_curves(
     u = np.where(rows < count // 2, rows / (count // 2 - 1), (rows - count // 2) / (count - count // 2 - 1))
     labels = (rows >= count // 2).astype(np.intp)
     u[outliers] = 0.0
-    matches = Matches(rows, labels, span * u, inlier, np.eye(3), np.zeros(3))
+    matches = Matches(rows, labels, span * u, inlier, np.ones(count, bool), np.eye(3), np.zeros(3))
     assert agrees(matches, [LEFT, RIGHT], ClosingSettings()) is expected
+
+
+def matches_along(inlier: Array, explained: Array) -> Matches:
+    """Returns matches of as many detections on either boundary, in turn, along 10 m of both."""
+    count = len(inlier)
+    rows = np.arange(count)
+    return Matches(rows, rows % 2, np.linspace(0.0, 10.0, count), inlier, explained, np.eye(3), np.zeros(3))
+
+
+@pytest.mark.parametrize(("explained", "expected"), [(False, True), (True, False)])
+def test_only_outliers_that_the_newest_curves_explain_contradict_a_place(
+    explained: bool, expected: bool
+) -> None:
+    """30 inliers, and 20 detections of another stretch of the road."""
+    inlier = np.arange(50) < 30
+    order = np.random.default_rng(0).permutation(50)
+    known = (inlier | explained)[order]
+    assert agrees(matches_along(inlier[order], known), [LEFT, RIGHT], ClosingSettings()) is expected
+
+
+def test_inliers_that_the_newest_curves_do_not_explain_are_no_evidence() -> None:
+    """Of 40 inliers 24 or 25 are explained, and 25 are needed."""
+    for count, expected in ((24, False), (25, True)):
+        known = np.random.default_rng(1).permutation(np.arange(40) < count)
+        found = matches_along(np.ones(40, bool), known)
+        assert agrees(found, [LEFT, RIGHT], ClosingSettings()) is expected
+
+
+@pytest.mark.parametrize("bad", [LEFT, RIGHT])
+def test_a_place_needs_both_boundaries(bad: int) -> None:
+    """One lies 40 detections along 10 m of its curve, the other one only five, along 1 m."""
+    good = LEFT + RIGHT - bad
+    labels = np.repeat([good, bad], [40, 5])
+    u = np.concatenate([np.linspace(0.0, 10.0, 40), np.linspace(0.0, 1.0, 5)])
+    known = np.ones(45, bool)
+    found = Matches(np.arange(45), labels, u, known, known, np.eye(3), np.zeros(3))
+    assert not agrees(found, [LEFT, RIGHT], ClosingSettings())
+    assert agrees(found, [good], ClosingSettings())
+
+
+@pytest.mark.parametrize(("explained", "closes"), [(False, True), (True, False)])
+def test_a_window_is_registered_among_clutter_that_no_curve_explains(explained: bool, closes: bool) -> None:
+    """In every cycle six more cones stand 1.2 m beside the boundaries, as those of a lane beside would."""
+    scene = window()
+    for k in range(POSES):
+        x, y, theta = scene.truth[k]
+        c, s = np.cos(theta), np.sin(theta)
+        ahead = np.arctan2(y, x) + np.array([0.15, 0.45, 0.75])
+        seen = np.concatenate([rim(1.6 * side, DENT, ahead) for side in SIDES.values()])
+        labels = np.repeat([LEFT, RIGHT], 3).astype(np.intp)
+        seen = (seen - [x, y]) @ np.array([[c, -s], [s, c]])
+        rows = scene.track.detections.append(detections(0.1 * k, seen, labels), k)
+        scene.track.detections.used[rows] = explained
+    scene.drift(motion(0.2, 0.1, 0.01, scene.truth[-1, :2]))
+    found = scene.register()
+    assert (found is not None) is closes
+    if found is not None:
+        np.testing.assert_allclose(found.motion.apply(scene.poses[:, :2]), scene.truth[:, :2], atol=0.2)
+
+
+def test_a_far_uncertain_detection_weighs_less() -> None:
+    """Its information across the curve is that of its own sigma and the registration's together."""
+    scene = window()
+    hessians = []
+    for sigma in (0.1, 1.0, 3.0):
+        sightings = Sightings.of_points(np.arange(6), np.array([LEFT] * 3 + [RIGHT] * 3), _seen_points(scene))
+        covariances = np.tile(sigma**2 * np.eye(2), (6, 1, 1))
+        seen = Sightings(sightings.rows, sightings.labels, sightings.points, covariances, np.ones(6, bool))
+        hessians.append(_match_at(scene, seen))
+    own = ClosingSettings().sigma_reading ** 2
+    for hessian, sigma in zip(hessians[1:], (1.0, 3.0), strict=True):
+        np.testing.assert_allclose(hessian, hessians[0] * (own + 0.01) / (own + sigma**2), rtol=1e-9)
+
+
+def _seen_points(scene: Window) -> Array:
+    """Returns the coloured detections (6, 2) of the first cycle, map frame."""
+    table = scene.track.detections
+    return np.asarray(to_map(table.point[:6], scene.poses[table.cycle[:6]]))
+
+
+def _match_at(scene: Window, seen: Sightings) -> Array:
+    """Returns the information about a motion from sightings where they are."""
+    stretches = dict.fromkeys(SIDES, (0.0, 60.0))
+    found = _match(scene.track.state, ClosingSettings(), seen, motion(0.0, 0.0, 0.0), stretches, 1.0)
+    return found.hessian
 
 
 @pytest.mark.parametrize(
@@ -218,7 +309,7 @@ def test_a_place_must_be_certain_and_less_so_after_a_long_stretch(
 ) -> None:
     """However long a straight is driven again, it tells no place along it; a lost vehicle gets no rebate."""
     rows, inlier = np.arange(30), np.ones(30, bool)
-    matches = Matches(rows, rows % 2, np.full(30, again), inlier, np.eye(3), np.zeros(3))
+    matches = Matches(rows, rows % 2, np.full(30, again), inlier, inlier, np.eye(3), np.zeros(3))
     assert is_certain(matches, np.diag([0.01, sigma**2, 1.0]), ClosingSettings(), lost) is certain
 
 

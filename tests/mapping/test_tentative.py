@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.settings.growth import GrowthSettings
 
@@ -15,36 +16,42 @@ SETTINGS = GrowthSettings(sightings=3, merge_radius=1.0, forget_after=6.0)
 
 
 def tentative(*detections: tuple[float, float, float, float]) -> TentativeTracks:
-    """Sightings after readings (x, y, variance, t), one at a time."""
+    """Sightings after readings (x, y, variance, t), one at a time; the variance is the trace."""
     found = TentativeTracks(SETTINGS)
     for x, y, variance, t in detections:
-        found.add(np.array([[x, y]]), np.array([variance]), t)
+        found.add(np.array([[x, y]]), round_covariances(variance), t)
     return found
+
+
+def round_covariances(*variances: float) -> Array:
+    """Returns covariances (m, 2, 2) that are alike in all directions, of these traces."""
+    return 0.5 * np.array(variances)[:, None, None] * np.eye(2)
 
 
 def test_a_merged_sighting_is_the_weighted_mean() -> None:
     """Weights 1 and 2: a third of the way is left to the first."""
     found = tentative((0.0, 0.0, 1.0, 0.0), (0.3, -0.6, 0.5, 0.1))
     np.testing.assert_allclose(found.points, [[0.2, -0.4]], atol=1e-15)
-    assert found.weights.tolist() == [3.0]
+    np.testing.assert_allclose(found.information, [6.0 * np.eye(2)])
     assert found.counts.tolist() == [2]
     assert found.last_t.tolist() == [0.1]
 
 
 def test_two_readings_of_one_cycle_merge_one_after_the_other() -> None:
     found = tentative((0.0, 0.0, 1.0, 0.0))
-    found.add(np.array([[0.6, 0.0], [0.0, 0.3]]), np.ones(2), 0.1)
+    found.add(np.array([[0.6, 0.0], [0.0, 0.3]]), round_covariances(1.0, 1.0), 0.1)
     np.testing.assert_allclose(found.points, [[0.2, 0.1]], atol=1e-15)
     assert found.counts.tolist() == [3]
 
 
 @pytest.mark.parametrize(("distance", "count"), [(0.99, 1), (1.01, 2)])
-def test_only_what_is_near_merges(distance: float, count: int) -> None:
-    assert len(tentative((0.0, 0.0, 1.0, 0.0), (distance, 0.0, 1.0, 0.1)).points) == count
+def test_of_what_is_known_well_only_what_is_near_merges(distance: float, count: int) -> None:
+    """Each is known to 0.22 m, so 1.01 m are more than three sigmas of both together."""
+    assert len(tentative((0.0, 0.0, 0.1, 0.0), (distance, 0.0, 0.1, 0.1)).points) == count
 
 
 def test_a_reading_goes_to_the_nearest() -> None:
-    found = tentative((0.0, 0.0, 1.0, 0.0), (1.5, 0.0, 1.0, 0.0), (0.9, 0.0, 1.0, 0.1))
+    found = tentative((0.0, 0.0, 0.1, 0.0), (1.5, 0.0, 0.1, 0.0), (0.9, 0.0, 0.1, 0.1))
     np.testing.assert_allclose(found.points, [[0.0, 0.0], [1.2, 0.0]], atol=1e-15)
     assert found.counts.tolist() == [1, 2]
 
@@ -60,8 +67,8 @@ def test_confirmed_when_seen_three_times() -> None:
 def test_what_is_not_seen_again_is_forgotten(t: float, left: int) -> None:
     """Also in a cycle in which nothing is seen."""
     found = tentative((0.0, 0.0, 1.0, 0.0), (5.0, 0.0, 1.0, 0.2))
-    found.add(np.zeros((0, 2)), np.zeros(0), t)
-    assert len(found.points) == len(found.weights) == len(found.counts) == len(found.last_t) == left
+    found.add(np.zeros((0, 2)), np.zeros((0, 2, 2)), t)
+    assert len(found.points) == len(found.information) == len(found.counts) == len(found.last_t) == left
 
 
 def test_seeing_it_again_keeps_it() -> None:
@@ -80,17 +87,18 @@ def test_remove_and_clear() -> None:
 
 
 def test_a_rigid_motion_moves_every_track() -> None:
-    """A half turn and a shift; weights and counts stay."""
+    """A half turn and a shift; what is alike in all directions and the counts stay."""
     found = tentative((1.0, 0.0, 1.0, 0.0), (4.0, 2.0, 0.5, 0.0))
     found.move(np.array([1.0, 1.0, np.pi]))
     np.testing.assert_allclose(found.points, [[0.0, 1.0], [-3.0, -1.0]], atol=1e-12)
-    assert found.weights.tolist() == [1.0, 2.0] and found.counts.tolist() == [1, 1]
+    np.testing.assert_allclose(found.information, [2.0 * np.eye(2), 4.0 * np.eye(2)], atol=1e-12)
+    assert found.counts.tolist() == [1, 1]
 
 
 def test_of_too_many_tracks_those_stay_that_were_seen_last() -> None:
     found = TentativeTracks(GrowthSettings(max_tracks=3))
     for k, t in enumerate([0.4, 0.1, 0.3, 0.2, 0.5]):
-        found.add(np.array([[3.0 * k, 0.0]]), np.ones(1), t)
+        found.add(np.array([[3.0 * k, 0.0]]), round_covariances(1.0), t)
     assert found.points[:, 0].tolist() == [0.0, 6.0, 12.0]
     assert found.last_t.tolist() == [0.4, 0.3, 0.5]
 
@@ -99,3 +107,86 @@ def test_a_late_detection_makes_no_track_older() -> None:
     found = tentative((0.0, 0.0, 1.0, 2.0), (0.0, 0.0, 1.0, 1.5))
     assert found.last_t.tolist() == [2.0]
     assert found.counts.tolist() == [2]
+
+
+# --- covariances -----------------------------------------------------------------------------------------
+
+
+def along(theta: float, long: float, wide: float) -> Array:
+    """Returns a covariance (1, 2, 2) with these standard deviations along a direction and across it."""
+    turn = rotation(theta)
+    return np.asarray((turn @ np.diag([long**2, wide**2]) @ turn.T)[None])
+
+
+def test_sightings_of_one_cone_that_are_smeared_along_their_rays_are_one_track() -> None:
+    """From 25 m away the range errs by 0.8 m: 1.7 m are more than the radius, but within 2.5 sigmas."""
+    ray = np.array([np.cos(0.3), np.sin(0.3)])
+    found = TentativeTracks(SETTINGS)
+    for t, off in enumerate((0.0, 1.7, -0.6, 1.2)):
+        found.add(((25.0 + off) * ray)[None], along(0.3, 0.8, 0.1), 0.1 * t)
+    assert found.counts.tolist() == [4]
+    across = TentativeTracks(SETTINGS)
+    side = np.array([-ray[1], ray[0]])
+    for t, off in enumerate((0.0, 1.7)):
+        across.add((25.0 * ray + off * side)[None], along(0.3, 0.8, 0.1), 0.1 * t)
+    assert across.counts.tolist() == [1, 1]
+
+
+@pytest.mark.parametrize(("distance", "count"), [(1.99, 1), (2.01, 2)])
+def test_however_uncertain_what_is_farther_than_two_radii_is_another_cone(
+    distance: float, count: int
+) -> None:
+    found = TentativeTracks(SETTINGS)
+    for x in (0.0, distance):
+        found.add(np.array([[x, 0.0]]), along(0.0, 3.0, 3.0), 0.0)
+    assert len(found.points) == count
+
+
+def test_cones_of_a_row_two_and_a_half_metres_apart_stay_apart() -> None:
+    """Each is seen 30 times with 0.3 m of noise, as both are passed."""
+    rng, found = np.random.default_rng(0), TentativeTracks(SETTINGS)
+    cones = np.array([[0.0, 0.0], [2.5, 0.0], [5.0, 0.0]])
+    for k in range(30):
+        found.add(cones + 0.3 * rng.normal(size=(3, 2)), np.repeat(along(0.0, 0.3, 0.3), 3, axis=0), 0.1 * k)
+    assert found.counts.tolist() == [30, 30, 30]
+    np.testing.assert_allclose(found.points, cones, atol=4 * 0.3 / np.sqrt(30))
+
+
+def test_a_detection_goes_to_the_track_that_explains_it_best_in_sigmas() -> None:
+    """It lies 1.4 m before one track along its own ray, and 1.2 m beside another one, across it."""
+    found = TentativeTracks(SETTINGS)
+    found.add(np.array([[1.4, 0.0], [0.0, 1.2]]), np.repeat(along(0.0, 0.1, 0.1), 2, axis=0), 0.0)
+    found.add(np.zeros((1, 2)), along(0.0, 0.8, 0.1), 0.1)
+    assert found.counts.tolist() == [2, 1]
+
+
+def test_the_place_of_a_track_is_the_least_squares_of_its_detections() -> None:
+    """Covariances differ in direction; half the trace and the worst direction are those of its own."""
+    rng, found = np.random.default_rng(1), TentativeTracks(SETTINGS)
+    points = 0.2 * rng.normal(size=(6, 2))
+    covariances = [along(float(a), 0.5, 0.1)[0] for a in rng.uniform(0.0, np.pi, 6)]
+    for t, (point, covariance) in enumerate(zip(points, covariances, strict=True)):
+        found.add(point[None], covariance[None], 0.1 * t)
+    information = [np.linalg.inv(covariance) for covariance in covariances]
+    joint = np.linalg.inv(np.sum(information, axis=0))
+    mean = joint @ sum(i @ p for i, p in zip(information, points, strict=True))
+    np.testing.assert_allclose(found.points, [mean], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.inv(found.information[0]), joint, atol=1e-12)
+    assert found.variances(np.array([0]))[0] == pytest.approx(0.5 * np.trace(joint))
+    assert found.sigmas(np.array([0]))[0] == pytest.approx(np.sqrt(np.linalg.eigvalsh(joint)[1]))
+
+
+def test_a_rigid_motion_turns_what_is_known_of_a_track() -> None:
+    found = TentativeTracks(SETTINGS)
+    found.add(np.array([[2.0, 1.0]]), along(0.4, 0.5, 0.1), 0.0)
+    found.move(np.array([1.0, -1.0, 0.9]))
+    np.testing.assert_allclose(found.points[0], rotation(0.9) @ [2.0, 1.0] + [1.0, -1.0], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.inv(found.information), along(1.3, 0.5, 0.1), atol=1e-12)
+
+
+def test_a_cone_that_is_taken_back_from_a_curve_is_confirmed_and_rather_certain() -> None:
+    found = TentativeTracks(SETTINGS)
+    found.restore(np.array([[1.0, 2.0], [4.0, 2.0]]), 3.0)
+    assert found.confirmed().tolist() == [0, 1]
+    np.testing.assert_allclose(found.sigmas(np.arange(2)), 0.3)
+    assert found.last_t.tolist() == [3.0, 3.0]

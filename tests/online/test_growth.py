@@ -12,9 +12,10 @@ from scipy.spatial import KDTree
 from pathspace_graph.eval.metrics.curves import mapped_points, true_curve
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.mapping.candidates import Candidates, End
 from pathspace_graph.mapping.path import PathAhead
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.online.growth import count_in_order, undisputed
+from pathspace_graph.online.growth import _end, count_in_order, undisputed
 from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -22,6 +23,9 @@ from ..scenes.drives import DT, ahead, corridor, detections, exact_log, map_log,
 from ..scenes.maps import boundary_through
 
 Array = NDArray[np.float64]
+
+ROUND = 0.005 * np.eye(2)
+"""A tentative detection has this covariance (m^2)."""
 
 
 # --- contradicting colours -------------------------------------------------------------------------------
@@ -103,7 +107,7 @@ def test_an_end_nearer_to_an_older_stretch_of_the_path_does_not_follow_that() ->
     confirmed, size = boundary.confirmed_end, boundary.size
     tentative.clear()
     for t in (5.0, 5.1, 5.2):
-        tentative.add(np.array([[36.0, 1.0], [32.0, 1.0], [28.0, 1.0]]), np.full(3, 0.01), t)
+        tentative.add(np.array([[36.0, 1.0], [32.0, 1.0], [28.0, 1.0]]), np.tile(ROUND, (3, 1, 1)), t)
     x = mapper.poses[-1, 0]
     points = np.array([[60.0, 3.0], [0.0, 3.0], [0.0, 0.0], [x, 0.0], [x + 7.0, 0.0]])
     stations = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
@@ -132,7 +136,7 @@ def along_x(driven: float = 0.0, begin: float = -10.0) -> PathAhead:
 def track(mapper: FixedLagMapper, *points: tuple[float, float], label: int = LEFT, times: int = 3) -> None:
     """Makes tentative tracks at points, detected so many times."""
     for k in range(times):
-        mapper.growth.tentative[label].add(np.array(points), np.full(len(points), 0.01), 0.1 * k)
+        mapper.growth.tentative[label].add(np.array(points), np.tile(ROUND, (len(points), 1, 1)), 0.1 * k)
 
 
 def grow(mapper: FixedLagMapper, path: PathAhead) -> list[tuple[float, float]]:
@@ -339,3 +343,109 @@ def test_the_window_holds_a_bounded_number_of_poses() -> None:
     log = exact_log(ahead(8.0, 3.0), *corridor(40.0))
     mapper, _ = map_log(log, FixedLagMapper(MapperSettings(max_poses=7)))
     assert len(mapper.poses) == 7
+
+
+# --- what is certain, and what lies across a line ----------------------------------------------------------
+
+
+def far_track(mapper: FixedLagMapper, point: tuple[float, float], sigma: float, times: int) -> None:
+    """Adds sightings of a cone on the left whose ranges, along x, have this standard deviation (m)."""
+    covariance = np.diag([sigma**2, 0.05**2])[None]
+    for k in range(times):
+        mapper.growth.tentative[LEFT].add(np.array([point]), covariance, 0.1 * k)
+
+
+def test_an_uncertain_cone_extends_a_curve_once_it_is_certain(alone: FixedLagMapper) -> None:
+    """Three sightings of 1.2 m know it to 0.69 m, and nine to 0.4 m; then one from nearby."""
+    track(alone, (0.0, 2.0), (4.0, 2.0))
+    assert len(grow(alone, along_x())) == 2
+    far_track(alone, (6.5, 2.0), 1.2, 3)
+    assert len(grow(alone, along_x())) == 2
+    far_track(alone, (6.5, 2.0), 1.2, 5)
+    assert alone.growth.tentative[LEFT].counts.tolist() == [8]
+    assert len(grow(alone, along_x())) == 2
+    far_track(alone, (6.5, 2.0), 0.3, 1)
+    assert grow(alone, along_x())[2:] == [(6.5, 2.0)]
+
+
+def test_a_curve_does_not_begin_through_uncertain_cones(alone: FixedLagMapper) -> None:
+    far_track(alone, (0.0, 2.0), 1.2, 3)
+    far_track(alone, (4.0, 2.0), 1.2, 3)
+    assert grow(alone, along_x()) == []
+    track(alone, (0.0, 2.0), (4.0, 2.0), times=1)
+    assert grow(alone, along_x()) == [(0.0, 2.0), (4.0, 2.0)]
+
+
+def uncrossed(mapper: FixedLagMapper, path: PathAhead, *points: tuple[float, float]) -> list[int]:
+    """Which of candidates at points the left curve reaches from its end at (4, 2) without crossing a line."""
+    places = np.array(points)
+    found = Candidates(places, np.arange(len(places)), places[:, 0], places[:, 1])
+    end = End(np.array([4.0, 2.0]), 4.0, 2.0)
+    return mapper.growth._uncrossed(mapper.smoother, LEFT, path, end, found).tolist()
+
+
+@pytest.fixture
+def between(alone: FixedLagMapper) -> FixedLagMapper:
+    """Curves from x = 0 to 4 m, 2 m beside the x axis on either side."""
+    track(alone, (0.0, 2.0), (4.0, 2.0))
+    track(alone, (0.0, -2.0), (2.0, -2.0), (4.0, -2.0), label=RIGHT)
+    assert len(grow(alone, along_x())) == 2 and RIGHT in alone.boundaries
+    return alone
+
+
+def test_a_cone_across_the_path_driven_is_not_reached_and_none_after_it(between: FixedLagMapper) -> None:
+    """The vehicle is at x = 8 m: the second cone is reached across the path at x = 7.2 m, or at 11 m."""
+    assert uncrossed(between, along_x(8.0), (6.0, 2.0), (8.5, -2.0), (12.0, 2.0)) == [0]
+    assert uncrossed(between, along_x(8.0), (6.0, 2.0), (9.0, 2.0), (13.0, -2.0)) == [0, 1, 2]
+    assert uncrossed(between, along_x(6.0), (6.0, 2.0), (8.5, -2.0), (12.0, 2.0)) == [0, 1, 2]
+
+
+def test_a_cone_across_the_other_boundary_is_not_reached(between: FixedLagMapper) -> None:
+    """The vehicle has not come to x = 0 yet, so only the right boundary lies between."""
+    path = along_x(-6.0)
+    assert uncrossed(between, path, (3.0, -1.0), (3.5, -3.0)) == [0]
+    assert uncrossed(between, path, (6.0, -1.0), (6.0, -3.0)) == [0, 1]
+
+
+def test_a_cone_across_the_curve_itself_is_not_reached(between: FixedLagMapper) -> None:
+    boundary = between.boundaries[LEFT]
+    boundary.observed[:] = [np.array(p) for p in ((0.0, 2.0), (4.0, 5.0), (7.0, 2.0), (4.0, 2.0))]
+    assert uncrossed(between, along_x(-6.0), (6.0, 6.0)) == []
+    assert uncrossed(between, along_x(-6.0), (3.0, 1.0)) == [0]
+
+
+def test_a_curve_that_runs_along_its_own_beginning_again_goes_on(between: FixedLagMapper) -> None:
+    """On the second lap the loop is still open, and the same cones are seen a few centimetres beside."""
+    boundary = between.boundaries[LEFT]
+    lap = [(0.0, 2.05), (4.0, 1.95), (8.0, 2.05), (12.0, 2.0), (20.0, 20.0), (-20.0, 20.0), (0.0, 1.95)]
+    boundary.observed[:] = [np.array(p) for p in (*lap, (4.0, 2.0))]
+    assert uncrossed(between, along_x(-6.0), (8.0, 1.98), (12.0, 2.03)) == [0, 1]
+
+
+# --- the side of an end ------------------------------------------------------------------------------------
+
+
+def test_one_wrong_cone_at_the_end_leads_no_farther(alone: FixedLagMapper) -> None:
+    """The newest cones are 2, 2 and 3.4 m beside the path: the next may be 2.7 m and a step away."""
+    track(alone, (-4.0, 2.0), (0.0, 2.0), (4.0, 3.4))
+    assert len(grow(alone, along_x())) == 3
+    end = _end(alone.smoother, LEFT, along_x())
+    assert end.side == pytest.approx(2.7, abs=0.05)  # of the cones and the end, four values
+    assert end.position == pytest.approx([4.0, 3.4], abs=0.05)
+
+
+def test_an_end_that_is_carried_on_around_a_bend_stays_beside_the_path() -> None:
+    """The cones end at x = 12 m; the vehicle goes on around three quarters of a circle of 15 m.
+
+    The newest cones are far behind then, and say something of the side only where the path ran beside them.
+    """
+    blind = np.tile([8.0, 0.0, 8.0 / 15.0], (round(9.0 / DT), 1))
+    log = exact_log(np.concatenate([ahead(8.0, 2.0), blind]), *corridor(16.0))
+    mapper, _ = map_log(log)
+    driven = true_poses(log)[:, :2]
+    for label, boundary in mapper.boundaries.items():
+        assert boundary.unseen > 40.0
+        u = np.linspace(2.0, boundary.confirmed_end, 60)
+        curve = boundary.evaluate(mapper.control_points(label), u)
+        distance = KDTree(driven).query(curve)[0]
+        np.testing.assert_allclose(distance, 2.0, atol=0.7)

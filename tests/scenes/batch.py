@@ -52,7 +52,7 @@ def straight(
     log = exact_log(ahead(6.0, seconds), cones, labels)
     settings = own_settings(whole)
     chain, detections = (
-        judge_log(log, log.odometry_sigma, settings).chain,
+        judge_log(log, log.noise, settings).chain,
         DetectionTable.of(log.cycles),
     )
     detections.twist[:] = ahead(6.0, 1.0)[0]

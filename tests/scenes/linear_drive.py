@@ -24,7 +24,6 @@ IntArray = NDArray[np.intp]
 
 POINTS = 12
 """This is the number of map points; pose k sees some of those near point k."""
-SIGMA_CALIBRATION = np.array([0.3, 0.5])
 SIGMA_START = np.array([0.5, 0.4, 0.3])
 NOTHING = np.zeros(0, np.intp)
 
@@ -114,6 +113,10 @@ class LinearDrive:
     seed: int = 0
     tolerance: float = 1e-9
     """Factors are linearized again after a change larger than this."""
+    means: tuple[float, float] = (0.0, 0.0)
+    """Prior means of the calibration."""
+    sigmas: tuple[float, float] = (0.3, 0.5)
+    """Prior standard deviations of the calibration."""
     odometry: list[IntegratedOdometry] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -121,7 +124,8 @@ class LinearDrive:
             lag=float(self.lag),
             tolerances=(self.tolerance, self.tolerance),
             keyframe_interval=1e9,
-            sigmas_calibrations=(float(SIGMA_CALIBRATION[0]), float(SIGMA_CALIBRATION[1])),
+            sigmas_calibrations=self.sigmas,
+            calibrations=self.means,
         )
         self.track = LinearTrack(self.seed)
         self.smoother = FixedLagSmoother(settings, self.track)
@@ -179,8 +183,9 @@ class LinearDrive:
     def batch(self) -> tuple[Array, Array]:
         """Returns `J'J` and `J'z` of all measurements, on the columns of all keys."""
         keys = self.keys
-        matrices = [_scattered([CALIBRATION_KEY], np.diag(1.0 / SIGMA_CALIBRATION), keys)]
-        right = [np.zeros(2)]
+        sigmas = np.array(self.sigmas)
+        matrices = [_scattered([CALIBRATION_KEY], np.diag(1.0 / sigmas), keys)]
+        right = [self.means / sigmas]
         matrices.append(_scattered([pose_key(0)], np.diag(1.0 / SIGMA_START), keys))
         right.append(self.start / SIGMA_START)
         for k in range(self.cycles):

@@ -28,6 +28,17 @@ UNLIMITED = {
     "limits.silence",
 }
 
+SIGNED = {
+    "odometry.scale",
+    "odometry.bias",
+    "calibration.yaw",
+    "calibration.lateral",
+    "calibration.latency",
+    "calibration.range_scale",
+    "calibration.range_bias",
+}
+"""Known errors may have either sign, and most often are zero."""
+
 
 def numbers(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
     """The dotted name of each number in a tree of settings, the group that holds it, and its field."""
@@ -43,8 +54,16 @@ NUMBERS = list(numbers(MapperSettings()))
 
 
 @pytest.mark.parametrize(("name", "group", "field"), NUMBERS, ids=[name for name, *_ in NUMBERS])
-def test_every_number_is_positive_and_most_are_finite(name: str, group: Any, field: str) -> None:
-    for wrong in (0, -1.0, nan, *(() if name in UNLIMITED else (inf,))):
+def test_every_number_but_a_known_error_is_positive_and_most_are_finite(
+    name: str, group: Any, field: str
+) -> None:
+    if name in SIGNED:
+        wrong_ones: tuple[float, ...] = (nan, inf, -inf)
+        for right in (0.0, -0.5, 0.5):
+            assert getattr(replace(group, **{field: right}), field) == right
+    else:
+        wrong_ones = (0, -1.0, nan, *(() if name in UNLIMITED else (inf,)))
+    for wrong in wrong_ones:
         with pytest.raises(SettingsError, match=f"^{re.escape(name)}: expected a .*, found {wrong}"):
             replace(group, **{field: wrong})
 
