@@ -170,6 +170,11 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
 
 def measure_log(log: Log) -> MeasuredNoise | None:
     """Returns the noise of a whole log and the constant errors of its sensor, by its readings alone."""
+    return measure(*seen_cycles(log), None)
+
+
+def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
+    """Returns the cycles of a log where odometry alone places them, and the twists."""
     unknown = KnownNoise(log.odometry_sigma, odometry_stated=False, detections_stated=False)
     front_end, twists, cycles = FrontEnd(MapperSettings(), unknown), TwistRecord(), []
     for odometry, detections in split_odometry(log):
@@ -177,4 +182,4 @@ def measure_log(log: Log) -> MeasuredNoise | None:
         reading = front_end.update(odometry, detections)
         labelled = replace(detections, labels=reading.detections.labels)
         cycles.append(SeenCycle(labelled, front_end.pose, reading.motion.odometry.twist))
-    return measure(cycles, twists, None)
+    return cycles, twists
