@@ -96,7 +96,7 @@ class MeasuredNoise:
 
 
 def along_and_across(points: Array, covariances: Array) -> Array:
-    """Return the standard deviations (m, 2) along and across the rays to points (m, 2), vehicle frame."""
+    """Returns the standard deviations (m, 2) along and across the rays to points (m, 2), vehicle frame."""
     ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)[:, None]
     axes = np.stack([ray, left_of(ray)], axis=1)
     return np.asarray(np.sqrt(np.einsum("mki,mij,mkj->mk", axes, covariances, axes)))

@@ -127,7 +127,7 @@ class NoiseLearner:
         return replace(settings, odometry=odometry, calibration=replace(sensor, doubt=inf, **priors))
 
     def used(self, settings: MapperSettings) -> RunNoise:
-        """Return the noise that is used, and what sets the size of the map where ranges and speeds disagree.
+        """Returns the noise that is used, and what sets the size of the map where ranges and speeds disagree.
 
         They do where `calibrated` finds that the scale of the ranges contradicts its prior.
         """
@@ -159,7 +159,7 @@ class NoiseLearner:
 
 
 def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
-    """Return where noise comes from that is stated or not, is to be measured or not, and is known or not."""
+    """Returns where noise comes from that is stated or not, is to be measured or not, and is known or not."""
     if stated and not (measured and known):
         return "stated"
     return "measured" if known else "assumed"

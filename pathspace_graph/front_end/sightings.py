@@ -206,7 +206,7 @@ class TwistRecord:
         return None if orders is None else (orders.min(axis=0), float(np.median(np.diff(np.array(self._t)))))
 
     def orders(self) -> Array | None:
-        """Return the noise (k, 3) of a twist by differences of second to fourth order; None without enough.
+        """Returns the noise (k, 3) of a twist by differences of second to fourth order; None without enough.
 
         It is their median absolute value over that of white noise, `sqrt(binomial(2 k, k))`. Where the orders
         differ, the noise is not white, or the motion itself is in it.
