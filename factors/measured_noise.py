@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from .se2 import left_of
 from .sensor import SENSOR_SIZE, by_sensor
 
 Array = NDArray[np.float64]
@@ -92,6 +93,13 @@ class MeasuredNoise:
     def corrected(self, points: Array, twist: Array) -> Array:
         """Return detections at points (m, 2), vehicle frame, without the constant errors of the sensor."""
         return np.asarray(points + by_sensor(points, np.tile(twist, (len(points), 1))) @ self.sensor)
+
+
+def along_and_across(points: Array, covariances: Array) -> Array:
+    """Returns the standard deviations (m, 2) along and across the rays to points (m, 2), vehicle frame."""
+    ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)[:, None]
+    axes = np.stack([ray, left_of(ray)], axis=1)
+    return np.asarray(np.sqrt(np.einsum("mki,mij,mkj->mk", axes, covariances, axes)))
 
 
 @dataclass(frozen=True, eq=False)

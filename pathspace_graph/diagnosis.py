@@ -1,4 +1,4 @@
-"""What the calibration found at the end of a run says about the vehicle, in words."""
+"""What a run has found about the vehicle, in words: the constant errors, and the noise that was measured."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from pathspace_graph.io.results import VehicleState
+from pathspace_graph.factors.measured_noise import MeasuredNoise
+from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.io.results import RunNoise, VehicleState
 
 LIMIT: Final = 3.0
 """A calibration farther from zero than this number of its prior's standard deviations is worth a line."""
@@ -67,3 +69,80 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
             text = cause.text.format(size, cause.signs[0 if ratio > 0.0 else 1])
             lines.append(f"{text} ({abs(ratio):.1f} sigmas of its prior)")
     return lines
+
+
+# --- measured noise --------------------------------------------------------------------------------------
+
+REFERENCE: Final = 10.0
+"""The noise of detections is told at this range (m)."""
+CLEAR: Final = 4.0
+"""A measured error of the sensor is told where it is larger than this number of its standard deviations."""
+WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_scale": 0.01, "range_bias": 0.05}
+"""It is told where it is larger than this (rad, m, s, -, m)."""
+STAYING: Final = 0.1
+"""Errors that stay with a cone are told where they are this share of the variance."""
+
+
+def noise_lines(noise: RunNoise | None) -> list[str]:
+    """Returns what was measured in a line, and in another one that ranges and speeds disagree if they do."""
+    if noise is None or noise.measured is None or "measured" not in (noise.odometry, noise.detections):
+        return []
+    return [measured_line(noise.measured), *size_lines(noise)]
+
+
+def measured_line(measured: MeasuredNoise) -> str:
+    """Returns in a line the noise, and those constant errors of the sensor that are clearly there."""
+    forward, sideways, turning = measured.odometry.tolist()
+    line = (
+        f"measured: odometry {forward:.2g} m/s, {sideways:.2g} m/s, {turning:.2g} rad/s from sample to sample"
+    )
+    if measured.along is None or measured.across is None:
+        return line
+    rays = measured.along, measured.across
+    along, across = (float(ray.sigmas(np.array([REFERENCE]))[0]) for ray in rays)
+    line += f"; detections {along:.2g} m along and {across:.2g} m across the ray at {REFERENCE:g} m"
+    if max(ray.share for ray in rays) > STAYING:
+        shares = " and ".join(f"{100.0 * ray.share:.0f} %" for ray in rays)
+        times = " and ".join(f"{ray.time:g} s" for ray in rays)
+        line += f", of which {shares} of the variance stay with a cone for {times}"
+    errors = _errors(measured)
+    return f"{line}; {', '.join(errors)}" if errors else line
+
+
+def size_lines(noise: RunNoise) -> list[str]:
+    """Returns a line where ranges and speeds disagree: by how much, and which of them the map believes."""
+    if noise.size is None or noise.measured is None:
+        return []
+    share = 100.0 * abs(noise.measured.sensor[SENSOR.index("range_scale")])
+    other = "ranges" if noise.size == "odometry" else "odometry"
+    whose = "the odometry's" if noise.size == "odometry" else "the ranges'"
+    advice = f"--calibration.trust {other} turns it round"
+    return [f"ranges and speeds disagree by {share:.0f} %: the map's size is {whose} ({advice})"]
+
+
+def _errors(measured: MeasuredNoise) -> list[str]:
+    """Returns the constant errors of the sensor that are clear and worth a word."""
+    clear = {
+        name: value
+        for name, value, sigma in zip(
+            SENSOR, measured.sensor.tolist(), measured.sensor_sigma.tolist(), strict=True
+        )
+        if abs(value) > max(CLEAR * sigma, WORTH[name])
+    }
+    texts = []
+    if "latency" in clear:
+        late = "late" if clear["latency"] > 0.0 else "early"
+        texts.append(f"stamps {1e3 * abs(clear['latency']):.0f} ms {late}")
+    if "yaw" in clear:
+        texts.append(f"turned {np.rad2deg(abs(clear['yaw'])):.1f} degrees to the {_side(clear['yaw'])}")
+    if "lateral" in clear:
+        texts.append(f"{abs(clear['lateral']):.2f} m too far to the {_side(clear['lateral'])}")
+    ranges = [f"{clear['range_scale']:+.1%}".replace("%", " %")] if "range_scale" in clear else []
+    if "range_bias" in clear:
+        sign = "-" if clear["range_bias"] < 0.0 else "+"
+        ranges.append(f"{sign} {abs(clear['range_bias']):.2f} m")
+    return [*texts, f"ranges {' '.join(ranges)}"] if ranges else texts
+
+
+def _side(value: float) -> str:
+    return "left" if value > 0.0 else "right"

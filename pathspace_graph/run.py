@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunNoise, RunResult, VehicleState
 
 from .health import Health
 from .labels import LEFT, RIGHT
@@ -97,6 +97,14 @@ class VehicleEstimator(Protocol):
 
     def vehicle_state(self) -> VehicleState:
         """Returns the newest pose and the calibration, with their joint covariance."""
+
+
+@runtime_checkable
+class NoiseEstimator(Protocol):
+    """Describes an online estimator that says which noise it uses."""
+
+    def noise_used(self) -> RunNoise:
+        """Returns the noise that is used now, and what was measured so far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,6 +373,7 @@ class _Run:
             observing=self._observing,
             batches=self._estimator.batches() if isinstance(self._estimator, BatchingEstimator) else None,
             waited=self._waited,
+            noise=self._estimator.noise_used() if isinstance(self._estimator, NoiseEstimator) else None,
         )
 
     def _take_snapshots(self, before: float) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from pathspace_graph.diagnosis import CAUSES, by_prior, diagnose
+from pathspace_graph.diagnosis import CAUSES, by_prior, diagnose, measured_line, noise_lines
+from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import CALIBRATION
-from pathspace_graph.io.results import VehicleState
+from pathspace_graph.io.results import RunNoise, VehicleState
 
 SETTINGS = {
     "odometry": {"sigma_scale": 0.005, "sigma_bias": 0.002},
@@ -69,3 +72,46 @@ def test_settings_of_another_estimator_give_no_line() -> None:
 
 def test_every_calibration_has_a_cause() -> None:
     assert set(CAUSES) == {*CALIBRATION, *SENSOR}
+
+
+# --- measured noise --------------------------------------------------------------------------------------
+
+ALONE = MeasuredNoise(np.array([0.0087, 0.0031, 0.0027]), np.full(3, 0.01), 0.025)
+MEASURED = MeasuredNoise(
+    ALONE.odometry,
+    ALONE.drift,
+    ALONE.interval,
+    along=RayNoise(np.array([0.07, 0.03]), 0.5, 2.0),
+    across=RayNoise(np.array([0.0, 0.014]), 0.8, 8.0),
+    sensor=np.array([-0.0227, 0.08, -0.115, 0.1, -0.31]),
+    sensor_sigma=np.array([0.005, 0.04, 0.006, 0.003, 0.03]),
+)
+
+
+def test_what_was_measured_is_a_line() -> None:
+    assert measured_line(ALONE) == (
+        "measured: odometry 0.0087 m/s, 0.0031 m/s, 0.0027 rad/s from sample to sample"
+    )
+    assert measured_line(MEASURED).split("; ")[1:] == [
+        "detections 0.37 m along and 0.14 m across the ray at 10 m, of which 50 % and 80 % of the variance "
+        "stay with a cone for 2 s and 8 s",
+        "stamps 115 ms early, turned 1.3 degrees to the right, ranges +10.0 % - 0.31 m",
+    ]
+
+
+def test_errors_of_the_sensor_that_are_not_clear_are_not_told() -> None:
+    unclear = replace(MEASURED, sensor_sigma=np.abs(MEASURED.sensor) / 3.9)
+    assert "stamps" not in measured_line(unclear)
+    small = replace(MEASURED, sensor=np.full(5, 1e-3), sensor_sigma=np.full(5, 1e-5))
+    assert measured_line(small) == measured_line(unclear)
+
+
+def test_a_run_says_what_sets_the_size_of_its_map() -> None:
+    run = RunNoise("measured", "measured", MEASURED, "odometry")
+    assert noise_lines(run)[1] == (
+        "ranges and speeds disagree by 10 %: the map's size is the odometry's (--calibration.trust ranges "
+        "turns it round)"
+    )
+    assert "the ranges' (--calibration.trust odometry" in noise_lines(replace(run, size="ranges"))[1]
+    assert len(noise_lines(replace(run, size=None))) == 1
+    assert noise_lines(None) == noise_lines(RunNoise("stated", "stated", MEASURED)) == []

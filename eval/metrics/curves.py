@@ -29,6 +29,8 @@ MAPPED_STEP: Final = 0.1
 """Distances are measured from points of a curve that are at most this far (m) apart."""
 CENTRE_STEP: Final = 1.0
 """The centre line is compared with the true one at points that are this far (m) apart."""
+CHORD: Final = 0.25
+"""Crossings are those of chords of this length (m)."""
 FARTHEST: Final = 3.0
 """A true boundary farther than this (m) from the mapped one is missed, as cones are in the paper's table."""
 ROUND_OFF: Final = 1e-9
@@ -148,6 +150,32 @@ def two_way_distance(first: MapBoundary, second: MapBoundary) -> float:
     forth = boundary_distances(second, mapped_points(first))
     back = boundary_distances(first, mapped_points(second))
     return 0.5 * (_mean(forth) + _mean(back))
+
+
+# --- crossings -------------------------------------------------------------------------------------------
+
+
+def crossings(track: Map) -> int:
+    """Returns how often the curves of a map cross each other or themselves, which no track does."""
+    chords = [np.zeros((0, 2, 2))]
+    for boundary in track.boundaries.values():
+        if isinstance(boundary, SplineBoundary):
+            points = mapped_points(boundary, CHORD)
+            ends = np.roll(points, -1, axis=0) if boundary.spline.periodic else points[1:]
+            chords.append(np.stack([points[: len(ends)], ends], axis=1))
+    begin, end = np.concatenate(chords).transpose(1, 0, 2)
+    return sum(
+        int((_apart(a, b, begin[k:], end[k:]) & _apart(begin[k:], end[k:], a, b)).sum())
+        for k, (a, b) in enumerate(zip(begin, end, strict=True))
+    )
+
+
+def _apart(begin: Array, end: Array, a: Array, b: Array) -> NDArray[np.bool_]:
+    """Returns whether points a and b lie on different sides of the lines through begin and end."""
+    way, first, second = end - begin, a - begin, b - begin
+    sides = way[..., 0] * first[..., 1] - way[..., 1] * first[..., 0]
+    others = way[..., 0] * second[..., 1] - way[..., 1] * second[..., 0]
+    return np.asarray(sides * others < 0.0)
 
 
 # --- the centre line -------------------------------------------------------------------------------------

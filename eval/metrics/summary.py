@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchResult
-from pathspace_graph.diagnosis import diagnose
+from pathspace_graph.diagnosis import diagnose, noise_lines
+from pathspace_graph.factors.measured_noise import along_and_across
+from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import Health, Stretch, counts, stretches
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.plausibility.hint import Hint
@@ -60,6 +62,10 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         summary["events"] = events
     if any(record.health for record in result.cycles):
         summary["health"] = _health(result)
+    if result.noise is not None:
+        summary["noise"] = _noise(result.noise, log)
+        notes = noise_lines(result.noise)
+        summary |= {"notes": notes} if notes else {}
     state = vehicle_of(result)
     if state is not None:
         summary |= _vehicle(state)
@@ -84,6 +90,41 @@ def _vehicle(state: VehicleState) -> dict[str, Any]:
     calibration = {name: value for name, (value, _) in known.items()}
     calibration |= {f"{name}_sigma": sigma for name, (_, sigma) in known.items()}
     return {"calibration": calibration, "heading_sigma": float(state.sigmas[2])}
+
+
+def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
+    """Returns where the noise comes from, what the log states of it, and what was measured."""
+    stated: dict[str, Any] = {}
+    if log.odometry_stated:
+        stated["odometry"] = log.odometry_sigma.tolist()
+    points = np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in log.cycles)])
+    if log.detections_stated and len(points):
+        covariances = np.concatenate([cycle.covariances for cycle in log.cycles])
+        along, across = np.median(along_and_across(points, covariances), axis=0).tolist()
+        stated["detections"] = {
+            "range": float(np.median(np.hypot(*points.T))),
+            "along": along,
+            "across": across,
+        }
+    found = {"odometry": noise.odometry, "detections": noise.detections, "stated": stated}
+    measured = noise.measured
+    if measured is None:
+        return found
+    values: dict[str, Any] = {
+        "odometry": measured.odometry.tolist(),
+        "drift": measured.drift.tolist(),
+        "seconds": measured.seconds,
+    }
+    for name, ray in (("along", measured.along), ("across", measured.across)):
+        if ray is not None:
+            begin, growth = ray.sigma.tolist()
+            values[name] = {"sigma": begin, "growth": growth, "share": ray.share, "time": ray.time}
+    if measured.along is not None:
+        values |= dict(zip(SENSOR, measured.sensor.tolist(), strict=True))
+        values |= {
+            f"{name}_sigma": sigma for name, sigma in zip(SENSOR, measured.sensor_sigma.tolist(), strict=True)
+        }
+    return found | {"measured": values}
 
 
 def _events(result: RunResult) -> list[dict[str, Any]]:

@@ -107,14 +107,14 @@ def _rows(track: Map, points: Mapping[int, Array], angle: float) -> _Rows:
         if len(turned) == 0 or boundary.size == 0:
             gradient.append(np.zeros(2 * boundary.size))
             continue
-        point, normal, position, basis = _pairs(boundary, turned)
+        point, normal, position, basis = near_pairs(boundary, turned)
         error.append(np.einsum("rd,rd->r", normal, point - position))
         lever.append(normal[:, 1] * point[:, 0] - normal[:, 0] * point[:, 1])
         gradient.append((basis.T @ (lever[-1][:, None] * normal)).ravel())
     return _Rows(*(np.concatenate(parts) for parts in (error, lever, gradient)))
 
 
-def _pairs(boundary: MapBoundary, points: Array) -> tuple[Array, Array, Array, Array]:
+def near_pairs(boundary: MapBoundary, points: Array) -> tuple[Array, Array, Array, Array]:
     """Returns points (r, 2) near a boundary, and there its normal, its position (r, 2) and basis (r, m)."""
     if isinstance(boundary, SplineBoundary):
         feet = boundary.spline.foot_points(points)

@@ -173,6 +173,7 @@ class BatchMapper:
             convergence=convergence,
             map_covariance=joint,
             calibration=at.state.calibration.copy(),
+            noise=judged.noise,
             online=online,
             seconds=watch.laps,
             system=system,

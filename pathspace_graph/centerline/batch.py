@@ -98,6 +98,7 @@ class CenterlineBatch:
             laps=start.laps,
             converged=start.converged,
             cost=start.cost,
+            noise=start.noise,
         )
 
     def _optimizer(

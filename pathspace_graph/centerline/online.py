@@ -11,7 +11,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import LapBatches, VehicleState
+from pathspace_graph.io.results import LapBatches, RunNoise, VehicleState
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult
 from pathspace_graph.settings.mapper import MapperSettings
@@ -50,6 +50,10 @@ class CenterlineMapper:
     def batches(self) -> LapBatches:
         """Returns when batches of the lap have ended."""
         return self.boundaries.batches()
+
+    def noise_used(self) -> RunNoise:
+        """Returns the noise that is used now, and what was measured so far."""
+        return self.boundaries.noise_used()
 
     def map(self) -> Map:
         """Returns the edges of the ribbon, with their joint covariance."""

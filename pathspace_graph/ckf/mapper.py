@@ -9,7 +9,7 @@ from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
-from pathspace_graph.io.results import VehicleState
+from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
 from pathspace_graph.mapping.motion import MeasuredMotion
@@ -126,6 +126,10 @@ class CkfMapper:
         keys = [state.columns(b, np.arange(curve.size)) for b, curve in sorted(state.curves.items())]
         columns = np.concatenate([np.zeros(0, np.intp), *keys])
         return Map(self.closed, curves, state.belief.covariance[np.ix_(columns, columns)])
+
+    def noise_used(self) -> RunNoise:
+        """Returns the noise that is used now, and what was measured so far."""
+        return self.front_end.noise_used
 
     def vehicle_state(self) -> VehicleState:
         """Returns the newest pose and the calibration, with their joint covariance."""

@@ -13,9 +13,10 @@ from tyro.conf import Positional, arg
 
 from pathspace_graph.convert.bag import BagOptions, read_bag
 from pathspace_graph.convert.csv_files import Columns, Units, read_csv
-from pathspace_graph.convert.recording import Recording, to_log
-from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings, Side
+from pathspace_graph.convert.recording import Recording, to_log, windowed
+from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings, Side, Window
 from pathspace_graph.convert.victoria_park import read_victoria_park
+from pathspace_graph.diagnosis import measured_line
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.io.files import check_target
@@ -81,6 +82,10 @@ class Convert:
     """The twists are made from the poses of nav_msgs/Odometry, for a publisher that leaves its twist zero."""
     received: bool = False
     """Stamps are the times at which messages were received, also where they have a stamp of their own."""
+    range_max: float | None = None
+    """Detections farther from the sensor than this (m) are left out."""
+    time_offset: float = 0.0
+    """This time (s) is added to the stamps of the detections: it is negative where they are too late."""
     noise: Annotated[NoiseSettings, arg(name="")] = field(default_factory=NoiseSettings)
     """These settings describe noise that the record does not state."""
 
@@ -88,9 +93,9 @@ class Convert:
         """Reads, converts, writes and reports."""
         check_target(self.out, LOG_FILE)
         frames = Frames(self.mounting or (0.0, 0.0, 0.0), self.y_odometry or self.y, self.y)
-        rule = LabelRule(self.labels)
+        rule, window = LabelRule(self.labels), Window(self.range_max, self.time_offset)
         with progress("converting"):
-            record = self._read(rule)
+            record = windowed(self._read(rule), window)
             file = self.source or Path(self.kind)
             log = with_measured_noise(to_log(record, frames, self.noise, file))
             write_checked(log, self.out, file)
@@ -159,7 +164,8 @@ def report(notes: Counter[str], log: Log, out: Path) -> None:
     for text, count in notes.items():
         if count:
             console.print(f"{count} {text}", highlight=False, soft_wrap=True, markup=False)
-    for line in (outline(log), f"{out}: {describe(log)}"):
+    measured = [] if log.measured is None else [measured_line(log.measured)]
+    for line in (outline(log), *measured, f"{out}: {describe(log)}"):
         console.print(line, highlight=False, soft_wrap=True, markup=False)
 
 

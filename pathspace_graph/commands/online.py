@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from pathspace_graph.diagnosis import diagnose
+from pathspace_graph.diagnosis import diagnose, noise_lines
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.estimators import DEFAULT, MapKind, check_online, for_map, make_online
 from pathspace_graph.eval.metrics.summary import (
@@ -157,7 +157,7 @@ def report(result: RunResult, log: Log) -> None:
         late = f"{result.batches.late} cycle{'' if result.batches.late == 1 else 's'}"
         console.print(f"in a vehicle the batch of the lap would have been {late} late", highlight=False)
     state = vehicle_of(result)
-    for line in [] if state is None else diagnose(state, result.settings):
+    for line in noise_lines(result.noise) + ([] if state is None else diagnose(state, result.settings)):
         console.print(line, highlight=False, soft_wrap=True, markup=False)
     missing = not_mapped(result.map, log)
     if missing:

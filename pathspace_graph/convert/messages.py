@@ -48,6 +48,10 @@ class Points:
     labels: IntArray
     """Each point has the label LEFT, RIGHT or UNKNOWN (m,)."""
 
+    def where(self, chosen: NDArray[np.bool_]) -> Points:
+        """Returns some of the points."""
+        return Points(self.points[chosen], self.covariances[chosen], self.labels[chosen])
+
 
 def header_of(message: Any) -> Any:
     """Returns the header of a message, which is that of its first point in an array of markers, or None."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -24,7 +24,7 @@ from pathspace_graph.io.log import (
 )
 
 from .messages import Points
-from .settings import SIGMA_ODOMETRY, Frames, NoiseSettings
+from .settings import SIGMA_ODOMETRY, Frames, NoiseSettings, Window
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -59,6 +59,25 @@ class Recording:
     """This is known of the drive, for evaluation only."""
     odometry_sigma: Array | None = None
     """(3,) The record states these standard deviations of a twist (m/s, m/s, rad/s)."""
+
+
+def windowed(record: Recording, window: Window) -> Recording:
+    """Returns a record with other stamps of its detections, and without those that are too far away.
+
+    Its truth then says no longer which cone each detection is of.
+    """
+    if window == Window():
+        return record
+    scans, most = record.scans, window.range_max
+    if most is not None:
+        with np.errstate(over="ignore"):
+            far = [np.hypot(*scan.points.T) > most for scan in scans]
+        record.notes[f"detections farther from the sensor than {most:g} m were left out"] += int(
+            sum(one.sum() for one in far)
+        )
+        scans = [scan.where(~one) for scan, one in zip(scans, far, strict=True)]
+    truth = None if record.truth is None else replace(record.truth, associations=None)
+    return replace(record, scan_t=record.scan_t + window.time_offset, scans=scans, truth=truth)
 
 
 def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) -> Log:
@@ -181,7 +200,7 @@ def usable(points: Points, notes: Counter[str]) -> Points:
     notes["detections that are not finite were left out"] += int((~finite).sum())
     notes[f"detections farther than {MAX_RANGE:g} m were left out"] += int((~inside).sum())
     good = finite & inside
-    return Points(points.points[good], points.covariances[good], points.labels[good])
+    return points.where(good)
 
 
 def in_vehicle_frame(

@@ -92,6 +92,22 @@ class Frames:
         return np.array([1.0, 1.0, 1.0] if self.y_odometry == "left" else [1.0, -1.0, -1.0])
 
 
+@dataclass(frozen=True)
+class Window:
+    """Says which detections of a record count, and when they were measured."""
+
+    range_max: float | None = None
+    """Detections farther from the sensor than this (m) are left out."""
+    time_offset: float = 0.0
+    """This time (s) is added to the stamps of the detections."""
+
+    def __post_init__(self) -> None:
+        if self.range_max is not None and not 0.0 < self.range_max < inf:
+            raise SettingsError(f"--range-max: expected a positive number, found {self.range_max:g}")
+        if not isfinite(self.time_offset):
+            raise SettingsError(f"--time-offset: expected a number, found {self.time_offset:g}")
+
+
 class LabelRule:
     """Tells the label of a number, a word or a colour.
 

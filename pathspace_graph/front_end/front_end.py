@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.run import split_odometry
@@ -111,6 +112,11 @@ class FrontEnd:
         )
 
     @property
+    def noise_used(self) -> RunNoise:
+        """Returns the noise that is used now, and what was measured so far."""
+        return self.noise.used(self._settings)
+
+    @property
     def pose(self) -> Array:
         """Returns a copy of the newest pose (3,) by odometry alone."""
         return self._motion.pose.copy()
@@ -139,6 +145,8 @@ class JudgedLog:
     """These are the detections of each cycle."""
     settings: MapperSettings
     """Here the priors of the sensor are wide, if the readings contradict them."""
+    noise: RunNoise
+    """This noise was used."""
 
 
 def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLog:
@@ -157,11 +165,16 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
     if readings[-1].sensor_doubted and settings.calibration.doubt < inf:
         settings = replace(settings, calibration=settings.calibration.widened())
     chain = chained([cycle.t for cycle in log.cycles], motions, settings.odometry)
-    return JudgedLog(chain, [reading.detections for reading in readings], settings)
+    return JudgedLog(chain, [reading.detections for reading in readings], settings, front_end.noise_used)
 
 
 def measure_log(log: Log) -> MeasuredNoise | None:
     """Returns the noise of a whole log and the constant errors of its sensor, by its readings alone."""
+    return measure(*seen_cycles(log), None)
+
+
+def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
+    """Returns the cycles of a log where odometry alone places them, and the twists."""
     unknown = KnownNoise(log.odometry_sigma, odometry_stated=False, detections_stated=False)
     front_end, twists, cycles = FrontEnd(MapperSettings(), unknown), TwistRecord(), []
     for odometry, detections in split_odometry(log):
@@ -169,4 +182,4 @@ def measure_log(log: Log) -> MeasuredNoise | None:
         reading = front_end.update(odometry, detections)
         labelled = replace(detections, labels=reading.detections.labels)
         cycles.append(SeenCycle(labelled, front_end.pose, reading.motion.odometry.twist))
-    return measure(cycles, twists, None)
+    return cycles, twists

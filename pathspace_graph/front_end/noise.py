@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 from math import inf
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.io.results import NoiseSource, RunNoise
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -125,6 +126,24 @@ class NoiseLearner:
         priors = values | {f"sigma_{name}": sigma for name, sigma in sigmas.items()}
         return replace(settings, odometry=odometry, calibration=replace(sensor, doubt=inf, **priors))
 
+    def used(self, settings: MapperSettings) -> RunNoise:
+        """Returns the noise that is used, and what sets the size of the map where ranges and speeds disagree.
+
+        They do where `calibrated` finds that the scale of the ranges contradicts its prior.
+        """
+        measured, sensor = self.measured, settings.calibration
+        size: Literal["odometry", "ranges"] | None = None
+        if self.of_detections and measured is not None and measured.along is not None and sensor.sensor:
+            place = SENSOR.index("range_scale")
+            off = abs(measured.sensor[place] - sensor.range_scale)
+            if off > sensor.doubt * np.hypot(measured.sensor_sigma[place], sensor.sigma_range_scale):
+                size = "odometry" if self.trusts_odometry(settings) else "ranges"
+        known = measured is not None, measured is not None and measured.along is not None
+        stated = self.known.odometry_stated, self.known.detections_stated
+        own = self.of_odometry, self.of_detections
+        odometry, detections = (_source(*one) for one in zip(stated, own, known, strict=True))
+        return RunNoise(odometry, detections, measured, size)
+
     def trusts_odometry(self, settings: MapperSettings) -> bool:
         """Return whether the odometry sets the size of the map, by default where it is the smoother one.
 
@@ -137,3 +156,10 @@ class NoiseLearner:
         sigma = float(measured.along.sigmas(np.array([REFERENCE_RANGE]))[0])
         stays = measured.along.inflation(measured.count, measured.period)
         return bool(walk < sigma * np.sqrt(stays * measured.period / measured.per_cycle))
+
+
+def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
+    """Returns where noise comes from that is stated or not, is to be measured or not, and is known or not."""
+    if stated and not (measured and known):
+        return "stated"
+    return "measured" if known else "assumed"

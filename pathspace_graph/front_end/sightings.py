@@ -200,12 +200,20 @@ class TwistRecord:
     def white(self) -> tuple[Array, float] | None:
         """Return the white noise (3,) of a twist, and the time between two twists (s).
 
-        It is the least median absolute difference of second to fourth order over that of white noise,
-        `sqrt(binomial(2 k, k))`: the higher the order, the less of the motion itself is in it.
+        It is the least of `orders`: the higher the order, the less of the motion itself is in it.
+        """
+        orders = self.orders()
+        return None if orders is None else (orders.min(axis=0), float(np.median(np.diff(np.array(self._t)))))
+
+    def orders(self) -> Array | None:
+        """Returns the noise (k, 3) of a twist by differences of second to fourth order; None without enough.
+
+        It is their median absolute value over that of white noise, `sqrt(binomial(2 k, k))`. Where the orders
+        differ, the noise is not white, or the motion itself is in it.
         """
         if len(self._t) < MIN_TWISTS:
             return None
-        t, twists = np.array(self._t), np.array(self._twists)
+        twists = np.array(self._twists)
         speeds = np.hypot(twists[:, 0], twists[:, 1])
         drives = speeds > MIN_SPEED_SHARE * np.median(speeds)
         orders = []
@@ -214,6 +222,4 @@ class TwistRecord:
             if inside.sum() >= MIN_TWISTS // 2:
                 differences = np.abs(np.diff(twists, k, axis=0)[inside])
                 orders.append(MAD * np.median(differences, axis=0) / np.sqrt(comb(2 * k, k)))
-        if not orders:
-            return None
-        return np.min(orders, axis=0), float(np.median(np.diff(t)))
+        return np.array(orders) if orders else None

@@ -7,11 +7,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.measured_noise import MeasuredNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.sensor import SENSOR
 
@@ -23,6 +24,9 @@ from .map import MAP_FILE, Map, map_to_json
 from .trajectory import TRAJECTORY_FILE, write_trajectory
 
 Array = NDArray[np.float64]
+
+NoiseSource = Literal["stated", "measured", "assumed"]
+"""Noise is what the log states, what a drive has shown, or a default."""
 
 CYCLES_FILE: Final = "cycles.csv"
 """A result folder holds its cycles in this file."""
@@ -136,6 +140,20 @@ class LapBatches:
 
 
 @dataclass(frozen=True, eq=False)
+class RunNoise:
+    """Holds which noise a run has used, and what it has measured."""
+
+    odometry: NoiseSource
+    """The noise of the odometry comes from here."""
+    detections: NoiseSource
+    """The covariances of the detections come from here."""
+    measured: MeasuredNoise | None = None
+    """This was measured in the drive, where anything was."""
+    size: Literal["odometry", "ranges"] | None = None
+    """Ranges and speeds disagree, and the size of the map is that of these; None where they agree."""
+
+
+@dataclass(frozen=True, eq=False)
 class RunResult:
     """Holds what a run of an estimator over a log gives."""
 
@@ -171,6 +189,8 @@ class RunResult:
     """This says when batches of the lap have ended, where the estimator has such."""
     waited: float = 0.0
     """Between cycles, the run waited for batches for this wall time (s)."""
+    noise: RunNoise | None = None
+    """This is the noise that was used, where the estimator says it."""
 
 
 @dataclass(frozen=True, eq=False)

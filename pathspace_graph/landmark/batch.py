@@ -81,6 +81,7 @@ class LandmarkBatch:
             cycles=(),
             laps=laps.completed,
             converged=converged,
+            noise=system.noise,
         )
 
 

@@ -26,7 +26,7 @@ from pathspace_graph.front_end.front_end import FrontEnd
 from pathspace_graph.graph.keys import POINT
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import VehicleState
+from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
 from pathspace_graph.mapping.prediction import known_noise
@@ -149,6 +149,10 @@ class LandmarkCkf:
     def map(self) -> Map:
         """Returns the map as it stands, with the joint covariance of each boundary's landmarks."""
         return point_map(self.belief.points, self.labels, self.belief.covariance[HEAD:, HEAD:], False)
+
+    def noise_used(self) -> RunNoise:
+        """Returns the noise that is used now, and what was measured so far."""
+        return self.front_end.noise_used
 
     def vehicle_state(self) -> VehicleState:
         """Returns the newest pose and the calibration, with their joint covariance."""

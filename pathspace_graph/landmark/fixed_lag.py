@@ -14,7 +14,7 @@ from pathspace_graph.front_end.late import at_nearest_pose
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import VehicleState
+from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import (
@@ -222,6 +222,10 @@ class LandmarkFixedLag:
         feet = np.full(points.shape, np.nan)
         feet[used] = state.landmarks[state.positions(table.landmark[rows[used]])]
         return Readings(points, table.label[rows], used, feet)
+
+    def noise_used(self) -> RunNoise:
+        """Returns the noise that is used now, and what was measured so far."""
+        return self.front_end.noise_used
 
     def vehicle_state(self) -> VehicleState:
         """Returns the newest pose and the calibration, with their joint covariance."""

@@ -15,6 +15,7 @@ from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
 from pathspace_graph.graph.keys import indices, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.io.log import Log
+from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import RIGHT
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -36,13 +37,17 @@ class LandmarkSystem:
     chain: LogOdometry
     """This is the odometry of the whole log."""
     settings: MapperSettings
+    noise: RunNoise
+    """This noise is used."""
 
     @classmethod
     def of_log(cls, log: Log, settings: MapperSettings, noise: KnownNoise) -> LandmarkSystem:
         """Returns the problem of a log without any association; `noise` is what is known before."""
         judged = judge_log(log, noise, settings)
         twists = judged.chain.twists
-        return cls(LandmarkDetections.of(judged.cycles, twists=twists), judged.chain, judged.settings)
+        return cls(
+            LandmarkDetections.of(judged.cycles, twists=twists), judged.chain, judged.settings, judged.noise
+        )
 
     def believing(self, settings: MapperSettings) -> LandmarkSystem:
         """Returns the same problem with the priors of the calibrations that other settings have."""

@@ -19,6 +19,7 @@ from pathspace_graph.front_end.late import at_nearest_pose
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.association import associate, associate_late
 from pathspace_graph.loop.closing import apply_correspondences, optimize_loop, simplify
@@ -255,6 +256,10 @@ class FixedLagMapper(MapperEstimate):
         return CycleResult(t, pose, sizes, used, self.closed, stages, jump, notice, self.loop.health)
 
     # --- the snapshot ------------------------------------------------------------------------------------
+
+    def noise_used(self) -> RunNoise:
+        """Returns the noise that is used now, and what was measured so far."""
+        return self.front_end.noise_used
 
     def save(self, path: Path | str) -> None:
         """Writes the whole mapper to one file, from which `restore` makes one that goes on to the same map.

@@ -18,6 +18,7 @@ Cause = Literal[
     "odometry",
     "mounting",
     "covariances",
+    "noise",
     "labels",
     "unexplained",
 ]

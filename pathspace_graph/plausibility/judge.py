@@ -13,6 +13,7 @@ from .hypotheses import Trial, Trials, verdict
 from .meanings import frame_hints, odometry_hints
 from .motions import Meaning, motions
 from .mounting import Mounting, best_lateness, mounting_of
+from .noise import noise_hints
 from .pairs import Pairs, pairs_of
 from .units import beyond_any_vehicle, one_clock, positions_in_metres, stamps_in_seconds, whole_stamps
 
@@ -41,7 +42,8 @@ def hints(log: Log, settings: PlausibilitySettings | None = None) -> list[Hint]:
     pairs = pairs_of(log.cycles, settings)
     if pairs is None:
         return found + beyond_any_vehicle(log.odometry, settings)
-    return found + _by_motion(Trials(log, telling_pairs(log, pairs, settings), settings), settings)
+    found += _by_motion(Trials(log, telling_pairs(log, pairs, settings), settings), settings)
+    return found or noise_hints(log, settings)
 
 
 def telling_pairs(log: Log, pairs: Pairs, settings: PlausibilitySettings) -> Pairs:

@@ -65,7 +65,13 @@ def _unchecked(odometry: Table, detections: Table) -> Log:
     xx, xy, yy = (detections.numbers(name, MOST) for name in ("xx", "xy", "yy"))
     covariances = covariances_of(xx, xy, yy)
     labels = np.array([label_from_name(name) for name in detections.columns["label"]], dtype=int)
-    return Log(Odometry(t, twist), cycles_of(stamps, points, covariances, labels), np.ones(3))
+    return Log(
+        Odometry(t, twist),
+        cycles_of(stamps, points, covariances, labels),
+        np.ones(3),
+        odometry_stated=False,
+        detections_stated=False,
+    )
 
 
 def _foreign_labels(folder: Path, log: Log) -> list[Hint]:

@@ -83,6 +83,17 @@ class PlausibilitySettings(Positive):
     """Covariances are too large if detections of one cone are this number of times nearer to each other."""
     least_scatter: float = 0.02
     """Detections that scatter less than this count as scattering by it (m)."""
+    noise_factor: float = 1.5
+    """Stated noise of the odometry is wrong if the measured one is larger or smaller by this factor."""
+    noise_agreement: float = 1.2
+    """Odometry has white noise if its differences of different orders agree up to this factor."""
+    scatter_factor: float = 2.0
+    """Covariances are wrong if detections scatter by this factor more or less. That is told less well, from
+    a few cones, and with the errors of odometry and stamps in it."""
+    noise_share: float = 0.75
+    """Covariances are wrong if they are so in this share of the detections."""
+    noise_cycles: int = 300
+    """The noise of detections is measured on at most this number of cycles."""
     both_sides: float = 0.15
     """Cones of one label are on both sides if their share on its own side is so near to a half."""
     near: float = 0.25

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.curves import (
     centre_line_errors,
+    crossings,
     curve_distance,
     driving_order,
     mapped_points,
@@ -15,8 +16,9 @@ from pathspace_graph.eval.metrics.curves import (
     two_way_distance,
 )
 from pathspace_graph.io.log import Truth
-from pathspace_graph.io.map import Map
+from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.spline.bspline import BSpline
 
 from ...scenes.maps import SIGMA, point_map, ring_map
 from .straight_maps import landmarks, line, row, truth
@@ -124,3 +126,15 @@ def test_a_true_boundary_far_away_has_no_errors() -> None:
 
 def test_a_map_of_points_has_no_centre_line() -> None:
     assert centre_line_errors(point_map(), rings(18.0, 22.0)) is None
+
+
+def test_boundaries_that_cross_each_other_or_themselves_are_counted() -> None:
+    assert crossings(Map(False, {LEFT: line(2.0), RIGHT: line(-2.0)})) == 0
+    assert crossings(ring_map()) == 0
+    slanted = np.array([[0.0, -1.0], [3.0, 0.0], [6.0, 2.0], [10.0, 3.0]])
+    crossed = SplineBoundary(BSpline.clamped_from(np.array([0.0, 10.0]), slanted), np.eye(8))
+    assert crossings(Map(False, {LEFT: line(2.0), RIGHT: crossed})) == 1
+    loop = np.array([[0.0, 0.0], [12.0, 10.0], [-8.0, 10.0], [4.0, 0.0]])
+    looped = SplineBoundary(BSpline.clamped_from(np.array([0.0, 10.0]), loop), np.eye(8))
+    assert crossings(Map(False, {LEFT: looped})) == 1
+    assert crossings(Map(False, {})) == crossings(Map(False, {LEFT: landmarks((0.0, 0.0))})) == 0

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.gap import from_batch, gap
+from pathspace_graph.eval.metrics.gap import aligned_distance, from_batch, gap
 from pathspace_graph.factors.bspline import clamped_knots
 from pathspace_graph.factors.gauge import greville
+from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import LEFT, RIGHT
@@ -82,3 +84,23 @@ def test_a_turn_and_an_rmse_are_compared_with_those_of_the_batch() -> None:
     found = from_batch({"turn": 0.003, "rmse": 0.3, "size": 4}, {"turn": -0.001, "rmse": 0.2})
     assert found == {"turn_from_batch": 0.004, "rmse_by_batch": 0.3 / 0.2}
     assert from_batch({"rmse": 0.3}, {"turn": -0.001, "rmse": 0.2}) == {}
+
+
+def bend(motion: Array, width: float = 4.0) -> Map:
+    """Both boundaries of a bend after a rigid motion (3,); the left one is `width` from the right one."""
+    angle = np.linspace(0.0, np.pi, 10)
+    boundaries = {}
+    for label, radius in ((LEFT, 20.0), (RIGHT, 20.0 + width)):
+        points = radius * np.column_stack([np.sin(angle), 1.0 - np.cos(angle)])
+        spline = BSpline.clamped_from(np.linspace(0.0, 60.0, 8), move_points(motion, points), 3)
+        boundaries[label] = SplineBoundary(spline, np.eye(20))
+    return Map(False, boundaries)
+
+
+def test_maps_in_different_frames_are_aligned() -> None:
+    reference = bend(np.zeros(3))
+    assert aligned_distance(bend(np.array([2.5, -0.6, 0.05])), reference) < 1e-3
+    assert aligned_distance(bend(np.array([1.0, 0.5, 0.0]), width=5.0), reference) == pytest.approx(
+        0.5, abs=0.1
+    )
+    assert aligned_distance(Map(False, {LEFT: line(0.0)}), Map(False, {RIGHT: line(0.0)})) == np.inf

@@ -1,0 +1,102 @@
+"""Noise that a log states, held against what its own readings show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.measured_noise import RayNoise, along_and_across
+from pathspace_graph.front_end.front_end import measure_log
+from pathspace_graph.front_end.measurement import DRIFT, LEAST
+from pathspace_graph.front_end.sightings import GATE, MAX_RANGE, TwistRecord
+from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, Log
+from pathspace_graph.settings.plausibility import PlausibilitySettings
+
+from .hint import Hint
+
+Array = NDArray[np.float64]
+
+TWIST: Final = (("vx", "m/s"), ("vy", "m/s"), ("wz", "rad/s"))
+ADVICE: Final = "--noise measured takes what is measured"
+
+
+def noise_hints(log: Log, settings: PlausibilitySettings) -> list[Hint]:
+    """Returns hints where the readings contradict the noise that the log states by a large factor."""
+    found = _odometry(log, settings) if log.odometry_stated else []
+    return found + (_detections(log, settings) if log.detections_stated else [])
+
+
+def _odometry(log: Log, settings: PlausibilitySettings) -> list[Hint]:
+    """Returns a hint where noise from sample to sample contradicts the stated one.
+
+    Motion is in the differences of readings as well. So the stated noise is too small only where differences
+    of all orders agree, and too large only beside the least slow errors of any odometry.
+    """
+    twists = TwistRecord()
+    twists.add(log.odometry)
+    orders, white = twists.orders(), twists.white()
+    if orders is None or white is None:
+        return []
+    least, interval = white
+    agree = orders.max(axis=0) < settings.noise_agreement * least
+    small = agree & (least > settings.noise_factor * log.odometry_sigma)
+    most = np.hypot(least, DRIFT / np.sqrt(interval))
+    large = settings.noise_factor * most < log.odometry_sigma
+    stated, hints = log.odometry_sigma, []
+    for which, values, size in ((small, least, "small"), (large, most, "large")):
+        figures = [
+            f"{name} scatters by {values[k]:.2g} {unit}, where {stated[k]:.2g} is stated"
+            for k, (name, unit) in enumerate(TWIST)
+            if which[k]
+        ]
+        if figures:
+            likely = f"the stated noise is too {size}"
+            likely += ", unless it stands for errors that change slowly" if size == "large" else ""
+            hints.append(Hint("noise", LOG_FILE, "[odometry] sigma", ", ".join(figures), likely, ADVICE))
+    return hints
+
+
+def _detections(log: Log, settings: PlausibilitySettings) -> list[Hint]:
+    """Returns hints where covariances contradict how single detections of a cone scatter, by range."""
+    cycles = log.cycles[: settings.noise_cycles]
+    measured = measure_log(replace(log, cycles=cycles))
+    if measured is None or measured.along is None or measured.across is None:
+        return []
+    points = np.concatenate([cycle.points_vehicle for cycle in cycles])
+    sigmas = along_and_across(points, np.concatenate([cycle.covariances for cycle in cycles]))
+    ranges = np.hypot(*points.T)
+    near = ranges < MAX_RANGE
+    hints = []
+    for axis, (name, ray) in enumerate((("along", measured.along), ("across", measured.across))):
+        size = _contradicted(ranges[near], sigmas[near, axis], ray, axis, settings)
+        if size:
+            at = float(np.median(ranges[near]))
+            scatter = float(ray.sigmas(np.array([at]))[0])
+            stated = scatter * float(np.median(sigmas[near, axis] / ray.sigmas(ranges[near])))
+            found = f"detections scatter by {scatter:.2g} m {name} the ray at {at:.0f} m"
+            found += f", where {stated:.2g} m is stated"
+            likely = f"the covariances are too {size}"
+            hints.append(Hint("noise", DETECTIONS_FILE, "columns xx, xy, yy", found, likely, ADVICE))
+    return hints
+
+
+def _contradicted(
+    ranges: Array, stated: Array, ray: RayNoise, axis: int, settings: PlausibilitySettings
+) -> str:
+    """Returns whether the stated standard deviations (m,) are too small or too large in most detections.
+
+    A cone is no point, which bounds the scatter from below. Detections count as those of a cone only within a
+    gate, so that only a scatter far below it says that the stated one is too large.
+    """
+    measured = ray.sigmas(ranges)
+    floor = np.array([np.full(len(ranges), LEAST[0]), LEAST[1] * ranges])[axis]
+    small = measured > settings.scatter_factor * np.maximum(stated, floor)
+    gate = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
+    large = (settings.scatter_factor * measured < stated) & (3.0 * measured < gate)
+    for size, which in (("small", small), ("large", large)):
+        if len(which) and which.mean() > settings.noise_share:
+            return size
+    return ""

@@ -1,0 +1,80 @@
+"""`convert` of a recording that states no noise, and what the runs on its log say of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pathspace_graph import read_log
+from pathspace_graph.cli import main
+
+from ..convert.recorded import camera_drive, write_recorded
+
+OPTIONS = ["--from", "csv", "--columns", "label=colour", "--labels", "left=1", "right=0", "--y", "right"]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_recorded(camera_drive(), tmp_path_factory.mktemp("drive") / "recorded")
+
+
+def run(*arguments: object, code: int = 0) -> None:
+    assert main([str(argument) for argument in arguments]) == code
+
+
+def test_what_was_measured_is_said(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("convert", recorded, *OPTIONS, "--out", tmp_path / "log")
+    printed = capsys.readouterr().out
+    (line,) = (line for line in printed.splitlines() if line.startswith("measured: "))
+    assert "m along and" in line
+    assert "ms early" in line
+    assert "degrees to the right" in line
+    assert "ranges +" in line
+    run("online", tmp_path / "log", "--out", tmp_path / "map")
+    printed = capsys.readouterr().out
+    assert "measured: odometry" in printed
+    assert "the map's size is the odometry's (--calibration.trust ranges turns it round)" in printed
+    summary = json.loads((tmp_path / "map" / "summary.json").read_text())
+    assert (summary["noise"]["odometry"], summary["noise"]["detections"]) == ("measured", "measured")
+    assert summary["noise"]["stated"] == {}
+    assert set(summary["noise"]["measured"]["along"]) == {"sigma", "growth", "share", "time"}
+    assert summary["notes"][1].startswith("ranges and speeds disagree by")
+    run("online", tmp_path / "log", "--out", tmp_path / "map", "--calibration.trust", "ranges")
+    assert "the map's size is the ranges'" in capsys.readouterr().out
+
+
+def test_far_detections_are_left_out_and_stamps_are_moved(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moves = ["--range-max", "12", "--time-offset", "0.125"]
+    run("convert", recorded, *OPTIONS, *moves, "--out", tmp_path / "log")
+    assert "detections farther from the sensor than 12 m were left out" in capsys.readouterr().out
+    log, drive = read_log(tmp_path / "log"), camera_drive()
+    ranges = np.concatenate([np.hypot(*cycle.points_vehicle.T) for cycle in log.cycles])
+    assert ranges.max() <= 12.0
+    stamps = np.array([cycle.t for cycle in drive.cycles]) + 0.125
+    assert all(np.abs(stamps - cycle.t).min() < 1e-6 for cycle in log.cycles)
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (("--range-max", "0"), "--range-max: expected a positive number, found 0"),
+        (("--range-max", "inf"), "--range-max: expected a positive number, found inf"),
+        (("--time-offset", "nan"), "--time-offset: expected a number, found nan"),
+    ],
+)
+def test_numbers_without_a_meaning_are_refused(
+    recorded: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    options: tuple[str, ...],
+    complaint: str,
+) -> None:
+    run("convert", recorded, *OPTIONS, *options, "--out", tmp_path / "log", code=2)
+    assert complaint in capsys.readouterr().err
