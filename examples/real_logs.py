@@ -188,7 +188,7 @@ def off(pose: Array, drive: Drive) -> str:
 
 def runs_table(drives: Sequence[Drive]) -> str:
     """Returns a row for each run."""
-    header = ["log", "run", "closed", "end off by", "dead reckoning's", "crossings"]
+    header = ["log", "run", "closed", "end off by", "dead reckoning's", "crossings, own"]
     header += ["degraded [%]", "lost [%]", "ms"]
     rows = []
     for one in drives:
@@ -203,7 +203,7 @@ def runs_table(drives: Sequence[Drive]) -> str:
                     "yes" if result.map.closed else "no",
                     off(result.trajectory[-1], one),
                     off(one.dead_reckoned, one) if name == "online" else "",
-                    str(crossings(result.map)),
+                    "{}, {}".format(*crossings(result.map)),
                     *(shares if any(health) else ("", "")),
                     f"{ms:.1f}" if name == "online" else "",
                 )

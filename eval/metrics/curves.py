@@ -155,19 +155,27 @@ def two_way_distance(first: MapBoundary, second: MapBoundary) -> float:
 # --- crossings -------------------------------------------------------------------------------------------
 
 
-def crossings(track: Map) -> int:
-    """Returns how often the curves of a map cross each other or themselves, which no track does."""
-    chords = [np.zeros((0, 2, 2))]
-    for boundary in track.boundaries.values():
+def crossings(track: Map) -> tuple[int, int]:
+    """Returns how often the curves of a map cross each other, and how often they cross themselves.
+
+    No boundary crosses the other one. Where the same cones bound two stretches of a track, a boundary lies on
+    itself.
+    """
+    chords, owner = [np.zeros((0, 2, 2))], [np.zeros(0)]
+    for label, boundary in track.boundaries.items():
         if isinstance(boundary, SplineBoundary):
             points = mapped_points(boundary, CHORD)
             ends = np.roll(points, -1, axis=0) if boundary.spline.periodic else points[1:]
             chords.append(np.stack([points[: len(ends)], ends], axis=1))
+            owner.append(np.full(len(ends), label))
     begin, end = np.concatenate(chords).transpose(1, 0, 2)
-    return sum(
-        int((_apart(a, b, begin[k:], end[k:]) & _apart(begin[k:], end[k:], a, b)).sum())
-        for k, (a, b) in enumerate(zip(begin, end, strict=True))
-    )
+    of = np.concatenate(owner)
+    other = own = 0
+    for k, (a, b) in enumerate(zip(begin, end, strict=True)):
+        crossed = _apart(a, b, begin[k:], end[k:]) & _apart(begin[k:], end[k:], a, b)
+        other += int((crossed & (of[k:] != of[k])).sum())
+        own += int((crossed & (of[k:] == of[k])).sum())
+    return other, own
 
 
 def _apart(begin: Array, end: Array, a: Array, b: Array) -> NDArray[np.bool_]:

@@ -129,12 +129,13 @@ def test_a_map_of_points_has_no_centre_line() -> None:
 
 
 def test_boundaries_that_cross_each_other_or_themselves_are_counted() -> None:
-    assert crossings(Map(False, {LEFT: line(2.0), RIGHT: line(-2.0)})) == 0
-    assert crossings(ring_map()) == 0
+    assert crossings(Map(False, {LEFT: line(2.0), RIGHT: line(-2.0)})) == (0, 0)
+    assert crossings(ring_map()) == (0, 0)
     slanted = np.array([[0.0, -1.0], [3.0, 0.0], [6.0, 2.0], [10.0, 3.0]])
     crossed = SplineBoundary(BSpline.clamped_from(np.array([0.0, 10.0]), slanted), np.eye(8))
-    assert crossings(Map(False, {LEFT: line(2.0), RIGHT: crossed})) == 1
+    assert crossings(Map(False, {LEFT: line(2.0), RIGHT: crossed})) == (1, 0)
     loop = np.array([[0.0, 0.0], [12.0, 10.0], [-8.0, 10.0], [4.0, 0.0]])
     looped = SplineBoundary(BSpline.clamped_from(np.array([0.0, 10.0]), loop), np.eye(8))
-    assert crossings(Map(False, {LEFT: looped})) == 1
-    assert crossings(Map(False, {})) == crossings(Map(False, {LEFT: landmarks((0.0, 0.0))})) == 0
+    assert crossings(Map(False, {LEFT: looped})) == (0, 1)
+    assert crossings(Map(False, {})) == (0, 0)
+    assert crossings(Map(False, {LEFT: landmarks((0.0, 0.0))})) == (0, 0)

@@ -9,9 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.summary import lap_times, laps_of, not_mapped, summarize
+from pathspace_graph.factors.measured_noise import MeasuredNoise
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunNoise, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 
 from .straight_maps import line, row, truth
@@ -112,3 +113,23 @@ def test_the_summary_has_the_calibration_with_its_sigmas_where_it_is_known() -> 
         {"scale": 0.01, "bias": 0.02, "scale_sigma": 0.04, "bias_sigma": 0.05}
     )
     assert summary["heading_sigma"] == pytest.approx(0.3)
+
+
+def test_the_noise_of_a_run_is_there_as_stated_and_as_measured() -> None:
+    assert "noise" not in summarize(RUN, log())
+    stated = summarize(replace(RUN, noise=RunNoise("stated", "stated")), log())
+    assert "notes" not in stated
+    assert stated["noise"] == {
+        "odometry": "stated",
+        "detections": "stated",
+        "stated": {
+            "odometry": pytest.approx([0.1, 0.1, 0.1]),
+            "detections": pytest.approx({"range": np.sqrt(2.0), "along": 1.0, "across": 1.0}),
+        },
+    }
+    measured = MeasuredNoise(np.full(3, 0.01), np.full(3, 0.02), 0.1, seconds=5.0)
+    unstated = replace(log(), odometry_stated=False, detections_stated=False)
+    summary = summarize(replace(RUN, noise=RunNoise("measured", "assumed", measured)), unstated)
+    assert summary["notes"] == ["measured: odometry 0.01 m/s, 0.01 m/s, 0.01 rad/s from sample to sample"]
+    assert summary["noise"]["stated"] == {}
+    assert summary["noise"]["measured"] == {"odometry": [0.01] * 3, "drift": [0.02] * 3, "seconds": 5.0}
