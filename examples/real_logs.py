@@ -27,6 +27,7 @@ from pathspace_graph.estimators import DEFAULT, DEFAULT_BATCH, make_batch, make_
 from pathspace_graph.eval.metrics.curves import crossings
 from pathspace_graph.eval.metrics.gap import aligned_distance
 from pathspace_graph.eval.metrics.summary import summarize
+from pathspace_graph.factors.measured_noise import MeasuredNoise
 from pathspace_graph.factors.se2 import compose, move_points, to_map, to_vehicle, wrap_angle
 from pathspace_graph.factors.sensor import SENSOR, by_sensor
 from pathspace_graph.front_end.front_end import seen_cycles
@@ -80,7 +81,7 @@ def convert(folder: Path) -> Log:
 # --- the pose at the end ---------------------------------------------------------------------------------
 
 
-def cones(cycles: Sequence[SeenCycle], label: int, sensor: Array, frame: Array) -> Array:
+def cones(cycles: Sequence[SeenCycle], label: int, noise: MeasuredNoise, frame: Array) -> Array:
     """Returns the cones (k, 2) of a label in the frame of a pose (3,), each the mean of its sightings."""
     own = []
     for cycle in cycles:
@@ -89,8 +90,8 @@ def cones(cycles: Sequence[SeenCycle], label: int, sensor: Array, frame: Array) 
         points, covariances = seen.points_vehicle[chosen], seen.covariances[chosen]
         detections = replace(seen, points_vehicle=points, covariances=covariances, labels=seen.labels[chosen])
         own.append(replace(cycle, detections=detections))
-    table: Sightings = follow(own, sensor)
-    corrected = table.point + by_sensor(table.point, table.twist) @ sensor
+    table: Sightings = follow(own, noise)
+    corrected = table.point + by_sensor(table.point, table.twist) @ noise.sensor
     points = to_vehicle(to_map(corrected, table.pose), np.tile(frame, (len(table.t), 1)))
     weights = 1.0 / np.maximum(np.hypot(*table.point.T), 1.0) ** 2
     found = []
@@ -101,12 +102,12 @@ def cones(cycles: Sequence[SeenCycle], label: int, sensor: Array, frame: Array) 
     return np.array(found).reshape(-1, 2)
 
 
-def end_by_registration(cycles: Sequence[SeenCycle], sensor: Array) -> Array | None:
+def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Array | None:
     """Returns the last pose (3,) of a drive, by the cones of its end laid on those of its beginning.
 
     The cones of the last 14 m, in the frame of the last pose, are registered on those of the first 25 m by
     closest points of the same colour, from starts around dead reckoning. Both stretches are short enough for
-    odometry, and the errors (5,) of the sensor are taken out.
+    odometry, and the constant errors of the sensor are taken out.
     """
     poses = np.array([cycle.pose for cycle in cycles])
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
@@ -114,8 +115,8 @@ def end_by_registration(cycles: Sequence[SeenCycle], sensor: Array) -> Array | N
         return None
     first = [cycle for cycle, s in zip(cycles, path, strict=True) if s <= FIRST]
     last = [cycle for cycle, s in zip(cycles, path, strict=True) if s >= path[-1] - LAST]
-    start = [cones(first, label, sensor, np.zeros(3)) for label in BOUNDARIES]
-    end = [cones(last, label, sensor, poses[-1]) for label in BOUNDARIES]
+    start = [cones(first, label, noise, np.zeros(3)) for label in BOUNDARIES]
+    end = [cones(last, label, noise, poses[-1]) for label in BOUNDARIES]
     tries = [
         registered(start, end, compose(poses[-1], np.array([ahead, left, turn])))
         for ahead in (-4.0, -2.0, 0.0, 2.0, 4.0)
@@ -164,8 +165,8 @@ def drive(folder: Path, out: Path) -> Drive:
     for name, result in runs.items():
         write_result(out / name / folder.name, result, summarize(result, log))
     cycles, _ = seen_cycles(log)
-    sensor = np.zeros(len(SENSOR)) if log.measured is None else log.measured.sensor
-    return Drive(folder.name, log, runs, cycles[-1].pose, end_by_registration(cycles, sensor))
+    end = None if log.measured is None else end_by_registration(cycles, log.measured)
+    return Drive(folder.name, log, runs, cycles[-1].pose, end)
 
 
 # --- tables ----------------------------------------------------------------------------------------------

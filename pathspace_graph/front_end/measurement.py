@@ -270,17 +270,16 @@ def measure(
 ) -> MeasuredNoise | None:
     """Return the noise that the readings show; None where not even the odometry's is known.
 
-    Cones are followed again with the errors that were found, from those `known` already on.
+    Cones are followed again with the noise and the errors that were found, from those `known` already on.
     """
     white = twists.white()
     if white is None:
         return None
     sigma, interval = white
-    found = MeasuredNoise(sigma, DRIFT.copy(), interval)
-    if known is not None:
-        found = replace(found, sensor=known.sensor)
+    found = known or MeasuredNoise(sigma, DRIFT.copy(), interval)
+    found = replace(found, odometry=sigma, interval=interval)
     for _ in range(PASSES if known is None or known.along is None else 1):
-        found = _measured(follow(cycles, found.sensor), found)
+        found = _measured(follow(cycles, found), found)
     return found
 
 

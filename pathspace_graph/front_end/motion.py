@@ -60,9 +60,14 @@ class MotionCheck:
         self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
 
     def believe(self, sigma: Array) -> None:
-        """Takes other standard deviations (3,) of a twist (m/s, m/s, rad/s) from now on."""
+        """Takes other standard deviations (3,) of a twist (m/s, m/s, rad/s) from now on.
+
+        The errors of the sensor are taken out of the detections from now on, so it forgets those that it has
+        learned, and the detections that have them.
+        """
         self.sigma = sigma
         self._rest.believe(sigma)
+        self._recent, self.errors = RecentDetections(self.settings), SensorErrors(self.settings)
 
     def update(self, odometry: Odometry, detections: Detections, may_doubt: bool = True) -> MeasuredMotion:
         """Returns the motion since the last cycle.

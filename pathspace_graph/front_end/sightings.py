@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.measured_noise import MeasuredNoise
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.io.log import Detections, Odometry
 
 Array = NDArray[np.float64]
@@ -32,7 +32,11 @@ MAX_RANGE: Final = 30.0
 MAX_AGE: Final = 3.0
 """A cone that was not seen for this time (s) is another one when it is seen again."""
 GATE: Final = (0.4, 0.06, 1.5)
-"""A sighting belongs to the nearest cone within `min(a + b r, c)`, in m."""
+"""A sighting is of the nearest cone within `min(a + b r, c)` (m), as long as its noise is not known, ..."""
+GATE_SIGMAS: Final = 3.0
+GATE_LEAST: Final = 0.4
+GATE_MOST: Final = 3.0
+"""... and then within this number of sigmas along and across its ray, at least and at most this far (m)."""
 
 
 @dataclass(eq=False)
@@ -82,21 +86,21 @@ class SeenCycle:
     """(3,) Twist of the vehicle: m/s, m/s, rad/s."""
 
 
-def follow(cycles: Iterable[SeenCycle], errors: Array) -> Sightings:
+def follow(cycles: Iterable[SeenCycle], known: MeasuredNoise) -> Sightings:
     """Return the sightings of cones in the cycles, in order of time.
 
-    Sightings are told to be of one cone after the constant errors of the sensor (5,), as far as they are
-    known, are taken out. What is returned is as measured.
+    Sightings are told to be of one cone after the constant errors of the sensor, as far as they are known,
+    are taken out, and by their noise, where that is known. What is returned is as measured.
     """
-    follower = _Follower(errors)
+    follower = _Follower(known)
     return Sightings.stacked([Sightings.none(), *(follower.add(cycle) for cycle in cycles)])
 
 
 class _Follower:
     """Holds the cones that were seen in the last seconds, by dead reckoning."""
 
-    def __init__(self, errors: Array) -> None:
-        self._errors = errors
+    def __init__(self, known: MeasuredNoise) -> None:
+        self._known = known
         self._points: Array = np.zeros((0, 2))
         self._labels: IntArray = np.zeros(0, np.intp)
         self._nearest: Array = np.zeros(0)  # least range at which each cone was seen (m)
@@ -122,9 +126,8 @@ class _Follower:
         order = np.argsort(ranges, kind="stable")
         order = order[ranges[order] < MAX_RANGE]
         measured = detections.points_vehicle[order]
-        corrected = measured + by_sensor(measured, np.tile(cycle.twist, (len(order), 1))) @ self._errors
-        points = to_map(corrected, pose[None])
-        rows, cones = self._assign(points, detections.labels[order], ranges[order], detections.t)
+        points = to_map(self._known.corrected(measured, cycle.twist), pose[None])
+        rows, cones = self._assign(points, detections.labels[order], ranges[order], pose, detections.t)
         count = len(rows)
         return Sightings(
             cones,
@@ -143,13 +146,44 @@ class _Follower:
             self._by_bias = self._by_bias + np.array([-moved[1] * middle, moved[0] * middle, -(t - self._t)])
         self._pose, self._t = pose.copy(), t
 
-    def _assign(self, points: Array, labels: IntArray, ranges: Array, t: float) -> tuple[IntArray, IntArray]:
+    def _gates(self, ranges: Array) -> tuple[Array, Array]:
+        """Return how far along and across its ray a detection (m,) may be from its cone (m)."""
+        known = self._known
+        if known.along is None or known.across is None:
+            round_gate = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
+            return round_gate, round_gate
+        along, across = (GATE_SIGMAS * ray.sigmas(ranges) for ray in (known.along, known.across))
+        return np.clip(along, GATE_LEAST, GATE_MOST), np.clip(across, GATE_LEAST, GATE_MOST)
+
+    def _nearest_cone(
+        self, points: Array, labels: IntArray, ranges: Array, pose: Array
+    ) -> tuple[IntArray, BoolArray]:
+        """Return the nearest cone of the same label to each point (m, 2), and whether it is in its gate."""
+        if len(self._points) == 0:
+            return np.zeros(len(points), np.intp), np.zeros(len(points), bool)
+        square = self._square(points, self._points, ranges, pose)
+        square[labels[:, None] != self._labels] = np.inf
+        nearest = square.argmin(axis=1)
+        return nearest, square[np.arange(len(points)), nearest] < 1.0
+
+    def _square(self, points: Array, others: Array, ranges: Array, pose: Array) -> Array:
+        """Return the square (m, n) of the distances of points (m, 2) from others (n, 2) in their gates."""
+        ray = points - pose[:2]
+        ray = ray / np.maximum(np.hypot(*ray.T), np.finfo(float).tiny)[:, None]
+        off = others - points[:, None]
+        along = off[:, :, 0] * ray[:, :1] + off[:, :, 1] * ray[:, 1:]
+        across = off[:, :, 1] * ray[:, :1] - off[:, :, 0] * ray[:, 1:]
+        gate_along, gate_across = self._gates(ranges)
+        return np.asarray((along / gate_along[:, None]) ** 2 + (across / gate_across[:, None]) ** 2)
+
+    def _assign(
+        self, points: Array, labels: IntArray, ranges: Array, pose: Array, t: float
+    ) -> tuple[IntArray, IntArray]:
         """Return which detections (m,), nearest first, are sightings, and of which cones.
 
         Of several detections at one cone the nearest to the vehicle counts.
         """
-        gates = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
-        place, near = _nearest(points, labels, self._points, self._labels, gates)
+        place, near = self._nearest_cone(points, labels, ranges, pose)
         known, first = np.unique(place[near], return_index=True)
         rows = np.flatnonzero(near)[first]
         weight = np.where(ranges[rows] <= self._nearest[known], 0.5, 0.15)
@@ -157,8 +191,8 @@ class _Follower:
         self._nearest[known] = np.minimum(self._nearest[known], ranges[rows])
         self._last[known] = t
         new = np.flatnonzero(~near)
-        apart = np.hypot(*(points[new][:, None] - points[new][None]).transpose(2, 0, 1))
-        same = (apart < gates[new]) & (labels[new][:, None] == labels[new])
+        same = self._square(points[new], points[new], ranges[new], pose) < 1.0
+        same &= labels[new][:, None] == labels[new]
         new = new[~np.tril(same, -1).any(axis=1)]
         cones = self._count + np.arange(len(new))
         self._count += len(new)
@@ -169,18 +203,6 @@ class _Follower:
         found = np.concatenate([self._cones[known], cones])
         self._cones = np.concatenate([self._cones, cones])
         return np.concatenate([rows, new]), found
-
-
-def _nearest(
-    points: Array, labels: IntArray, known: Array, known_labels: IntArray, gates: Array
-) -> tuple[IntArray, BoolArray]:
-    """Return the nearest known cone of the same label to each point (m, 2), and whether it is in its gate."""
-    if len(known) == 0:
-        return np.zeros(len(points), np.intp), np.zeros(len(points), bool)
-    distance = np.hypot(*(points[:, None] - known).transpose(2, 0, 1))
-    distance[labels[:, None] != known_labels] = np.inf
-    nearest = distance.argmin(axis=1)
-    return nearest, distance[np.arange(len(points)), nearest] < gates
 
 
 class TwistRecord:
