@@ -86,6 +86,8 @@ class HealthMonitor:
             squares += one.innovations
         share = explained / offered if offered >= self.settings.min_offered else 1.0
         innovation = squares / used if used >= self.settings.min_offered else 0.0
+        cones = max(used / len(self._recent), 1.0)  # cycles show the same ones, with the same errors
+        innovation /= 1.0 + (2.0 / cones) ** 0.5
         health = self._judge(evidence, share, innovation)
         return self._beside_gap(offered) if health == Health(GOOD) else health
 

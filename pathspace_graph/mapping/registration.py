@@ -118,17 +118,24 @@ def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool
     return bool((same_direction & (away < drift)).any())
 
 
-def passes_start(path: DrivenPath, motion: Motion, settings: ClosingSettings) -> bool:
-    """Returns whether the newest path, moved, crosses the line at which the drive began, as it did then.
+def passes_start(state: State, path: DrivenPath, motion: Motion, settings: ClosingSettings) -> bool:
+    """Returns whether the newest path, moved, crosses the line at which the drive began, on its road.
 
     A vehicle that comes back to a later place of its beginning has not closed a lap: on a skidpad it does so
     in each round.
     """
+    start, turn = path.beginning[0, :2], rotation(path.beginning[0, 2])
     newest = motion.apply(path.points[path.stations > path.length - settings.beginning])
-    ahead, left = ((newest - path.beginning[0, :2]) @ rotation(path.beginning[0, 2])).T
+    ahead, left = ((newest - start) @ turn).T
     steps, forward = np.hypot(np.diff(ahead), np.diff(left)), np.diff(ahead)
     crosses = (ahead[:-1] <= 0.0) & (ahead[1:] > 0.0) & (np.abs(left[1:]) < settings.start_lateral)
-    return bool((crosses & (forward > np.cos(settings.start_heading) * steps)).any())
+    crosses &= forward > np.cos(settings.start_heading) * steps
+    for boundary, points in ((one, state.control_points(label)) for label, one in state.boundaries.items()):
+        u = np.arange(0.0, min(settings.beginning, boundary.confirmed_end), boundary.settings.search_step)
+        curve = boundary.evaluate(points, u) - start
+        _, beside = curve[np.hypot(*curve.T).argmin()] @ turn
+        crosses &= (left[1:] - beside) * beside < 0.0  # on the same side of it as the start
+    return bool(crosses.any())
 
 
 def register(
@@ -158,7 +165,7 @@ def register(
         vector = [vector, *starts][int(np.argmax(inliers))]
     found = refine(state, recent, Motion(centre, vector), stretches, (np.zeros(3), prior), settings)
     agrees = found.agrees(list(state.boundaries), settings, lost)
-    if not agrees or not passes_start(path, found.motion, settings):
+    if not agrees or not passes_start(state, path, found.motion, settings):
         return None
     return Registration(found.motion, {label: found.matches.inliers(label) for label in state.boundaries})
 

@@ -38,7 +38,8 @@ class HealthSettings(Positive):
     stretches that are not mapped yet lie beside the curves."""
     innovation: float = 1.2
     """The estimate is degraded where the mean squared distance of detections in use from their curve, before
-    the update and in units of its variance, is larger than this; it is about 1 if the model is right."""
+    the update and in units of its variance, is larger than this, and by one sigma of the mean over the cones
+    in view; it is about 1 if the model is right."""
     sigma_degraded: float = 1.0
     """The estimate is degraded where the standard deviation of the position on a closed map is larger than
     this in its worst direction (m)."""
