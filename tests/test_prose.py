@@ -22,10 +22,10 @@ BEGINS_WELL = re.compile(r"[A-Z0-9`'\"(\[{|<=~+\-\u0370-\u03ff\u2200-\u22ff]")
 """A text begins with an upper-case letter, a digit, a quote, a bracket or a symbol of a formula."""
 BLOCK = re.compile(r" {4}|- |\| ")
 """A line that begins so belongs to a formula, a list or a table, which needs no full stop."""
-FRAGMENT = re.compile(r"(Whether|How|The same|Which) |(Of|What|Where|As) [^,]*$")
-"""The text of a field or a class that reads so has no verb of its own."""
-VERB = re.compile(r"[A-Z][a-z]+s\b")
-"""A function's docstring begins with a verb in the third person, the function being its subject."""
+FRAGMENT = re.compile(r"The same |(Of|Where|As) [^,]*$")
+"""The text of a field or a class that reads so is neither a sentence nor a noun phrase."""
+VERB = re.compile(r"[A-Z][a-z]+\b")
+"""A function's docstring begins with a verb: imperative in new ones, in the third person in older ones."""
 
 Kind = Literal["module", "class", "function", "field"]
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -75,7 +75,7 @@ def faults(text: Text) -> Iterator[str]:
     elif text.kind in ("field", "class") and FRAGMENT.match(text.text):
         yield "is a fragment without a verb"
     elif text.kind == "function" and not VERB.match(text.text):
-        yield "does not begin with a verb in the third person"
+        yield "does not begin with a verb"
     if text.text.endswith(DOTS):
         yield "ends with dots"
     elif not last.endswith((".", ".)")) and not BLOCK.match(last):

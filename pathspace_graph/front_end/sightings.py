@@ -32,11 +32,11 @@ MAX_RANGE: Final = 30.0
 MAX_AGE: Final = 3.0
 """A cone that was not seen for this time (s) is another one when it is seen again."""
 GATE: Final = (0.4, 0.06, 1.5)
-"""A sighting is of the nearest cone within `min(a + b r, c)` (m), as long as its noise is not known, ..."""
+"""Gate of the nearest cone while its noise is not known, `min(a + b r, c)`, m."""
 GATE_SIGMAS: Final = 3.0
 GATE_LEAST: Final = 0.4
 GATE_MOST: Final = 3.0
-"""... and then within this number of sigmas along and across its ray, at least and at most this far (m)."""
+"""Gate once it is known: sigmas along and across the ray, at least and at most this far, m."""
 
 
 @dataclass(eq=False)

@@ -68,14 +68,22 @@ def _measured(file: Path, section: Any) -> MeasuredNoise:
     if not isinstance(section, dict):
         raise InputError(file, f"expected a section [noise.measured], found {shown(section)}")
     sigmas = {name: _numbers(file, section, name, 3, 0.0) for name in ("odometry", "drift")}
+    _require(file, sigmas["odometry"] + sigmas["drift"] > 0.0, "a twist with some noise as odometry or drift")
     interval, seconds = (float(_numbers(file, section, name, 1, 0.0)[0]) for name in ("interval", "seconds"))
+    _require(file, interval > 0.0, "a positive number as interval")
     if RAYS[0] not in section:
         return MeasuredNoise(**sigmas, interval=interval, seconds=seconds)
     along, across = (_numbers(file, section, name, 4, 0.0) for name in RAYS)
     count, period, per_cycle = (
         float(_numbers(file, section, name, 1, 0.0)[0]) for name in ("count", "period", "per_cycle")
     )
+    for name, ray in zip(RAYS, (along, across), strict=True):
+        good = ray[0] + ray[1] > 0.0 and ray[2] <= 1.0 and ray[3] > 0.0
+        _require(file, good, f"some noise, a share of at most 1 and a positive time as {name}")
+    good = count >= 1.0 and count == int(count) and period > 0.0 and per_cycle > 0.0
+    _require(file, good, "a whole number as count, and positive numbers as period and per_cycle")
     sensor = np.array([_numbers(file, section, name, 2, -MAX_NOISE) for name in SENSOR])
+    _require(file, sensor[:, 1] > 0.0, "a positive sigma as the second number of each error of the sensor")
     return MeasuredNoise(
         **sigmas,
         interval=interval,
@@ -88,6 +96,11 @@ def _measured(file: Path, section: Any) -> MeasuredNoise:
         sensor_sigma=sensor[:, 1],
         seconds=seconds,
     )
+
+
+def _require(file: Path, good: Any, expected: str) -> None:
+    if not np.all(good):
+        raise InputError(file, f"[noise.measured]: expected {expected}")
 
 
 def _numbers(file: Path, section: dict[str, Any], name: str, count: int, least: float) -> Any:

@@ -15,9 +15,9 @@ IntArray = NDArray[np.intp]
 
 
 MERGE_CHI: Final = 2.5
-"""A detection is of a track within this number of sigmas of both together ..."""
+"""Gate of a smeared detection about a track, in sigmas of both together."""
 MERGE_MOST: Final = 2.0
-"""... and within this number of merge radii: the next cone of the row is farther away."""
+"""Its limit in merge radii: the next cone of the row is farther away."""
 RESTORED: Final = 0.3
 """Standard deviation of a cone that is taken back from a curve (m)."""
 

@@ -63,9 +63,9 @@ class ConeSettings(Positive, group="batch.cones"):
     """The density is smoothed with a Gaussian. Its standard deviation is this share of the least distance
     that `separation` sets."""
     sigma: float = 0.6
-    """Detections with a larger standard deviation (m) do not say where a cone stands ..."""
+    """Largest standard deviation of detections that say where a cone stands, m."""
     sharp_share: float = 0.1
-    """... unless fewer than this share of them has a smaller one."""
+    """All detections say it where fewer than this share of them is that certain."""
     min_share: float = 0.1
     """A cluster with fewer detections than this share of the median cluster's is no cone."""
     min_share_beside: float = 0.3

@@ -44,10 +44,10 @@ class ClosingSettings(Positive):
     """The loop may close where the heading differs by less than this from the heading at the beginning
     (rad)."""
     start_lateral: float = 5.0
-    """The loop closes once the vehicle has crossed the line at which its drive began, at most this far from
-    where it crossed it first (m) ..."""
+    """Largest distance from the place of the start at which the vehicle crosses the line of the start again
+    (m). The loop closes only after that."""
     start_heading: float = 0.5
-    """... and in the direction that it had there, to this angle (rad)."""
+    """Largest angle between both directions there (rad)."""
     overlap: float = 8.0
     """This length of the beginning must have been driven again (m)."""
     inlier_distance: float = 0.4

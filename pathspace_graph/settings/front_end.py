@@ -56,9 +56,9 @@ class MotionSettings(Positive):
     """No motion is told where the mean square of the whitened distances is larger than this. It is about 1
     where the vehicle has moved, and 4 and more where it was put down elsewhere."""
     misfit_odometry: float = 2.0
-    """Odometry is contradicted only where the mean square at its own pose is larger than this ..."""
+    """Odometry is contradicted only where the mean square at its own pose is larger than this."""
     misfit_ratio: float = 1.3
-    """... and than this number of times that of the match."""
+    """It must also be larger than this number of times that of the match."""
     max_change: float = 3.5
     """No motion is told that differs from the one before by more than this number of standard deviations of
     `sigma_speed`, `sigma_lateral` and `sigma_rate`."""
