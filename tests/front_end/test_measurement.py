@@ -124,10 +124,14 @@ def test_a_plain_sensor_has_no_errors_and_the_noise_that_is_stated(seed: int) ->
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_errors_of_a_simulated_camera_are_found(seed: int) -> None:
-    """Errors of ranges are those beside the scale of the speeds, which cannot be told from theirs."""
+    """Errors of ranges are those beside the scale of the speeds, which cannot be told from theirs.
+
+    A range that reads `(1 + a) r + b` is corrected by `z a / (1 + a) + b / (1 + a)`.
+    """
     log, measured = simulated("camera", seed)
     assert log.truth is not None and log.truth.sensor is not None and log.truth.calibration is not None
     true = log.truth.sensor.copy()
+    true[3:] /= 1.0 + true[3]
     true[3] -= log.truth.calibration[0]
     assert (np.abs(measured.sensor - true) < 4.0 * measured.sensor_sigma).all()
     assert measured.across is not None and measured.across.share > 0.3
