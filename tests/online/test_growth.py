@@ -434,18 +434,21 @@ def test_one_wrong_cone_at_the_end_leads_no_farther(alone: FixedLagMapper) -> No
     assert end.position == pytest.approx([4.0, 3.4], abs=0.05)
 
 
-def test_an_end_that_is_carried_on_around_a_bend_stays_beside_the_path() -> None:
-    """The cones end at x = 12 m; the vehicle goes on around three quarters of a circle of 15 m.
+def test_an_end_that_was_carried_on_around_a_bend_has_the_side_that_it_has(alone: FixedLagMapper) -> None:
+    """The newest cones are far behind then, where the end of the path does not run beside them.
 
-    The newest cones are far behind then, and say something of the side only where the path ran beside them.
+    The path goes straight on to x = 12 m and half around a circle of 15 m, and the curve 2 m to its left. The
+    end's place is searched on the newest stretch of the path, as in growth.
     """
-    blind = np.tile([8.0, 0.0, 8.0 / 15.0], (round(9.0 / DT), 1))
-    log = exact_log(np.concatenate([ahead(8.0, 2.0), blind]), *corridor(16.0))
-    mapper, _ = map_log(log)
-    driven = true_poses(log)[:, :2]
-    for label, boundary in mapper.boundaries.items():
-        assert boundary.unseen > 40.0
-        u = np.linspace(2.0, boundary.confirmed_end, 60)
-        curve = boundary.evaluate(mapper.control_points(label), u)
-        distance = KDTree(driven).query(curve)[0]
-        np.testing.assert_allclose(distance, 2.0, atol=0.7)
+    angle = np.linspace(0.0, np.pi, 80)[1:]
+    bend = np.array([12.0, 15.0]) + 15.0 * np.column_stack([np.sin(angle), -np.cos(angle)])
+    straight = np.column_stack([np.arange(0.0, 12.1, 0.5), np.zeros(25)])
+    points = np.concatenate([straight, bend])
+    inner = np.concatenate([np.add(straight, [0.0, 2.0]), [12.0, 15.0] + (bend - [12.0, 15.0]) * 13.0 / 15.0])
+    stations = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
+    path = PathAhead(points, stations, float(stations[-1]))
+    boundary, control_points = boundary_through(inner)
+    alone.smoother.map.state.add_boundary(LEFT, boundary, control_points)
+    boundary.observed[:] = [np.array([x, 2.0]) for x in (0.0, 4.0, 8.0, 12.0)]
+    newest = path.since(path.driven - GrowthSettings().end_behind)
+    assert _end(alone.smoother, LEFT, newest).side == pytest.approx(2.0, abs=0.1)

@@ -1,0 +1,242 @@
+"""Noise that is learned in a drive: never read ahead, only where nobody has stated it, and what it is for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise, RayNoise
+from pathspace_graph.front_end.front_end import FrontEnd, judge_log, measure_log
+from pathspace_graph.front_end.noise import NoiseLearner
+from pathspace_graph.io.log import Log
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.run import run_online, split_odometry
+from pathspace_graph.settings.calibration import CalibrationSettings
+from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
+
+from ..scenes.drives import detections, short_drive
+
+Array = NDArray[np.float64]
+
+STATED = np.array([0.25, 0.12, 0.035])
+SETTINGS = MapperSettings()
+SIGMA = np.array([0.001, 0.01, 0.002, 0.002, 0.01])
+"""Of the measured errors of the sensor."""
+
+
+def noise(sensor: Array | None = None, odometry: float = 0.02, **fields: object) -> MeasuredNoise:
+    """Returns measured noise, of the sensor's errors as well."""
+    return MeasuredNoise(
+        np.array([odometry, 0.02, 0.003]),
+        np.array([0.012, 0.006, 0.0017]),
+        0.02,
+        along=RayNoise(np.array([0.1, 0.02]), 0.5, 2.0),
+        across=RayNoise(np.array([0.0, 0.01]), 0.8, 1.0),
+        count=20,
+        sensor=np.zeros(5) if sensor is None else sensor,
+        sensor_sigma=SIGMA,
+        **fields,  # type: ignore[arg-type]
+    )
+
+
+def learner(
+    measured: MeasuredNoise | None, odometry: bool = False, cones: bool = False, use: str | None = None
+) -> NoiseLearner:
+    """Returns a learner that knows what was measured, and whether noise of odometry and cones was stated."""
+    return NoiseLearner(KnownNoise(STATED, odometry, cones, measured), use)
+
+
+# --- what is used ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("odometry", "cones", "use", "measured"),
+    [
+        (True, True, None, (False, False)),
+        (False, True, None, (True, False)),
+        (True, False, None, (False, True)),
+        (False, False, None, (True, True)),
+        (True, True, "measured", (True, True)),
+        (False, False, "stated", (False, False)),
+    ],
+)
+def test_noise_is_measured_where_nobody_has_stated_it_or_where_that_is_asked_for(
+    odometry: bool, cones: bool, use: str | None, measured: tuple[bool, bool]
+) -> None:
+    known = learner(noise(), odometry, cones, use)
+    assert (known.of_odometry, known.of_detections) == measured
+    np.testing.assert_array_equal(known.twist_sigma, noise().twist_sigma if measured[0] else STATED)
+    seen = detections(0.0, np.array([[10.0, 2.0]]), np.zeros(1, np.intp))
+    expected = noise().covariances(seen.points_vehicle, inflated=True)
+    assert expected is not None
+    found = known.for_map(seen)
+    np.testing.assert_array_equal(found.covariances, expected if measured[1] else seen.covariances)
+    np.testing.assert_array_equal(found.points_vehicle, seen.points_vehicle)
+    assert not known.is_learning  # it was measured before
+    assert known.is_settled
+
+
+def test_for_comparisons_detections_are_single_and_without_constant_errors() -> None:
+    errors, twist = np.array([0.02, 0.1, 0.05, 0.1, 0.2]), np.array([8.0, 0.0, 0.4])
+    seen = detections(0.0, np.array([[10.0, 0.0]]), np.zeros(1, np.intp))
+    found = learner(noise(errors)).for_check(seen, twist)
+    expected = noise().covariances(seen.points_vehicle, inflated=False)
+    assert expected is not None
+    np.testing.assert_allclose(found.points_vehicle, [[8.4, 0.1]], atol=1e-12)
+    np.testing.assert_array_equal(found.covariances, expected)
+    assert learner(noise(errors), cones=True).for_check(seen, twist) is seen
+    assert learner(None).for_check(seen, twist) is seen
+
+
+def test_what_is_not_measured_yet_is_assumed() -> None:
+    known = learner(None)
+    assert known.is_learning and not known.is_settled
+    np.testing.assert_array_equal(known.twist_sigma, STATED)
+    seen = detections(0.0, np.array([[10.0, 2.0]]), np.zeros(1, np.intp))
+    assert known.for_map(seen) is seen
+    assert known.calibrated(SETTINGS) is SETTINGS
+    odometry_only = learner(MeasuredNoise(np.full(3, 0.1), np.full(3, 0.01), 0.02))
+    assert not odometry_only.is_settled and odometry_only.for_map(seen) is seen
+    assert odometry_only.calibrated(SETTINGS) is SETTINGS
+
+
+# --- calibrations ----------------------------------------------------------------------------------------
+
+SMALL = 3.0 * np.hypot(SIGMA, CalibrationSettings().sigmas)
+"""Three sigmas of measurement and prior together do not contradict the prior, and five do."""
+
+
+@pytest.mark.parametrize("entry", range(5))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_settings_stay_where_no_prior_is_contradicted(entry: int, sign: float) -> None:
+    errors = np.zeros(5)
+    errors[entry] = sign * SMALL[entry]
+    assert learner(noise(errors)).calibrated(SETTINGS) is SETTINGS
+    errors[entry] *= 5.0 / 3.0
+    assert learner(noise(errors)).calibrated(SETTINGS) is not SETTINGS
+    assert learner(noise(errors), cones=True).calibrated(SETTINGS) is SETTINGS
+    fixed = replace(SETTINGS, calibration=CalibrationSettings(sensor=False))
+    assert learner(noise(errors)).calibrated(fixed) is fixed
+
+
+def test_an_error_that_is_known_already_contradicts_nothing() -> None:
+    known = CalibrationSettings(yaw=0.05, range_scale=0.08)
+    settings = replace(SETTINGS, calibration=known)
+    assert learner(noise(np.array([0.05, 0.0, 0.0, 0.08, 0.0]))).calibrated(settings) is settings
+    assert learner(noise()).calibrated(settings) is not settings
+
+
+ERRORS = np.array([0.05, -0.3, 0.1, 0.08, 0.2])
+
+
+def test_where_the_odometry_is_trusted_the_ranges_take_the_whole_ratio() -> None:
+    settings = replace(SETTINGS, calibration=CalibrationSettings(trust="odometry"))
+    found = learner(noise(ERRORS)).calibrated(settings)
+    assert found.odometry == settings.odometry
+    np.testing.assert_array_equal(found.calibration.means, ERRORS)
+    np.testing.assert_array_equal(found.calibration.sigmas, np.maximum(SIGMA, settings.calibration.sigmas))
+    assert found.calibration.doubt == inf
+    assert replace(found, calibration=settings.calibration) == settings
+
+
+def test_where_the_ranges_are_trusted_the_speeds_take_the_whole_ratio() -> None:
+    """Ranges 8 % too long by true speeds are speeds that read `1 / 1.08` of what they should."""
+    settings = replace(
+        SETTINGS, calibration=CalibrationSettings(trust="ranges"), odometry=OdometrySettings(bias=0.01)
+    )
+    found = learner(noise(ERRORS)).calibrated(settings)
+    assert found.odometry.scale == pytest.approx(1.0 / 1.08 - 1.0)
+    assert found.odometry.bias == 0.01 and found.odometry.doubt == inf
+    assert found.odometry.sigma_scale >= settings.odometry.sigma_scale
+    expected = np.where(np.arange(5) == 3, 0.0, ERRORS)
+    np.testing.assert_array_equal(found.calibration.means, expected)
+    assert found.calibration.sigma_range_scale == settings.calibration.sigma_range_scale
+
+
+def test_the_smoother_of_odometry_and_ranges_sets_the_size_of_the_map() -> None:
+    """In a second the poses walk 0.013 m or 0.14 m; the mean of 80 detections errs by about 0.1 m."""
+    smooth, rough = noise(per_cycle=8.0), noise(odometry=1.0, per_cycle=8.0)
+    assert smooth.along is not None
+    by_ranges = 0.3 * np.sqrt(smooth.along.inflation(20, 0.1) * 0.1 / 8.0)
+    assert smooth.twist_sigma[0] * np.sqrt(0.02) < by_ranges < rough.twist_sigma[0] * np.sqrt(0.02)
+    assert learner(smooth).trusts_odometry(SETTINGS)
+    assert not learner(rough).trusts_odometry(SETTINGS)
+    for trust, expected in (("odometry", True), ("ranges", False)):
+        own = replace(SETTINGS, calibration=CalibrationSettings(trust=trust))  # type: ignore[arg-type]
+        assert learner(smooth).trusts_odometry(own) is expected
+        assert learner(rough).trusts_odometry(own) is expected
+
+
+# --- learning --------------------------------------------------------------------------------------------
+
+
+def unstated(log: Log) -> Log:
+    return replace(log, odometry_stated=False, detections_stated=False)
+
+
+def cut(log: Log, cycles: int) -> Log:
+    """The log of its first cycles."""
+    until = log.cycles[cycles - 1].t
+    return replace(log, odometry=log.odometry.between(-inf, until), cycles=log.cycles[:cycles])
+
+
+def test_a_learner_never_reads_ahead() -> None:
+    """After each cycle of a log it knows the same as at the end of the log that ends there."""
+    log = unstated(short_drive())
+    front_end, fresh = FrontEnd(SETTINGS, log.noise), []
+    for k, (odometry, cycle) in enumerate(split_odometry(log)):
+        before = front_end.noise.measured
+        front_end.update(odometry, cycle)
+        if front_end.noise.measured is not before:
+            fresh.append((k + 1, front_end.noise.measured))
+    assert len(fresh) >= 2
+    for count, expected in fresh:
+        again = FrontEnd(SETTINGS, log.noise)
+        for odometry, cycle in split_odometry(cut(log, count)):
+            again.update(odometry, cycle)
+        found = again.noise.measured
+        assert found is not None and expected is not None
+        np.testing.assert_array_equal(found.odometry, expected.odometry)
+        np.testing.assert_array_equal(found.sensor, expected.sensor)
+
+
+def test_a_mapper_that_measures_noise_never_reads_ahead() -> None:
+    """The poses up to the end of half a drive are those of the whole drive, to the bit."""
+    log = short_drive()
+    settings, half = replace(SETTINGS, noise="measured"), 2 * len(log.cycles) // 3
+    whole, part = ([result.pose for result in poses(one, settings)] for one in (log, cut(log, half)))
+    assert len(part) == half
+    np.testing.assert_array_equal(part, whole[:half])
+
+
+def poses(log: Log, settings: MapperSettings) -> list:  # type: ignore[type-arg]
+    """What a mapper says after each cycle, which has measured the noise in the end."""
+    mapper, found = FixedLagMapper(settings, log.noise), []
+    for odometry, cycle in split_odometry(log):
+        mapper.wait()
+        found.append(mapper.update(odometry, cycle))
+    assert mapper.front_end.noise.measured is not None
+    return found
+
+
+def test_stated_noise_is_not_touched_by_what_a_drive_shows() -> None:
+    """A log with stated noise is mapped the same, whatever is in its measurement."""
+    log = cut(short_drive(), 80)
+    other = replace(log, measured=noise(ERRORS))
+    maps = [run_online(one, FixedLagMapper(SETTINGS, one.noise)).trajectory for one in (log, other)]
+    np.testing.assert_array_equal(*maps)
+
+
+def test_a_whole_log_is_measured_before_it_is_judged() -> None:
+    log = unstated(short_drive())
+    measured = measure_log(log)
+    assert measured is not None and measured.along is not None
+    judged = judge_log(log, log.noise, SETTINGS)
+    expected = measured.covariances(log.cycles[0].points_vehicle, inflated=True)
+    np.testing.assert_array_equal(judged.cycles[0].covariances, expected)
+    stated = judge_log(short_drive(), short_drive().noise, SETTINGS)
+    np.testing.assert_array_equal(stated.cycles[0].covariances, log.cycles[0].covariances)
