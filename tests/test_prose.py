@@ -101,9 +101,8 @@ def test_docstrings_and_texts_of_fields_are_whole_sentences() -> None:
         ("field", "Distance (m) within which it may close, ...", "ends with dots"),
         ("field", "Stamp, s", "full stop"),
         ("class", "the vehicle's pose.", "upper-case"),
-        ("class", "What is known of the sensor.", "fragment"),
-        ("field", "Whether the loop has closed.", "fragment"),
-        ("function", "The pose at a stamp.", "verb"),
+        ("class", "Of a sensor.", "fragment"),
+        ("function", "the pose at a stamp.", "upper-case"),
     ],
 )
 def test_a_riddle_is_found(kind: Kind, text: str, fault: str) -> None:

@@ -12,7 +12,6 @@ from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.graph.keys import POINT, POSE, pose_keys
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import Motion, register
 from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
 from pathspace_graph.settings.mapper import MapperSettings
@@ -26,12 +25,12 @@ IntArray = NDArray[np.intp]
 
 
 def associate_early_segment(
-    state: CurveState, cycles: list[tuple[Array, Detections]], path: DrivenPath
+    state: CurveState, cycles: list[tuple[Array, Detections]], beginning: Array
 ) -> Motion | None:
     """Returns the motion that moves the newest detections onto the beginning of the curves, or None.
 
-    cycles holds the poses (3,) and detections of the last few seconds, oldest first, and the `path` is what
-    was driven. The result is None if the registration fails.
+    cycles holds the poses (3,) and detections of the last few seconds, oldest first. beginning holds the
+    poses (k, 3) of the first stretch of the drive. The result is None if the registration fails.
     """
     ckf = state.settings.ckf
     closing = replace(
@@ -42,7 +41,7 @@ def associate_early_segment(
     )
     covariance = state.belief.covariance[:POSE, :POSE]
     times = [detections.t for _, detections in cycles]
-    found = register(_recent(state, cycles), times, covariance, path, closing)
+    found = register(_recent(state, cycles), times, covariance, beginning, closing)
     return None if found is None else found.motion
 
 
@@ -54,6 +53,7 @@ def _recent(state: CurveState, cycles: list[tuple[Array, Detections]]) -> CurveM
     for cycle, (pose, detections) in enumerate(cycles):
         track.variables.insert(pose_keys(np.array([cycle])), pose)
         track.detections.append(detections, cycle)
+    track.detections.used[:] = True  # a filter keeps no record of what its curves explained
     return track
 
 

@@ -109,7 +109,7 @@ class CkfMapper:
         if self.path.length - self._last_check < settings.check_interval:
             return
         self._last_check = self.path.length
-        motion = associate_early_segment(state, self._recent, self.path)
+        motion = associate_early_segment(state, self._recent, self.path.beginning)
         if motion is not None and update_by_correspondences(state, motion):
             simplify(state, self.expansion.observed)
             self.closed = True

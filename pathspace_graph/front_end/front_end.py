@@ -174,11 +174,16 @@ def measure_log(log: Log) -> MeasuredNoise | None:
 
 
 def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
-    """Returns the cycles of a log where odometry alone places them, and the twists."""
-    unknown = KnownNoise(log.odometry_sigma, odometry_stated=False, detections_stated=False)
-    front_end, twists, cycles = FrontEnd(MapperSettings(), unknown), TwistRecord(), []
-    for odometry, detections in split_odometry(log):
+    """Returns the cycles of a log where odometry alone places them, and the twists.
+
+    It is not doubted, since the detections' noise and the sensor's errors are not known yet.
+    """
+    twists, cycles = TwistRecord(), []
+    for odometry, _ in split_odometry(log):
         twists.add(odometry)
+    unknown = KnownNoise(log.odometry_sigma, False, False, measure([], twists, None))
+    front_end = FrontEnd(MapperSettings(), unknown)
+    for odometry, detections in split_odometry(log):
         reading = front_end.update(odometry, detections)
         labelled = replace(detections, labels=reading.detections.labels)
         cycles.append(SeenCycle(labelled, front_end.pose, reading.motion.odometry.twist))

@@ -18,7 +18,7 @@ from scipy.optimize import nnls
 from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotations, to_map
-from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor
+from pathspace_graph.factors.sensor import RANGE, SENSOR_SIZE, by_sensor
 
 from .sightings import MAD, MIN_SPEED_SHARE, SeenCycle, Sightings, TwistRecord, follow
 
@@ -54,6 +54,8 @@ TIMES: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 """Correlation times that are tried (s)."""
 LAGS: Final = (0.05, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)
 """Edges of the lags at which correlation is measured (s)."""
+MODEL_ERROR: Final = 0.05
+"""Share of an error that the linear model may be wrong by, one sigma."""
 FIRST_SHARE: Final = 0.5
 """Share of a cone's error that stays with it, as long as hardly any cone says otherwise."""
 FIRST_CONES: Final = 8.0
@@ -72,12 +74,21 @@ class _Cones:
     table: Sightings
     begins: IntArray
     ranges: Array
+    """(n,) Range of the cone (m)."""
     ray: Array
     """(n, 2) Unit vector along the ray, map frame."""
     side: Array
     points: Array
     columns: Array
     """(n, 2, 6) Derivatives by the sensor's errors and by the bias of the yaw rate."""
+
+    def seen_at(self, errors: Array, off: Array) -> _Cones:
+        """Return the sightings with the ranges of their cones, as errors (6,) leave them `off` (n, 2).
+
+        Weights by a measured range would prefer sightings that came out too short.
+        """
+        arm = self.points + self.columns @ errors - off - self.table.pose[:, :2]
+        return replace(self, ranges=np.maximum(np.hypot(*arm.T), np.finfo(float).tiny))
 
     def sums(self, values: Array) -> Array:
         """Return the sum of values (n, ...) over each cone."""
@@ -116,24 +127,30 @@ def _information(cones: _Cones, along: RayNoise, across: RayNoise, weights: Arra
     return np.asarray((by_ray + by_side) * weights[:, None, None])
 
 
-def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Array]:
+def _solve(cones: _Cones, information: Array, errors: Array, off: Array) -> tuple[Array, Array, Array, Array]:
     """Return errors b (6,), their covariance twice, and what is left (n, 2) of each sighting about its cone.
 
-    The places of the cones are eliminated: they are the weighted means of `p + A b`. The covariances are that
-    of independent sightings, and `_clustered`.
+    It is a Gauss-Newton step from errors (6,) that leave `off` (n, 2). The places of the cones, which are the
+    weighted means of `p + A b`, are eliminated. The noise is that of measured detections, so what is left of
+    a corrected one counts as `M^-1 r` (`factors.sensor:by_range`): or else a smaller world would fit better.
+    The covariances are that of independent sightings, and `_clustered`.
     """
     total = np.linalg.inv(cones.sums(information))
     mean_columns = total @ cones.sums(information @ cones.columns)
     mean_points = (total @ cones.sums(information @ cones.points[:, :, None]))[:, :, 0]
     columns = cones.columns - cones.spread(mean_columns)
     points = cones.points - cones.spread(mean_points)
-    weighted = information @ columns
-    normal = np.einsum("nik,nil->kl", columns, weighted) + np.diag(PRIOR**-2)
-    covariance = np.linalg.inv(normal)
-    errors = -covariance @ np.einsum("nik,ni->k", weighted, points)
-    off = points + columns @ errors
-    scores = cones.sums(np.einsum("nik,ni->nk", weighted, off))
-    return errors, covariance, _clustered(cones, scores, covariance), off
+    slopes = columns.copy()
+    slopes[:, :, RANGE.start] += off
+    slopes[:, :, RANGE.start + 1] += cones.side * ((cones.side * off).sum(axis=1) / cones.ranges)[:, None]
+    weighted = information @ slopes
+    prior = np.diag(PRIOR**-2)
+    covariance = np.linalg.inv(np.einsum("nik,nil->kl", slopes, weighted) + prior)
+    left = points + columns @ errors
+    errors = errors - covariance @ (np.einsum("nik,ni->k", weighted, left) + prior @ errors)
+    left = points + columns @ errors
+    scores = cones.sums(np.einsum("nik,ni->nk", weighted, left))
+    return errors, covariance, _clustered(cones, scores, covariance), left
 
 
 def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:
@@ -175,20 +192,22 @@ def _residuals(cones: _Cones, errors: Array, noise: tuple[RayNoise, RayNoise], o
     if not enough.any():
         return _Residuals(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2)))
     points = cones.points + cones.columns @ errors
-    variance = 0.5 * (noise[0].sigmas(ranges) ** 2 + noise[1].sigmas(ranges) ** 2)
-    weight = 1.0 / variance[j]
-    total = np.add.reduceat(weight, begins)
-    mean = np.add.reduceat(weight[:, None] * points[j], begins) / total[:, None]
-    stay = 0.5 * (noise[0].share + noise[1].share)
-    lag = np.add.reduceat(weight * np.abs(t[j] - t[i]), begins) / total
-    spread = counts / total * np.maximum(1.0 / counts, stay)
-    off = points[rows] - mean
+    isotropic = 0.5 * (noise[0].sigmas(ranges) ** 2 + noise[1].sigmas(ranges) ** 2)
+
+    def mean(values: Array) -> Array:
+        """Return the weighted mean of values (p, ...) of the pairs over the references of each row."""
+        weight = (1.0 / isotropic[j]).reshape(-1, *[1] * (values.ndim - 1))
+        return np.asarray(np.add.reduceat(weight * values, begins) / np.add.reduceat(weight, begins))
+
+    lag = mean(np.abs(t[j] - t[i]))
+    off = points[rows] - mean(points[j])
     offsets = np.stack([(off * cones.ray[rows]).sum(axis=1), (off * cones.side[rows]).sum(axis=1)], axis=1)
-    drifted = np.stack(
+    known = np.stack(
         [odometry[0] ** 2 * lag, (odometry[1] ** 2 + (odometry[2] * ranges[rows]) ** 2) * lag], 1
     )
-    reference = spread[:, None] + drifted
-    return _Residuals(rows[enough], offsets[enough], reference[enough])
+    for axis, one in enumerate(noise):
+        known[:, axis] += mean(one.sigmas(ranges[j])) ** 2 * np.maximum(1.0 / counts, one.share)
+    return _Residuals(rows[enough], offsets[enough], known[enough])
 
 
 def _pairs(cones: _Cones) -> tuple[IntArray, IntArray]:
@@ -210,7 +229,7 @@ def _ray_noise(cones: _Cones, left: _Residuals, axis: int) -> RayNoise:
     middle = np.array([ranges[one].mean() for one in bins])
     scatter = np.array([(MAD * np.median(np.abs(off[one]))) ** 2 for one in bins])
     known = np.array([reference[one].mean() for one in bins])
-    sigma = np.sqrt(np.maximum(scatter - known, 0.25 * scatter))
+    sigma = np.sqrt(np.clip(scatter - known, 0.25 * scatter, 4.0 * scatter))
     (begin, growth), _ = nnls(
         np.stack([np.ones(len(middle)), middle], axis=1) / sigma[:, None], np.ones(len(sigma))
     )
@@ -238,7 +257,7 @@ def _staying(cones: _Cones, left: _Residuals, axis: int, noise: RayNoise) -> tup
     j -= np.repeat(np.cumsum(repeats) - repeats, repeats)
     lag = t[j] - t[i]
     place = np.digitize(lag, LAGS) - 1
-    product = whitened[i] * whitened[j] - np.sqrt(own[i] * own[j])
+    product = whitened[i] * whitened[j] - 0.5 * (own[i] + own[j])
     scale = max(float((whitened**2 - own).mean()), 0.25)
     lags, correlations, weights = [], [], []
     for k in range(len(LAGS) - 1):
@@ -293,8 +312,11 @@ def _measured(sightings: Sightings, found: MeasuredNoise) -> MeasuredNoise:
     walk = np.hypot(DRIFT, found.odometry * np.sqrt(found.interval))
     noise = RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))
     weights = np.ones(len(cones.ranges))
+    errors, off = np.zeros(len(PRIOR)), np.zeros((len(cones.ranges), 2))
     for _ in range(ROUNDS):
-        errors, covariance, clustered, off = _solve(cones, _information(cones, *noise, weights))
+        information = _information(cones, *noise, weights)
+        errors, covariance, clustered, off = _solve(cones, information, errors, off)
+        cones = cones.seen_at(errors, off)
         square = ((off * cones.ray).sum(axis=1) / noise[0].sigmas(cones.ranges)) ** 2
         square += ((off * cones.side).sum(axis=1) / noise[1].sigmas(cones.ranges)) ** 2
         weights = huber_weights(np.sqrt(square), HUBER) ** 2
@@ -305,6 +327,7 @@ def _measured(sightings: Sightings, found: MeasuredNoise) -> MeasuredNoise:
     per_cone = np.diff(np.append(cones.begins, len(cones.ranges)))
     count = int(np.median(per_cone))
     stays = max(one.inflation(count, period) for one in noise)
+    sigmas = np.sqrt(np.maximum(stays * np.diag(covariance), np.diag(clustered)))
     return replace(
         found,
         along=noise[0],
@@ -313,6 +336,6 @@ def _measured(sightings: Sightings, found: MeasuredNoise) -> MeasuredNoise:
         period=period,
         per_cycle=len(sightings.t) / len(stamps),
         sensor=errors[:SENSOR_SIZE],
-        sensor_sigma=np.sqrt(np.maximum(stays * np.diag(covariance), np.diag(clustered)))[:SENSOR_SIZE],
+        sensor_sigma=np.hypot(sigmas, MODEL_ERROR * np.abs(errors))[:SENSOR_SIZE],
         seconds=float(np.sum(np.minimum(np.diff(np.unique(cones.table.t)), 1.0))),
     )

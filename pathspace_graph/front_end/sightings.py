@@ -157,14 +157,14 @@ class _Follower:
 
     def _nearest_cone(
         self, points: Array, labels: IntArray, ranges: Array, pose: Array
-    ) -> tuple[IntArray, BoolArray]:
-        """Return the nearest cone of the same label to each point (m, 2), and whether it is in its gate."""
+    ) -> tuple[IntArray, Array]:
+        """Return the nearest cone of the same label to each point (m, 2), and its square distance by gate."""
         if len(self._points) == 0:
-            return np.zeros(len(points), np.intp), np.zeros(len(points), bool)
+            return np.zeros(len(points), np.intp), np.full(len(points), np.inf)
         square = self._square(points, self._points, ranges, pose)
         square[labels[:, None] != self._labels] = np.inf
         nearest = square.argmin(axis=1)
-        return nearest, square[np.arange(len(points)), nearest] < 1.0
+        return nearest, square[np.arange(len(points)), nearest]
 
     def _square(self, points: Array, others: Array, ranges: Array, pose: Array) -> Array:
         """Return the square (m, n) of the distances of points (m, 2) from others (n, 2) in their gates."""
@@ -181,11 +181,13 @@ class _Follower:
     ) -> tuple[IntArray, IntArray]:
         """Return which detections (m,), nearest first, are sightings, and of which cones.
 
-        Of several detections at one cone the nearest to the vehicle counts.
+        Of several detections of one cone that is known, the one that fits best counts.
         """
-        place, near = self._nearest_cone(points, labels, ranges, pose)
-        known, first = np.unique(place[near], return_index=True)
-        rows = np.flatnonzero(near)[first]
+        place, square = self._nearest_cone(points, labels, ranges, pose)
+        near = square < 1.0
+        rows = np.flatnonzero(near)[np.argsort(square[near], kind="stable")]
+        known, first = np.unique(place[rows], return_index=True)
+        rows = rows[first]
         weight = np.where(ranges[rows] <= self._nearest[known], 0.5, 0.15)
         self._points[known] += weight[:, None] * (points[rows] - self._points[known])
         self._nearest[known] = np.minimum(self._nearest[known], ranges[rows])

@@ -139,15 +139,14 @@ def passes_start(state: State, path: DrivenPath, motion: Motion, settings: Closi
 
 
 def register(
-    track: CurveMap, times: Sequence[float], covariance: Array, path: DrivenPath, settings: ClosingSettings
+    track: CurveMap, times: Sequence[float], covariance: Array, beginning: Array, settings: ClosingSettings
 ) -> Registration | None:
     """Registers the newest detections with the beginning of the curves; returns None if they disagree.
 
     Iterated closest points on the curves minimize `sum (n . (M p - S(u)))^2 / sigma^2 + m' P^-1 m`. The
     `covariance` P (3, 3) of the newest pose is the prior, because detections along a straight or an arc leave
     the motion free. If P is larger than what the iteration can bridge, the iteration starts from the best
-    pose of the beginning of the `path`, the first stretch of the drive. `times` are the stamps of the poses
-    (s).
+    pose of the `beginning` (k, 3), the first stretch of the drive. `times` are the stamps of the poses (s).
     """
     recent, state = _recent(track, times, settings.window), track.state
     prior = np.asarray(np.linalg.inv(covariance * settings.prior_scale**2), np.float64)
@@ -156,7 +155,7 @@ def register(
     vector = np.zeros(3)
     lost = is_lost(covariance, settings)
     if lost:
-        motions = _motions(state.poses[-1], path.beginning, settings)
+        motions = _motions(state.poses[-1], beginning, settings)
         starts = [v for v in motions if v @ prior @ v < settings.start_chi2]
         inliers = [
             _match(state, settings, recent, Motion(centre, v), stretches, settings.icp_reach).inlier.sum()
@@ -164,8 +163,7 @@ def register(
         ]
         vector = [vector, *starts][int(np.argmax(inliers))]
     found = refine(state, recent, Motion(centre, vector), stretches, (np.zeros(3), prior), settings)
-    agrees = found.agrees(list(state.boundaries), settings, lost)
-    if not agrees or not passes_start(state, path, found.motion, settings):
+    if not found.agrees(list(state.boundaries), settings, lost):
         return None
     return Registration(found.motion, {label: found.matches.inliers(label) for label in state.boundaries})
 

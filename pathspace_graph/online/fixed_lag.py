@@ -31,7 +31,7 @@ from pathspace_graph.mapping.prediction import (
     predict,
     smoother_settings,
 )
-from pathspace_graph.mapping.registration import register
+from pathspace_graph.mapping.registration import passes_start, register
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.snapshot import restore, save
@@ -235,9 +235,9 @@ class FixedLagMapper(MapperEstimate):
         self.smoother.carry()
         self.smoother.refresh()
         covariance = self.smoother.covariance(pose_keys(np.array([self.smoother.next_cycle - 1])))
-        settings = self.settings.closing
-        registration = register(self.smoother.map, self.smoother.times, covariance, self.path, settings)
-        if registration is None:
+        track, beginning, settings = self.smoother.map, self.path.beginning, self.settings.closing
+        registration = register(track, self.smoother.times, covariance, beginning, settings)
+        if registration is None or not passes_start(track.state, self.path, registration.motion, settings):
             return False
         apply_correspondences(self.smoother, registration)
         optimize_loop(self.smoother)

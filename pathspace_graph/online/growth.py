@@ -127,19 +127,20 @@ class Growth:
     ) -> IntArray:
         """Returns the candidates, by index, up to the first that is reached only across a line.
 
-        No boundary crosses the path driven, the other boundary or itself.
+        No boundary crosses the path driven, the other boundary or itself, on their newest stretches: in a
+        second lap of an open loop it runs along its own first one.
         """
-        boundaries = smoother.map.state.boundaries
         driven = path_ahead.stations <= path_ahead.driven
         lines = [path_ahead.points[driven]]
-        lines += [
-            np.array(one.observed[:-1] if own == label else one.observed) for own, one in boundaries.items()
-        ]
-        begin = end.position
+        for own, boundary in smoother.map.state.boundaries.items():
+            begin = boundary.confirmed_end - self.settings.recall
+            first = int(np.searchsorted(boundary.cone_parameters, begin))
+            lines.append(np.array(boundary.observed[first : -1 if own == label else None]))
+        before = end.position
         for k, point in enumerate(found.points):
-            if any(len(line) > 1 and crosses(begin, point[None], line)[0] for line in lines):
+            if any(len(line) > 1 and crosses(before, point[None], line)[0] for line in lines):
                 return np.arange(k)
-            begin = point
+            before = point
         return np.arange(len(found.points))
 
     def _begin(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> None:
@@ -174,7 +175,7 @@ class Growth:
         The end's station is searched on the path from `behind` (m) behind the vehicle on.
         """
         settings = self.settings
-        end = _end(smoother, label, path_ahead.since(path_ahead.driven - behind))
+        end = _end(smoother, label, path_ahead, behind)
         found = self._candidates(smoother, label, path_ahead, end)
         room = settings.max_unseen - smoother.map.state.boundaries[label].unseen
         if len(found.points) and np.hypot(*(found.points[0] - end.position)) < room:
@@ -290,15 +291,15 @@ def _relocate_poses(smoother: CurveSmoother, label: int, from_u: float) -> None:
     pose_u[late] = boundary.find(state.control_points(label), poses, low, high).u
 
 
-def _end(smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> End:
-    """Returns the confirmed end of a curve, located beside the path.
+def _end(smoother: CurveSmoother, label: int, path_ahead: PathAhead, behind: float) -> End:
+    """Returns the confirmed end of a curve, located on the path from `behind` (m) behind the vehicle on.
 
     Its distance from the path is the median of the newest cones', so that one wrong cone leads no further.
     """
     boundary = smoother.map.state.boundaries[label]
     u = np.array([boundary.confirmed_end])
     position = boundary.evaluate(smoother.map.state.control_points(label), u)
-    station, lateral = path_ahead.locate(position)
+    station, lateral = path_ahead.since(path_ahead.driven - behind).locate(position)
     side = SIDES[label] * float(lateral[0])
     if len(boundary.observed) >= NEWEST:
         _, beside = path_ahead.locate(np.array(boundary.observed[-NEWEST:]))

@@ -419,6 +419,9 @@ def test_a_curve_that_runs_along_its_own_beginning_again_goes_on(between: FixedL
     boundary = between.boundaries[LEFT]
     lap = [(0.0, 2.05), (4.0, 1.95), (8.0, 2.05), (12.0, 2.0), (20.0, 20.0), (-20.0, 20.0), (0.0, 1.95)]
     boundary.observed[:] = [np.array(p) for p in (*lap, (4.0, 2.0))]
+    lengths = np.hypot(*np.diff(np.array(boundary.observed), axis=0).T)
+    boundary.cone_parameters[:] = np.append(0.0, np.cumsum(lengths)).tolist()
+    boundary.confirmed_end = boundary.cone_parameters[-1]
     assert uncrossed(between, along_x(-6.0), (8.0, 1.98), (12.0, 2.03)) == [0, 1]
 
 
@@ -429,7 +432,7 @@ def test_one_wrong_cone_at_the_end_leads_no_farther(alone: FixedLagMapper) -> No
     """The newest cones are 2, 2 and 3.4 m beside the path: the next may be 2.7 m and a step away."""
     track(alone, (-4.0, 2.0), (0.0, 2.0), (4.0, 3.4))
     assert len(grow(alone, along_x())) == 3
-    end = _end(alone.smoother, LEFT, along_x())
+    end = _end(alone.smoother, LEFT, along_x(), 5.0)
     assert end.side == pytest.approx(2.7, abs=0.05)  # of the cones and the end, four values
     assert end.position == pytest.approx([4.0, 3.4], abs=0.05)
 
@@ -450,5 +453,4 @@ def test_an_end_that_was_carried_on_around_a_bend_has_the_side_that_it_has(alone
     boundary, control_points = boundary_through(inner)
     alone.smoother.map.state.add_boundary(LEFT, boundary, control_points)
     boundary.observed[:] = [np.array([x, 2.0]) for x in (0.0, 4.0, 8.0, 12.0)]
-    newest = path.since(path.driven - GrowthSettings().end_behind)
-    assert _end(alone.smoother, LEFT, newest).side == pytest.approx(2.0, abs=0.1)
+    assert _end(alone.smoother, LEFT, path, GrowthSettings().end_behind).side == pytest.approx(2.0, abs=0.1)
