@@ -87,8 +87,8 @@ class HealthMonitor:
         share = explained / offered if offered >= self.settings.min_offered else 1.0
         innovation = squares / used if used >= self.settings.min_offered else 0.0
         cones = max(used / len(self._recent), 1.0)  # cycles show the same ones, with the same errors
-        innovation /= 1.0 + (2.0 / cones) ** 0.5
-        health = self._judge(evidence, share, innovation)
+        most = self.settings.innovation * (1.0 + (2.0 / cones) ** 0.5)
+        health = self._judge(evidence, share, innovation, most)
         return self._beside_gap(offered) if health == Health(GOOD) else health
 
     def _beside_gap(self, offered: int) -> Health:
@@ -133,8 +133,8 @@ class HealthMonitor:
                 return
             self._offered -= recent.popleft().offered
 
-    def _judge(self, newest: Evidence, share: float, innovation: float) -> Health:
-        """Returns the health by the share of explained detections and the mean squared innovation."""
+    def _judge(self, newest: Evidence, share: float, innovation: float, most: float) -> Health:
+        """Returns the health by the share of explained detections, and by the innovation and its limit."""
         settings = self.settings
         lost = settings.share_lost if newest.closed else 0.0  # on an open map it goes on by dead reckoning
         degraded = settings.share_degraded if newest.closed else settings.open_degraded
@@ -151,7 +151,7 @@ class HealthMonitor:
             return Health(DEGRADED, newest.odometry)
         if blind > settings.blind:
             return Health(DEGRADED, f"no detection in view of the map for {blind:.1f} s")
-        if innovation > settings.innovation:
+        if innovation > most:
             sigmas = innovation**0.5
             return Health(DEGRADED, f"detections lie {sigmas:.1f} standard deviations beside the map")
         return Health(GOOD)

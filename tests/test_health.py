@@ -52,7 +52,7 @@ def test_half_of_the_detections_beside_the_curves_is_no_alarm_while_the_loop_is_
     hairpin = replace(CLEAN, explained=5, used=5, closed=False)
     assert drive((hairpin, 3.0))[-1] == Health(GOOD)
     assert drive((replace(hairpin, closed=True), 3.0))[-1].condition == LOST
-    assert drive((replace(hairpin, explained=1, used=1), 3.0))[-1].condition == LOST
+    assert drive((replace(hairpin, explained=1, used=1), 3.0))[-1].condition == DEGRADED
 
 
 def test_a_boundary_that_is_wrong_beside_one_that_is_right_does_not_lose_the_vehicle() -> None:

@@ -56,13 +56,12 @@ def test_every_estimator_finds_a_sensor_that_is_turned(estimator: str) -> None:
     assert mapper.vehicle_state().sensor[0] == pytest.approx(0.035, abs=0.012)  # type: ignore[attr-defined]
 
 
-def test_a_calibration_that_is_being_learned_is_said_in_the_open_lap() -> None:
+def test_a_calibration_that_is_learned_is_a_notice_and_no_reason_for_doubt() -> None:
     log = driven("yaw", 0.035)
-    told = [
-        cycle for cycle in run_online(log, make_online("fixed-lag", SETTINGS, log)).cycles if cycle.reason
-    ]
-    assert any("calibration" in cycle.reason for cycle in told)
-    assert not any("calibration" in cycle.reason for cycle in told if cycle.closed)
+    cycles = run_online(log, make_online("fixed-lag", SETTINGS, log)).cycles
+    noticed = [cycle for cycle in cycles if "calibration" in cycle.notice]
+    assert len(noticed) == 1 and not noticed[0].closed
+    assert not any("calibration" in cycle.reason for cycle in cycles)
 
 
 def test_a_sensor_that_is_what_it_was_said_to_be_is_not_doubted() -> None:

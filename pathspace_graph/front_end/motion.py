@@ -194,9 +194,9 @@ class MotionCheck:
 
         In a bend, a few cones may as well be laid on each other's neighbours, far from where they fit.
         """
+        points, own = detections.points_vehicle[best.is_matched], variances[best.is_matched]
         at_odometry, at_match = (
-            misfit_at(self._recent, detections.points_vehicle, variances, pose, self.settings)
-            for pose in (predicted, best.pose)
+            misfit_at(self._recent, points, own, pose, self.settings) for pose in (predicted, best.pose)
         )
         return at_odometry > max(self.settings.misfit_odometry, self.settings.misfit_ratio * at_match)
 

@@ -139,13 +139,13 @@ def misfit_at(
 ) -> float:
     """Return the mean square of the whitened distances as `match` has them, at a pose (3,) that is given.
 
-    Each counts at most `MOST_MISFIT`; it is 0 where nothing lies on earlier detections.
+    Each counts at most `MOST_MISFIT`, and as much where nothing was detected before.
     """
     points = to_map(points_vehicle, pose[None])
     means, weights = _means(points, recent.points, settings.reach_last)
     matched = weights > settings.min_weight
-    variance = variances[matched] * (1.0 + 1.0 / weights[matched]) + settings.sigma_cone**2
-    square = ((points - means)[matched] ** 2).sum(axis=1) / variance
+    variance = variances * (1.0 + 1.0 / np.where(matched, weights, 1.0)) + settings.sigma_cone**2
+    square = np.where(matched, ((points - means) ** 2).sum(axis=1) / variance, MOST_MISFIT)
     return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
 
 

@@ -38,6 +38,10 @@ LONGEST_WAIT = 1.0
 """A cycle waits for a batch no longer than this (s), however long ago the cycle before it was."""
 
 
+LEARNED = "the drive contradicts the calibration, which is learned"
+"""Notice of the cycle in which the priors of the calibrations are first doubted."""
+
+
 class TrackLoop:
     """Looks after the loop: the batch of the open lap when it closes, and a vehicle that is lost on it."""
 
@@ -131,12 +135,17 @@ class TrackLoop:
             return "the two boundaries of the map cross"
         return ""
 
-    def doubt_calibrations(self, reading: Reading) -> None:
-        """Widens the priors of calibrations that the drive contradicts, while the loop is open."""
-        if not self.closed:
-            self._believed = doubt_calibrations(
-                self._smoother, self._believed, reading.sensor_doubted, reading.measured
-            )
+    def doubt_calibrations(self, reading: Reading) -> str:
+        """Widens the priors of calibrations that the drive contradicts, while the loop is open.
+
+        Returns a notice in the first cycle in which it does.
+        """
+        if self.closed:
+            return ""
+        before = self._believed
+        self._believed = doubt_calibrations(self._smoother, before, reading.sensor_doubted, reading.measured)
+        doubted = before == self.settings != self._believed and reading.measured is None
+        return LEARNED if doubted else ""
 
     # --- the batch of the open lap -----------------------------------------------------------------------
 

@@ -133,7 +133,7 @@ class FixedLagMapper(MapperEstimate):
         for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
             self._step()
         watch.lap("update")
-        self.loop.doubt_calibrations(reading)
+        learned = self.loop.doubt_calibrations(reading)
         closes = self._close()
         watch.lap("close")
         if closes:
@@ -148,7 +148,7 @@ class FixedLagMapper(MapperEstimate):
             self.growth.clear()
         self.smoother.marginalize(self.loop.first_kept)
         watch.lap("marginalize")
-        notice = "; ".join(text for text in (notice, self.growth.notice, reading.notice) if text)
+        notice = "; ".join(text for text in (notice, self.growth.notice, reading.notice, learned) if text)
         return cycle.counted(self._result(cycle.detections.t, watch.laps, jump, notice))
 
     def _step(self) -> None:

@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
+AROUND: Final = 2.0
+"""The path around a hairpin is at most this number of times as long as the curve inside."""
 NEWEST: Final = 3
 """This number of newest cones and the end of a curve say how far it runs beside the path."""
 
@@ -259,7 +261,8 @@ def count_in_order(boundary: Boundary, path_ahead: PathAhead, settings: GrowthSe
     recent = np.array(boundary.observed[first:]).reshape(-1, 2)
     if len(recent) < 3:
         return len(boundary.observed)
-    station, _ = path_ahead.locate(recent)  # the path around a hairpin is longer than the curve inside
+    path = path_ahead.since(path_ahead.driven - AROUND * settings.recall)
+    station, _ = path.locate(recent)
     passed = np.where(station <= path_ahead.driven, station, np.inf)
     later = np.minimum.accumulate(passed[::-1])[::-1]
     wrong = np.flatnonzero(passed[1:-1] > later[2:] + settings.station_margin)

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
 from pathspace_graph.front_end.front_end import measure_log
-from pathspace_graph.front_end.measurement import MIN_ROWS, measure
+from pathspace_graph.front_end.measurement import MIN_ROWS, MODEL_ERROR, measure
 from pathspace_graph.front_end.sightings import TwistRecord
 from pathspace_graph.io.log import Log
 from pathspace_graph.sim.presets import preset
@@ -58,7 +58,8 @@ def test_constant_errors_are_found_within_their_own_sigmas(name: str) -> None:
 def test_errors_scatter_from_drive_to_drive_as_their_sigmas_say(name: str) -> None:
     """The geometric mean of all five is right to a factor of two, and none claims a third of its scatter."""
     scatter = np.std([one.sensor for one in found(name)], axis=0, ddof=1)
-    claimed = np.mean([one.sensor_sigma for one in found(name)], axis=0)
+    model = MODEL_ERROR * np.abs([one.sensor for one in found(name)])
+    claimed = np.sqrt(np.mean(np.square([one.sensor_sigma for one in found(name)]) - model**2, axis=0))
     assert 0.5 < np.exp(np.log(claimed / scatter).mean()) < 2.0
     assert (claimed > scatter / 3.0).all()
 

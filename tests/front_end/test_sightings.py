@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.measured_noise import MeasuredNoise
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end.sightings import (
@@ -24,7 +27,7 @@ from ..scenes.drives import detections
 
 Array = NDArray[np.float64]
 
-NO_ERRORS = np.zeros(5)
+NO_ERRORS = MeasuredNoise(np.ones(3), np.ones(3), 0.02)
 PERIOD = 0.1
 WHITE = np.array([0.06, 0.03, 0.004])
 
@@ -181,7 +184,7 @@ def test_with_known_errors_a_cone_keeps_its_number_from_afar_until_it_is_near() 
     cones = np.column_stack([22.0 * np.sin(angle), 20.0 - 22.0 * np.cos(angle)])
     exact = drive((10.0, 0.0, 0.5), 22, cones)[::5]
     cycles = with_errors(exact, errors)
-    found, expected = follow(cycles, errors), follow(exact, NO_ERRORS)
+    found, expected = follow(cycles, replace(NO_ERRORS, sensor=errors)), follow(exact, NO_ERRORS)
     assert counts(found) == counts(expected)
     np.testing.assert_array_equal(found.cone, expected.cone)
     measured = np.concatenate([cycle.detections.points_vehicle for cycle in cycles])

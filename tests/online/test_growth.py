@@ -109,11 +109,11 @@ def test_an_end_nearer_to_an_older_stretch_of_the_path_does_not_follow_that() ->
     for t in (5.0, 5.1, 5.2):
         tentative.add(np.array([[36.0, 1.0], [32.0, 1.0], [28.0, 1.0]]), np.tile(ROUND, (3, 1, 1)), t)
     x = mapper.poses[-1, 0]
-    points = np.array([[60.0, 3.0], [0.0, 3.0], [0.0, 0.0], [x, 0.0], [x + 7.0, 0.0]])
-    stations = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
-    assert (
-        mapper.growth.expand(mapper.smoother, PathAhead(points, stations, float(stations[3]))) == frozenset()
-    )
+    corners = np.array([[60.0, 3.0], [0.0, 3.0], [0.0, 0.0], [x, 0.0], [x + 7.0, 0.0]])
+    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
+    stations = np.union1d(np.arange(0.0, along[-1], 0.3), along)  # the path is stored in such steps
+    points = np.column_stack([np.interp(stations, along, corners[:, k]) for k in range(2)])
+    assert mapper.growth.expand(mapper.smoother, PathAhead(points, stations, float(along[3]))) == frozenset()
     assert (boundary.confirmed_end, boundary.size) == (confirmed, size)
 
 

@@ -100,7 +100,7 @@ def test_growth_reaches_for_the_cones_and_keeps_what_was_confirmed(steps: list[t
         before = boundary.evaluate(points, held)
         points = boundary.grow(points, u[k : k + 1], cones[k : k + 1])
         np.testing.assert_allclose(boundary.evaluate(points, held), before, atol=1e-9)
-        assert np.hypot(*(boundary.evaluate(points, u[k : k + 1])[0] - cones[k])) < 1.0
+        assert np.hypot(*(boundary.evaluate(points, u[k : k + 1])[0] - cones[k])) < 1.1
 
 
 def test_a_straight_stays_straight_and_evenly_spaced() -> None:
