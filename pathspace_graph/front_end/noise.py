@@ -118,7 +118,7 @@ class NoiseLearner:
         sigmas = dict(zip(SENSOR, np.maximum(measured.sensor_sigma, sensor.sigmas).tolist(), strict=True))
         scale = values["range_scale"]
         if self.trusts_odometry(settings):
-            odometry = settings.odometry
+            odometry = replace(settings.odometry, hold_scale=True)
         else:
             wide = replace(settings.odometry, scale=-scale / (1.0 + scale), doubt=inf)
             odometry = replace(wide, sigma_scale=max(sigmas["range_scale"], wide.sigma_scale))

@@ -164,6 +164,8 @@ class OdometrySettings(Positive):
     odometry is not what it was said to be. It is infinite where the priors always hold."""
     wide: float = 10.0
     """The wide priors have this number of times the standard deviations."""
+    hold_scale: bool = False
+    """The prior of the speeds' scale never becomes wide, since the speeds set the size of the map."""
     doubt_cycles: int = 10
     """All calibrations are judged again after this number of cycles."""
     sigma_start: float = 1e-4
@@ -175,7 +177,8 @@ class OdometrySettings(Positive):
 
     def widened(self) -> OdometrySettings:
         """Returns the settings of wide priors, which are not doubted again."""
-        scale, bias = self.wide * self.sigma_scale, self.wide * self.sigma_bias
+        scale = self.sigma_scale if self.hold_scale else self.wide * self.sigma_scale
+        bias = self.wide * self.sigma_bias
         return replace(self, doubt=inf, sigma_scale=scale, sigma_bias=bias)
 
     @property
