@@ -136,11 +136,14 @@ ERRORS = np.array([0.05, -0.3, 0.1, 0.08, 0.2])
 def test_where_the_odometry_is_trusted_the_ranges_take_the_whole_ratio() -> None:
     settings = replace(SETTINGS, calibration=CalibrationSettings(trust="odometry"))
     found = learner(noise(ERRORS)).calibrated(settings)
-    assert found.odometry == settings.odometry
+    assert found.odometry == replace(settings.odometry, hold_scale=True)
+    doubted = found.odometry.widened()
+    assert doubted.sigma_scale == settings.odometry.sigma_scale  # never both free
+    assert doubted.sigma_bias > settings.odometry.sigma_bias
     np.testing.assert_array_equal(found.calibration.means, ERRORS)
     np.testing.assert_array_equal(found.calibration.sigmas, np.maximum(SIGMA, settings.calibration.sigmas))
     assert found.calibration.doubt == inf
-    assert replace(found, calibration=settings.calibration) == settings
+    assert replace(found, odometry=settings.odometry, calibration=settings.calibration) == settings
 
 
 def test_where_the_ranges_are_trusted_the_speeds_take_the_whole_ratio() -> None:
