@@ -95,7 +95,7 @@ class MeasuredNoise:
         return np.asarray(points + by_sensor(points, np.tile(twist, (len(points), 1))) @ self.sensor)
 
 
-def along_and_across(points: Array, covariances: Array) -> Array:
+def ray_sigmas(points: Array, covariances: Array) -> Array:
     """Returns the standard deviations (m, 2) along and across the rays to points (m, 2), vehicle frame."""
     ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)[:, None]
     axes = np.stack([ray, left_of(ray)], axis=1)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.diagnosis import diagnose, noise_lines
-from pathspace_graph.factors.measured_noise import along_and_across
+from pathspace_graph.factors.measured_noise import ray_sigmas
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import Health, Stretch, counts, stretches
 from pathspace_graph.io.log import Log, Truth
@@ -100,7 +100,7 @@ def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
     points = np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in log.cycles)])
     if log.detections_stated and len(points):
         covariances = np.concatenate([cycle.covariances for cycle in log.cycles])
-        along, across = np.median(along_and_across(points, covariances), axis=0).tolist()
+        along, across = np.median(ray_sigmas(points, covariances), axis=0).tolist()
         stated["detections"] = {
             "range": float(np.median(np.hypot(*points.T))),
             "along": along,

@@ -24,7 +24,6 @@ from .sightings import MAD, MIN_SPEED_SHARE, SeenCycle, Sightings, TwistRecord, 
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
 DRIFT: Final = np.array([0.012, 0.006, 0.0017])
 """Least slow part of any odometry (m, m, rad by root of s): a heading drifts by 0.8 degrees in a minute. A
@@ -183,7 +182,7 @@ class _Residuals:
 
 def _residuals(cones: _Cones, errors: Array, noise: tuple[RayNoise, RayNoise], odometry: Array) -> _Residuals:
     """Return the residuals of sightings against nearer ones; `odometry` is drift (3,) by root of s."""
-    i, j = _pairs(cones)
+    i, j = pairs(cones.table.cone)
     t, ranges = cones.table.t, cones.ranges
     near = (ranges[j] < NEAR * ranges[i]) & (np.abs(t[j] - t[i]) < NEAR_TIME)
     i, j = i[near], j[near]
@@ -210,15 +209,14 @@ def _residuals(cones: _Cones, errors: Array, noise: tuple[RayNoise, RayNoise], o
     return _Residuals(rows[enough], offsets[enough], known[enough])
 
 
-def _pairs(cones: _Cones) -> tuple[IntArray, IntArray]:
-    """Return all pairs of rows of the same cone."""
-    counts = np.diff(np.append(cones.begins, len(cones.ranges)))
+def pairs(groups: IntArray) -> tuple[IntArray, IntArray]:
+    """Return all ordered pairs of rows of one group, by index; groups (n,) of equal number are neighbours."""
+    begins = np.flatnonzero(np.diff(groups, prepend=-1))
+    counts = np.diff(np.append(begins, len(groups)))
     repeats = np.repeat(counts, counts)
-    i = np.repeat(np.arange(len(cones.ranges)), repeats)
-    starts = np.repeat(np.repeat(cones.begins, counts), repeats)
-    ends = np.cumsum(repeats)
-    j = starts + np.arange(len(i)) - np.repeat(ends - repeats, repeats)
-    return i, j
+    i = np.repeat(np.arange(len(groups)), repeats)
+    nth = np.arange(len(i)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
+    return i, np.repeat(np.repeat(begins, counts), repeats) + nth
 
 
 def _ray_noise(cones: _Cones, left: _Residuals, axis: int) -> RayNoise:
@@ -233,9 +231,7 @@ def _ray_noise(cones: _Cones, left: _Residuals, axis: int) -> RayNoise:
     (begin, growth), _ = nnls(
         np.stack([np.ones(len(middle)), middle], axis=1) / sigma[:, None], np.ones(len(sigma))
     )
-    least = LEAST[0], 0.0
-    if axis == 1:
-        least = 0.0, LEAST[1]
+    least = (LEAST[0], 0.0) if axis == 0 else (0.0, LEAST[1])
     found = RayNoise(np.maximum([begin, growth], least))
     share, time = _staying(cones, left, axis, found)
     count = len(np.unique(cones.table.cone[left.rows]))
@@ -249,34 +245,22 @@ def _staying(cones: _Cones, left: _Residuals, axis: int, noise: RayNoise) -> tup
     whitened = np.clip(left.offsets[:, axis] / sigma, -3.0, 3.0)
     own = left.reference[:, axis] / sigma**2
     cone, t = cones.table.cone[left.rows], cones.table.t[left.rows]
-    begins = np.flatnonzero(np.diff(cone, prepend=-1))
-    counts = np.diff(np.append(begins, len(cone)))
-    repeats = np.repeat(counts, counts)
-    i = np.repeat(np.arange(len(cone)), repeats)
-    j = np.repeat(np.repeat(begins, counts), repeats) + np.arange(len(i))
-    j -= np.repeat(np.cumsum(repeats) - repeats, repeats)
+    i, j = pairs(cone)
     lag = t[j] - t[i]
     place = np.digitize(lag, LAGS) - 1
     product = whitened[i] * whitened[j] - 0.5 * (own[i] + own[j])
     scale = max(float((whitened**2 - own).mean()), 0.25)
-    lags, correlations, weights = [], [], []
-    for k in range(len(LAGS) - 1):
-        inside = place == k
-        if inside.sum() >= MIN_ROWS // 2:
-            lags.append(float(lag[inside].mean()))
-            correlations.append(float(product[inside].mean()) / scale)
-            weights.append(float(np.sqrt(inside.sum())))
-    if not lags:
+    enough = [k for k in range(len(LAGS) - 1) if (place == k).sum() >= MIN_ROWS // 2]
+    if not enough:
         return 0.0, 1.0
+    lags = np.array([lag[place == k].mean() for k in enough])
+    correlations = np.array([product[place == k].mean() for k in enough]) / scale
+    weights = np.sqrt([(place == k).sum() for k in enough])
     best = (np.inf, 0.0, 1.0)
     for time in TIMES:
-        model = np.exp(-np.array(lags) / time)
-        share = float(
-            np.clip(
-                (np.array(weights) * model) @ correlations / ((np.array(weights) * model) @ model), 0.0, 1.0
-            )
-        )
-        misfit = float((np.array(weights) * (np.array(correlations) - share * model) ** 2).sum())
+        model = np.exp(-lags / time)
+        share = float(np.clip((weights * model) @ correlations / ((weights * model) @ model), 0.0, 1.0))
+        misfit = float((weights * (correlations - share * model) ** 2).sum())
         best = min(best, (misfit, share, time))
     return best[1], best[2]
 

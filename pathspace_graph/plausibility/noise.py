@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.measured_noise import RayNoise, along_and_across
+from pathspace_graph.factors.measured_noise import RayNoise, ray_sigmas
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.measurement import DRIFT, LEAST
 from pathspace_graph.front_end.sightings import GATE, MAX_RANGE, TwistRecord
@@ -66,7 +66,7 @@ def _detections(log: Log, settings: PlausibilitySettings) -> list[Hint]:
     if measured is None or measured.along is None or measured.across is None:
         return []
     points = np.concatenate([cycle.points_vehicle for cycle in cycles])
-    sigmas = along_and_across(points, np.concatenate([cycle.covariances for cycle in cycles]))
+    sigmas = ray_sigmas(points, np.concatenate([cycle.covariances for cycle in cycles]))
     ranges = np.hypot(*points.T)
     near = ranges < MAX_RANGE
     hints = []
