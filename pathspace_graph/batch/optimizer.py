@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import gtsam
 import numpy as np
@@ -22,6 +23,11 @@ from .association import associate, locate_poses
 from .system import BatchSystem, Biweight, Evaluation, moved
 
 Array = NDArray[np.float64]
+
+SEARCH: Final = 20
+"""Associations are found anew in this number of rounds."""
+SETTLE: Final = 8
+"""Foot points are refined again at most this number of times before a step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,25 +82,28 @@ class Optimizer:
         """Optimizes in rounds until nothing changes, and returns the problem there.
 
         The gate shrinks from the schedule's to that of the settings (graduated robust weights), and only then
-        may the optimization end. Each round takes one step.
+        may the optimization end. Each round takes one step. After `SEARCH` rounds, or half of them,
+        associations and sigmas stay as they are: some would change for ever where two rows are near each other.
         """
         system, gate = self.system, schedule.gate
         locate_poses(state, self.settings.association)
         system.begin(state)
         self._last_step = None
         at: Evaluation | None = None
-        cost = np.inf
+        cost, searched = np.inf, 0
+        search = max(min(SEARCH, schedule.rounds // 2), 1)
         for number in range(1, schedule.rounds + 1):
             gate = max(gate, self.settings.gate)
             strict = gate <= self.settings.gate
             system.kernel = Biweight(gate)
-            before = self._refreshed(state, gate, strict)
+            held, searched = searched >= search, searched + strict
+            before = self._refreshed(state, gate, strict, held)
             at = self._step(before)
             state, gain, cost = at.state, abs(cost - at.cost), at.cost
             if on_round is not None:
                 on_round()
             if strict and self._is_still(before, at, gain, schedule.tolerance):
-                at = self._refreshed(state, gate, strict)
+                at = self._refreshed(state, gate, strict, held)
                 decrease = self.predicted_decrease(at)
                 if decrease <= schedule.tolerance * self.settings.tolerance_decrease:
                     return at, self._report(at, number, "nothing changes any more", decrease)
@@ -109,16 +118,33 @@ class Optimizer:
             state = moved(state, self.system.poses_alone(self._refreshed(state, gate, False)))
         return state
 
-    def _refreshed(self, state: State, gate: float, strict: bool) -> Evaluation:
-        """Returns the problem of a new round: with new places of the poses, associations and sigmas."""
+    def _refreshed(self, state: State, gate: float, strict: bool, held: bool = False) -> Evaluation:
+        """Returns the problem of a new round: with new places of the poses, associations and sigmas.
+
+        Associations and sigmas are those of the round before if `held`.
+        """
         system = self.system
         if not strict:
             locate_poses(state, self.settings.association)
         system.detections.correct(state.variables.sensor)
-        associate(state, system.detections, system.settings, gate, strict)
-        if strict and system.settings.place.use == "cones":
-            system.place(state)
-        return system.evaluate(state, hold=True)
+        if not held:
+            associate(state, system.detections, system.settings, gate, strict)
+            if strict and system.settings.place.use == "cones":
+                system.place(state)
+        return self._settled(state, held)
+
+    def _settled(self, state: State, held: bool) -> Evaluation:
+        """Returns the problem with foot points that stay where they are when they are refined again.
+
+        Where one is still on its way along a tight bend, the cost changes without a step.
+        """
+        at = self.system.evaluate(state, hold=not held)
+        for _ in range(SETTLE):
+            self._keep_foot_points(at)
+            before, at = at, self.system.evaluate(state, hold=not held)
+            if abs(before.cost - at.cost) <= self.settings.tolerance_cost * at.cost:
+                break
+        return at
 
     def _is_still(self, before: Evaluation, after: Evaluation, gain: float, tolerance: float) -> bool:
         """Returns whether a round has changed neither the curves, as their poses see them, nor the cost."""

@@ -147,12 +147,13 @@ class NoiseLearner:
     def trusts_odometry(self, settings: MapperSettings) -> bool:
         """Return whether the odometry sets the size of the map, by default where it is the smoother one.
 
-        Over a second it errs by the random walk of its poses, the ranges by the mean over their detections.
+        Over a second it errs by the white noise of its readings, the ranges by that of their detections. What
+        drifts slowly hardly changes a length.
         """
         measured, trust = self.measured, settings.calibration.trust
         if trust is not None or measured is None or measured.along is None:
             return trust == "odometry"
-        walk = measured.twist_sigma[0] * np.sqrt(measured.interval)
+        walk = measured.odometry[0] * np.sqrt(measured.interval)
         sigma = float(measured.along.sigmas(np.array([REFERENCE_RANGE]))[0])
         stays = measured.along.inflation(measured.count, measured.period)
         return bool(walk < sigma * np.sqrt(stays * measured.period / measured.per_cycle))

@@ -33,9 +33,9 @@ MAX_AGE: Final = 3.0
 """A cone that was not seen for this time (s) is another one when it is seen again."""
 GATE: Final = (0.4, 0.06, 1.5)
 """Gate of the nearest cone while its noise is not known, `min(a + b r, c)`, m."""
-GATE_SIGMAS: Final = 3.0
+GATE_SIGMAS: Final = 3.5
 GATE_LEAST: Final = 0.4
-GATE_MOST: Final = 3.0
+GATE_MOST: Final = 3.5
 """Gate once it is known: sigmas along and across the ray, at least and at most this far, m."""
 
 
@@ -181,30 +181,35 @@ class _Follower:
     ) -> tuple[IntArray, IntArray]:
         """Return which detections (m,), nearest first, are sightings, and of which cones.
 
-        Of several detections of one cone that is known, the one that fits best counts.
+        Several cameras may see a cone at once, and each sighting counts: the one that fits best would pull
+        the errors of the sensor towards what is known of them already.
         """
         place, square = self._nearest_cone(points, labels, ranges, pose)
         near = square < 1.0
-        rows = np.flatnonzero(near)[np.argsort(square[near], kind="stable")]
-        known, first = np.unique(place[rows], return_index=True)
-        rows = rows[first]
-        weight = np.where(ranges[rows] <= self._nearest[known], 0.5, 0.15)
-        self._points[known] += weight[:, None] * (points[rows] - self._points[known])
-        self._nearest[known] = np.minimum(self._nearest[known], ranges[rows])
+        rows = np.flatnonzero(near)
+        known, index, counts = np.unique(place[rows], return_inverse=True, return_counts=True)
+        mean, nearest = np.zeros((len(known), 2)), np.full(len(known), np.inf)
+        np.add.at(mean, index, points[rows] / counts[index, None])
+        np.minimum.at(nearest, index, ranges[rows])
+        weight = np.where(nearest <= self._nearest[known], 0.5, 0.15)
+        self._points[known] += weight[:, None] * (mean - self._points[known])
+        self._nearest[known] = np.minimum(self._nearest[known], nearest)
         self._last[known] = t
         new = np.flatnonzero(~near)
         same = self._square(points[new], points[new], ranges[new], pose) < 1.0
         same &= labels[new][:, None] == labels[new]
-        new = new[~np.tril(same, -1).any(axis=1)]
-        cones = self._count + np.arange(len(new))
-        self._count += len(new)
-        self._points = np.concatenate([self._points, points[new]])
-        self._labels = np.concatenate([self._labels, labels[new]])
-        self._nearest = np.concatenate([self._nearest, ranges[new]])
-        self._last = np.concatenate([self._last, np.full(len(new), t)])
-        found = np.concatenate([self._cones[known], cones])
-        self._cones = np.concatenate([self._cones, cones])
-        return np.concatenate([rows, new]), found
+        first = same.argmax(axis=1) if len(new) else new
+        is_first = first == np.arange(len(new))
+        own = is_first[first]
+        cones = self._count + np.cumsum(is_first) - 1
+        self._points = np.concatenate([self._points, points[new[is_first]]])
+        self._labels = np.concatenate([self._labels, labels[new[is_first]]])
+        self._nearest = np.concatenate([self._nearest, ranges[new[is_first]]])
+        self._last = np.concatenate([self._last, np.full(is_first.sum(), t)])
+        found = np.concatenate([self._cones[place[rows]], cones[first[own]]])
+        self._cones = np.concatenate([self._cones, cones[is_first]])
+        self._count += int(is_first.sum())
+        return np.concatenate([rows, new[own]]), found
 
 
 class TwistRecord:

@@ -37,6 +37,9 @@ WORKER_IDLE = 600
 LATE = "the batch of the lap was late"
 """This says why a batch was given up that the process has not solved in time."""
 
+SOLVED = 3.0
+"""A batch counts as solved within this distance (joint sigmas) of its optimum: its marginal has the rest."""
+
 
 class DriveRecord:
     """Keeps the odometry, the detections and the poses of every cycle, as long as a batch can solve them."""
@@ -201,7 +204,9 @@ class LapBatch:
             return " ".join(f"the batch of the lap has failed: {type(error).__name__}: {error}".split())
         if solved is None:
             return "the detections are against the loop"
-        return solved if solved.convergence.converged else "the batch of the lap has not converged"
+        convergence = solved.convergence
+        nearly = convergence.converged or convergence.gradient < SOLVED
+        return solved if nearly else "the batch of the lap has not converged"
 
 
 def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:

@@ -78,6 +78,8 @@ def doubted(mean: Array, variance: Array, settings: MapperSettings) -> MapperSet
     sigma = np.array(settings.sigmas_calibrations)
     limits = np.full(len(sigma), settings.calibration.doubt)
     limits[:CALIBRATION_SIZE] = settings.odometry.doubt
+    if settings.odometry.hold_scale:
+        limits[0] = np.inf
     spread = sigma**2 - variance
     shown = spread > np.finfo(np.float32).eps * sigma**2  # the drive says something at all
     off = mean - settings.calibrations

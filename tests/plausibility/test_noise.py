@@ -25,7 +25,8 @@ def test_stated_noise_of_odometry_is_contradicted(factor: float, size: str) -> N
     (found,) = hints(replace(log, odometry_sigma=factor * log.odometry_sigma))
     assert (found.cause, found.file) == ("noise", "log.toml")
     assert f"the stated noise is too {size}" in found.likely
-    assert all(name in found.found for name in ("vx scatters by", "vy scatters by", "wz scatters by"))
+    assert "vx scatters by" in found.found
+    assert "wz scatters by" in found.found
     assert found.advice.startswith("--noise measured")
 
 
