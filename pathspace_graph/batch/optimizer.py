@@ -83,7 +83,7 @@ class Optimizer:
 
         The gate shrinks from the schedule's to that of the settings (graduated robust weights), and only then
         may the optimization end. Each round takes one step. After `SEARCH` rounds, or half of them,
-        associations and sigmas stay as they are: some would change for ever where two rows are near each other.
+        associations and sigmas stay as they are: where two rows are near, some would change for ever.
         """
         system, gate = self.system, schedule.gate
         locate_poses(state, self.settings.association)

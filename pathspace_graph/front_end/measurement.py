@@ -28,7 +28,7 @@ IntArray = NDArray[np.intp]
 DRIFT: Final = np.array([0.05, 0.05, 0.0017])
 """Slow part of any odometry (m, m, rad by root of s): after 90 s it is 0.5 m and 0.9 degrees off.
 
-It is assumed, since an open drive does not show it: cones in view for 3 s tell errors of speed above 0.05 m/s."""
+It is assumed, since an open drive does not show it: cones in view for 3 s show 0.05 m/s at least."""
 PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02])
 """Weak priors of the sensor's errors (rad, m, s, -, m) and of the yaw rate's bias (rad/s), one sigma."""
 FIRST_ALONG: Final = (0.1, 0.04)

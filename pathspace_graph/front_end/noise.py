@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 from math import inf
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.measured_noise import KnownNoise
-from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.factors.sensor import SENSOR, SENSOR_SIZE
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import NoiseSource, RunNoise
 from pathspace_graph.mapping.motion import MeasuredMotion
@@ -30,6 +30,7 @@ MOST_CYCLES: Final = 300
 """It is measured on this number of newest cycles, which bounds its time."""
 MIN_SPEED: Final = 0.3
 """Driving is faster than this (m/s)."""
+SCALE: Final = SENSOR.index("range_scale")
 REFERENCE_RANGE: Final = 10.0
 """Ranges are compared with speeds by their noise at this range (m)."""
 
@@ -102,42 +103,44 @@ class NoiseLearner:
         return detections if covariances is None else replace(detections, covariances=covariances)
 
     def calibrated(self, settings: MapperSettings) -> MapperSettings:
-        """Return settings with measured priors of the calibrations, where the old ones are contradicted.
+        """Return settings with measured priors of those calibrations whose old ones are contradicted.
 
-        An error b is contradicted where `|b - m| > doubt hypot(sigma, sigma_prior)`. Then all errors of the
-        sensor have the measured priors. Of ranges and speeds only the ratio can be seen: the scale of one is
-        held, that of the other is what was measured.
+        An error b is contradicted where `|b - m| > doubt hypot(sigma, sigma_prior)`. Of ranges and speeds
+        only the ratio can be seen: the scale of one is held, that of the other is what was measured.
         """
         measured, sensor = self.measured, settings.calibration
-        if not self.of_detections or measured is None or measured.along is None or not sensor.sensor:
+        contradicted = self._contradicted(settings)
+        if measured is None or not contradicted.any():
             return settings
-        off = np.abs(measured.sensor - sensor.means)
-        if not (off > sensor.doubt * np.hypot(measured.sensor_sigma, sensor.sigmas)).any():
-            return settings
-        values = dict(zip(SENSOR, measured.sensor.tolist(), strict=True))
-        sigmas = dict(zip(SENSOR, np.maximum(measured.sensor_sigma, sensor.sigmas).tolist(), strict=True))
-        scale = values["range_scale"]
-        if self.trusts_odometry(settings):
-            odometry = replace(settings.odometry, hold_scale=True)
-        else:
-            wide = replace(settings.odometry, scale=-scale / (1.0 + scale), doubt=inf)
-            odometry = replace(wide, sigma_scale=max(sigmas["range_scale"], wide.sigma_scale))
-            values["range_scale"], sigmas["range_scale"] = sensor.range_scale, sensor.sigma_range_scale
-        priors = values | {f"sigma_{name}": sigma for name, sigma in sigmas.items()}
+        sigmas = np.maximum(measured.sensor_sigma, sensor.sigmas)
+        odometry = settings.odometry
+        if contradicted[SCALE] and self.trusts_odometry(settings):
+            odometry = replace(odometry, hold_scale=True)
+        elif contradicted[SCALE]:
+            scale, contradicted[SCALE] = float(measured.sensor[SCALE]), False
+            odometry = replace(odometry, scale=-scale / (1.0 + scale), doubt=inf)
+            odometry = replace(odometry, sigma_scale=max(float(sigmas[SCALE]), odometry.sigma_scale))
+        priors: dict[str, Any] = {SENSOR[k]: float(measured.sensor[k]) for k in np.flatnonzero(contradicted)}
+        priors |= {f"sigma_{SENSOR[k]}": float(sigmas[k]) for k in np.flatnonzero(contradicted)}
         return replace(settings, odometry=odometry, calibration=replace(sensor, doubt=inf, **priors))
+
+    def _contradicted(self, settings: MapperSettings) -> NDArray[np.bool_]:
+        """Return which errors (5,) of the sensor are measured, and contradict their priors."""
+        measured, sensor = self.measured, settings.calibration
+        if not self.of_detections or measured is None or measured.along is None or not sensor.sensor:
+            return np.zeros(SENSOR_SIZE, bool)
+        off = np.abs(measured.sensor - sensor.means)
+        return np.asarray(off > sensor.doubt * np.hypot(measured.sensor_sigma, sensor.sigmas))
 
     def used(self, settings: MapperSettings) -> RunNoise:
         """Returns the noise that is used, and what sets the size of the map where ranges and speeds disagree.
 
         They do where `calibrated` finds that the scale of the ranges contradicts its prior.
         """
-        measured, sensor = self.measured, settings.calibration
+        measured = self.measured
         size: Literal["odometry", "ranges"] | None = None
-        if self.of_detections and measured is not None and measured.along is not None and sensor.sensor:
-            place = SENSOR.index("range_scale")
-            off = abs(measured.sensor[place] - sensor.range_scale)
-            if off > sensor.doubt * np.hypot(measured.sensor_sigma[place], sensor.sigma_range_scale):
-                size = "odometry" if self.trusts_odometry(settings) else "ranges"
+        if self._contradicted(settings)[SCALE]:
+            size = "odometry" if self.trusts_odometry(settings) else "ranges"
         known = measured is not None, measured is not None and measured.along is not None
         stated = self.known.odometry_stated, self.known.detections_stated
         own = self.of_odometry, self.of_detections
