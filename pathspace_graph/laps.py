@@ -14,10 +14,10 @@ Array = NDArray[np.float64]
 class LapSettings:
     """Describes what counts as passing the start line, the y axis of the map frame at the first pose."""
 
-    min_path: float = 40.0
+    min_path: float = 25.0
     """A lap is at least this long (m along the path); jitter or an overlap may cross the line sooner."""
 
-    min_distance: float = 15.0
+    min_distance: float = 7.0
     """A lap leads at least this far away from the start (m)."""
 
     gate_half_width: float = 5.0

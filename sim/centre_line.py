@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import KDTree
 
 from .geometry import along_polyline, arc_lengths, curvature, direction, left_normals, ring, unit
 
@@ -90,6 +91,12 @@ def fit_centre_line(left: FloatArray, right: FloatArray, closed: bool, near: Flo
         _row_distances(curve, left, index[:, 0], closed), _row_distances(curve, right, index[:, 1], closed)
     )
     return _as_spline(curve, clearance, closed)
+
+
+def along_path(points: FloatArray, cones: FloatArray, closed: bool) -> CentreLine:
+    """Returns the smooth curve along points (k, 2), whose clearance is the distance to the nearest cone."""
+    curve = _smooth(_resample(points, STEP, closed)[0], closed)
+    return _as_spline(curve, np.asarray(KDTree(cones).query(curve)[0]), closed)
 
 
 def match_rows(left: FloatArray, right: FloatArray, closed: bool, near: FloatArray) -> IntArray:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
-from .centre_line import CentreLine, fit_centre_line
+from .centre_line import CentreLine, along_path, fit_centre_line
 from .geometry import direction, left_normals
 
 FloatArray = NDArray[np.float64]
@@ -33,10 +33,14 @@ class Track:
     """The vehicle starts from this pose [x, y, theta] (3,) in m, m, rad."""
     name: str
     """The track is known by this name."""
+    path: FloatArray | None = None
+    """The road is driven along these points (k, 2) in m, where that is not once along its middle."""
 
     @cached_property
     def centre_line(self) -> CentreLine:
-        """Returns the smooth curve halfway between the boundaries, in the track's frame."""
+        """Returns the smooth curve halfway between the boundaries, or along the path, track frame."""
+        if self.path is not None:
+            return along_path(self.path, np.vstack([self.left, self.right]), self.closed)
         return fit_centre_line(self.left, self.right, self.closed, self.start[:2])
 
     @property
@@ -59,5 +63,10 @@ def to_map_frame(track: Track) -> Track:
         return np.asarray((points - track.start[:2]) @ rotation)
 
     return replace(
-        track, left=move(track.left), right=move(track.right), other=move(track.other), start=np.zeros(3)
+        track,
+        left=move(track.left),
+        right=move(track.right),
+        other=move(track.other),
+        start=np.zeros(3),
+        path=None if track.path is None else move(track.path),
     )

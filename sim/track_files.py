@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -43,6 +43,8 @@ MAX_START_DISTANCE: Final = 10.0
 """The start is at most this far from the middle of the track (m)."""
 CONE_SPACING: Final = 5.0
 """The cones along a circuit that is given by its widths are at most this far apart (m)."""
+MIN_CLEARANCE: Final = 0.2
+"""The middle of a road is never nearer to a cone than this share of its usual distance."""
 WIDTH_STEP: Final = 0.5
 """The samples of such a circuit's boundaries are this far apart (m)."""
 TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
@@ -98,6 +100,12 @@ def _check(path: Path, track: Track) -> None:
                 path, f"expected at least {MIN_CONES} cones of the {name} boundary, found {len(row)}"
             )
     line = track.centre_line
+    if line.clearance.min() < MIN_CLEARANCE * np.median(line.clearance):
+        raise InputError(
+            path,
+            f"expected two rows with a road between them, found their middle {line.clearance.min():.2f} m "
+            f"from a cone where the road is {2.0 * np.median(line.clearance):.1f} m wide",
+        )
     s = np.arange(0.0, line.length, WIDTH_STEP)
     distances = np.linalg.norm(line.points(s) - track.start[:2], axis=1)
     nearest = int(np.argmin(distances))
@@ -152,17 +160,43 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
     rows = [
         _pacsim_cones(path, _get(path, data, name, "track."), f"track.{name}") for name in ("left", "right")
     ]
-    left, right = (_without_repeats(row, closed) for row in rows)
-    other = _pacsim_cones(path, data.get("unknown"), "track.unknown")
-    return Track(left, right, other, closed, np.append(position, orientation[2]), path.stem)
+    orange = [row.points[row.is_orange] for row in rows]
+    other = np.vstack([_pacsim_cones(path, data.get("unknown"), "track.unknown").points, *orange])
+    left, right = (_without_repeats(row.points[~row.is_orange], closed) for row in rows)
+    track = Track(left, right, other, closed, np.append(position, orientation[2]), path.stem)
+    hidden = np.vstack([row.points[row.is_invisible] for row in rows])
+    return _with_hidden(track, hidden) if len(hidden) else track
 
 
-def _pacsim_cones(path: Path, cones: object, key: str) -> FloatArray:
-    points = [
-        _vector(path, _get(path, cone, "position", f"{key}[{k}]."), 2, f"{key}[{k}].position")
-        for k, cone in enumerate(_list(path, cones, key))
-    ]
-    return np.array(points).reshape(-1, 2)
+def _with_hidden(track: Track, hidden: FloatArray) -> Track:
+    """Returns the track without the cones (k, 2) that nobody sees; they still say where its middle is."""
+    line = track.centre_line
+    left, right = (
+        row[~(row[:, None] == hidden).all(axis=2).any(axis=1)] for row in (track.left, track.right)
+    )
+    s = np.arange(0.0, line.length, WIDTH_STEP)
+    return replace(track, left=left, right=right, path=line.points(s))
+
+
+@dataclass(frozen=True, eq=False)
+class _PacsimRow:
+    """Cones of a list in a PacSim file, by their `class`."""
+
+    points: FloatArray
+    is_orange: NDArray[np.bool_]
+    """(n,) Cones of no boundary."""
+    is_invisible: NDArray[np.bool_]
+    """(n,) Cones that are not detected."""
+
+
+def _pacsim_cones(path: Path, cones: object, key: str) -> _PacsimRow:
+    points, classes = [], []
+    for k, cone in enumerate(_list(path, cones, key)):
+        points.append(_vector(path, _get(path, cone, "position", f"{key}[{k}]."), 2, f"{key}[{k}].position"))
+        classes.append(str(cone.get("class", "")))
+    is_orange = np.array(["orange" in name for name in classes], bool)
+    is_invisible = np.array([name == "invisible" for name in classes], bool)
+    return _PacsimRow(np.array(points).reshape(-1, 2), is_orange, is_invisible)
 
 
 def _fssim(path: Path, data: Mapping[str, Any]) -> Track:

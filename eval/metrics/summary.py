@@ -165,7 +165,7 @@ def lap_times(log: Log) -> Array:
 
 
 def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
-    """Returns the paper's table: a row at the end of each true lap.
+    """Returns the paper's table: a row at the end of each true lap, or that of the end where there is none.
 
     Without a true path the laps are the estimated ones, without true cones there is no row. The snapshots of
     `result` are those at `lap_times`. A batch has one map for all laps, and so one row.
@@ -176,7 +176,7 @@ def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
         return [lap_metrics(result.map, log.truth, result.laps)]
     by_truth = tuple(enumerate(result.snapshots, start=1))
     maps = by_truth if len(log.truth.poses) else result.lap_maps
-    return [lap_metrics(track, log.truth, lap) for lap, track in maps]
+    return [lap_metrics(track, log.truth, lap) for lap, track in maps or ((0, result.map),)]
 
 
 def not_mapped(track: Map, log: Log) -> list[str]:

@@ -22,6 +22,8 @@ RUN: Final = ("track", "seed")
 """These columns name a drive; combinations are paired on the same drive and noise."""
 SIMULATION: Final = "simulation."
 """Columns with settings of the simulation have this prefix."""
+SETTING: Final = "settings."
+"""Columns with settings of the estimator have this prefix where another column has their name."""
 TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
 """These columns hold wall times, all that differs when a study is run again."""
 
@@ -58,7 +60,8 @@ def add_batch(rows: Sequence[dict[str, Any]]) -> None:
 def _settings_row(study: Study, cell: Cell) -> dict[str, Any]:
     settings, simulation = leaves(cell.settings), leaves(cell.drive.simulation)
     row = {f"{SIMULATION}{name}": _cell(simulation[name]) for name in study.varied_noise}
-    return row | {name: _cell(settings[name]) for name in study.varied}
+    own = {"study", *RUN, *COMBINATION}
+    return row | {f"{SETTING}{name}" if name in own else name: _cell(settings[name]) for name in study.varied}
 
 
 def _cell(value: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ from .cones import cones_of_curve, first_parameter
 from .knots import fit_through, reknot
 
 Array = NDArray[np.float64]
+
+ALIKE: Final = (3.0, 0.01)
+"""Parameters of two curves through the same cones differ by less than `a + b L` (m), with L their length."""
 
 
 def simplify(
@@ -58,15 +62,26 @@ def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Ar
     on beyond the ends of the new one, which doesn't count.
     """
 
-    def foot_on_new(u: Array) -> Array:
-        return find_anywhere(new, new_points, old.evaluate(old_points, u)).u
+    if old.periodic or new.periodic:
 
-    within = (-np.inf, np.inf)
-    if not new.periodic:
-        ends = new.evaluate(new_points, np.array([new.tables.low, new.tables.high]))
-        first, last = find_anywhere(old, old_points, ends).u.tolist()
-        within = (first, last)
-    return refit(old.spline(old_points), new.spline(new_points), foot_on_new, within).new_from_old
+        def foot_on_new(u: Array) -> Array:
+            return find_anywhere(new, new_points, old.evaluate(old_points, u)).u
+
+        return refit(old.spline(old_points), new.spline(new_points), foot_on_new).new_from_old
+
+    # an open curve that passes the same cones again lies on itself, so it is searched near the same place
+    ends, quarter = np.array([new.tables.low, new.tables.high]), 0.25 * (old.tables.high - old.tables.low)
+    low = np.array([old.tables.low, old.tables.high - quarter])
+    within = old.find(old_points, new.evaluate(new_points, ends), low, low + quarter).u
+    room = ALIKE[0] + ALIKE[1] * (ends[1] - ends[0])
+
+    def foot_near(u: Array) -> Array:
+        alike = ends[0] + (u - within[0]) * (ends[1] - ends[0]) / (within[1] - within[0])
+        low, high = (np.clip(alike + side * room, *ends) for side in (-1.0, 1.0))
+        return new.find(new_points, old.evaluate(old_points, u), low, high).u
+
+    first, last = within.tolist()
+    return refit(old.spline(old_points), new.spline(new_points), foot_near, (first, last)).new_from_old
 
 
 def map_block(state: State, label: int) -> slice:

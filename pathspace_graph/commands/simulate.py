@@ -17,6 +17,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import LOG_FILE, Log, write_log
 from pathspace_graph.progress import progress
+from pathspace_graph.sim.events import EVENTS
 from pathspace_graph.sim.presets import PRESETS, preset
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
@@ -34,6 +35,8 @@ class Simulate:
     """The track is read from this file: PacSim or fssim YAML, EUFS or TUM CSV."""
     generate: int | None = None
     """Where no track file is given, a Formula Student track is generated from this seed."""
+    event: Literal["skidpad", "acceleration"] | None = None
+    """Or else the drive is this event, on the track that the rules describe."""
     seed: int = 0
     """The drive's wander and all noise are drawn from this seed."""
     sensor: Literal["plain", "camera"] = "plain"
@@ -65,9 +68,11 @@ class Simulate:
     def _track(self) -> Track:
         if self.track is not None:
             return read_track(self.track)
-        if self.generate is None:
-            raise SettingsError("simulate: expected a track, either --track FILE or --generate SEED")
-        return generated_track(self.generate, self.generator)
+        if self.generate is not None:
+            return generated_track(self.generate, self.generator)
+        if self.event is not None:
+            return EVENTS[self.event]()
+        raise SettingsError("simulate: expected a track: --track FILE, --generate SEED or --event NAME")
 
 
 def generated_track(seed: int, settings: TrackGeneratorSettings | None = None) -> Track:

@@ -37,6 +37,8 @@ _LEAST_COSINE: Final = 0.1
 """Boundaries that diverge by more than the angle of this cosine are treated as if it were this one."""
 _CROSSING_STEPS: Final = 8
 """The crossing of a normal of the line and a boundary is found by this number of Newton steps."""
+_LONGEST: Final = 3.0
+"""A centre line that is longer than this many times its boundaries has run astray."""
 _LARGEST_GAP: Final = 4.0
 """Neighbours are at most this many mean distances apart; farther ones are on both sides of a break."""
 _FEWEST_POINTS: Final = 4
@@ -115,6 +117,8 @@ def find_line(left: BSpline, right: BSpline, closed: bool, step: float) -> Line:
     stations = _in_order(left, right, _first_stations(left, right, closed), closed)
     for _ in range(_RESAMPLINGS):
         lengths = arc_lengths(stations, closed)
+        if not lengths[-1] < _LONGEST * max(left.length(), right.length()):
+            raise SettingsError(_NOT_SIDE_BY_SIDE)
         count = max(round(lengths[-1] / step), _FEWEST_POINTS) * every
         stations = _resampled(left, right, stations, lengths, count, closed)
     lengths = arc_lengths(stations, closed)

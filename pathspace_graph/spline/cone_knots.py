@@ -72,8 +72,9 @@ def thin(
 ) -> Iterator[Thinned]:
     """Yields least-squares curves with one knot less each, from a knot at each point down to `least` points.
 
-    The points (k, 2) have the parameters u (k,) in [0, high]; `least` counts control points. Each step
-    removes the knot whose removal costs least; ties go to the shortest interval.
+    The points (k, 2) have the parameters u (k,) in [0, high]; `least` counts control points, and where there
+    are too few points for so many, the first curve is the only one. Each step removes the knot whose removal
+    costs least; ties go to the shortest interval.
 
     A knot disappears where the p-th derivative does not jump: a linear constraint a'c = 0. The removal costs
     `|a'c|^2 / (a' G^-1 a)`, where G is the matrix of the normal equations, and every linear function `w'c`
@@ -81,13 +82,15 @@ def thin(
     one, where the rows of W are the jumps A at all knots and the basis at the points.
     """
     breaks = _breaks(u, high)
+    while periodic and len(breaks) <= fit.degree + 1:
+        breaks = np.sort(np.append(breaks, 0.5 * (breaks[1:] + breaks[:-1])))
     frame = _frame(breaks, periodic, fit.degree)
     B, bending, jumps = frame.basis_matrix(u), energy_rows(frame), _jumps(frame)
     factor = cho_factor(B.T @ B + fit.smoothness * bending.T @ bending)
     watched, n, remaining = np.concatenate([jumps, B]), len(jumps), np.arange(len(jumps))
     spread, values = watched @ cho_solve(factor, jumps.T), watched @ cho_solve(factor, B.T @ points)
     leverage = np.einsum("kn,nk->k", B, cho_solve(factor, B.T))
-    for size in range(B.shape[1], max(least, B.shape[1] - n) - 1, -1):
+    for size in range(B.shape[1], max(min(least, B.shape[1]), B.shape[1] - n) - 1, -1):
         kept = breaks[np.concatenate([[0], 1 + remaining, [-1]])]
         yield Thinned(kept, size, points - values[n:], leverage)
         if len(remaining):

@@ -113,8 +113,14 @@ def refit(
 
 
 def _least_squares(matrix: Floats, right: Floats) -> Floats:
-    """Returns argmin |M X - R| by normal equations, which a sampled B-spline basis keeps well conditioned."""
-    factor = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
+    """Returns argmin |M X - R| by normal equations, which a sampled B-spline basis keeps well conditioned.
+
+    Where a stretch has no sample, X is the least of all that are as good.
+    """
+    try:
+        factor = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.lstsq(matrix, right)[0])
     return np.asarray(scipy.linalg.cho_solve(factor, matrix.T @ right, check_finite=False))
 
 

@@ -63,7 +63,8 @@ def test_real_track(path: Path) -> None:
 
 @real_tracks
 def test_stray_points_and_gate_cones_are_of_no_boundary() -> None:
-    assert len(read_track(TRACKS / "pacsim" / "FSG24.yaml").other) == 188
+    # two big orange cones stand in the rows of the boundaries
+    assert len(read_track(TRACKS / "pacsim" / "FSG24.yaml").other) == 190
     assert len(read_track(TRACKS / "fssim" / "FSG.yaml").other) == 4
     bone = read_track(TRACKS / "eufs" / "bone.csv")
     # five rows are big_orange, two of them the same cone
@@ -180,6 +181,37 @@ def test_pacsim_square(tmp_path: Path) -> None:
     assert 70.0 < track.centre_line.length < 80.0
     moved = to_map_frame(track)
     np.testing.assert_allclose(moved.left, track.left + np.array([0.0, 10.0]), atol=1e-12)
+
+
+def test_the_classes_of_pacsim(tmp_path: Path) -> None:
+    """Two cones of the left row are orange, and one of the right row is not seen."""
+    text = square_yaml()
+    plain = tmp_path / "plain.yml"
+    plain.write_text(text)
+    track = read_track(plain)
+    first, second = (f"[{x}, {y}, 0.0]" for x, y in track.left[:2].tolist())
+    hidden = f"[{track.right[3, 0]}, {track.right[3, 1]}, 0.0]"
+    for at, kind in ((first, "big-orange"), (second, "small-orange"), (hidden, "invisible")):
+        assert f"{at}, class: cone" in text
+        text = text.replace(f"{at}, class: cone", f"{at}, class: {kind}")
+    (tmp_path / "classes.yml").write_text(text)
+    found = read_track(tmp_path / "classes.yml")
+    np.testing.assert_array_equal(found.left, track.left[2:])
+    np.testing.assert_array_equal(found.other, track.left[:2])
+    np.testing.assert_array_equal(found.right, np.delete(track.right, 3, axis=0))
+    assert found.centre_line.length == pytest.approx(track.centre_line.length, rel=0.06)
+
+
+def test_rows_without_a_road_between_them_are_refused(tmp_path: Path) -> None:
+    """Some cones of the right row stand beyond the left one."""
+    (tmp_path / "square.yml").write_text(square_yaml())
+    track = read_track(tmp_path / "square.yml")
+    text = square_yaml()
+    for x, y in track.right[1:4].tolist():
+        text = text.replace(f"[{x}, {y}, 0.0]", f"[{x}, {y + 7.0}, 0.0]")
+    (tmp_path / "crossed.yml").write_text(text)
+    with pytest.raises(InputError, match="a road between them"):
+        read_track(tmp_path / "crossed.yml")
 
 
 BAD_YAML = [

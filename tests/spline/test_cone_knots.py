@@ -124,3 +124,13 @@ def test_cones_at_the_ends_up_to_rounding_add_no_knot() -> None:
     u[0], high = 1e-12, float(u[-1]) + 1e-12
     first = next(thin(points, u, high, False, FIT, 8))
     assert (first.size, first.breaks[0], first.breaks[-1]) == (len(points) + 2, 0.0, high)
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 7])
+@pytest.mark.parametrize("periodic", [True, False])
+def test_few_cones_have_a_curve_through_them(count: int, periodic: bool) -> None:
+    """There are fewer than the control points that are asked for."""
+    points = circle(count, 0.0)
+    chosen = chosen_breaks(points, periodic, FIT, 8, 8)
+    spline = fit_spline(points, chosen.size, periodic, FIT, chosen.breaks)
+    assert np.abs(closest_points(spline, points).distance).max() < 0.5
