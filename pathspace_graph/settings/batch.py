@@ -130,7 +130,7 @@ class ClosureSettings(Positive, group="batch.closure"):
     """The loop is tried where the curvature agrees with itself a lap later to this degree at least, 1 where
     it is the same. Of two loops side by side the second agrees with the first to 0.89 at most; a true lap
     agrees to 0.92 and more."""
-    used: float = 0.6
+    used: float = 0.75
     """A closed result has at least this share of the first lap's coloured detections on its curves."""
     used_again: float = 0.85
     """The share of those after the first lap is at least this part of it."""
