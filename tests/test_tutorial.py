@@ -53,7 +53,8 @@ def test_the_tutorial(tmp_path: Path) -> None:
     truth = read_map(tmp_path / "map-with-truth")
     assert abs(online.size - truth.size) < 10  # the bag lost nothing that matters
     poses = [read_trajectory(tmp_path / name / "trajectory.tum")[1] for name in ("map", "map-with-truth")]
-    assert np.hypot(*(poses[0] - poses[1])[:, :2].T).max() < 1.5
+    # one of them may close its loop a cycle earlier
+    assert np.quantile(np.hypot(*(poses[0] - poses[1])[:, :2].T), 0.99) < 1.0
     assert (tmp_path / "drive.rrd").stat().st_size > 0
     assert (tmp_path / "comparison" / "table.md").exists()
     rows = np.loadtxt(tmp_path / "centerline.csv", delimiter=",")
