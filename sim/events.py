@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from .centre_line import STEP
 from .track import Track
 
 FloatArray = NDArray[np.float64]
@@ -24,8 +25,6 @@ APPROACH: Final = 15.0
 """Length of the lanes into and out of the circles (m)."""
 ROUNDS: Final = 2
 """Each circle is driven for this number of rounds: the right one first."""
-PATH_STEP: Final = 0.25
-"""Distance of the samples of a path (m)."""
 
 STRETCH: Final = 75.0
 """Length of the acceleration event (m)."""
@@ -38,8 +37,8 @@ SPACING: Final = 5.0
 def skidpad() -> Track:
     """Returns the two circles, entered and left along x between them: two rounds right, two rounds left.
 
-    Inner and outer cones have the colour of their side as each circle is driven. The lanes into and out of
-    the circles, and the timing gate, are orange.
+    Inner and outer cones have the colour of their side as each circle is driven. The cones of the lanes into
+    and out of the circles are orange.
     """
     middle, outer = CIRCLES / 2, INNER + LANE
     # the outer rows leave the lanes free
@@ -50,7 +49,7 @@ def skidpad() -> Track:
     mirrored = np.array([1.0, -1.0])
     x = np.arange(-APPROACH, -LANE - 2.0, LANE)
     lanes = [(side * at, y) for at in x for side in (1, -1) for y in (-LANE / 2, LANE / 2)]
-    rounds = np.arange(0.0, ROUNDS * 2 * np.pi, PATH_STEP / middle)
+    rounds = np.arange(0.0, ROUNDS * 2 * np.pi, STEP / middle)
     path = [
         _line(-APPROACH, 0.0),
         _circle(middle, rounds) + below,
@@ -75,7 +74,7 @@ def _circle(radius: float, angles: FloatArray) -> FloatArray:
 
 def _line(begin: float, end: float) -> FloatArray:
     """Returns points (n, 2) along the x axis, the end left out."""
-    x = np.arange(begin, end, PATH_STEP)
+    x = np.arange(begin, end, STEP)
     return np.column_stack([x, np.zeros(len(x))])
 
 

@@ -43,6 +43,10 @@ MAX_START_DISTANCE: Final = 10.0
 """The start is at most this far from the middle of the track (m)."""
 CONE_SPACING: Final = 5.0
 """The cones along a circuit that is given by its widths are at most this far apart (m)."""
+ORANGE: Final = "orange"
+"""PacSim's classes of cones of no boundary contain this."""
+INVISIBLE: Final = "invisible"
+"""PacSim's class of cones that are not detected."""
 MIN_CLEARANCE: Final = 0.2
 """The middle of a road is never nearer to a cone than this share of its usual distance."""
 WIDTH_STEP: Final = 0.5
@@ -160,11 +164,11 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
     rows = [
         _pacsim_cones(path, _get(path, data, name, "track."), f"track.{name}") for name in ("left", "right")
     ]
-    orange = [row.points[row.is_orange] for row in rows]
-    other = np.vstack([_pacsim_cones(path, data.get("unknown"), "track.unknown").points, *orange])
-    left, right = (_without_repeats(row.points[~row.is_orange], closed) for row in rows)
+    unknown, _ = _pacsim_cones(path, data.get("unknown"), "track.unknown")
+    other = np.vstack([unknown, *(points[kinds == ORANGE] for points, kinds in rows)])
+    left, right = (_without_repeats(points[kinds != ORANGE], closed) for points, kinds in rows)
     track = Track(left, right, other, closed, np.append(position, orientation[2]), path.stem)
-    hidden = np.vstack([row.points[row.is_invisible] for row in rows])
+    hidden = np.vstack([points[kinds == INVISIBLE] for points, kinds in rows])
     return _with_hidden(track, hidden) if len(hidden) else track
 
 
@@ -178,25 +182,14 @@ def _with_hidden(track: Track, hidden: FloatArray) -> Track:
     return replace(track, left=left, right=right, path=line.points(s))
 
 
-@dataclass(frozen=True, eq=False)
-class _PacsimRow:
-    """Cones of a list in a PacSim file, by their `class`."""
-
-    points: FloatArray
-    is_orange: NDArray[np.bool_]
-    """(n,) Cones of no boundary."""
-    is_invisible: NDArray[np.bool_]
-    """(n,) Cones that are not detected."""
-
-
-def _pacsim_cones(path: Path, cones: object, key: str) -> _PacsimRow:
-    points, classes = [], []
+def _pacsim_cones(path: Path, cones: object, key: str) -> tuple[FloatArray, NDArray[np.str_]]:
+    """Returns the points (n, 2) and the classes (n,) of a list of cones; all orange ones have one class."""
+    points, kinds = [], []
     for k, cone in enumerate(_list(path, cones, key)):
         points.append(_vector(path, _get(path, cone, "position", f"{key}[{k}]."), 2, f"{key}[{k}].position"))
-        classes.append(str(cone.get("class", "")))
-    is_orange = np.array(["orange" in name for name in classes], bool)
-    is_invisible = np.array([name == "invisible" for name in classes], bool)
-    return _PacsimRow(np.array(points).reshape(-1, 2), is_orange, is_invisible)
+        kind = str(cone.get("class", ""))
+        kinds.append(ORANGE if ORANGE in kind else kind)
+    return np.array(points).reshape(-1, 2), np.array(kinds, str)
 
 
 def _fssim(path: Path, data: Mapping[str, Any]) -> Track:

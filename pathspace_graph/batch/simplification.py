@@ -62,26 +62,23 @@ def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Ar
     on beyond the ends of the new one, which doesn't count.
     """
 
-    if old.periodic or new.periodic:
-
-        def foot_on_new(u: Array) -> Array:
-            return find_anywhere(new, new_points, old.evaluate(old_points, u)).u
-
-        return refit(old.spline(old_points), new.spline(new_points), foot_on_new).new_from_old
-
+    splines = old.spline(old_points), new.spline(new_points)
+    if new.periodic:
+        return refit(
+            *splines, lambda u: find_anywhere(new, new_points, old.evaluate(old_points, u)).u
+        ).new_from_old
     # an open curve that passes the same cones again lies on itself, so it is searched near the same place
     ends, quarter = np.array([new.tables.low, new.tables.high]), 0.25 * (old.tables.high - old.tables.low)
     low = np.array([old.tables.low, old.tables.high - quarter])
-    within = old.find(old_points, new.evaluate(new_points, ends), low, low + quarter).u
+    first, last = old.find(old_points, new.evaluate(new_points, ends), low, low + quarter).u.tolist()
     room = ALIKE[0] + ALIKE[1] * (ends[1] - ends[0])
 
-    def foot_near(u: Array) -> Array:
-        alike = ends[0] + (u - within[0]) * (ends[1] - ends[0]) / (within[1] - within[0])
+    def foot_on_new(u: Array) -> Array:
+        alike = ends[0] + (u - first) * (ends[1] - ends[0]) / (last - first)
         low, high = (np.clip(alike + side * room, *ends) for side in (-1.0, 1.0))
         return new.find(new_points, old.evaluate(old_points, u), low, high).u
 
-    first, last = within.tolist()
-    return refit(old.spline(old_points), new.spline(new_points), foot_near, (first, last)).new_from_old
+    return refit(*splines, foot_on_new, (first, last)).new_from_old
 
 
 def map_block(state: State, label: int) -> slice:

@@ -178,12 +178,12 @@ def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
 
     It is not doubted, since the detections' noise and the sensor's errors are not known yet.
     """
-    twists, cycles = TwistRecord(), []
-    for odometry, _ in split_odometry(log):
+    readings, twists, cycles = list(split_odometry(log)), TwistRecord(), []
+    for odometry, _ in readings:
         twists.add(odometry)
     unknown = KnownNoise(log.odometry_sigma, False, False, measure([], twists, None))
     front_end = FrontEnd(MapperSettings(), unknown)
-    for odometry, detections in split_odometry(log):
+    for odometry, detections in readings:
         reading = front_end.update(odometry, detections)
         labelled = replace(detections, labels=reading.detections.labels)
         cycles.append(SeenCycle(labelled, front_end.pose, reading.motion.odometry.twist))

@@ -26,9 +26,10 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 DRIFT: Final = np.array([0.05, 0.05, 0.0017])
-"""Slow part of any odometry (m, m, rad by root of s): after 90 s it is 0.5 m and 0.9 degrees off.
+"""Assumed drift of any odometry (m, m, rad per root of s): 0.5 m and 0.9 degrees after 90 s.
 
-It is assumed, since an open drive does not show it: cones in view for 3 s show 0.05 m/s at least."""
+It cannot be measured on an open drive: a cone stays in view for some 3 s, in which an error of the speed of
+less than 0.05 m/s is lost in the noise of its detections."""
 PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02])
 """Weak priors of the sensor's errors (rad, m, s, -, m) and of the yaw rate's bias (rad/s), one sigma."""
 FIRST_ALONG: Final = (0.1, 0.04)
@@ -43,6 +44,7 @@ STRETCH: Final = 3.0
 COUNTED: Final = 0.8
 """Cones beyond this share of `MAX_RANGE` hardly count: they are followed only where they seem nearer."""
 HARDLY: Final = 1e-6
+"""Weight of their sightings. It is not zero, so that a cone seen only there still has a place."""
 HUBER: Final = 2.0
 MIN_COUNT: Final = 5
 """A cone counts with this number of sightings."""

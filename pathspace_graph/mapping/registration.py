@@ -130,9 +130,9 @@ def passes_start(state: State, path: DrivenPath, motion: Motion, settings: Closi
     steps, forward = np.hypot(np.diff(ahead), np.diff(left)), np.diff(ahead)
     crosses = (ahead[:-1] <= 0.0) & (ahead[1:] > 0.0) & (np.abs(left[1:]) < settings.start_lateral)
     crosses &= forward > np.cos(settings.start_heading) * steps
-    for boundary, points in ((one, state.control_points(label)) for label, one in state.boundaries.items()):
+    for label, boundary in state.boundaries.items():
         u = np.arange(0.0, min(settings.beginning, boundary.confirmed_end), boundary.settings.search_step)
-        curve = boundary.evaluate(points, u) - start
+        curve = boundary.evaluate(state.control_points(label), u) - start
         _, beside = curve[np.hypot(*curve.T).argmin()] @ turn
         crosses &= (left[1:] - beside) * beside < 0.0  # on the same side of it as the start
     return bool(crosses.any())

@@ -19,14 +19,16 @@ def with_covariances(log: Log, factor: float) -> Log:
     return replace(log, cycles=tuple(cycles))
 
 
-@pytest.mark.parametrize(("factor", "size"), [(0.4, "small"), (4.0, "large")])
-def test_stated_noise_of_odometry_is_contradicted(factor: float, size: str) -> None:
+@pytest.mark.parametrize(
+    ("factor", "size", "which"), [(0.4, "small", ("vx", "vy", "wz")), (4.0, "large", ("vx", "wz"))]
+)
+def test_stated_noise_of_odometry_is_contradicted(factor: float, size: str, which: tuple[str, ...]) -> None:
+    """A lateral velocity that is stated four times too large may stand for the drift that is assumed."""
     log = short_drive()
     (found,) = hints(replace(log, odometry_sigma=factor * log.odometry_sigma))
     assert (found.cause, found.file) == ("noise", "log.toml")
     assert f"the stated noise is too {size}" in found.likely
-    assert "vx scatters by" in found.found
-    assert "wz scatters by" in found.found
+    assert tuple(part.split()[0] for part in found.found.split(", ") if "scatters by" in part) == which
     assert found.advice.startswith("--noise measured")
 
 
