@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,11 @@ from .se2 import left_of
 from .sensor import SENSOR_SIZE, by_sensor
 
 Array = NDArray[np.float64]
+
+SURE: Final = 4.0
+"""An error of the sensor is beyond doubt at this number of sigmas."""
+STAYS: Final = 1.5
+"""Stated noise is contradicted where errors that stay make the mean of a cone so many times as uncertain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +45,15 @@ class RayNoise:
         """
         k = np.arange(1, max(count, 1))
         return float(1.0 + 2.0 * self.share * ((1.0 - k / count) * np.exp(-k * period / self.time)).sum())
+
+    def inflation_of_slope(self, count: int, period: float) -> float:
+        """Return the variance of a slope over `count` errors of one cone by that of independent ones.
+
+        With the times g from their middle, and the correlations R, it is `g' R g / g' g`.
+        """
+        times = period * (np.arange(count) - 0.5 * (count - 1))
+        alike = self.share * np.exp(-np.abs(times[:, None] - times) / self.time)
+        return float(1.0 - self.share + times @ alike @ times / max(times @ times, np.finfo(float).tiny))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +104,27 @@ class MeasuredNoise:
         ray = points / ranges[:, None]
         outer = ray[:, :, None] * ray[:, None, :]
         return np.asarray(across[:, None, None] * np.eye(2) + (along - across)[:, None, None] * outer)
+
+    def inflated(self, points: Array, covariances: Array) -> Array:
+        """Return covariances (m, 2, 2) of single detections so wide that errors that stay may be forgotten.
+
+        That is `G C G` with the roots of the inflations along and across the ray in G, where one of them is
+        more than `STAYS`.
+        """
+        if self.along is None or self.across is None:
+            return covariances
+        roots = np.sqrt([one.inflation(self.count, self.period) for one in (self.along, self.across)])
+        if (roots < STAYS).all():
+            return covariances
+        ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)[:, None]
+        axes = np.stack([ray, left_of(ray)], axis=1)
+        wider = np.einsum("mki,k,mkj->mij", axes, roots, axes)
+        return np.asarray(wider @ covariances @ wider)
+
+    @property
+    def shown(self) -> Array:
+        """Return those errors (5,) of the sensor that are more than `SURE` sigmas; the others are zero."""
+        return np.where(np.abs(self.sensor) > SURE * self.sensor_sigma, self.sensor, 0.0)
 
     def corrected(self, points: Array, twist: Array) -> Array:
         """Return detections at points (m, 2), vehicle frame, without the constant errors of the sensor."""

@@ -18,9 +18,9 @@ from scipy.optimize import nnls
 from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotations, to_map
-from pathspace_graph.factors.sensor import RANGE, SENSOR_SIZE, by_sensor
+from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor
 
-from .sightings import MAD, MAX_RANGE, MIN_SPEED_SHARE, SeenCycle, Sightings, TwistRecord, follow
+from .sightings import MAD, MAX_RANGE, MIN_SPEED_SHARE, Follower, SeenCycle, Sightings, TwistRecord
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -37,6 +37,8 @@ FIRST_ACROSS: Final = (0.05, 0.016)
 """Noise that the iteration begins with: m and m/m, then m and rad."""
 PASSES: Final = 4
 """Number of times that cones are followed."""
+FOLLOWED: Final = 40
+"""Number of cycles in which cones are followed in a step."""
 ROUNDS: Final = 5
 """Number of times that errors, noise and weights are found in turn."""
 STRETCH: Final = 3.0
@@ -88,12 +90,17 @@ class _Cones:
     """(n, 2, 6) Derivatives by the sensor's errors and by the bias of the yaw rate."""
 
     def seen_at(self, errors: Array, off: Array) -> _Cones:
-        """Return the sightings with the ranges of their cones, as errors (6,) leave them `off` (n, 2).
+        """Return ranges and derivatives at the cones, which errors (6,) leave the sightings `off` by (n, 2).
 
-        Weights by a measured range would prefer sightings that came out too short.
+        At the measured points both have the noise in them: weights would prefer sightings that came out too
+        short, and errors would come out too small.
         """
-        arm = self.points + self.columns @ errors - off - self.table.pose[:, :2]
-        return replace(self, ranges=np.maximum(np.hypot(*arm.T), np.finfo(float).tiny))
+        to_vehicle = rotations(-self.table.pose[:, 2])
+        seen = self.table.point - np.einsum("nij,nj->ni", to_vehicle, off)
+        columns = _columns(self.table, self.begins, seen)
+        arm = self.points + columns @ errors - off - self.table.pose[:, :2]
+        ranges = np.maximum(np.hypot(*arm.T), np.finfo(float).tiny)
+        return replace(self, ranges=ranges, columns=columns)
 
     def sums(self, values: Array) -> Array:
         """Return the sum of values (n, ...) over each cone."""
@@ -118,10 +125,22 @@ def _cones(sightings: Sightings) -> _Cones | None:
     turn = rotations(table.pose[:, 2])
     ray = np.einsum("nij,nj->ni", turn, table.point / ranges[:, None])
     points = to_map(table.point, table.pose)
-    turning = table.by_bias[:, :2] + table.by_bias[:, 2:] * left_of(points - table.pose[:, :2])
-    sensor = np.einsum("nij,njk->nik", turn, by_sensor(table.point, table.twist))
-    columns = np.concatenate([sensor, turning[:, :, None]], axis=2)
-    return _Cones(table, begins, ranges, ray, left_of(ray), points, columns)
+    return _Cones(table, begins, ranges, ray, left_of(ray), points, _columns(table, begins, table.point))
+
+
+def _columns(table: Sightings, begins: IntArray, seen: Array) -> Array:
+    """Return the derivatives (n, 2, 6) of sightings at points (n, 2), vehicle frame, in the map frame.
+
+    The bias of the yaw rate counts from the first sighting of each cone on: what it did before turns all
+    sightings of the cone alike.
+    """
+    first = np.repeat(begins, np.diff(np.append(begins, len(seen))))
+    turn, by_bias, then = rotations(table.pose[:, 2]), table.by_bias, table.by_bias[first]
+    moved = table.pose[:, :2] - table.pose[first, :2]
+    at_pose = by_bias[:, :2] - then[:, :2] - then[:, 2:] * left_of(moved)
+    turning = at_pose + (by_bias - then)[:, 2:] * left_of(np.einsum("nij,nj->ni", turn, seen))
+    sensor = np.einsum("nij,njk->nik", turn, by_sensor(seen, table.twist))
+    return np.concatenate([sensor, turning[:, :, None]], axis=2)
 
 
 def _information(cones: _Cones, along: RayNoise, across: RayNoise, weights: Array) -> Array:
@@ -132,27 +151,20 @@ def _information(cones: _Cones, along: RayNoise, across: RayNoise, weights: Arra
     return np.asarray((by_ray + by_side) * weights[:, None, None])
 
 
-def _solve(cones: _Cones, information: Array, errors: Array, off: Array) -> tuple[Array, Array, Array, Array]:
+def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Array]:
     """Return errors b (6,), their covariance twice, and what is left (n, 2) of each sighting about its cone.
 
-    It is a Gauss-Newton step from errors (6,) that leave `off` (n, 2). The places of the cones, which are the
-    weighted means of `p + A b`, are eliminated. The noise is that of measured detections, so what is left of
-    a corrected one counts as `M^-1 r` (`factors.sensor:by_range`): or else a smaller world would fit better.
-    The covariances are that of independent sightings, and `_clustered`.
+    The places of the cones, which are the weighted means of `p + A b`, are eliminated. The covariances are
+    that of independent sightings, and `_clustered`.
     """
     total = np.linalg.inv(cones.sums(information))
     mean_columns = total @ cones.sums(information @ cones.columns)
     mean_points = (total @ cones.sums(information @ cones.points[:, :, None]))[:, :, 0]
     columns = cones.columns - cones.spread(mean_columns)
     points = cones.points - cones.spread(mean_points)
-    slopes = columns.copy()
-    slopes[:, :, RANGE.start] += off
-    slopes[:, :, RANGE.start + 1] += cones.side * ((cones.side * off).sum(axis=1) / cones.ranges)[:, None]
-    weighted = information @ slopes
-    prior = np.diag(PRIOR**-2)
-    covariance = np.linalg.inv(np.einsum("nik,nil->kl", slopes, weighted) + prior)
-    left = points + columns @ errors
-    errors = errors - covariance @ (np.einsum("nik,ni->k", weighted, left) + prior @ errors)
+    weighted = information @ columns
+    covariance = np.linalg.inv(np.einsum("nik,nil->kl", columns, weighted) + np.diag(PRIOR**-2))
+    errors = -covariance @ np.einsum("nik,ni->k", weighted, points)
     left = points + columns @ errors
     scores = cones.sums(np.einsum("nik,ni->nk", weighted, left))
     return errors, covariance, _clustered(cones, scores, covariance), left
@@ -277,59 +289,114 @@ def _staying(cones: _Cones, left: _Residuals, axis: int, noise: RayNoise) -> tup
 # --- all of it -------------------------------------------------------------------------------------------
 
 
+class _Rounds:
+    """Finds errors, noise and weights in turn."""
+
+    def __init__(self, sightings: Sightings, cones: _Cones, found: MeasuredNoise) -> None:
+        self._sightings, self._cones, self._found = sightings, cones, found
+        self._noise = RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))
+        self._weights: Array = np.ones(len(cones.ranges))
+        self._left = ROUNDS
+
+    def advance(self) -> MeasuredNoise | None:
+        """Do one round; return what was found after the last one."""
+        walk, noise = self._found.odometry * np.sqrt(self._found.interval), self._noise
+        information = _information(self._cones, *noise, self._weights)
+        errors, *covariances, off = _solve(self._cones, information)
+        cones = self._cones = self._cones.seen_at(errors, off)
+        square = ((off * cones.ray).sum(axis=1) / noise[0].sigmas(cones.ranges)) ** 2
+        square += ((off * cones.side).sum(axis=1) / noise[1].sigmas(cones.ranges)) ** 2
+        self._weights = huber_weights(np.sqrt(square), HUBER) ** 2
+        self._weights[cones.ranges > COUNTED * MAX_RANGE] = HARDLY
+        left = _residuals(cones, errors, noise, walk)
+        if len(left.rows) < MIN_ROWS:
+            return self._found
+        self._noise = _ray_noise(cones, left, 0), _ray_noise(cones, left, 1)
+        self._left -= 1
+        return None if self._left else self._result(errors, *covariances)
+
+    def _result(self, errors: Array, covariance: Array, clustered: Array) -> MeasuredNoise:
+        """Return what was found, with errors (6,) and both covariances (6, 6) of them.
+
+        What stays of a cone's errors shifts its place, and only what changes while it is seen is taken for
+        an error of the sensor, as a slope would be.
+        """
+        stamps, cones = np.unique(self._sightings.t), self._cones
+        period = float(np.median(np.diff(stamps)))
+        count = int(np.median(np.diff(np.append(cones.begins, len(cones.ranges)))))
+        stays = max(one.inflation_of_slope(count, period) for one in self._noise)
+        sigmas = np.sqrt(np.maximum(stays * np.diag(covariance), np.diag(clustered)))
+        return replace(
+            self._found,
+            along=self._noise[0],
+            across=self._noise[1],
+            count=count,
+            period=period,
+            per_cycle=len(self._sightings.t) / len(stamps),
+            sensor=errors[:SENSOR_SIZE],
+            sensor_sigma=np.hypot(sigmas, MODEL_ERROR * np.abs(errors))[:SENSOR_SIZE],
+            seconds=float(np.sum(np.minimum(np.diff(np.unique(cones.table.t)), 1.0))),
+        )
+
+
+class Measurement:
+    """Measures noise in steps short enough for a perception cycle.
+
+    Cones are followed again with the noise and the errors that were found, from those known already on.
+    """
+
+    def __init__(self, cycles: Sequence[SeenCycle], found: MeasuredNoise) -> None:
+        """Begin with the cycles of a drive, and with what is known: the noise of the odometry at least."""
+        self._cycles, self._found = cycles, found
+        self._passes = PASSES if found.along is None else 1
+        self._follower, self._sightings = Follower(found), [Sightings.none()]
+        self._followed = 0
+        self._rounds: _Rounds | None = None
+
+    @classmethod
+    def of(
+        cls, cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None
+    ) -> Measurement | None:
+        """Return a measurement; None where not even the noise of the odometry can be told."""
+        white = twists.white()
+        if white is None:
+            return None
+        sigma, interval = white
+        found = known or MeasuredNoise(sigma, DRIFT.copy(), interval)
+        return cls(cycles, replace(found, odometry=sigma, interval=interval))
+
+    def advance(self) -> MeasuredNoise | None:
+        """Do a step; return the noise after the last one."""
+        if self._rounds is not None:
+            found = self._rounds.advance()
+            return None if found is None else self._passed(found)
+        for cycle in self._cycles[self._followed : self._followed + FOLLOWED]:
+            self._sightings.append(self._follower.add(cycle))
+        self._followed += FOLLOWED
+        if self._followed < len(self._cycles):
+            return None
+        sightings = Sightings.stacked(self._sightings)
+        cones = _cones(sightings)
+        if cones is None:
+            return self._passed(self._found)
+        self._rounds = _Rounds(sightings, cones, self._found)
+        return None
+
+    def _passed(self, found: MeasuredNoise) -> MeasuredNoise | None:
+        """End a pass, and begin the next one unless it was the last."""
+        self._passes -= 1
+        self._found, self._rounds, self._followed = found, None, 0
+        self._follower, self._sightings = Follower(found), [Sightings.none()]
+        return None if self._passes else found
+
+
 def measure(
     cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None
 ) -> MeasuredNoise | None:
-    """Return the noise that the readings show; None where not even the odometry's is known.
-
-    Cones are followed again with the noise and the errors that were found, from those `known` already on.
-    """
-    white = twists.white()
-    if white is None:
+    """Return the noise that the readings show; None where not even the odometry's is known."""
+    measurement = Measurement.of(cycles, twists, known)
+    if measurement is None:
         return None
-    sigma, interval = white
-    found = known or MeasuredNoise(sigma, DRIFT.copy(), interval)
-    found = replace(found, odometry=sigma, interval=interval)
-    for _ in range(PASSES if known is None or known.along is None else 1):
-        found = _measured(follow(cycles, found), found)
+    while (found := measurement.advance()) is None:
+        pass
     return found
-
-
-def _measured(sightings: Sightings, found: MeasuredNoise) -> MeasuredNoise:
-    """Return the noise with that of the detections, and the errors of the sensor, if enough cones show it."""
-    cones = _cones(sightings)
-    if cones is None:
-        return found
-    stamps = np.unique(sightings.t)
-    period = float(np.median(np.diff(stamps)))
-    walk = found.odometry * np.sqrt(found.interval)
-    noise = RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))
-    weights = np.ones(len(cones.ranges))
-    errors, off = np.zeros(len(PRIOR)), np.zeros((len(cones.ranges), 2))
-    for _ in range(ROUNDS):
-        information = _information(cones, *noise, weights)
-        errors, covariance, clustered, off = _solve(cones, information, errors, off)
-        cones = cones.seen_at(errors, off)
-        square = ((off * cones.ray).sum(axis=1) / noise[0].sigmas(cones.ranges)) ** 2
-        square += ((off * cones.side).sum(axis=1) / noise[1].sigmas(cones.ranges)) ** 2
-        weights = huber_weights(np.sqrt(square), HUBER) ** 2
-        weights[cones.ranges > COUNTED * MAX_RANGE] = HARDLY
-        left = _residuals(cones, errors, noise, walk)
-        if len(left.rows) < MIN_ROWS:
-            return found
-        noise = _ray_noise(cones, left, 0), _ray_noise(cones, left, 1)
-    per_cone = np.diff(np.append(cones.begins, len(cones.ranges)))
-    count = int(np.median(per_cone))
-    stays = max(one.inflation(count, period) for one in noise)
-    sigmas = np.sqrt(np.maximum(stays * np.diag(covariance), np.diag(clustered)))
-    return replace(
-        found,
-        along=noise[0],
-        across=noise[1],
-        count=count,
-        period=period,
-        per_cycle=len(sightings.t) / len(stamps),
-        sensor=errors[:SENSOR_SIZE],
-        sensor_sigma=np.hypot(sigmas, MODEL_ERROR * np.abs(errors))[:SENSOR_SIZE],
-        seconds=float(np.sum(np.minimum(np.diff(np.unique(cones.table.t)), 1.0))),
-    )

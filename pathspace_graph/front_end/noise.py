@@ -17,7 +17,7 @@ from pathspace_graph.io.results import NoiseSource, RunNoise
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .measurement import measure
+from .measurement import Measurement
 from .sightings import SeenCycle, TwistRecord
 
 Array = NDArray[np.float64]
@@ -44,18 +44,21 @@ class NoiseLearner:
         self.of_odometry = use == "measured" or (use is None and not known.odometry_stated)
         """The noise of the odometry is the measured one."""
         self.of_detections = use == "measured" or (use is None and not known.detections_stated)
-        """The noise of the detections, and the constant errors of the sensor, are the measured ones."""
+        """The noise of the detections is the measured one."""
+        self.of_sensor = use != "stated"
+        """Constant errors of the sensor are measured: stated noise says nothing of them."""
         self.measured = known.measured
         """What was measured so far, or by an earlier look at the whole drive."""
         self._cycles: deque[SeenCycle] = deque(maxlen=MOST_CYCLES)
         self._twists = TwistRecord()
+        self._measurement: Measurement | None = None
         self._driven, self._due = 0.0, FIRST
         self._t: float | None = None
 
     @property
     def is_learning(self) -> bool:
         """Return whether the drive is still needed to know its noise."""
-        return (self.of_odometry or self.of_detections) and self.known.measured is None
+        return self.of_sensor and self.known.measured is None
 
     @property
     def is_settled(self) -> bool:
@@ -72,7 +75,10 @@ class NoiseLearner:
     def observe(
         self, odometry: Odometry, detections: Detections, motion: MeasuredMotion, pose: Array
     ) -> bool:
-        """Learn from a cycle at a pose (3,) of the front end; return whether the noise was measured anew."""
+        """Learn from a cycle at a pose (3,) of the front end; return whether the noise was measured anew.
+
+        That takes some cycles, with a step in each.
+        """
         if not self.is_learning:
             return False
         self._twists.add(odometry)
@@ -80,27 +86,39 @@ class NoiseLearner:
         if self._t is not None and np.hypot(*motion.odometry.twist[:2]) > MIN_SPEED:
             self._driven += min(detections.t - self._t, 1.0)
         self._t = detections.t
-        if self._driven < self._due:
+        if self._measurement is None and self._driven >= self._due:
+            self._due = AGAIN * self._driven
+            self._measurement = Measurement.of(list(self._cycles), self._twists, self.measured)
+        found = None if self._measurement is None else self._measurement.advance()
+        if found is None:
             return False
-        self._due = AGAIN * self._driven
-        self.measured = measure(self._cycles, self._twists, self.measured) or self.measured
-        return self.measured is not None
+        self.measured, self._measurement = found, None
+        return True
 
     def for_check(self, detections: Detections, twist: Array) -> Detections:
-        """Return detections for comparisons over a few cycles: single errors, constant ones taken out."""
-        if not self.of_detections or self.measured is None or self.measured.along is None:
+        """Return detections for comparisons over a few cycles: without sure constant errors."""
+        measured, points = self.measured, detections.points_vehicle
+        if not self.of_sensor or measured is None or measured.along is None:
             return detections
-        points = self.measured.corrected(detections.points_vehicle, twist)
-        covariances = self.measured.covariances(detections.points_vehicle, inflated=False)
-        assert covariances is not None
-        return replace(detections, points_vehicle=points, covariances=covariances)
+        covariances = measured.covariances(points, inflated=False) if self.of_detections else None
+        return replace(
+            detections,
+            points_vehicle=replace(measured, sensor=measured.shown).corrected(points, twist),
+            covariances=detections.covariances if covariances is None else covariances,
+        )
 
     def for_map(self, detections: Detections) -> Detections:
-        """Return detections whose covariances say what each adds to the others of its cone."""
-        if not self.of_detections or self.measured is None:
+        """Return detections whose covariances say what each adds to the others of its cone.
+
+        Stated ones are those of single detections, which say nothing of errors that stay.
+        """
+        measured, points = self.measured, detections.points_vehicle
+        if not self.of_sensor or measured is None:
             return detections
-        covariances = self.measured.covariances(detections.points_vehicle, inflated=True)
-        return detections if covariances is None else replace(detections, covariances=covariances)
+        covariances = measured.covariances(points, inflated=True) if self.of_detections else None
+        if covariances is None:
+            covariances = measured.inflated(points, detections.covariances)
+        return replace(detections, covariances=covariances)
 
     def calibrated(self, settings: MapperSettings) -> MapperSettings:
         """Return settings with measured priors of those calibrations whose old ones are contradicted.
@@ -125,12 +143,17 @@ class NoiseLearner:
         return replace(settings, odometry=odometry, calibration=replace(sensor, doubt=inf, **priors))
 
     def _contradicted(self, settings: MapperSettings) -> NDArray[np.bool_]:
-        """Return which errors (5,) of the sensor are measured, and contradict their priors."""
+        """Return which errors (5,) of the sensor are measured, and contradict their priors.
+
+        What is measured of the scale of the ranges is its ratio to that of the speeds.
+        """
         measured, sensor = self.measured, settings.calibration
-        if not self.of_detections or measured is None or measured.along is None or not sensor.sensor:
+        if not self.of_sensor or measured is None or measured.along is None or not sensor.sensor:
             return np.zeros(SENSOR_SIZE, bool)
         off = np.abs(measured.sensor - sensor.means)
-        return np.asarray(off > sensor.doubt * np.hypot(measured.sensor_sigma, sensor.sigmas))
+        prior = np.array(sensor.sigmas)
+        prior[SCALE] = np.hypot(prior[SCALE], settings.odometry.sigma_scale)
+        return np.asarray(off > sensor.doubt * np.hypot(measured.sensor_sigma, prior))
 
     def used(self, settings: MapperSettings) -> RunNoise:
         """Returns the noise that is used, and what sets the size of the map where ranges and speeds disagree.

@@ -92,11 +92,11 @@ def follow(cycles: Iterable[SeenCycle], known: MeasuredNoise) -> Sightings:
     Sightings are told to be of one cone after the constant errors of the sensor, as far as they are known,
     are taken out, and by their noise, where that is known. What is returned is as measured.
     """
-    follower = _Follower(known)
+    follower = Follower(known)
     return Sightings.stacked([Sightings.none(), *(follower.add(cycle) for cycle in cycles)])
 
 
-class _Follower:
+class Follower:
     """Holds the cones that were seen in the last seconds, by dead reckoning."""
 
     def __init__(self, known: MeasuredNoise) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -93,3 +95,30 @@ def test_detections_without_the_constant_errors_of_the_sensor_by_hand() -> None:
         [0.1 - 0.05 * (8.0 + 2.0), -5.0 + 0.1 + 0.5 + 0.2],
     ]
     np.testing.assert_allclose(noise.corrected(points, twist), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("share", "time"), [(0.0, 1.0), (0.5, 0.4), (0.8, 3.0)])
+def test_the_inflation_of_a_slope_is_that_of_drawn_errors(share: float, time: float) -> None:
+    count, period, rng = 12, 0.2, np.random.default_rng(0)
+    lag = period * np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    correlation = share * np.exp(-lag / time) + (1.0 - share) * np.eye(count)
+    errors = rng.multivariate_normal(np.zeros(count), correlation, 40_000)
+    variance = np.polyfit(period * np.arange(count), errors.T, 1)[0].var()
+    independent = 1.0 / (period**2 * count * (count**2 - 1) / 12)
+    found = RayNoise(np.array([0.1, 0.0]), share, time).inflation_of_slope(count, period)
+    assert found == pytest.approx(variance / independent, rel=0.03)
+
+
+def test_stated_covariances_grow_along_and_across_the_ray_where_errors_stay() -> None:
+    """At a point on the diagonal, with errors across the ray that stay for ever and others that do not."""
+    points, stated = np.array([[5.0, 5.0]]), np.array([[[0.04, 0.01], [0.01, 0.09]]])
+    stays = RayNoise(np.array([0.0, 0.01]), 1.0, 1e9)
+    noise = MeasuredNoise(
+        np.ones(3), np.ones(3), 0.02, along=RayNoise(np.array([0.1, 0.0])), across=stays, count=4
+    )
+    turn = np.array([[1.0, -1.0], [1.0, 1.0]]) / np.sqrt(2.0)
+    expected = turn @ np.diag([1.0, 2.0]) @ turn.T @ stated[0] @ turn @ np.diag([1.0, 2.0]) @ turn.T
+    np.testing.assert_allclose(noise.inflated(points, stated)[0], expected, atol=1e-12)
+    white = replace(noise, across=noise.along)
+    assert white.inflated(points, stated) is stated
+    assert replace(noise, along=None).inflated(points, stated) is stated

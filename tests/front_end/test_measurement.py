@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,7 +12,15 @@ from scipy.stats import chi2
 
 from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
 from pathspace_graph.front_end.front_end import measure_log
-from pathspace_graph.front_end.measurement import MIN_ROWS, MODEL_ERROR, measure
+from pathspace_graph.front_end.measurement import (
+    FOLLOWED,
+    MIN_ROWS,
+    MODEL_ERROR,
+    PASSES,
+    ROUNDS,
+    Measurement,
+    measure,
+)
 from pathspace_graph.front_end.sightings import TwistRecord
 from pathspace_graph.io.log import Log
 from pathspace_graph.sim.presets import preset
@@ -136,3 +145,25 @@ def test_the_errors_of_a_simulated_camera_are_found(seed: int) -> None:
     true[3] -= log.truth.calibration[0]
     assert (np.abs(measured.sensor - true) < 4.0 * measured.sensor_sigma).all()
     assert measured.across is not None and measured.across.share > 0.3
+
+
+@pytest.mark.parametrize("bias", [-0.02, 0.02])
+def test_a_biased_yaw_rate_is_not_taken_for_a_turned_sensor(bias: float) -> None:
+    """Over a view of 2 s both look alike but for the curvature: derivatives with noise in them hide that."""
+    log, measured = simulated("plain", 0)
+    turned = replace(log.odometry, twist=log.odometry.twist + np.array([0.0, 0.0, bias]))
+    found = measure_log(replace(log, odometry=turned))
+    assert found is not None
+    assert abs(found.sensor[0] - measured.sensor[0]) < 0.2 * abs(bias)
+
+
+def test_in_steps_it_is_the_same_and_none_is_long() -> None:
+    cycles, twists = CAMERAS["white"].drive(0)
+    whole = measure(cycles, twists, None)
+    steps, measurement = 0, Measurement.of(cycles, twists, None)
+    assert measurement is not None and whole is not None
+    while (found := measurement.advance()) is None:
+        steps += 1
+    np.testing.assert_array_equal(found.sensor, whole.sensor)
+    follows = -(-len(cycles) // FOLLOWED)
+    assert steps + 1 == PASSES * (follows + ROUNDS)

@@ -72,9 +72,13 @@ def test_noise_is_measured_where_nobody_has_stated_it_or_where_that_is_asked_for
     np.testing.assert_array_equal(known.twist_sigma, noise().twist_sigma if measured[0] else STATED)
     seen = detections(0.0, np.array([[10.0, 2.0]]), np.zeros(1, np.intp))
     expected = noise().covariances(seen.points_vehicle, inflated=True)
+    if use == "stated":
+        expected = seen.covariances
+    elif not measured[1]:  # it is stated for single detections
+        expected = noise().inflated(seen.points_vehicle, seen.covariances)
     assert expected is not None
     found = known.for_map(seen)
-    np.testing.assert_array_equal(found.covariances, expected if measured[1] else seen.covariances)
+    np.testing.assert_array_equal(found.covariances, expected)
     np.testing.assert_array_equal(found.points_vehicle, seen.points_vehicle)
     assert not known.is_learning  # it was measured before
     assert known.is_settled
@@ -88,7 +92,12 @@ def test_for_comparisons_detections_are_single_and_without_constant_errors() -> 
     assert expected is not None
     np.testing.assert_allclose(found.points_vehicle, [[8.4, 0.1]], atol=1e-12)
     np.testing.assert_array_equal(found.covariances, expected)
-    assert learner(noise(errors), cones=True).for_check(seen, twist) is seen
+    stated = learner(noise(errors), cones=True).for_check(seen, twist)
+    np.testing.assert_array_equal(stated.points_vehicle, found.points_vehicle)
+    assert stated.covariances is seen.covariances
+    assert learner(noise(errors), cones=True, use="stated").for_check(seen, twist) is seen
+    unsure = learner(noise(3.9 * SIGMA)).for_check(seen, twist)
+    np.testing.assert_array_equal(unsure.points_vehicle, seen.points_vehicle)
     assert learner(None).for_check(seen, twist) is seen
 
 
@@ -100,13 +109,17 @@ def test_what_is_not_measured_yet_is_assumed() -> None:
     assert known.for_map(seen) is seen
     assert known.calibrated(SETTINGS) is SETTINGS
     odometry_only = learner(MeasuredNoise(np.full(3, 0.1), np.full(3, 0.01), 0.02))
-    assert not odometry_only.is_settled and odometry_only.for_map(seen) is seen
+    assert not odometry_only.is_settled
+    assert odometry_only.for_map(seen).covariances is seen.covariances
     assert odometry_only.calibrated(SETTINGS) is SETTINGS
 
 
 # --- calibrations ----------------------------------------------------------------------------------------
 
-SMALL = 3.0 * np.hypot(SIGMA, CalibrationSettings().sigmas)
+PRIORS = np.array(CalibrationSettings().sigmas)
+PRIORS[3] = np.hypot(PRIORS[3], OdometrySettings().sigma_scale)
+"""The scale of the ranges can only be seen beside that of the speeds."""
+SMALL = 3.0 * np.hypot(SIGMA, PRIORS)
 """Three sigmas of measurement and prior together do not contradict the prior, and five do."""
 
 
@@ -118,7 +131,8 @@ def test_settings_stay_where_no_prior_is_contradicted(entry: int, sign: float) -
     assert learner(noise(errors)).calibrated(SETTINGS) is SETTINGS
     errors[entry] *= 5.0 / 3.0
     assert learner(noise(errors)).calibrated(SETTINGS) is not SETTINGS
-    assert learner(noise(errors), cones=True).calibrated(SETTINGS) is SETTINGS
+    assert learner(noise(errors), cones=True).calibrated(SETTINGS) is not SETTINGS
+    assert learner(noise(errors), cones=True, use="stated").calibrated(SETTINGS) is SETTINGS
     fixed = replace(SETTINGS, calibration=CalibrationSettings(sensor=False))
     assert learner(noise(errors)).calibrated(fixed) is fixed
 
@@ -226,11 +240,21 @@ def poses(log: Log, settings: MapperSettings) -> list:  # type: ignore[type-arg]
     return found
 
 
+def test_stated_noise_stays_unless_errors_stay() -> None:
+    """The mean of 20 detections is then more than 1.5 times as uncertain."""
+    seen = detections(0.0, np.array([[10.0, 2.0]]), np.zeros(1, np.intp))
+    for share, same in ((0.05, True), (0.5, False)):
+        ray = RayNoise(np.array([0.1, 0.02]), share, 1.0)
+        known = learner(replace(noise(), along=ray, across=ray), cones=True)
+        assert (ray.inflation(20, 0.1) < 1.5**2) == same
+        assert (known.for_map(seen).covariances is seen.covariances) == same
+
+
 def test_stated_noise_is_not_touched_by_what_a_drive_shows() -> None:
-    """A log with stated noise is mapped the same, whatever is in its measurement."""
-    log = cut(short_drive(), 80)
+    """Where that is asked for, a log is mapped the same whatever is in its measurement."""
+    log, settings = cut(short_drive(), 80), replace(SETTINGS, noise="stated")
     other = replace(log, measured=noise(ERRORS))
-    maps = [run_online(one, FixedLagMapper(SETTINGS, one.noise)).trajectory for one in (log, other)]
+    maps = [run_online(one, FixedLagMapper(settings, one.noise)).trajectory for one in (log, other)]
     np.testing.assert_array_equal(*maps)
 
 

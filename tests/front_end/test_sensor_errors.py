@@ -123,10 +123,13 @@ def test_a_drive_shows_the_errors_of_its_sensor(
 
 
 def test_the_prior_of_a_sensor_becomes_wide_for_a_batch_where_the_drive_contradicts_it() -> None:
-    turned, settings = drive(yaw=-0.03), MapperSettings()
+    turned, settings = drive(yaw=-0.03), MapperSettings(noise="stated")
     judged = judge_log(turned, turned.noise, settings)
     assert judged.settings.calibration == settings.calibration.widened()
     sure = replace(settings, calibration=CalibrationSettings(doubt=np.inf))
     assert judge_log(turned, turned.noise, sure).settings == sure
     none = replace(settings, calibration=CalibrationSettings(sensor=False))
     assert judge_log(turned, turned.noise, none).settings == none
+    measured = judge_log(turned, turned.noise, MapperSettings()).settings.calibration
+    assert measured.yaw == pytest.approx(-0.03, abs=4.0 * measured.sigma_yaw)
+    assert measured.sigma_yaw < settings.calibration.widened().sigma_yaw
