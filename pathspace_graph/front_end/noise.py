@@ -121,25 +121,29 @@ class NoiseLearner:
         return replace(detections, covariances=covariances)
 
     def calibrated(self, settings: MapperSettings) -> MapperSettings:
-        """Return settings with measured priors of those calibrations whose old ones are contradicted.
+        """Return settings with measured priors of the calibrations where one of the old ones is contradicted.
 
-        An error b is contradicted where `|b - m| > doubt hypot(sigma, sigma_prior)`. Of ranges and speeds
-        only the ratio can be seen: the scale of one is held, that of the other is what was measured.
+        An error b is contradicted where `|b - m| > doubt hypot(sigma, sigma_prior)`. Then the sensor is not
+        what it was said to be, and all of its errors are what was measured. Of ranges and speeds only the ratio
+        can be seen: the scale of one is held, that of the other is what was measured.
         """
         measured, sensor = self.measured, settings.calibration
         contradicted = self._contradicted(settings)
         if measured is None or not contradicted.any():
             return settings
         sigmas = np.maximum(measured.sensor_sigma, sensor.sigmas)
-        odometry = settings.odometry
-        if contradicted[SCALE] and self.trusts_odometry(settings):
+        odometry, means = settings.odometry, measured.sensor.copy()
+        if not contradicted[SCALE]:
+            means[SCALE], sigmas[SCALE] = sensor.range_scale, sensor.sigma_range_scale
+        elif self.trusts_odometry(settings):
             odometry = replace(odometry, hold_scale=True)
-        elif contradicted[SCALE]:
-            scale, contradicted[SCALE] = float(measured.sensor[SCALE]), False
-            odometry = replace(odometry, scale=-scale / (1.0 + scale), doubt=inf)
-            odometry = replace(odometry, sigma_scale=max(float(sigmas[SCALE]), odometry.sigma_scale))
-        priors: dict[str, Any] = {SENSOR[k]: float(measured.sensor[k]) for k in np.flatnonzero(contradicted)}
-        priors |= {f"sigma_{SENSOR[k]}": float(sigmas[k]) for k in np.flatnonzero(contradicted)}
+        else:
+            scale = float(means[SCALE])
+            sigma = max(float(sigmas[SCALE]), odometry.sigma_scale)
+            odometry = replace(odometry, scale=-scale / (1.0 + scale), doubt=inf, sigma_scale=sigma)
+            means[SCALE], sigmas[SCALE] = sensor.range_scale, sensor.sigma_range_scale
+        priors: dict[str, Any] = dict(zip(SENSOR, means.tolist(), strict=True))
+        priors |= {f"sigma_{name}": sigma for name, sigma in zip(SENSOR, sigmas.tolist(), strict=True)}
         return replace(settings, odometry=odometry, calibration=replace(sensor, doubt=inf, **priors))
 
     def _contradicted(self, settings: MapperSettings) -> NDArray[np.bool_]:
