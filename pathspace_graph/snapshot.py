@@ -29,6 +29,7 @@ from pathspace_graph.graph.keys import sizes
 from pathspace_graph.io.object_graph import FORMAT_ERRORS, Codec, Decoder, Encoder
 from pathspace_graph.io.snapshot import read_snapshot, write_snapshot
 
+from .checkpoint import Recovery
 from .errors import InputError, PathspaceError
 
 E = TypeVar("E")
@@ -133,6 +134,7 @@ CODECS: Final = {
         lambda keys, matrix: hessian_factor_of(keys, sizes(keys), matrix),
     ),
     "tree": Codec(KDTree, lambda tree: (np.array(tree.data),), KDTree),
+    "recovery": Codec(Recovery, lambda recovery: (recovery.failures,), Recovery),
     "future": Codec(Future, lambda _: (), lambda: None),
 }
 """Types of other packages by name; what another process is about to give is asked for again."""

@@ -216,15 +216,30 @@ class TwistRecord:
     """Keeps the newest twists that were measured while the vehicle drove."""
 
     def __init__(self) -> None:
-        self._t: deque[float] = deque(maxlen=MOST_TWISTS)
-        self._twists: deque[Array] = deque(maxlen=MOST_TWISTS)
+        self._parts: deque[Odometry] = deque()
+        self._count = 0
 
     def add(self, odometry: Odometry) -> None:
         """Add twists; one that only repeats the one before is held, and not measured."""
-        for t, twist in zip(odometry.t.tolist(), odometry.twist, strict=True):
-            if not self._twists or (t > self._t[-1] and (twist != self._twists[-1]).any()):
-                self._t.append(t)
-                self._twists.append(twist.copy())
+        t, twist = odometry.t, odometry.twist
+        if self._parts:
+            last = self._parts[-1]
+            t, twist = np.append(last.t[-1], t), np.concatenate([last.twist[-1:], twist])
+            new = (np.diff(t) > 0.0) & (np.diff(twist, axis=0) != 0.0).any(axis=1)
+            t, twist = t[1:][new], twist[1:][new]
+        if len(t) == 0:
+            return
+        self._parts.append(Odometry(t.copy(), twist.copy()))
+        self._count += len(t)
+        while self._count - len(self._parts[0].t) >= MOST_TWISTS:
+            self._count -= len(self._parts.popleft().t)
+
+    @property
+    def _newest(self) -> tuple[Array, Array]:
+        """Return the stamps (n,) and the twists (n, 3) that are kept."""
+        t = np.concatenate([np.zeros(0), *(part.t for part in self._parts)])
+        twists = np.concatenate([np.zeros((0, 3)), *(part.twist for part in self._parts)])
+        return t[-MOST_TWISTS:], twists[-MOST_TWISTS:]
 
     def white(self) -> tuple[Array, float] | None:
         """Return the white noise (3,) of a twist, and the time between two twists (s).
@@ -232,7 +247,7 @@ class TwistRecord:
         It is the least of `orders`: the higher the order, the less of the motion itself is in it.
         """
         orders = self.orders()
-        return None if orders is None else (orders.min(axis=0), float(np.median(np.diff(np.array(self._t)))))
+        return None if orders is None else (orders.min(axis=0), float(np.median(np.diff(self._newest[0]))))
 
     def orders(self) -> Array | None:
         """Returns the noise (k, 3) of a twist by differences of second to fourth order; None without enough.
@@ -240,9 +255,9 @@ class TwistRecord:
         It is their median absolute value over that of white noise, `sqrt(binomial(2 k, k))`. Where the orders
         differ, the noise is not white, or the motion itself is in it.
         """
-        if len(self._t) < MIN_TWISTS:
+        _, twists = self._newest
+        if len(twists) < MIN_TWISTS:
             return None
-        twists = np.array(self._twists)
         speeds = np.hypot(twists[:, 0], twists[:, 1])
         drives = speeds > MIN_SPEED_SHARE * np.median(speeds)
         orders = []

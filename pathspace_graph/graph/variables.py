@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from typing import TypeVar, cast
+from typing import ClassVar, TypeVar, cast
 
 import gtsam
 import numpy as np
@@ -36,6 +36,9 @@ UNKNOWN = -1
 
 class Layout:
     """A layout assigns the columns of a flat vector to keys in ascending order."""
+
+    constant: ClassVar[bool] = True
+    """Nothing changes a layout once it is made but what it caches."""
 
     def __init__(self, keys: IntArray) -> None:
         self.keys = keys

@@ -90,6 +90,11 @@ class Odometry:
         stop = max(first, int(np.searchsorted(self.t, end, side="left"))) if end > start else first
         return Odometry(np.maximum(self.t[first:stop], start), self.twist[first:stop])
 
+    def followed_by(self, later: Odometry) -> Odometry:
+        """Returns these twists and the later ones that are newer."""
+        new = later.t > self.t[-1] if len(self.t) else np.ones(len(later.t), bool)
+        return Odometry(np.append(self.t, later.t[new]), np.concatenate([self.twist, later.twist[new]]))
+
 
 @dataclass(frozen=True, eq=False)
 class Detections:

@@ -71,7 +71,7 @@ class DriveRecord:
         self._motions.append(motion)
         self._detections.append(detections)
         last = self._reckoned[-1] if self._reckoned else np.zeros(3)
-        self._reckoned.append(compose(last, motion.odometry.delta))
+        self._reckoned.append(_kept(compose(last, motion.odometry.delta)))
         if len(self._stamps) > self.settings.open_lap.max_cycles:
             self.give_up("the lap is too long for a batch")
 
@@ -89,7 +89,7 @@ class DriveRecord:
     def estimated(self, state: State) -> None:
         """Adds the newest pose, and its place along each of the curves."""
         cycle = len(self.poses)
-        self.poses.append(state.poses[-1].copy())
+        self.poses.append(_kept(state.poses[-1].copy()))
         for label, boundary in state.boundaries.items():
             u = state.pose_u[label][-1:]
             (pose,) = curve_poses(boundary, state.control_points(label), u)
@@ -98,11 +98,11 @@ class DriveRecord:
     def followed(self, newest: Array) -> None:
         """Adds the newest pose (3,) on a closed map."""
         if self.unsolvable is None:
-            self.poses.append(newest.copy())
+            self.poses.append(_kept(newest.copy()))
 
     def replaced(self, earlier: Array, window: Array) -> None:
         """Replaces all poses by those (k, 3) before the window and those (P, 3) in it, after a swap."""
-        self.poses = [*unwrap(np.concatenate([earlier, window]))]
+        self.poses = [*_kept(unwrap(np.concatenate([earlier, window])))]
 
     def recurrence(self) -> Recurrence | None:
         """Returns the recurrence of the path driven, if odometry alone says that the lap is over."""
@@ -156,6 +156,12 @@ class DriveRecord:
             first_kept=first_kept,
             start=start,
         )
+
+
+def _kept(poses: Array) -> Array:
+    """Returns poses that nobody can change any more, so that copies of the record share them."""
+    poses.flags.writeable = False
+    return poses
 
 
 class LapBatch:

@@ -38,6 +38,9 @@ LONGEST_WAIT = 1.0
 """A cycle waits for a batch no longer than this (s), however long ago the cycle before it was."""
 
 
+REST = 10.0
+"""After a failure the loop is left as it is for this distance (m)."""
+
 LEARNED = "the drive contradicts the calibration, which is learned"
 """Notice of the cycle in which the priors of the calibrations are first doubted."""
 
@@ -73,6 +76,7 @@ class TrackLoop:
         self._settled: float | None = None  # path driven (m) when the closed map was last replaced
         self._closing_tried = 0.0
         self._loop_tried, self._recognition_tried = 0.0, 0.0
+        self._resumes = 0.0
 
     @property
     def is_searching(self) -> bool:
@@ -99,7 +103,7 @@ class TrackLoop:
         """Returns whether it is time to register the newest detections with the beginning of an open loop."""
         settings, length = self.settings.closing, self._path.length
         newest = self._smoother.variables.poses[-1]
-        if self.closed or not near_start(self._path, newest, settings):
+        if self.closed or self._rests or not near_start(self._path, newest, settings):
             return False
         if length - self._closing_tried < settings.check_interval:
             return False
@@ -149,6 +153,18 @@ class TrackLoop:
 
     # --- the batch of the open lap -----------------------------------------------------------------------
 
+    def pause(self) -> None:
+        """Gives up what is under way, and rests for `REST` metres: something has failed."""
+        self._resumes = self._path.length + REST
+        if self._lap_batch is not None:
+            self._lap_batch.give_up()
+            self._lap_batch = None
+            self._batch_ends.append(self._smoother.next_cycle)
+
+    @property
+    def _rests(self) -> bool:
+        return self._path.length < self._resumes
+
     def go_on(self, closes: bool, spent: float) -> tuple[Array | None, str]:
         """Records the open lap, has it solved when it closes, and goes on from the result when it is due.
 
@@ -163,6 +179,8 @@ class TrackLoop:
             self.record.followed(self._smoother.variables.poses[-1])
         else:
             self._record_open_lap()
+        if self._rests:
+            return None, ""
         batch = self._lap_batch
         if batch is None:
             self._hold_gauge()
@@ -187,7 +205,7 @@ class TrackLoop:
     def _record_open_lap(self) -> None:
         """Records the estimate of an open lap, and tries to close it where the drive says that it is over."""
         self.record.estimated(self._smoother.map.state)
-        if self._path.length > self.settings.closing.min_path:
+        if self._path.length > self.settings.closing.min_path and not self._rests:
             self.record.prepare()
             if self._lap_batch is None:
                 self._try_loop()
@@ -339,7 +357,7 @@ class TrackLoop:
 
     def find_back(self) -> tuple[Array | None, str]:
         """Starts the window anew where a lost vehicle is found; returns its jump (3,) and a notice."""
-        if self._search is None:
+        if self._search is None or self._rests:
             return None, ""
         found = self._search.find()
         if found is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -11,6 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.checkpoint import Recovery
 from pathspace_graph.errors import ReadingError, SettingsError
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
@@ -83,6 +85,9 @@ class FixedLagMapper(MapperEstimate):
         """This closes the loop of the track, and looks after the closed map."""
         if self.settings.open_lap.prior == "window" or solver is not None:
             self.loop.record.give_up("no batch of the lap was asked for")
+        self.recovery = Recovery()
+        """It takes the mapper back where an update fails."""
+        self._unused: Odometry | None = None  # twists of a cycle that was left out
         self._grown: frozenset[int] = frozenset()
 
     def update(
@@ -113,15 +118,37 @@ class FixedLagMapper(MapperEstimate):
         step until one of its poses leaves the window; then it is part of the prior. A factor on control
         points alone is kept until the loop closes, which replaces the control points. If a key is not a
         variable of the graph, or a number not finite, SettingsError is raised and nothing is changed.
+
+        Nothing else is raised. Where a step fails, the mapper goes back to what it was before the cycle.
+        Then it takes the cycle again and leaves the loop alone, or uses no detections, or leaves the cycle
+        out. The notice says which, and `recovery.failures` counts.
         """
-        watch = Stopwatch()
         factors = tuple(factors)
-        cycle = self._admit(odometry, detections, factors)
+        self.recovery.before(self, self.front_end.gate)
+        cycle, unused = self._admit(odometry, detections, factors), self._unused
+        if unused is not None and not cycle.late:
+            cycle = replace(cycle, odometry=unused.followed_by(cycle.odometry))
+        again = partial(self._process, cycle, factors)
+        try:
+            result = again()
+        except Exception as error:  # a vehicle drives on, whatever has failed
+            return cycle.counted(self._without(cycle, factors, error))
+        self.recovery.called(again)
+        self._unused = unused if cycle.late else None
+        return cycle.counted(result)
+
+    def _process(
+        self, cycle: Admitted, factors: Sequence[gtsam.NonlinearFactor], *, careful: bool = False
+    ) -> CycleResult:
+        """Takes the steps of the paper; a `careful` cycle leaves the loop as it is for some metres."""
+        watch = Stopwatch()
         if cycle.late:
-            return cycle.counted(self._use_late(cycle.detections, watch))
+            return self._use_late(cycle.detections, watch)
         self.smoother.add_factors(factors)
         if factors:
             self.loop.record.give_up("the batch of the lap does not know the user's factors")
+        if careful:
+            self.loop.pause()
         reading = self._predict(cycle.odometry, cycle.detections)
         watch.lap("predict")
         self._classify(reading)  # detections that no curve explains may expand one
@@ -149,7 +176,44 @@ class FixedLagMapper(MapperEstimate):
         self.smoother.marginalize(self.loop.first_kept)
         watch.lap("marginalize")
         notice = "; ".join(text for text in (notice, self.growth.notice, reading.notice, learned) if text)
-        return cycle.counted(self._result(cycle.detections.t, watch.laps, jump, notice))
+        return self._result(cycle.detections.t, watch.laps, jump, notice)
+
+    def _without(
+        self, cycle: Admitted, factors: Sequence[gtsam.NonlinearFactor], error: Exception
+    ) -> CycleResult:
+        """Goes on where a cycle has failed: without the loop, or without detections, or without the cycle.
+
+        The mapper is as it was before the cycle each time. The notice says what has failed.
+        """
+        self.recovery.failures += 1
+        unused, seen = self._unused, cycle.detections
+        nothing = Detections(seen.t, seen.points_vehicle[:0], seen.covariances[:0], seen.labels[:0])
+        blind = replace(cycle, detections=nothing)
+        attempts = {
+            "the loop is left as it is": partial(self._process, cycle, factors, careful=True),
+            "its detections are not used": partial(self._process, blind, factors, careful=True),
+        }
+        for consequence, again in attempts.items():
+            self.recovery.take_back(self, self.front_end.gate)
+            try:
+                result = again()
+            except Exception:  # the next attempt does less
+                continue
+            self.recovery.called(again)
+            self._unused = unused if cycle.late else None
+            return replace(result, notice=self._failed(error, consequence, result.notice))
+        self.recovery.take_back(self, self.front_end.gate)
+        self._unused = unused if cycle.late else cycle.odometry
+        result = self._result(cycle.detections.t, {}, None, "")
+        return replace(result, notice=self._failed(error, "the cycle is not used"))
+
+    def _failed(self, error: Exception, consequence: str, notice: str = "") -> str:
+        """Returns the notice of a cycle that has failed, in full for the first one."""
+        number = self.recovery.failures
+        why = f": {type(error).__name__}: {error}" if number == 1 else f" (failure {number})"
+        return "; ".join(
+            text for text in (" ".join(f"an update failed{why}".split()), consequence, notice) if text
+        )
 
     def _step(self) -> None:
         """Takes one Gauss-Newton step, relinearized at the current estimate, or the solver's step."""
@@ -252,7 +316,7 @@ class FixedLagMapper(MapperEstimate):
         detections = self.smoother.map.detections
         used = int(detections.used[detections.cycle.searchsorted(self.smoother.next_cycle - 1) :].sum())
         left, right = (self.boundaries[b].size if b in self.boundaries else 0 for b in (LEFT, RIGHT))
-        pose, sizes = self.poses[-1].copy(), (left, right)
+        pose, sizes = (self.poses[-1].copy() if len(self.poses) else np.zeros(3)), (left, right)
         return CycleResult(t, pose, sizes, used, self.closed, stages, jump, notice, self.loop.health)
 
     # --- the snapshot ------------------------------------------------------------------------------------

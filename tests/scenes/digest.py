@@ -15,8 +15,8 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.front_end.gate import Gate
 
-WALL_TIMES = ("lap_seconds", "late_cycles")
-"""These attributes are times of the machine."""
+NOT_ESTIMATED = ("lap_seconds", "late_cycles", "recovery", "_unused", "_first_pose")
+"""These attributes are times of the machine, what is kept for a failure or after one, and a cache."""
 
 
 def digest(estimator: object) -> str:
@@ -60,5 +60,5 @@ def _held(value: object) -> dict[str, Any]:
     return {
         name: held
         for name, held in vars(value).items()
-        if name not in WALL_TIMES and not isinstance(getattr(kind, name, None), cached_property)
+        if name not in NOT_ESTIMATED and not isinstance(getattr(kind, name, None), cached_property)
     }

@@ -1,0 +1,159 @@
+"""Copies of an estimator in memory, to which it goes back where an update fails.
+
+A copy shares what nothing changes: frozen dataclasses of arrays, classes that say that they are `constant`,
+arrays that cannot be written, and GTSAM's factors. All else is copied, so that what a failed update has done
+to it is forgotten with it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from types import MethodType
+from typing import Any, Final
+
+import gtsam
+import numpy as np
+
+_GRAPHS: Final = (gtsam.GaussianFactorGraph, gtsam.GaussianBayesNet)
+"""Factors are added to these in place."""
+_SHARED, _ARRAY, _SEQUENCE, _MAPPING, _GRAPH, _METHOD, _OBJECT = range(7)
+_KINDS: Final[dict[type, int]] = {}
+"""How instances of each type that was met are copied."""
+
+
+class Recovery:
+    """Takes an estimator back to what it was before its newest call, by a copy and the calls since then."""
+
+    EVERY: Final = 20
+    """A copy is made anew after this number of calls, so that its time hardly counts."""
+
+    def __init__(self, failures: int = 0) -> None:
+        self.failures = failures
+        """Number of calls that have failed."""
+        self._copy: dict[str, Any] | None = None
+        self._calls: list[Callable[[], object]] = []
+
+    def before(self, estimator: object, *shared: object) -> None:
+        """Make a copy of an estimator before a call where one is due; it shares itself and some objects."""
+        if self._copy is None or len(self._calls) >= self.EVERY:
+            self._copy, self._calls = self._held(vars(estimator), estimator, shared), []
+
+    def called(self, again: Callable[[], object]) -> None:
+        """Note a call that has changed the estimator: it is made again after a copy has taken its place."""
+        self._calls.append(again)
+
+    def take_back(self, estimator: object, *shared: object) -> None:
+        """Take an estimator back to what it was after the last call that was noted."""
+        if self._copy is None:
+            raise RuntimeError("expected a copy of the estimator, found none")
+        own = self._held(self._copy, estimator, shared)  # the copy stays, for the next failure
+        vars(estimator).clear()
+        vars(estimator).update(own)
+        for done, again in enumerate(self._calls):
+            try:
+                again()
+            except Exception:  # it did not fail before: something outside has changed
+                self._calls = self._calls[:done]
+                self.take_back(estimator, *shared)
+                return
+
+    def _held(
+        self, attributes: dict[str, Any], estimator: object, shared: tuple[object, ...]
+    ) -> dict[str, Any]:
+        memo = {id(one): one for one in (self, estimator, *shared)}
+        return {name: copied(own, memo) for name, own in attributes.items()}
+
+
+def copied(value: Any, memo: dict[int, Any]) -> Any:
+    """Return a copy of a value; what is held twice is held twice in the copy.
+
+    `memo` has the copies by the `id` of what they are copies of.
+    """
+    kind = kind_of(value)
+    if kind == _SHARED:
+        return value
+    found = memo.get(id(value))
+    if found is not None:
+        return found
+    if kind == _ARRAY:
+        found = _array(value, memo)
+    elif kind == _SEQUENCE:
+        found = _sequence(value, memo)
+    elif kind == _MAPPING:
+        found = memo[id(value)] = value.copy()
+        for key, own in value.items():
+            found[key] = copied(own, memo)
+    elif kind == _GRAPH:
+        found = type(value)()
+        for i in range(value.size()):
+            found.push_back(value.at(i))
+    elif kind == _METHOD:
+        found = MethodType(value.__func__, copied(value.__self__, memo))
+    else:
+        found = memo[id(value)] = object.__new__(type(value))
+        for name, own in vars(value).items():
+            object.__setattr__(found, name, copied(own, memo))
+    memo[id(value)] = found
+    return found
+
+
+def kind_of(value: object) -> int:
+    """Return how a value is copied; a frozen dataclass is shared unless it holds what may change."""
+    kind = _KINDS.get(type(value))
+    if kind is None:
+        kind = _KINDS[type(value)] = _kind(type(value))
+        if kind == _SHARED and hasattr(type(value), "__dataclass_params__"):
+            held = [own for own in vars(value).values() if type(own) is not np.ndarray]
+            kind = _KINDS[type(value)] = _SHARED if all(map(is_shared, held)) else _OBJECT
+    return kind
+
+
+def is_shared(value: object) -> bool:
+    """Return whether copies share a value."""
+    if isinstance(value, tuple):
+        return all(map(is_shared, value))
+    return kind_of(value) == _SHARED
+
+
+def _kind(type_: type) -> int:
+    if type_ is np.ndarray:
+        return _ARRAY
+    if type_ in _GRAPHS:
+        return _GRAPH
+    if issubclass(type_, (list, tuple, set, deque)):
+        return _SEQUENCE
+    if issubclass(type_, dict):
+        return _MAPPING
+    if type_ is MethodType:
+        return _METHOD
+    parameters = getattr(type_, "__dataclass_params__", None)
+    is_frozen = (parameters is not None and parameters.frozen) or getattr(type_, "constant", False)
+    return _OBJECT if type_.__module__.startswith(f"{__package__}.") and not is_frozen else _SHARED
+
+
+def _array(value: Any, memo: dict[int, Any]) -> Any:
+    """Return a copy of an array in the same order; views of one array are views of its copy."""
+    if not value.flags.writeable:
+        return value
+    base = value.base
+    if type(base) is not np.ndarray:
+        return value.copy(order="K")
+    own = copied(base, memo)
+    begin = value.__array_interface__["data"][0] - base.__array_interface__["data"][0]
+    return np.ndarray(value.shape, value.dtype, own, begin, value.strides)
+
+
+def _sequence(value: Any, memo: dict[int, Any]) -> Any:
+    """Return a copy of a list, a tuple, a set or a deque; one of shared values is copied at once."""
+    if all(_KINDS.get(one) == _SHARED for one in set(map(type, value))):
+        return value if type(value) is tuple else value.copy()
+    if isinstance(value, tuple):
+        items = [copied(one, memo) for one in value]
+        return type(value)._make(items) if hasattr(value, "_make") else tuple(items)
+    found = memo[id(value)] = value.copy()
+    found.clear()
+    add = found.add if isinstance(found, set) else found.append
+    for one in value:
+        add(copied(one, memo))
+    return found
