@@ -225,7 +225,7 @@ def test_each_step_of_the_paper_is_two_calls_from_the_update() -> None:
     page = text_of(ROOT / "docs" / "architecture.md")
     steps = re.findall(r"^\| [^|]* \| `FixedLagMapper\.(\w+)` \| ([^|]*) \|", page, flags=re.MULTILINE)
     assert len(steps) == 7
-    update = inspect.getsource(FixedLagMapper.update)
+    update = inspect.getsource(FixedLagMapper._process)
     for method, functions in steps:
         assert f"self.{method}(" in update
         for _, function in NAMED.findall(functions):

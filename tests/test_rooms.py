@@ -18,7 +18,9 @@ EXTRAS = {"distributed", "rerun", "rosbags"}
 LEAVES = {"errors", "labels", "progress"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "ckf", "landmark", "centerline"}
-BELOW_MAPPING = {"factors", "settings", "spline", "io", "graph", "laps", "health", "run", "snapshot"}
+BELOW_MAPPING = {
+    *("factors", "settings", "spline", "io", "graph", "laps", "health", "run", "checkpoint", "snapshot"),
+}
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
 BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "diagnosis", "plausibility"}
 
@@ -36,7 +38,8 @@ ARROWS: dict[str, set[str]] = {
     "health": {"settings"},
     "run": {"io", "laps", "health"},
     "diagnosis": {"factors", "io"},
-    "snapshot": {"factors", "io", "graph"},
+    "checkpoint": set(),
+    "snapshot": {"factors", "io", "graph", "checkpoint"},
     "mapping": BELOW_MAPPING,
     "front_end": BELOW_MAPPING | {"mapping"},
     "plausibility": {"factors", "settings", "io", "front_end"},

@@ -124,8 +124,8 @@ class NoiseLearner:
         """Return settings with measured priors of the calibrations where one of the old ones is contradicted.
 
         An error b is contradicted where `|b - m| > doubt hypot(sigma, sigma_prior)`. Then the sensor is not
-        what it was said to be, and all of its errors are what was measured. Of ranges and speeds only the ratio
-        can be seen: the scale of one is held, that of the other is what was measured.
+        what it was said to be, and all of its errors are what was measured. Of ranges and speeds only the
+        ratio can be seen: the scale of one is held, that of the other is what was measured.
         """
         measured, sensor = self.measured, settings.calibration
         contradicted = self._contradicted(settings)
