@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pathspace_graph.settings.mapper import MapperSettings
     from pathspace_graph.spline.bspline import BSpline
 
-    from .errors import InputError, OutputError, PathspaceError, ReadingError, SettingsError
+    from .errors import InputError, OutputError, PathspaceError, ReadingError, SettingsError, SolveError
     from .frames import read_cycles, read_study
     from .run import run_online
 
@@ -36,6 +36,7 @@ __all__ = [
     "ReadingError",
     "RunResult",
     "SettingsError",
+    "SolveError",
     "SplineBoundary",
     "hints",
     "read_cycles",
@@ -49,7 +50,7 @@ __all__ = [
 
 # imported when first asked for: the command line's help, and sim, need no estimator
 _HOMES = {
-    "errors": ("InputError", "OutputError", "PathspaceError", "ReadingError", "SettingsError"),
+    "errors": ("InputError", "OutputError", "PathspaceError", "ReadingError", "SettingsError", "SolveError"),
     "frames": ("read_cycles", "read_study"),
     "io.log": ("Detections", "Log", "Odometry", "read_log", "write_log"),
     "io.map": ("Map", "PointBoundary", "SplineBoundary", "read_map"),

@@ -9,11 +9,12 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import Any, Final
 
-from .errors import PathspaceError, SettingsError
+from .errors import PathspaceError, SettingsError, SolveError
 
 PROGRAM: Final = "pathspace-graph"
 DONE: Final = 0
 BAD_INPUT: Final = 2
+NOT_SOLVED: Final = 3
 INTERRUPTED: Final = 130
 
 
@@ -58,9 +59,15 @@ COMMANDS: Final = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a command; returns 0 on success, and 2 with one line on standard error on bad usage or input."""
+    """Runs a command; returns 0 on success.
+
+    Bad usage and bad input give one line on standard error and 2; an estimate that cannot be computed, 3.
+    """
     try:
         return _run(list(sys.argv[1:] if arguments is None else arguments))
+    except SolveError as error:
+        _refuse(str(error))
+        return NOT_SOLVED
     except PathspaceError as error:
         return _refuse(str(error))
     except OSError as error:

@@ -1,8 +1,9 @@
-"""The few exceptions of this library; the command line turns each into one line and exit code 2."""
+"""The few exceptions of this library; the command line turns each into one line and exit code 2 or 3."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from math import inf
 from pathlib import Path
@@ -64,8 +65,26 @@ class SettingsError(PathspaceError):
     """A setting is out of its range, or names something unknown."""
 
 
-class SingularSystemError(PathspaceError):
+class SolveError(PathspaceError):
+    """An estimate cannot be computed, though nothing is wrong with the input as such.
+
+    The text says what failed; the command line's exit code is 3.
+    """
+
+
+class SingularSystemError(SolveError):
     """The normal equations are not positive definite, since nothing determines some variable."""
+
+
+@contextmanager
+def solving(what: str) -> Iterator[None]:
+    """Turns whatever numerics raise within the context into a SolveError about `what`."""
+    try:
+        yield
+    except PathspaceError:
+        raise
+    except Exception as error:
+        raise SolveError(f"{what} has failed: {type(error).__name__}: {error}") from error
 
 
 def check_name(name: Any, known: Iterable[str], expected: str) -> None:

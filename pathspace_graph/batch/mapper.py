@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import SettingsError, solving
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.front_end.front_end import judge_log
@@ -130,9 +130,9 @@ class BatchMapper:
         """Returns the optimum, which is searched from an online map or from odometry alone.
 
         By default `batch.start` decides. `on_round` is called after each round. SettingsError if there is no
-        online mapper to begin with.
+        online mapper to begin with, and SolveError where the log leaves no way to an optimum.
         """
-        with threadpool_limits(limits=1):
+        with threadpool_limits(limits=1), solving("the batch"):
             return self._solve(log, start or self.settings.batch.start, on_round)
 
     def _solve(self, log: Log, start: Start, on_round: Callable[[], None] | None) -> BatchResult:

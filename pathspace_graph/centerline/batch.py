@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.batch.nonlinear_graph import drive_factors
 from pathspace_graph.batch.start import CurveMapper
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import SettingsError, solving
 from pathspace_graph.factors.gtsam_factors import pose_array
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.graph.keys import pose_key
@@ -53,7 +53,7 @@ class CenterlineBatch:
     def solve(self, log: Log) -> BatchRun:
         """Returns the optimum over a whole log."""
         start = self._boundaries.solve(log)
-        with threadpool_limits(limits=1):
+        with threadpool_limits(limits=1), solving("the batch"):
             try:
                 return self._solve(start)
             except SettingsError:

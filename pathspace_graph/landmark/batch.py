@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.errors import solving
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.graph.keys import POSE
 from pathspace_graph.io.log import Log
@@ -43,7 +44,7 @@ class LandmarkBatch:
 
         The result has converged if the last round changed hardly any association.
         """
-        with threadpool_limits(limits=1):
+        with threadpool_limits(limits=1), solving("the batch"):
             return self._solve(log)
 
     def _solve(self, log: Log) -> BatchRun:

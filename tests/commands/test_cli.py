@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline as ScipyBSpline
 
+from pathspace_graph.batch.system import BatchSystem
 from pathspace_graph.cli import COMMANDS, main
 from pathspace_graph.commands import online as commands_online
 from pathspace_graph.io.log import Detections, Log, read_log, write_log
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.results import LapBatches, RunResult
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
+from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.options import one_line
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -184,6 +186,31 @@ def test_a_second_run_keeps_the_earlier_result(tmp_path: Path) -> None:
     assert simulate(tmp_path / "log", "--seed", "1") == 0
     assert names(tmp_path) == {"log", "log.~1~"}
     assert contents(tmp_path / "log.~1~") == first
+
+
+@pytest.mark.parametrize("estimator", ["landmark-fixed-lag", "spline"])
+def test_an_estimate_that_cannot_be_computed_is_one_line_and_exit_code_3(
+    log_folder: Path,
+    tmp_path: Path,
+    estimator: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise np.linalg.LinAlgError("SVD did not\nconverge")
+
+    monkeypatch.setattr(LandmarkFixedLag, "update", fails)
+    monkeypatch.setattr(BatchSystem, "eliminated", fails)
+    command = "batch" if estimator == "spline" else "online"
+    options = (
+        ["--estimator", estimator, "--start", "odometry"]
+        if command == "batch"
+        else ["--estimator", estimator]
+    )
+    assert main([command, str(log_folder), "--out", str(tmp_path / "map"), *options]) == 3
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.endswith("has failed: LinAlgError: SVD did not converge")
+    assert not (tmp_path / "map").exists()
 
 
 def test_a_saved_mapper_goes_on_with_the_rest_of_a_log(
