@@ -81,7 +81,7 @@ class _Cones:
     table: Sightings
     begins: IntArray
     ranges: Array
-    """(n,) Range of the cone (m)."""
+    """(n,) Range of the cone as the sensor measures it, without noise (m)."""
     ray: Array
     """(n, 2) Unit vector along the ray, map frame."""
     side: Array
@@ -89,18 +89,15 @@ class _Cones:
     columns: Array
     """(n, 2, 6) Derivatives by the sensor's errors and by the bias of the yaw rate."""
 
-    def seen_at(self, errors: Array, off: Array) -> _Cones:
-        """Return ranges and derivatives at the cones, which errors (6,) leave the sightings `off` by (n, 2).
+    def without(self, off: Array) -> _Cones:
+        """Return the sightings with ranges and derivatives where they would be without their errors (n, 2).
 
-        At the measured points both have the noise in them: weights would prefer sightings that came out too
-        short, and errors would come out too small.
+        At the measured points both have the noise in them: weights would prefer sightings that came out
+        too short, and errors would come out too small.
         """
-        to_vehicle = rotations(-self.table.pose[:, 2])
-        seen = self.table.point - np.einsum("nij,nj->ni", to_vehicle, off)
-        columns = _columns(self.table, self.begins, seen)
-        arm = self.points + columns @ errors - off - self.table.pose[:, :2]
-        ranges = np.maximum(np.hypot(*arm.T), np.finfo(float).tiny)
-        return replace(self, ranges=ranges, columns=columns)
+        seen = self.table.point - np.einsum("nij,nj->ni", rotations(-self.table.pose[:, 2]), off)
+        ranges = np.maximum(np.hypot(*seen.T), np.finfo(float).tiny)
+        return replace(self, ranges=ranges, columns=_columns(self.table, self.begins, seen))
 
     def sums(self, values: Array) -> Array:
         """Return the sum of values (n, ...) over each cone."""
@@ -303,7 +300,7 @@ class _Rounds:
         walk, noise = self._found.odometry * np.sqrt(self._found.interval), self._noise
         information = _information(self._cones, *noise, self._weights)
         errors, *covariances, off = _solve(self._cones, information)
-        cones = self._cones = self._cones.seen_at(errors, off)
+        cones = self._cones = self._cones.without(off)
         square = ((off * cones.ray).sum(axis=1) / noise[0].sigmas(cones.ranges)) ** 2
         square += ((off * cones.side).sum(axis=1) / noise[1].sigmas(cones.ranges)) ** 2
         self._weights = huber_weights(np.sqrt(square), HUBER) ** 2

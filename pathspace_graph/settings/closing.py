@@ -66,7 +66,7 @@ class ClosingSettings(Positive):
     sigma_reading: float = 0.5
     """This is the standard deviation of a detection in the registration (m); it is large, since many
     detections are of one cone."""
-    sigma_max: float = 0.3
+    sigma_max: float = 0.4
     """The standard deviation of the registered position along its worst direction must be below this (m)."""
     patience: float = 40.0
     """Once this length of the beginning has been driven again (m), `sigma_patience` replaces `sigma_max`."""
