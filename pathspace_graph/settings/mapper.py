@@ -244,7 +244,8 @@ class MapperSettings(Positive):
     optimum where it is."""
     noise: Literal["measured", "stated"] | None = None
     """Noise of odometry and detections that is used: what the log states, or what is measured in the drive.
-    By default what is stated, and measured where nothing is."""
+    By default what is stated, and measured where nothing is. Constant errors of the sensor are measured
+    unless this is `stated`."""
     limits: LimitSettings = field(default_factory=LimitSettings)
     """These settings say what a perception cycle may hold."""
     spline: SplineSettings = field(default_factory=SplineSettings)
