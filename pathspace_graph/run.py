@@ -18,7 +18,6 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunNoise, RunResult, VehicleState
 
-from .errors import solving
 from .health import Health
 from .labels import LEFT, RIGHT
 from .laps import LapCounter
@@ -340,8 +339,7 @@ class _Run:
         """Runs and times one update, records it, and shows it to the observers."""
         self._take_snapshots(before=detections.t)
         self._waited += timed_wait(self._estimator)
-        with solving(f"the update at {detections.t:.12g} s"):
-            result, seconds = timed_update(self._estimator, odometry, detections)
+        result, seconds = timed_update(self._estimator, odometry, detections)
         lap_before = self._laps.lap
         lap = self._laps.update(result.pose)
         if lap > lap_before:

@@ -13,7 +13,7 @@ from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from pathspace_graph.diagnosis import diagnose, noise_lines
-from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT, MapKind, check_online, for_map, make_online
 from pathspace_graph.eval.metrics.summary import (
     health_of,
@@ -130,7 +130,7 @@ def map_online(
     log: Log, estimator: OnlineEstimator, name: str = DEFAULT, observers: Sequence[Observer] = ()
 ) -> RunResult:
     """Maps a log with progress; the map at the end of each true lap is kept where there is truth."""
-    with progress("mapping", len(log.cycles)) as advance:
+    with progress("mapping", len(log.cycles)) as advance, solving("an update"):
         return run_online(
             log,
             estimator,

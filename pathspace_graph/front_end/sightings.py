@@ -223,10 +223,11 @@ class TwistRecord:
         """Add twists; one that only repeats the one before is held, and not measured."""
         t, twist = odometry.t, odometry.twist
         if self._parts:
-            last = self._parts[-1]
-            t, twist = np.append(last.t[-1], t), np.concatenate([last.twist[-1:], twist])
-            new = (np.diff(t) > 0.0) & (np.diff(twist, axis=0) != 0.0).any(axis=1)
-            t, twist = t[1:][new], twist[1:][new]
+            t = np.append(self._parts[-1].t[-1], t)
+            twist = np.concatenate([self._parts[-1].twist[-1:], twist])
+        new = (np.diff(t) > 0.0) & (np.diff(twist, axis=0) != 0.0).any(axis=1)
+        new = np.append(not self._parts, new) if len(t) else np.zeros(0, bool)
+        t, twist = t[new], twist[new]
         if len(t) == 0:
             return
         self._parts.append(Odometry(t.copy(), twist.copy()))
