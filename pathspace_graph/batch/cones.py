@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import to_map, to_vehicle
+from pathspace_graph.mapping.candidates import SIDES, in_front_row
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.batch import ConeSettings
+from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import find_anywhere
@@ -77,7 +79,7 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     others = clustered(beside & ~on_curve & _far_from(points, cones.points, radius))
     cones = cones.merged(others.where(others.count >= min_share * np.median(cones.count)))
     if boundary.periodic:
-        cones = in_order_of_drive(cones, last_lap(state, label))
+        cones = along_drive(cones, last_lap(state, label), label, settings.growth)
     return without_folds(cones, boundary.periodic, settings.batch.cones)
 
 
@@ -108,17 +110,20 @@ def last_lap(state: State, label: int) -> Array:
     return np.asarray(state.poses[pose_u > pose_u[-1] - state.boundaries[label].length])
 
 
-def in_order_of_drive(cones: Cones, lap: Array) -> Cones:
-    """Returns the cones in the order in which the poses (l, 3) of a lap pass them.
+def along_drive(cones: Cones, lap: Array, label: int, settings: GrowthSettings) -> Cones:
+    """Return the cones of the row nearest to the poses (l, 3) of a lap, in the order in which these pass it.
 
-    A cone is passed at the path length of its nearest pose, plus its distance ahead of that pose.
+    A cone is passed at the path length of its nearest pose, plus its distance ahead of that pose. What stands
+    behind the row belongs to another stretch, or is smeared between two rows by far detections.
     """
     driven = path_lengths(lap)
     offset = cones.points[:, None] - lap[:, :2]
     nearest = (offset**2).sum(axis=2).argmin(axis=1)
-    dx, dy = offset[np.arange(len(nearest)), nearest].T
-    ahead = dx * np.cos(lap[nearest, 2]) + dy * np.sin(lap[nearest, 2])
-    return cones.where(np.argsort(driven[nearest] + ahead, kind="stable"))
+    ahead, left = to_vehicle(cones.points, lap[nearest]).T
+    station, side = driven[nearest] + ahead, SIDES[label] * left
+    front = in_front_row(station, side, settings.beside, settings.lateral_gap)
+    order = np.argsort(station, kind="stable")
+    return cones.where(order[front[order]])
 
 
 def _beside(

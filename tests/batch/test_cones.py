@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.cones import (
     Cones,
+    along_drive,
     cluster,
     cones_of_curve,
-    in_order_of_drive,
     places,
     without_folds,
 )
-from pathspace_graph.labels import LEFT
+from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.batch import straight
@@ -87,6 +87,15 @@ def test_cones_are_passed_in_the_order_of_the_drive() -> None:
     )
     wrong = np.array([0, 1, 4, 3, 2, 5, 6])
     cones = Cones(true[wrong], np.arange(7.0), wrong)
-    passed = in_order_of_drive(cones, lap)
+    passed = along_drive(cones, lap, LEFT, SETTINGS.growth)
     np.testing.assert_array_equal(passed.points, true)
     np.testing.assert_array_equal(passed.count, np.arange(7))
+
+
+def test_a_cone_behind_the_row_is_none_of_it() -> None:
+    """Far detections of two parallel rows, smeared along their rays, have their mean between the rows."""
+    x = np.arange(0.0, 20.0)
+    lap = np.column_stack([x, np.zeros(20), np.zeros(20)])
+    row = np.column_stack([np.arange(1.0, 18.0, 4.0), [-2.0, -2.6, -3.2, -2.6, -2.0]])
+    cones = Cones(np.concatenate([row, [[10.0, -4.4]]]), np.arange(6.0), np.full(6, 9))
+    np.testing.assert_array_equal(along_drive(cones, lap, RIGHT, SETTINGS.growth).points, row)
