@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,8 @@ class RayNoise:
     Its standard deviation is `sigma[0] + sigma[1] r` at range r. Two errors of one cone that are dt apart
     have the correlation `share exp(-dt / time)`.
     """
+
+    LENGTHS: ClassVar = {"sigma": (1, 0)}
 
     sigma: Array
     """(2,) Standard deviation at range 0 (m), and its growth with the range (m/m)."""
@@ -59,6 +61,15 @@ class RayNoise:
 @dataclass(frozen=True, eq=False)
 class MeasuredNoise:
     """Noise of odometry and detections, measured from nothing but the readings of a drive."""
+
+    LENGTHS: ClassVar = {
+        "odometry": (1, 1, 0),
+        "drift": (1, 1, 0),
+        "along": 0,
+        "across": 0,
+        "sensor": (0, 1, 0, 0, 1),
+        "sensor_sigma": (0, 1, 0, 0, 1),
+    }
 
     odometry: Array
     """(3,) White noise of a twist from sample to sample: m/s, m/s, rad/s, one sigma."""
@@ -141,6 +152,8 @@ def ray_sigmas(points: Array, covariances: Array) -> Array:
 @dataclass(frozen=True, eq=False)
 class KnownNoise:
     """What is known of the noise before a drive."""
+
+    LENGTHS: ClassVar = {"odometry": (1, 1, 0), "measured": 0}
 
     odometry: Array
     """(3,) Standard deviation of a twist (m/s, m/s, rad/s): stated, or assumed where it is not."""

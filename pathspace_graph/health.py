@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from math import nan
-from typing import Final
+from typing import ClassVar, Final
 
 from .labels import BOUNDARIES, NAMES
 from .settings.health import HealthSettings
@@ -21,6 +21,8 @@ CONDITIONS: Final = (GOOD, DEGRADED, LOST)
 @dataclass(frozen=True)
 class Health:
     """Says how far the estimate of a cycle can be trusted."""
+
+    LENGTHS: ClassVar = {"reason": 1}
 
     condition: str = ""
     """The estimate is good, degraded or lost; this is empty for an estimator without a monitor."""

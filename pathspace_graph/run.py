@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import cached_property
 from math import nan
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunNoise, RunResult, VehicleState
+from pathspace_graph.lengths import POSE, scaled
 
 from .health import Health
 from .labels import LEFT, RIGHT
@@ -30,6 +31,8 @@ BoolArray = NDArray[np.bool_]
 @dataclass(frozen=True, eq=False)
 class CycleResult:
     """Holds what an online estimator found in one perception cycle."""
+
+    LENGTHS: ClassVar = {"pose": POSE, "jump": POSE, "notice": 1, "health": 0}
 
     t: float
     """This is the stamp of the cycle (s)."""
@@ -111,6 +114,8 @@ class NoiseEstimator(Protocol):
 class Readings:
     """Holds the detections of the newest cycle as the estimator took them, seen from its newest pose."""
 
+    LENGTHS: ClassVar = {"points": 1, "feet": 1}
+
     points: Array
     """Each row is a detected position (k, 2) in m, map frame, corrected as the estimator corrects it."""
     labels: IntArray
@@ -155,6 +160,11 @@ class BatchingEstimator(Protocol):
 
     def batches(self) -> LapBatches:
         """Returns the cycles in which batches have ended."""
+
+
+def scale(estimator: OnlineEstimator) -> float:
+    """Returns the scale of the scene as an estimator knows it; 1 where it takes every scene as it is."""
+    return float(getattr(estimator, "scale", 1.0))
 
 
 def outline(estimator: OnlineEstimator) -> Map:
@@ -341,7 +351,7 @@ class _Run:
         self._waited += timed_wait(self._estimator)
         result, seconds = timed_update(self._estimator, odometry, detections)
         lap_before = self._laps.lap
-        lap = self._laps.update(result.pose)
+        lap = self._laps.update(scaled(result, 1.0 / scale(self._estimator)).pose)
         if lap > lap_before:
             self._lap_maps.append((lap_before, self._estimator.map()))
         self._poses.append(np.array(result.pose, dtype=float))
@@ -374,6 +384,7 @@ class _Run:
             batches=self._estimator.batches() if isinstance(self._estimator, BatchingEstimator) else None,
             waited=self._waited,
             noise=self._estimator.noise_used() if isinstance(self._estimator, NoiseEstimator) else None,
+            scale=scale(self._estimator),
         )
 
     def _take_snapshots(self, before: float) -> None:

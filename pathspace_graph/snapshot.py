@@ -47,6 +47,7 @@ ROOMS: Final = (
     "loop",
     "mapping",
     "online",
+    "scale",
     "settings",
     "spline",
 )

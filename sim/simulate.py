@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import SENSOR, Detections, Log, SensorInfo, Truth
+from pathspace_graph.lengths import scaled
 
 from .disturbance import FaultySensor, colours, measure_odometry, put_down, turned_round
 from .faults import Faults, SensorFaults
@@ -35,10 +36,14 @@ class SimulationSettings:
     """These settings describe what the cone detector sees, and its errors."""
     faults: Faults = field(default_factory=Faults, repr=False)
     """These settings describe what is wrong with the vehicle and its sensors."""
+    scale: float = field(default=1.0, repr=False)
+    """All lengths and speeds are this many times as large: 0.1 for a model car of 1:10, 3 for a road."""
 
     def __post_init__(self) -> None:
         if self.laps < 1:
             raise SettingsError(f"laps: expected at least 1, found {self.laps}")
+        if not 0.0 < self.scale < np.inf:
+            raise SettingsError(f"scale: expected a positive number, found {self.scale}")
 
 
 def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
@@ -63,7 +68,7 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
         sensor=_constant_errors(faults.sensor),
         noise=_noise(settings),
     )
-    return Log(
+    log = Log(
         odometry=odometry,
         cycles=tuple(cycles),
         odometry_sigma=np.hypot(settings.odometry.white, settings.odometry.slow),
@@ -71,6 +76,7 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
         source=_source(track, settings, seed),
         truth=truth,
     )
+    return scaled(log, settings.scale)
 
 
 def _constant_errors(faults: SensorFaults) -> FloatArray | None:
@@ -91,6 +97,7 @@ def _noise(settings: SimulationSettings) -> FloatArray | None:
 def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, str]:
     """Returns what the log says of its making, with its faults and slow errors where it has any."""
     source = {"track": track.name, "seed": str(seed), "settings": repr(settings)}
+    source |= {"scale": str(settings.scale)} if settings.scale != 1.0 else {}
     for group in ("odometry", "sensor"):
         part = getattr(settings, group)
         changed = [entry.name for entry in fields(part) if not entry.repr]

@@ -99,7 +99,7 @@ def test_the_command_line_starts_without_the_heavy_libraries() -> None:
 def test_the_simulator_knows_no_estimator() -> None:
     loaded = modules_after("import pathspace_graph.sim.simulate, pathspace_graph.sim.track_generator")
     ours = {name for name in loaded if name.startswith("pathspace_graph.")}
-    allowed = {"errors", "factors", "io", "labels", "spline"}
+    allowed = {"errors", "factors", "io", "labels", "lengths", "spline"}
     assert {name.split(".")[1] for name in ours} - {"sim"} <= allowed
     assert "gtsam" not in loaded
 

@@ -15,14 +15,15 @@ MOST_FILES = 15
 EXTRAS = {"distributed", "rerun", "rosbags"}
 """Optional packages, which are imported only where they are needed."""
 
-LEAVES = {"errors", "labels", "progress"}
+LEAVES = {"errors", "labels", "progress", "lengths"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "ckf", "landmark", "centerline"}
 BELOW_MAPPING = {
     *("factors", "settings", "spline", "io", "graph", "laps", "health", "run", "checkpoint", "snapshot"),
+    "scale",
 }
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
-BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "diagnosis", "plausibility"}
+BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "plausibility"}
 
 ARROWS: dict[str, set[str]] = {
     **{leaf: set() for leaf in sorted(LEAVES)},
@@ -37,12 +38,12 @@ ARROWS: dict[str, set[str]] = {
     "graph": {"factors"},
     "health": {"settings"},
     "run": {"io", "laps", "health"},
-    "diagnosis": {"factors", "io"},
+    "scale": {"factors", "settings", "io", "run"},
     "checkpoint": set(),
     "snapshot": {"factors", "io", "graph", "checkpoint"},
     "mapping": BELOW_MAPPING,
     "front_end": BELOW_MAPPING | {"mapping"},
-    "plausibility": {"factors", "settings", "io", "front_end"},
+    "plausibility": {"factors", "settings", "io", "front_end", "scale"},
     **dict.fromkeys(sorted(ESTIMATORS), BELOW_ESTIMATORS),
     "loop": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes
     "online": BELOW_ESTIMATORS | {"loop"},

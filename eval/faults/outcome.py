@@ -9,10 +9,10 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from pathspace_graph.diagnosis import LIMIT
 from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.eval.study.frame import RUN, last_laps
 from pathspace_graph.eval.study.study import Study
+from pathspace_graph.plausibility.diagnosis import LIMIT
 
 from .suite import CLEAN, Fault, fault_of
 

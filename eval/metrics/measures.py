@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike
 
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.batch.recurrence import path_lengths
-from pathspace_graph.diagnosis import by_prior
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
+from pathspace_graph.lengths import scaled
+from pathspace_graph.plausibility.diagnosis import by_prior
 
 from .consistency import joint_cone_error, map_nees, normal_errors, with_marginals
 from .cost import covariance_bytes, map_bytes, stage_times
@@ -222,7 +223,7 @@ def measure(
     marginals: bool = False,
     yardsticks: bool = False,
 ) -> list[Row]:
-    """Returns a row for each complete lap, and one for the whole run as the last.
+    """Returns a row for each complete lap, and one for the whole run as the last; lengths are over the scale.
 
     The row of a lap has the map as it stood at its end, and the poses and updates of its cycles. Laps are the
     true ones where the log has a true path, else the estimator's own. A batch has one map for all laps, and
@@ -230,6 +231,7 @@ def measure(
     metrics of the paper's squared basis, `yardsticks` for `l`, `f` and `limit`, which take a batch with
     oracle association and thus a simulated log (ValueError without associations).
     """
+    run, log = run.at_scale_one(), scaled(log, 1.0 / run.scale)
     rows = []
     for lap, track, begin, end in _laps(run, log):
         values = _map_values(track, log.truth, ghost_settings, marginals)

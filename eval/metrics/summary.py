@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from typing import Any, Final
 
@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchResult
-from pathspace_graph.diagnosis import diagnose, noise_lines
 from pathspace_graph.factors.measured_noise import ray_sigmas
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import Health, Stretch, counts, stretches
@@ -21,7 +20,10 @@ from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.laps import lap_end_indices
+from pathspace_graph.lengths import scaled
+from pathspace_graph.plausibility.diagnosis import diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
+from pathspace_graph.scale.scene import scale_of
 
 from .consistency import normal_errors
 from .table1 import LapMetrics, lap_metrics, root_mean_square
@@ -41,6 +43,7 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
     summary: dict[str, Any] = {
         "estimator": result.estimator,
         "settings": result.settings,
+        "scale": result.scale,
         "versions": versions(),
         "lap_count": result.laps,
         "closed": result.map.closed,
@@ -161,7 +164,7 @@ def lap_times(log: Log) -> Array:
     """Returns the stamps (s) at which true laps end; without a true path there are none."""
     if log.truth is None or len(log.truth.poses) == 0:
         return np.zeros(0)
-    return log.truth.pose_t[lap_end_indices(log.truth.poses)]
+    return log.truth.pose_t[lap_end_indices(scaled(log.truth, 1.0 / scale_of(log)).poses)]
 
 
 def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
@@ -173,10 +176,16 @@ def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
     if log.truth is None or not has_cones(log.truth):
         return []
     if isinstance(result, BatchRun):
-        return [lap_metrics(result.map, log.truth, result.laps)]
+        return [_metrics(result.map, log.truth, result.laps, result.scale)]
     by_truth = tuple(enumerate(result.snapshots, start=1))
     maps = by_truth if len(log.truth.poses) else result.lap_maps
-    return [lap_metrics(track, log.truth, lap) for lap, track in maps or ((0, result.map),)]
+    return [_metrics(track, log.truth, lap, result.scale) for lap, track in maps or ((0, result.map),)]
+
+
+def _metrics(track: Map, truth: Truth, lap: int, scale: float) -> LapMetrics:
+    """Returns the metrics of a map where a cone more than 3 m times the scale away is missed."""
+    found = lap_metrics(scaled(track, 1.0 / scale), scaled(truth, 1.0 / scale), lap)
+    return replace(found, rmse=found.rmse * scale)
 
 
 def not_mapped(track: Map, log: Log) -> list[str]:
@@ -211,12 +220,14 @@ def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:
     """Returns `laps`, and as `final` the same of the map at the end of the log."""
     if not has_cones(truth):
         return {}
-    final = asdict(lap_metrics(result.map, truth, result.laps))
+    final = asdict(_metrics(result.map, truth, result.laps, result.scale))
     del final["lap"]
     return {
         "laps": [asdict(row) for row in laps_of(result, log)],
         "final": final,
-        "inside_two_sigma": normal_errors(result.map, truth).share_inside(),
+        "inside_two_sigma": normal_errors(
+            result.at_scale_one().map, scaled(truth, 1.0 / result.scale)
+        ).share_inside(),
     }
 
 

@@ -6,13 +6,13 @@ from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from typing import Any, Final
 
-from pathspace_graph.diagnosis import diagnose
 from pathspace_graph.eval.harness.attempts import Attempt, attempt
 from pathspace_graph.eval.harness.drives import Drive, identity
 from pathspace_graph.eval.metrics.measures import METRICS, measure
 from pathspace_graph.eval.metrics.summary import vehicle_of, versions
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult
+from pathspace_graph.plausibility.diagnosis import diagnose
 from pathspace_graph.settings.mapper import MapperSettings
 
 FORMAT: Final = "pathspace-cell/3"

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -26,10 +27,12 @@ from pathspace_graph.io.map import Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
+from pathspace_graph.lengths import POSE, scaled
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.prediction import doubted, known_noise
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import Stopwatch, settings_dict
+from pathspace_graph.scale.door import log_at_scale
 from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -53,6 +56,8 @@ NAME = "spline"
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BatchResult(BatchRun):
     """Holds the result of a batch optimization, how it ended, and its uncertainty."""
+
+    LENGTHS: ClassVar = RunResult.LENGTHS | {"map_covariance": 2, "scatter": 0, "online": 0}
 
     convergence: Convergence
     """This is how the optimization ended."""
@@ -79,7 +84,8 @@ class BatchResult(BatchRun):
         It is computed when it is first asked for.
         """
         with threadpool_limits(limits=1):
-            return self.system.eliminated(self.optimum).pose_marginals
+            weights = self.scale ** np.array(POSE, float)
+            return np.outer(weights, weights) * self.system.eliminated(self.optimum).pose_marginals
 
     @cached_property
     def vehicle_state(self) -> VehicleState:
@@ -94,18 +100,26 @@ class BatchResult(BatchRun):
             information, _ = eliminated_system(self.system.linear_graph(self.optimum), kept)
             system = FactoredSystem(kept, cholesky(information))
             covariance = system.covariance(np.append(last, variables.calibration_keys))
-        return VehicleState.split(self.trajectory[-1], variables.calibrations, covariance)
+        pose = self.optimum.state.poses[-1]
+        return scaled(VehicleState.split(pose, variables.calibrations, covariance), self.scale)
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Returns the whole problem at the optimum as GTSAM's nonlinear factors (see `nonlinear_graph`)."""
+        """Returns the whole problem at the optimum as GTSAM's nonlinear factors (see `nonlinear_graph`).
+
+        Its lengths are over the scale.
+        """
         return nonlinear_graph(self.system, self.optimum)
 
     def values(self) -> gtsam.Values:
-        """Returns the optimum: control points l_j and r_j, calibration b_0, poses x_k."""
+        """Returns the optimum: control points l_j and r_j, calibration b_0, poses x_k.
+
+        Its lengths are over the scale.
+        """
         variables = self.optimum.state.variables
         return variables.gtsam_values(variables.keys)
 
 
+@log_at_scale
 class BatchMapper:
     """A batch mapper maps a whole log at once."""
 
@@ -184,7 +198,7 @@ class BatchMapper:
         """Returns the start from an online run of the log, and the run."""
         if self.online is None:
             raise SettingsError("start online: expected an online mapper to begin with, found none")
-        return start_online(log, self.online(self.settings, self.noise))
+        return start_online(log, self.online(replace(self.settings, scale=1.0), self.noise))
 
 
 def _with_doubt(

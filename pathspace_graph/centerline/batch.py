@@ -21,6 +21,7 @@ from pathspace_graph.graph.keys import pose_key
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import BatchRun
 from pathspace_graph.run import settings_dict
+from pathspace_graph.scale.door import log_at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.ribbon import SIDE, Ribbon, along_ribbon, ribbon_between
 
@@ -33,6 +34,7 @@ NAME: Final = "centerline"
 """This is the estimator's name on the command line."""
 
 
+@log_at_scale
 class CenterlineBatch:
     """Maps a whole log as a ribbon.
 

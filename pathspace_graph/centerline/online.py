@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -14,6 +15,7 @@ from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import LapBatches, RunNoise, VehicleState
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult
+from pathspace_graph.scale.door import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .edges import map_of, ribbon_of
@@ -24,6 +26,7 @@ NAME: Final = "centerline-fixed-lag"
 """This is the estimator's name on the command line."""
 
 
+@at_scale
 class CenterlineMapper:
     """Maps a track online as a ribbon.
 
@@ -36,7 +39,7 @@ class CenterlineMapper:
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
         self.settings = settings or MapperSettings()
-        self.boundaries = FixedLagMapper(self.settings, odometry_sigma)
+        self.boundaries = FixedLagMapper(replace(self.settings, scale=1.0), odometry_sigma)
         """It maps both boundaries, and estimates the poses."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:

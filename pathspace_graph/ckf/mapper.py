@@ -17,6 +17,7 @@ from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import known_noise
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.run import CycleResult, Stopwatch
+from pathspace_graph.scale.door import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .closing import associate_early_segment, simplify, update_by_correspondences
@@ -27,6 +28,7 @@ from .update import OnCurve, classify, update
 Array = NDArray[np.float64]
 
 
+@at_scale
 class CkfMapper:
     """Maps a track's two boundaries by a cubature Kalman filter over the pose and all control points.
 

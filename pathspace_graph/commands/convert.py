@@ -16,15 +16,17 @@ from pathspace_graph.convert.csv_files import Columns, Units, read_csv
 from pathspace_graph.convert.recording import Recording, to_log, windowed
 from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings, Side, Window
 from pathspace_graph.convert.victoria_park import read_victoria_park
-from pathspace_graph.diagnosis import measured_line
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import LOG_FILE, Log, write_log
 from pathspace_graph.labels import NAMES
+from pathspace_graph.lengths import scaled
+from pathspace_graph.plausibility.diagnosis import measured_line
 from pathspace_graph.plausibility.hint import because
 from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.progress import progress
+from pathspace_graph.scale.scene import scale_of
 
 from .online import tell
 from .simulate import describe
@@ -132,7 +134,8 @@ def with_measured_noise(log: Log) -> Log:
     """Returns a log whose noise is measured where nobody has stated it."""
     if log.odometry_stated and log.detections_stated:
         return log
-    measured = measure_log(log)
+    scale = scale_of(log)
+    measured = scaled(measure_log(scaled(log, 1.0 / scale)), scale)
     if measured is None:
         return log
     log = replace(log, measured=measured)

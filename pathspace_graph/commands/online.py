@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from pathspace_graph.diagnosis import diagnose, noise_lines
 from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT, MapKind, check_online, for_map, make_online
 from pathspace_graph.eval.metrics.summary import (
@@ -32,6 +31,7 @@ from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.labels import NAMES
 from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.plausibility.diagnosis import diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.plausibility.reading import read_plausible_log
 from pathspace_graph.progress import progress
@@ -170,7 +170,8 @@ def outline(result: RunResult) -> str:
     loop = "loop closed" if result.map.closed else "loop not closed"
     sizes = [f"{NAMES[label]} {boundary.size}" for label, boundary in sorted(result.map.boundaries.items())]
     points = f"control points: {' + '.join(sizes) or 'none'}"
-    return ", ".join([laps, loop, points, *health_outline(result)])
+    size = [] if result.scale == 1.0 else [f"{result.scale:g} times the size of a Formula Student track"]
+    return ", ".join([laps, loop, points, *size, *health_outline(result)])
 
 
 def health_outline(result: RunResult) -> list[str]:

@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import InputError, ReadingError
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.lengths import scaled
 from pathspace_graph.run import CycleResult, split_odometry
+from pathspace_graph.scale.scene import scale_of
 from pathspace_graph.settings.limits import LimitSettings
 
 Array = NDArray[np.float64]
@@ -145,6 +147,7 @@ class Gate:
 def read_usable_log(folder: Path, limits: LimitSettings) -> Log:
     """Reads a log whose cycles may all be used; otherwise raises an InputError with file, row and stamp."""
     log, newest = read_log(folder), Newest()
+    limits = scaled(limits, scale_of(log))
     for odometry, detections in split_odometry(log):
         try:
             admitted = admit(odometry, detections, limits, newest)

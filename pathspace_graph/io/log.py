@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise
 from pathspace_graph.labels import NAMES, label_from_name
+from pathspace_graph.lengths import POSE
 
 from .csv_table import FloatArray, Table, read_table
 from .files import atomic_folder
@@ -74,6 +75,8 @@ MIN_RELATIVE_DETERMINANT: Final = 1e-12
 class Odometry:
     """Holds the measured body twists, each of which is held until the next."""
 
+    LENGTHS: ClassVar = {"twist": POSE}
+
     t: FloatArray
     """These are the stamps (N,) in s, strictly increasing."""
     twist: FloatArray
@@ -100,6 +103,8 @@ class Odometry:
 class Detections:
     """Holds the boundary points detected in one perception cycle."""
 
+    LENGTHS: ClassVar = {"points_vehicle": 1, "covariances": 2}
+
     t: float
     """This is the stamp of the cycle (s)."""
     points_vehicle: FloatArray
@@ -114,6 +119,8 @@ class Detections:
 class SensorInfo:
     """Holds what is known of the sensor; None stands where the log does not say."""
 
+    LENGTHS: ClassVar = {"range_max": 1}
+
     range_max: float | None = None
     """This is the greatest range (m)."""
     fov: float | None = None
@@ -125,6 +132,13 @@ class SensorInfo:
 @dataclass(frozen=True, eq=False)
 class Truth:
     """Holds what a simulator or a survey knows, for evaluation only; what is not known has no rows."""
+
+    LENGTHS: ClassVar = {
+        "poses": POSE,
+        "cones": 1,
+        "sensor": (0, 1, 0, 0, 1),
+        "noise": (1, 1, 0, 0, 0, 0),
+    }
 
     pose_t: FloatArray
     """These are the stamps of the true poses (N,) in s."""
@@ -152,6 +166,15 @@ class Truth:
 @dataclass(frozen=True, eq=False)
 class Log:
     """Holds all that a vehicle recorded on one drive."""
+
+    LENGTHS: ClassVar = {
+        "odometry": 0,
+        "cycles": 0,
+        "odometry_sigma": POSE,
+        "sensor": 0,
+        "measured": 0,
+        "truth": 0,
+    }
 
     odometry: Odometry
     """These are the measured body twists."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,8 @@ _NEGATIVE_TOLERANCE = 1e-9
 class SplineBoundary:
     """Holds a boundary as a B-spline."""
 
+    LENGTHS: ClassVar = {"spline": 0, "covariance": 2, "confirmed_until": 1}
+
     spline: BSpline
     """The curve is in the map frame, in the direction of travel."""
 
@@ -60,6 +62,8 @@ class SplineBoundary:
 class PointBoundary:
     """Holds a boundary as points: the landmarks of an estimator that does not know that they form a curve."""
 
+    LENGTHS: ClassVar = {"points": 1, "covariance": 2}
+
     points: Array
     """Each row is a point (m, 2) in m, map frame, in no particular order."""
 
@@ -78,6 +82,8 @@ MapBoundary = SplineBoundary | PointBoundary
 @dataclass(frozen=True, eq=False)
 class Map:
     """Holds what was mapped of a track."""
+
+    LENGTHS: ClassVar = {"boundaries": 0, "joint_covariance": 2}
 
     closed: bool
     """The track was found to be a loop where this is true."""

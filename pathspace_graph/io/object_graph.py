@@ -105,12 +105,13 @@ def attributes_of(kind: type) -> tuple[frozenset[str], frozenset[str]]:
 
 
 def _stored(function: Any) -> set[str]:
-    """Returns the names of the attributes of its own object that a method sets."""
-    code = getattr(function, "__code__", None)
+    """Returns the names of the attributes of its own object that a method sets, or one that it wraps."""
+    code, inner = getattr(function, "__code__", None), getattr(function, "__wrapped__", None)
+    own = set() if inner is None else _stored(inner)
     if code is None or not code.co_varnames:
-        return set()
+        return own
     steps = [*dis.get_instructions(code)]
-    return {
+    return own | {
         str(step.argval)
         for before, step in pairwise(steps)
         if step.opname == "STORE_ATTR" and _loads(before, code.co_varnames[0])

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.measured_noise import MeasuredNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.lengths import POSE, scaled
 
 from .csv_table import read_table
 from .files import atomic_folder, write_json
@@ -48,6 +49,8 @@ _CYCLE_COLUMNS: Final = (
 @dataclass(frozen=True)
 class CycleRecord:
     """Holds one row of `cycles.csv` (FORMATS)."""
+
+    LENGTHS: ClassVar = {"jump": POSE, "notice": 1, "reason": 1}
 
     cycle: int
     """This is the number of the perception cycle, from 0."""
@@ -88,6 +91,9 @@ class CycleRecord:
 @dataclass(frozen=True, eq=False)
 class VehicleState:
     """Holds what an estimator believes of the vehicle: its pose, and the calibration of its odometry."""
+
+    LENGTHS: ClassVar = {"pose": POSE, "sensor": (0, 1, 0, 0, 1)}
+    COVARIANCES: ClassVar = {"covariance": (*POSE, 0, 0), "sensor_covariance": (0, 1, 0, 0, 1)}
 
     pose: Array
     """This is the pose [x, y, theta] (3,) in m and rad, map frame; theta isn't wrapped."""
@@ -143,6 +149,8 @@ class LapBatches:
 class RunNoise:
     """Holds which noise a run has used, and what it has measured."""
 
+    LENGTHS: ClassVar = {"measured": 0}
+
     odometry: NoiseSource
     """The noise of the odometry comes from here."""
     detections: NoiseSource
@@ -156,6 +164,18 @@ class RunNoise:
 @dataclass(frozen=True, eq=False)
 class RunResult:
     """Holds what a run of an estimator over a log gives."""
+
+    LENGTHS: ClassVar = {
+        "map": 0,
+        "trajectory": POSE,
+        "cycles": 0,
+        "lap_maps": 0,
+        "snapshots": 0,
+        "vehicle": 0,
+        "reach": (1, 2, 0),
+        "noise": 0,
+        "scale": 1,
+    }
 
     estimator: str
     """This is the name of the estimator (FORMATS)."""
@@ -191,6 +211,12 @@ class RunResult:
     """Between cycles, the run waited for batches for this wall time (s)."""
     noise: RunNoise | None = None
     """This is the noise that was used, where the estimator says it."""
+    scale: float = 1.0
+    """Size of the scene by that of a Formula Student track."""
+
+    def at_scale_one(self) -> Self:
+        """Return the result of a scene that is as large as a Formula Student track."""
+        return scaled(self, 1.0 / self.scale)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from pathspace_graph.io.results import BatchRun
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.prediction import known_noise
 from pathspace_graph.run import settings_dict, split_odometry
+from pathspace_graph.scale.door import log_at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .fixed_lag import LandmarkFixedLag
@@ -30,6 +31,7 @@ NAME: Final = "landmark-batch"
 """This is the estimator's name on the command line."""
 
 
+@log_at_scale
 class LandmarkBatch:
     """Maps cones as points with all poses of a log; the start is the online run of `LandmarkFixedLag`."""
 

@@ -32,6 +32,7 @@ from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
 from pathspace_graph.mapping.prediction import known_noise
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult, Stopwatch
+from pathspace_graph.scale.door import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import Association, Gates, associate, compatible, pair_costs
@@ -41,6 +42,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
+@at_scale
 class LandmarkCkf:
     """Maps cones as points: predict, associate, update, create.
 

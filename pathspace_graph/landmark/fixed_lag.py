@@ -27,6 +27,7 @@ from pathspace_graph.mapping.prediction import (
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult, Readings, Stopwatch
+from pathspace_graph.scale.door import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import associate_created, associate_newest
@@ -39,6 +40,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
+@at_scale
 class LandmarkFixedLag:
     """Maps cones as points: predict, associate, create, update, close, marginalize.
 

@@ -35,6 +35,7 @@ from pathspace_graph.mapping.prediction import (
 )
 from pathspace_graph.mapping.registration import passes_start, register
 from pathspace_graph.run import CycleResult, Stopwatch
+from pathspace_graph.scale.door import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.snapshot import restore, save
 
@@ -52,6 +53,7 @@ class Solver(Protocol):
         """Moves the smoother's variables to the estimate, and leaves its `last_step` for gating."""
 
 
+@at_scale
 class FixedLagMapper(MapperEstimate):
     """Maps a track's two boundaries cycle by cycle, as splines in one factor graph with the vehicle's poses.
 
@@ -117,7 +119,8 @@ class FixedLagMapper(MapperEstimate):
         on control points (`control_keys`: `Point2`) and on the calibration. Each is relinearized at every
         step until one of its poses leaves the window; then it is part of the prior. A factor on control
         points alone is kept until the loop closes, which replaces the control points. If a key is not a
-        variable of the graph, or a number not finite, SettingsError is raised and nothing is changed.
+        variable of the graph, or a number not finite, SettingsError is raised and nothing is changed. Its
+        lengths are those at scale 1.
 
         Nothing else is raised. Where a step fails, the mapper goes back to what it was before the cycle.
         Then it takes the cycle again and leaves the loop alone, or uses no detections, or leaves the cycle

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 Cause = Literal[
     "stamps",
@@ -28,6 +28,8 @@ Cause = Literal[
 @dataclass(frozen=True)
 class Hint:
     """Names a likely mistake in a log, with the figure that shows it."""
+
+    LENGTHS: ClassVar = {"found": 1, "likely": 1, "advice": 1}
 
     cause: Cause
     """The mistake is of this kind."""

@@ -6,6 +6,8 @@ import numpy as np
 
 from pathspace_graph.io.log import DETECTIONS_FILE, Log
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
+from pathspace_graph.lengths import scaled
+from pathspace_graph.scale.scene import scale_of
 from pathspace_graph.settings.plausibility import PlausibilitySettings
 
 from .hint import Hint
@@ -30,6 +32,12 @@ def hints(log: Log, settings: PlausibilitySettings | None = None) -> list[Hint]:
     settings = settings or PlausibilitySettings()
     if len(log.odometry.t) < settings.least_twists:
         return []
+    scale = scale_of(log)
+    return [scaled(hint, scale) for hint in _hints(scaled(log, 1.0 / scale), settings)]
+
+
+def _hints(log: Log, settings: PlausibilitySettings) -> list[Hint]:
+    """Returns the hints about a log at scale 1."""
     of_parts = whole_stamps(log)
     if of_parts:
         return of_parts

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from .checked import Positive
 
@@ -15,6 +16,7 @@ class LimitSettings(Positive, group="limits"):
     """
 
     UNLIMITED = ("silence",)
+    LENGTHS: ClassVar = {"speed": 1, "range_min": 1, "range_max": 1, "sigma_min": 1, "sigma_max": 1}
 
     speed: float = 100.0
     """No vehicle is faster than this, ahead or to a side (m/s)."""

@@ -246,6 +246,9 @@ class MapperSettings(Positive):
     """Noise of odometry and detections that is used: what the log states, or what is measured in the drive.
     By default what is stated, and measured where nothing is. Constant errors of the sensor are measured
     unless this is `stated`."""
+    scale: float | None = None
+    """Size of the scene by that of a Formula Student track: 0.1 for a model car of 1:10, 3 for a road. All
+    lengths of the settings are those at scale 1. By default the first metres of the drive tell it."""
     limits: LimitSettings = field(default_factory=LimitSettings)
     """These settings say what a perception cycle may hold."""
     spline: SplineSettings = field(default_factory=SplineSettings)

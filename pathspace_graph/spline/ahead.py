@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,16 @@ class TrackAhead:
     The centre line has n points: n is 0 where only one boundary is known, and smaller than what was asked for
     where the map ends. Each point is equally far from both boundaries.
     """
+
+    LENGTHS: ClassVar = {
+        "points": 1,
+        "curvature": -1,
+        "arc_length": 1,
+        "width_left": 1,
+        "width_right": 1,
+        "left": 1,
+        "right": 1,
+    }
 
     points: Array
     """These are the points (n, 2) in m; the first one is beside the vehicle."""

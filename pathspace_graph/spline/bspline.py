@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, Literal
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 from scipy.interpolate import BSpline as ScipyBSpline
@@ -40,6 +40,8 @@ class BSpline:
 
     Knots and control points are laid out as in scipy's `BSpline`.
     """
+
+    LENGTHS: ClassVar = {"knots": 1, "control_points": 1}
 
     knots: Floats
     """(n + p + 1,) The knots never decrease."""

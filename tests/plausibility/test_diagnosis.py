@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pathspace_graph.diagnosis import CAUSES, by_prior, diagnose, measured_line, noise_lines
 from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import CALIBRATION
 from pathspace_graph.io.results import RunNoise, VehicleState
+from pathspace_graph.plausibility.diagnosis import CAUSES, by_prior, diagnose, measured_line, noise_lines
 
 SETTINGS = {
     "odometry": {"sigma_scale": 0.005, "sigma_bias": 0.002},

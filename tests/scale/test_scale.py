@@ -1,0 +1,325 @@
+"""Scenes of any size: how the scale is found, and that a log s times as large gives s times the map."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+from dataclasses import fields, is_dataclass, replace
+from importlib import import_module
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pathspace_graph.batch.mapper import BatchMapper
+from pathspace_graph.ckf.mapper import CkfMapper
+from pathspace_graph.errors import ReadingError
+from pathspace_graph.estimators import ONLINE, make_batch, make_online
+from pathspace_graph.eval.metrics.measures import measure
+from pathspace_graph.eval.metrics.summary import laps_of, summarize
+from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise, RayNoise
+from pathspace_graph.health import Health
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.map import SplineBoundary
+from pathspace_graph.io.results import RunResult, VehicleState
+from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
+from pathspace_graph.lengths import scaled
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.plausibility.judge import hints
+from pathspace_graph.run import CycleResult, run_online, split_odometry
+from pathspace_graph.scale.scene import JUDGED, SceneScale, scale_of, width_and_gap
+from pathspace_graph.settings.mapper import MapperSettings
+
+from ..scenes.drives import ODOMETRY_SIGMA, short_drive
+from ..scenes.paths import modules
+
+STANDING = Odometry(np.array([0.0]), np.zeros((1, 3)))
+CLOSE = 1e-9
+"""Results agree to this share of the map's size."""
+
+
+def road(width: float, gap: float, label: int | None = None) -> Detections:
+    """Five cones on each side of a straight road ahead."""
+    x = 1.0 * gap + gap * np.arange(5)
+    points = np.concatenate([np.column_stack([x, np.full(5, side * width / 2)]) for side in (1.0, -1.0)])
+    labels = np.repeat([LEFT, RIGHT], 5) if label is None else np.full(10, label)
+    return Detections(0.0, points, np.tile(1e-4 * np.eye(2), (10, 1, 1)), labels)
+
+
+def driven(cycle: Detections, speed: float, count: int) -> SceneScale:
+    """What a cycle tells that is seen time and again, ten times a second, while the vehicle drives."""
+    scene = SceneScale()
+    for k in range(count):
+        odometry = Odometry(np.array([0.1 * k]), np.array([[speed, 0.0, 0.0]]))
+        scene.see(odometry, replace(cycle, t=0.1 * (k + 1)))
+    return scene
+
+
+# --- the scale of a scene --------------------------------------------------------------------------------
+
+
+def test_width_and_gap_are_those_of_the_rows() -> None:
+    assert width_and_gap(road(3.0, 2.0)) == pytest.approx((3.0, 2.0))
+    assert width_and_gap(road(3.0, 2.0, UNKNOWN)) == pytest.approx((3.0, 2.0))  # by the sides of the vehicle
+    nothing = Detections(0.0, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, int))
+    assert np.isnan(width_and_gap(nothing)).all()
+
+
+def test_a_cone_that_is_detected_twice_is_one() -> None:
+    once, rng = road(3.0, 2.0), np.random.default_rng(0)
+    points = np.concatenate([once.points_vehicle, once.points_vehicle + rng.normal(0.0, 0.01, (10, 2))])
+    twice = Detections(0.0, points, np.tile(once.covariances, (2, 1, 1)), np.tile(once.labels, 2))
+    assert width_and_gap(twice) == pytest.approx((3.0, 2.0), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("width", "gap", "scale"),
+    [
+        (3.5, 3.2, 1.0),
+        (5.0, 5.0, 1.0),
+        (0.35, 0.32, 0.1),
+        (1.0, 1.0, 0.3),
+        (10.0, 9.0, 3.0),
+        (40.0, 30.0, 10.0),
+        (15.0, 5.0, 1.0),  # a wide road
+        (3.0, 0.3, 1.0),  # dense rows
+        (3500.0, 3200.0, 1.0),  # millimetres, which are no scale
+    ],
+)
+def test_the_scale_is_what_width_and_gap_agree_on(width: float, gap: float, scale: float) -> None:
+    scene = driven(road(width, gap), speed=2.0 * gap, count=JUDGED[-1] + 1)
+    assert scene.value == scale
+    assert scene.is_final
+
+
+def test_a_vehicle_at_rest_learns_nothing_more() -> None:
+    scene = driven(road(0.35, 0.32), speed=0.0, count=50)
+    assert scene.value == 0.1
+    assert not scene.is_final
+
+
+def test_a_given_scale_is_final() -> None:
+    scene = SceneScale(2.5)
+    scene.see(STANDING, road(0.35, 0.32))
+    assert (scene.value, scene.is_final) == (2.5, True)
+
+
+# --- records ---------------------------------------------------------------------------------------------
+
+
+def scalable() -> list[type]:
+    """Every dataclass that says which of its fields are lengths."""
+    found = []
+    for name, file in modules().items():
+        if "LENGTHS: ClassVar" not in file.read_text():
+            continue
+        module = import_module(f"pathspace_graph.{name}".removesuffix(".__init__"))
+        found += [own for own in vars(module).values() if isinstance(own, type) and "LENGTHS" in vars(own)]
+    return [one for one in dict.fromkeys(found) if is_dataclass(one)]
+
+
+@pytest.mark.parametrize("kind", scalable(), ids=lambda kind: kind.__name__)
+def test_every_field_that_is_said_to_be_in_metres_has_a_power(kind: Any) -> None:
+    """The texts of the fields are held against `LENGTHS`: what is in m, m^2 or m/s changes with the scale."""
+    powers = {*kind.LENGTHS, *getattr(kind, "COVARIANCES", {})}
+    body = ast.parse(inspect.getsource(kind)).body[0].body  # type: ignore[attr-defined]
+    for node, text in pairwise(body):
+        if isinstance(node, ast.AnnAssign) and isinstance(text, ast.Expr):
+            name, said = ast.unparse(node.target), ast.unparse(text.value)
+            in_metres = re.search(r"\bin m\b|\(m\)|\bm\^2|\bm/s|\bm, m\b", said)
+            if in_metres and name not in powers and not name.startswith("LENGTHS"):
+                pytest.fail(f"{kind.__name__}.{name}: {said}")
+    assert powers <= {field.name for field in fields(kind)}
+
+
+def test_each_number_changes_by_its_own_power() -> None:
+    noise = MeasuredNoise(
+        np.array([1.0, 2.0, 3.0]), np.ones(3), 0.1, RayNoise(np.array([0.1, 0.2])), sensor=np.arange(5.0)
+    )
+    larger = scaled(KnownNoise(np.ones(3), measured=noise), 10.0).measured
+    assert larger is not None
+    assert larger.along is not None
+    np.testing.assert_allclose(larger.odometry, [10.0, 20.0, 3.0])
+    np.testing.assert_allclose(larger.along.sigma, [1.0, 0.2])
+    np.testing.assert_allclose(larger.sensor, [0.0, 10.0, 2.0, 3.0, 40.0])
+    state = scaled(VehicleState(np.ones(3), np.ones(2), np.ones((5, 5))), 10.0)
+    np.testing.assert_allclose(state.pose, [10.0, 10.0, 1.0])
+    np.testing.assert_allclose(state.covariance[0], [100.0, 100.0, 10.0, 10.0, 10.0])
+    np.testing.assert_allclose(state.covariance[2:, 2:], 1.0)
+
+
+def test_a_text_has_metres_of_the_scene() -> None:
+    said = CycleResult(0.0, np.zeros(3), (0, 0), 0, False, notice="12 control points on 34 m, at 3 m/s")
+    assert scaled(said, 10.0).notice == "12 control points on 340 m, at 30 m/s"
+    assert scaled(Health("lost", "the position is uncertain by 0.5 m"), 0.1).reason.endswith("by 0.05 m")
+
+
+@given(st.floats(0.01, 100.0))
+def test_there_and_back_is_the_same_log(factor: float) -> None:
+    log = short_drive()
+    again = scaled(scaled(log, factor), 1.0 / factor)
+    np.testing.assert_allclose(again.odometry.twist, log.odometry.twist, rtol=1e-12)
+    for one, other in zip(again.cycles, log.cycles, strict=True):
+        np.testing.assert_allclose(one.points_vehicle, other.points_vehicle, rtol=1e-12)
+        np.testing.assert_allclose(one.covariances, other.covariances, rtol=1e-12)
+    assert scaled(log, 1.0) is log
+
+
+# --- estimators ------------------------------------------------------------------------------------------
+
+
+def assert_alike(found: RunResult, known: RunResult, scale: float) -> None:
+    """A result is that of a scene `scale` times as large, to rounding."""
+    assert found.scale == scale
+    assert found.map.closed == known.map.closed
+    assert found.laps == known.laps
+    size = scale * np.ptp(known.trajectory[:, :2])
+    weights = np.array([scale, scale, 1.0])
+    np.testing.assert_allclose(found.trajectory, known.trajectory * weights, rtol=0.0, atol=CLOSE * size)
+    for label, boundary in known.map.boundaries.items():
+        other = found.map.boundaries[label]
+        assert isinstance(boundary, SplineBoundary)
+        assert isinstance(other, SplineBoundary)
+        points = boundary.spline.control_points
+        np.testing.assert_allclose(other.spline.control_points, scale * points, rtol=0.0, atol=CLOSE * size)
+        largest = scale**2 * np.abs(boundary.covariance).max()
+        np.testing.assert_allclose(
+            other.covariance, scale**2 * boundary.covariance, rtol=0.0, atol=1e-6 * largest
+        )
+
+
+def online(log: Log, scale: float | None) -> RunResult:
+    return run_online(log, FixedLagMapper(MapperSettings(scale=scale), log.odometry_sigma))
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.37, 3.0, 10.0])
+def test_a_log_s_times_as_large_gives_s_times_the_map(scale: float) -> None:
+    log = short_drive()
+    assert_alike(online(scaled(log, scale), scale), online(log, 1.0), scale)
+
+
+def test_a_batch_of_a_log_s_times_as_large_is_s_times_as_large() -> None:
+    log = short_drive()
+    known = BatchMapper(MapperSettings(), log.odometry_sigma, FixedLagMapper).solve(log)
+    larger = scaled(log, 3.0)
+    found = make_batch("spline", MapperSettings(), larger).solve(larger)
+    assert_alike(found, known, 3.0)
+    np.testing.assert_allclose(
+        found.vehicle_state.pose, known.vehicle_state.pose * [3.0, 3.0, 1.0], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        found.pose_covariances[-1], known.pose_covariances[-1] * np.outer([3, 3, 1], [3, 3, 1]), rtol=1e-3
+    )
+
+
+@pytest.mark.parametrize("name", ONLINE)
+def test_an_estimator_finds_the_scale_without_reading_ahead(name: str) -> None:
+    """It begins anew with the scale that the first cycle tells; only what was said before differs."""
+    log = short_drive()
+    log = replace(log, cycles=log.cycles[:60])
+    small = scaled(log, 0.1)
+    known = run_online(log, make_online(name, MapperSettings(scale=1.0), log))
+    found = run_online(small, make_online(name, MapperSettings(), small))
+    assert found.scale == 0.1
+    np.testing.assert_allclose(
+        found.trajectory[1:], known.trajectory[1:] * [0.1, 0.1, 1.0], rtol=0.0, atol=1e-8
+    )
+    assert found.map.size == known.map.size
+
+
+def test_an_estimator_begins_anew_where_more_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first cycles show a false scale; what was mapped with it is mapped again."""
+    log = short_drive()
+    log = replace(log, cycles=log.cycles[:40])
+    values = iter([0.1] * 4 + [1.0] * 100)
+
+    def see(scene: SceneScale, odometry: Odometry, detections: Detections) -> None:
+        scene.value = next(values)
+        scene.is_final = scene.value == 1.0
+
+    monkeypatch.setattr(SceneScale, "see", see)
+    found = run_online(log, FixedLagMapper(None, log.odometry_sigma))
+    monkeypatch.undo()
+    known = online(log, 1.0)
+    np.testing.assert_array_equal(found.trajectory[4:], known.trajectory[4:])
+    assert not np.array_equal(found.trajectory[:4], known.trajectory[:4])
+
+
+def test_what_a_mapper_is_asked_for_has_the_size_of_the_scene() -> None:
+    log = short_drive()
+    log = replace(log, cycles=log.cycles[:60])
+    one, ten = (
+        FixedLagMapper(MapperSettings(scale=s), log.odometry_sigma * [s, s, 1.0]) for s in (1.0, 10.0)
+    )
+    for odometry, detections in split_odometry(log):
+        one.update(odometry, detections)
+        ten.update(scaled(odometry, 10.0), scaled(detections, 10.0))
+    np.testing.assert_allclose(ten.ahead(50.0, 10.0).points, 10.0 * one.ahead(5.0).points, atol=1e-6)
+    np.testing.assert_allclose(ten.ahead(50.0, 10.0).curvature, 0.1 * one.ahead(5.0).curvature, atol=1e-6)
+    np.testing.assert_allclose(ten.window_poses(), one.window_poses() * [10.0, 10.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(ten.readings().points, 10.0 * one.readings().points, atol=1e-6)
+    np.testing.assert_allclose(ten.vehicle_state().pose, one.vehicle_state().pose * [10, 10, 1], atol=1e-6)
+    assert ten.outline().size == one.outline().size
+
+
+def test_a_mapper_is_saved_while_it_still_learns_the_scale(tmp_path: Path) -> None:
+    log = scaled(short_drive(), 0.1)
+    log = replace(log, cycles=log.cycles[:30])
+    mapper = FixedLagMapper(None, log.odometry_sigma)
+    cycles = [*split_odometry(log)]
+    for cycle in cycles[:5]:
+        mapper.update(*cycle)
+    mapper.save(tmp_path / "early.snap")
+    again = FixedLagMapper.restore(tmp_path / "early.snap")
+    for cycle in cycles[5:]:
+        np.testing.assert_array_equal(again.update(*cycle).pose, mapper.update(*cycle).pose)
+    assert again.outline().size == mapper.outline().size > 0
+
+
+@pytest.mark.parametrize("kind", [FixedLagMapper, LandmarkFixedLag, CkfMapper])
+def test_a_wrong_shape_is_refused_at_any_scale(kind: Any) -> None:
+    estimator = kind(MapperSettings(scale=0.1), ODOMETRY_SIGMA)
+    twists = Odometry(np.array([0.0]), np.zeros((1, 2)))
+    with pytest.raises(ReadingError):
+        estimator.update(twists, road(0.3, 0.3))
+
+
+@given(seed=st.integers(0, 10**6), strange=st.sampled_from([0.0, np.nan, np.inf, 1e308, 1e-308, -1e5]))
+@settings(max_examples=20, deadline=None)
+def test_no_detections_break_the_search_for_a_scale(seed: int, strange: float) -> None:
+    """Cones anywhere tell all kinds of scales, and the mapper begins anew with each of them."""
+    rng, mapper = np.random.default_rng(seed), FixedLagMapper(None, ODOMETRY_SIGMA)
+    for k in range(8):
+        points = rng.normal(0.0, 10.0 ** rng.uniform(-1.0, 1.5), (12, 2))
+        points[rng.integers(12), rng.integers(2)] = strange
+        covariances = np.tile(1e-4 * np.eye(2), (12, 1, 1))
+        cycle = Detections(0.1 * (k + 1), points, covariances, rng.integers(0, 3, 12))
+        result = mapper.update(Odometry(np.array([0.1 * k]), np.array([[5.0, 0.0, 0.1]])), cycle)
+        assert np.isfinite(result.pose).all()
+
+
+# --- metrics ---------------------------------------------------------------------------------------------
+
+
+def test_metrics_are_those_of_scale_one_times_the_scale() -> None:
+    log = short_drive()
+    known, found = online(log, 1.0), online(scaled(log, 10.0), None)
+    first, second = summarize(known, log), summarize(found, scaled(log, 10.0))
+    assert second["scale"] == scale_of(scaled(log, 10.0)) == 10.0
+    assert second["ate"] == pytest.approx(10.0 * first["ate"], rel=1e-6)
+    assert second["final"]["rmse"] == pytest.approx(10.0 * first["final"]["rmse"], rel=1e-6)
+    assert second["final"]["missed"] == first["final"]["missed"]
+    assert len(laps_of(found, scaled(log, 10.0))) == len(laps_of(known, log))
+    over_scale = measure(found, scaled(log, 10.0))[-1].values
+    assert over_scale["rmse"] == pytest.approx(measure(known, log)[-1].values["rmse"], rel=1e-6)
+
+
+def test_a_small_scene_is_no_mistake_of_a_log() -> None:
+    log = short_drive()
+    assert hints(scaled(log, 0.1)) == hints(log) == []
