@@ -7,17 +7,31 @@ from typing import Final
 LEFT: Final = 0
 RIGHT: Final = 1
 UNKNOWN: Final = 2
+ORANGE: Final = 3
+BIG_ORANGE: Final = 4
 
-NAMES: Final = ("left", "right", "unknown")
+NAMES: Final = ("left", "right", "unknown", "orange", "big_orange")
 """These are the words of the file format, indexed by label."""
 
 BOUNDARIES: Final = (LEFT, RIGHT)
 """These labels name a boundary."""
 
-_CODES: Final = {"left": LEFT, "blue": LEFT, "right": RIGHT, "yellow": RIGHT}
+POINTS: Final = (ORANGE, BIG_ORANGE)
+"""Cones with these labels bound no road: they stand at gates, and along lanes that lead to a track."""
+
+_CODES: Final = {
+    "left": LEFT,
+    "blue": LEFT,
+    "right": RIGHT,
+    "yellow": RIGHT,
+    "orange": ORANGE,
+    "small_orange": ORANGE,
+    "big_orange": BIG_ORANGE,
+    "large_orange": BIG_ORANGE,
+    "orange_big": BIG_ORANGE,
+}
 
 
 def label_from_name(name: str) -> int:
-    """Returns LEFT for `left` or `blue`, RIGHT for `right` or `yellow`, UNKNOWN for any other word
-    (FORMATS)."""
-    return _CODES.get(name.strip().lower(), UNKNOWN)
+    """Return the label of a word, of either case and with `-` for `_`; UNKNOWN for any other (FORMATS)."""
+    return _CODES.get(name.strip().lower().replace("-", "_"), UNKNOWN)

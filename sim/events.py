@@ -8,6 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.labels import BIG_ORANGE, ORANGE
+
 from .centre_line import STEP
 from .track import Track
 
@@ -60,6 +62,7 @@ def skidpad() -> Track:
         left=np.concatenate([outer_row + below, inner * mirrored + above]),
         right=np.concatenate([inner + below, outer_row * mirrored + above]),
         other=np.array(lanes),
+        other_labels=np.full(len(lanes), ORANGE),
         closed=False,
         start=np.array([-APPROACH, 0.0, 0.0]),
         name="skidpad",
@@ -84,7 +87,8 @@ def acceleration() -> Track:
     left = np.column_stack([x, np.full(len(x), LANE / 2)])
     gates = [(at, y) for at in (0.3, STRETCH + 0.3) for y in (-LANE / 2 - 0.3, LANE / 2 + 0.3)]
     right = left * [1.0, -1.0]
-    return Track(left, right, np.array(gates), False, np.array([0.3, 0.0, 0.0]), "acceleration")
+    labels = np.full(len(gates), BIG_ORANGE)
+    return Track(left, right, np.array(gates), False, np.array([0.3, 0.0, 0.0]), "acceleration", labels)
 
 
 EVENTS: Final[dict[str, Callable[[], Track]]] = {"skidpad": skidpad, "acceleration": acceleration}

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from pathspace_graph.errors import SettingsError, check_numbers
 from pathspace_graph.io.log import Detections, covariances_of
-from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int_]
@@ -216,7 +216,7 @@ class ConeSensor:
         first = rng.standard_normal((2, len(cones)))
         second, again = self._second_rng.standard_normal((2, len(cones))), self._second_rng.random(len(cones))
         labels = self._labels[cones]
-        flipped = (colour < settings.wrong_colour) & (labels != UNKNOWN)
+        flipped = (colour < settings.wrong_colour) & np.isin(labels, BOUNDARIES)
         labels = np.where(flipped, LEFT + RIGHT - labels, labels)
         hit = chance < settings.detection_probabilities(ranges)
         overlap = np.digitize(np.abs(bearings), settings.overlap) == 1

@@ -33,6 +33,8 @@ class Track:
     """The vehicle starts from this pose [x, y, theta] (3,) in m, m, rad."""
     name: str
     """The track is known by this name."""
+    other_labels: IntArray | None = None
+    """(k,) Labels of the other cones; all are UNKNOWN where this is None."""
     path: FloatArray | None = None
     """The road is driven along these points (k, 2) in m, where that is not once along its middle."""
 
@@ -50,8 +52,9 @@ class Track:
 
     @property
     def cone_labels(self) -> IntArray:
-        """Returns LEFT, RIGHT or UNKNOWN for each of `cones` (M,)."""
-        return np.repeat([LEFT, RIGHT, UNKNOWN], [len(self.left), len(self.right), len(self.other)])
+        """Returns the label of each of `cones` (M,)."""
+        other = np.full(len(self.other), UNKNOWN) if self.other_labels is None else self.other_labels
+        return np.concatenate([np.repeat([LEFT, RIGHT], [len(self.left), len(self.right)]), other])
 
 
 def to_map_frame(track: Track) -> Track:

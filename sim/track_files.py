@@ -23,6 +23,8 @@ from pathspace_graph.io.limits import (
     shown,
 )
 from pathspace_graph.io.parsing import parse_yaml, read_text
+from pathspace_graph.labels import BIG_ORANGE, POINTS, UNKNOWN, label_from_name
+from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
 from .driving_order import driving_order
 from .geometry import along_polyline, arc_lengths, direction, left_normals, ring, unit
@@ -164,10 +166,17 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
     rows = [
         _pacsim_cones(path, _get(path, data, name, "track."), f"track.{name}") for name in ("left", "right")
     ]
-    unknown, _ = _pacsim_cones(path, data.get("unknown"), "track.unknown")
-    other = np.vstack([unknown, *(points[kinds == ORANGE] for points, kinds in rows)])
-    left, right = (_without_repeats(points[kinds != ORANGE], closed) for points, kinds in rows)
-    track = Track(left, right, other, closed, np.append(position, orientation[2]), path.stem)
+    others = [_pacsim_cones(path, data.get("unknown"), "track.unknown"), *rows]
+    other, kinds = (np.concatenate(parts) for parts in zip(*others, strict=True))
+    labels = np.array([_pacsim_label(kind) for kind in kinds.tolist()], int)
+    no_boundary = np.isin(labels, POINTS) | (np.arange(len(labels)) < len(others[0][0]))
+    left, right = (
+        _without_repeats(points[[ORANGE not in kind for kind in kinds.tolist()]], closed)
+        for points, kinds in rows
+    )
+    start = np.append(position, orientation[2])
+    other, labels = other[no_boundary], labels[no_boundary]
+    track = Track(left, right, other, closed, start, path.stem, labels)
     hidden = np.vstack([points[kinds == INVISIBLE] for points, kinds in rows])
     return _with_hidden(track, hidden) if len(hidden) else track
 
@@ -183,13 +192,19 @@ def _with_hidden(track: Track, hidden: FloatArray) -> Track:
 
 
 def _pacsim_cones(path: Path, cones: object, key: str) -> tuple[FloatArray, NDArray[np.str_]]:
-    """Returns the points (n, 2) and the classes (n,) of a list of cones; all orange ones have one class."""
+    """Returns the points (n, 2) and the classes (n,) of a list of cones."""
     points, kinds = [], []
     for k, cone in enumerate(_list(path, cones, key)):
         points.append(_vector(path, _get(path, cone, "position", f"{key}[{k}]."), 2, f"{key}[{k}].position"))
-        kind = str(cone.get("class", ""))
-        kinds.append(ORANGE if ORANGE in kind else kind)
+        kinds.append(str(cone.get("class", "")))
     return np.array(points).reshape(-1, 2), np.array(kinds, str)
+
+
+def _pacsim_label(kind: str) -> int:
+    """Returns the label of a class of cones of no boundary."""
+    if ORANGE not in kind:
+        return UNKNOWN
+    return BIG_ORANGE if "big" in kind else SMALL_ORANGE
 
 
 def _fssim(path: Path, data: Mapping[str, Any]) -> Track:
@@ -197,11 +212,10 @@ def _fssim(path: Path, data: Mapping[str, Any]) -> Track:
         _without_repeats(_fssim_cones(path, _get(path, data, name), name), closed=True)
         for name in ("cones_left", "cones_right")
     )
-    other = np.vstack(
-        [_fssim_cones(path, data.get(name), name) for name in ("cones_orange", "cones_orange_big")]
-    )
+    small, big = (_fssim_cones(path, data.get(name), name) for name in ("cones_orange", "cones_orange_big"))
     start = _vector(path, _get(path, data, "starting_pose_front_wing"), 3, "starting_pose_front_wing")
-    return Track(left, right, other, True, start, path.stem)
+    kinds = np.repeat([SMALL_ORANGE, BIG_ORANGE], [len(small), len(big)])
+    return Track(left, right, np.concatenate([small, big]), True, start, path.stem, kinds)
 
 
 def _fssim_cones(path: Path, cones: object, key: str) -> FloatArray:
@@ -275,7 +289,8 @@ def _eufs(path: Path, _: Table) -> Track:
     if len(points) > 2 * MAX_CONES:
         raise InputError(path, f"expected at most {2 * MAX_CONES} cones, found {len(points)}")
     left, right = (_without_duplicates(points[tags == tag]) for tag in ("blue", "yellow"))
-    other, gate = points[np.isin(tags, EUFS_OTHER)], points[tags == "big_orange"]
+    others = [_without_duplicates(points[tags == tag]) for tag in EUFS_OTHER]
+    gate = points[tags == "big_orange"]
     for tag, cones in (("blue", left), ("yellow", right)):
         if len(cones) < MIN_CONES:
             raise InputError(path, f"expected at least {MIN_CONES} {tag} cones, found {len(cones)}")
@@ -287,9 +302,17 @@ def _eufs(path: Path, _: Table) -> Track:
         raise InputError(
             path, f"expected one lane from the start on, found {count - placed} of {count} cones off it"
         )
-    strays = [np.delete(left, order.left, axis=0), np.delete(right, order.right, axis=0)]
-    other = np.vstack([_without_duplicates(other), *strays])
-    return Track(left[order.left], right[order.right], other, order.closed, start, path.stem)
+    others += [np.delete(left, order.left, axis=0), np.delete(right, order.right, axis=0)]
+    kinds = [*map(label_from_name, EUFS_OTHER), UNKNOWN, UNKNOWN]
+    return Track(
+        left[order.left],
+        right[order.right],
+        np.concatenate(others),
+        order.closed,
+        start,
+        path.stem,
+        np.repeat(kinds, [len(cones) for cones in others]),
+    )
 
 
 def _eufs_start(

@@ -17,7 +17,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
-from pathspace_graph.labels import LEFT, NAMES, RIGHT
+from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, RIGHT
 
 from .marks import (
     SIGMAS,
@@ -97,6 +97,8 @@ def plot_map(
         # the legend names what is drawn first before the rest; zorder decides what lies on top
         for label, boundary in sorted(track.boundaries.items()):
             draw_boundary(axes, boundary, label, WHOLE_TRACK, band_scale)
+        for label, cones in sorted(track.points.items()):
+            draw_orange(axes, cones.points, label, WHOLE_TRACK)
         if log is not None and log.truth is not None:
             draw_truth(axes, log.truth, WHOLE_TRACK)
         if trajectory is not None and len(trajectory):
@@ -146,6 +148,13 @@ def _draw_landmarks(
     axes.add_patch(key)
     size = style.landmark_size
     draw_points(axes, boundary.points, "o", color, f"{name} landmarks", markersize=size, zorder=4)
+
+
+def draw_orange(axes: Axes, points: Array, label: int, style: MapStyle) -> None:
+    """Draws orange cones (n, 2) as triangles, those of gates larger, map frame (m)."""
+    size = (2.0 if label == BIG_ORANGE else 1.2) * style.landmark_size
+    name = NAMES[label].replace("_", " ")
+    draw_points(axes, points, "^", RED, f"{name} cones", markersize=size, zorder=4.5)
 
 
 def _band_name(scale: float, shape: str = "band") -> str:

@@ -37,7 +37,8 @@ class NamedTrack:
     @cached_property
     def digest(self) -> str:
         """Identifies the geometry, wherever it came from."""
-        parts = (self.track.left, self.track.right, self.track.other, self.track.start)
+        track = self.track
+        parts = (track.left, track.right, track.other, track.start, track.cone_labels)
         cones = b"|".join(np.ascontiguousarray(part, dtype=float).tobytes() for part in parts)
         return hashlib.sha256(cones + str(self.track.closed).encode()).hexdigest()[:_IDENTITY_DIGITS]
 

@@ -49,6 +49,7 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         "closed": result.map.closed,
         "size": result.map.size,
         "not_mapped": not_mapped(result.map, log),
+        "points": {NAMES[label]: own.size for label, own in sorted(result.map.points.items())},
         "seconds": _timing(result),
         "gate": {
             "dropped": sum(record.dropped for record in result.cycles),

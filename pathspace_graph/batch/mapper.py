@@ -16,14 +16,14 @@ from threadpoolctl import threadpool_limits
 from pathspace_graph.errors import SettingsError, solving
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
-from pathspace_graph.front_end.front_end import judge_log
+from pathspace_graph.front_end.front_end import JudgedLog, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
 from pathspace_graph.graph.keys import are_poses, pose_key
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
-from pathspace_graph.io.map import Map, SplineBoundary, joint_covariance
+from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
@@ -31,6 +31,7 @@ from pathspace_graph.lengths import POSE, scaled
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.prediction import doubted, known_noise
 from pathspace_graph.mapping.state import State
+from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import Stopwatch, settings_dict
 from pathspace_graph.scale.door import log_at_scale
 from pathspace_graph.settings.batch import Start
@@ -176,7 +177,7 @@ class BatchMapper:
         return BatchResult(
             estimator=NAME,
             settings=settings_dict(self.settings),
-            map=_map(state, joint, scatter),
+            map=replace(_map(state, joint, scatter), points=_orange(judged, at.state, settings)),
             scatter=scatter,
             trajectory_t=chain.stamps,
             trajectory=at.state.poses.copy(),
@@ -280,6 +281,14 @@ def _map(state: State, joint: Array, scatter: Scatter) -> Map:
         covariance = joint[block, block] + np.diag(sigma**2)
         boundaries[label] = SplineBoundary(state.spline(label), covariance)
     return Map(state.closed, boundaries, joint_covariance(joint, boundaries))
+
+
+def _orange(judged: JudgedLog, state: State, settings: MapperSettings) -> dict[int, PointBoundary]:
+    """Returns the orange cones by label, as the poses place them."""
+    cones, twists = OrangeCones(settings.growth, settings.spline.sigma_shape), judged.chain.twists
+    for k, detections in enumerate(judged.orange):
+        cones.add(Sighting(k, state.poses[k], twists[k], detections), state.variables.sensor)
+    return cones.points()
 
 
 def _records(

@@ -82,7 +82,7 @@ class CenterlineBatch:
         covariance = ribbon_covariance(graph, values, ribbon)
         return replace(
             self._run(start),
-            map=map_of(ribbon, covariance, settings.spline.sigma_shape, {}),
+            map=replace(map_of(ribbon, covariance, settings.spline.sigma_shape, {}), points=start.map.points),
             trajectory=_poses(values, len(start.trajectory)),
             converged=bool(optimizer.iterations() < settings.centerline.max_iterations),
             cost=float(optimizer.error()),

@@ -75,4 +75,5 @@ class CenterlineMapper:
             fitted = ribbon_of(track, self.settings)
         except SettingsError:
             return track
-        return map_of(fitted.ribbon, fitted.covariance, self.settings.spline.sigma_shape, fitted.until)
+        edges = map_of(fitted.ribbon, fitted.covariance, self.settings.spline.sigma_shape, fitted.until)
+        return replace(edges, points=track.points)

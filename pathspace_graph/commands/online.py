@@ -170,8 +170,10 @@ def outline(result: RunResult) -> str:
     loop = "loop closed" if result.map.closed else "loop not closed"
     sizes = [f"{NAMES[label]} {boundary.size}" for label, boundary in sorted(result.map.boundaries.items())]
     points = f"control points: {' + '.join(sizes) or 'none'}"
+    orange = sorted(result.map.points.items())
+    cones = [f"{own.size} {NAMES[label].replace('_', ' ')} cones" for label, own in orange]
     size = [] if result.scale == 1.0 else [f"{result.scale:g} times the size of a Formula Student track"]
-    return ", ".join([laps, loop, points, *size, *health_outline(result)])
+    return ", ".join([laps, loop, points, *cones, *size, *health_outline(result)])
 
 
 def health_outline(result: RunResult) -> list[str]:

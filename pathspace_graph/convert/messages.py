@@ -10,13 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import PathspaceError
-from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
 from .settings import LabelRule
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int_]
 
+LIST_NAMES: Final = {
+    "big_orange": BIG_ORANGE,
+    "orange": ORANGE,
+    "blue": LEFT,
+    "left": LEFT,
+    "yellow": RIGHT,
+    "right": RIGHT,
+}
+"""A list of cones with such a word in its name has cones of this label."""
 LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type")
 """The label of a detection is in the first of these fields, unless one is named."""
 NO_LABEL: Final = "none"
@@ -207,7 +216,7 @@ def _of_marker(marker: Any, rule: LabelRule) -> Iterator[tuple[float, float, int
 def cone_points(message: Any, rule: LabelRule, label_field: str | None = None) -> Points:
     """Returns the cones in all lists of a message, such as `ConeArrayWithCovariance` and `Track`.
 
-    A list whose name has `blue` or `left`, `yellow` or `right` in it gives all its cones that label. In other
+    A list whose name has a word of `LIST_NAMES` in it gives all its cones that label. In other
     lists a cone has its own. Its covariance has 4 (x, y), 9 (x, y, z) or 36 entries (a pose), row by row.
     """
     lists = {name: getattr(message, name) for name in _names(message)}
@@ -254,8 +263,8 @@ def _covariance(cone: Any) -> Array:
 
 
 def _cone_label(name: str, cone: Any, rule: LabelRule, label_field: str | None) -> int:
-    for words, label in ((("blue", "left"), LEFT), (("yellow", "right"), RIGHT)):
-        if any(word in name.lower() for word in words):
+    for word, label in LIST_NAMES.items():
+        if word in name.lower():
             return label
     field = label_field or next((field for field in LABEL_FIELDS if hasattr(cone, field)), None)
     return rule.of(getattr(cone, field)) if field is not None and hasattr(cone, field) else UNKNOWN

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError, check_numbers
-from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN, label_from_name
+from pathspace_graph.labels import LEFT, NAMES, ORANGE, RIGHT, UNKNOWN, label_from_name
 
 Side = Literal["left", "right"]
 """The y axis points to this side of the x axis."""
@@ -145,13 +145,15 @@ def _whole(text: str) -> str:
 BLUE_HUES: Final = (190.0, 265.0)
 """A colour with a hue (degrees) between these is blue."""
 YELLOW_HUES: Final = (44.0, 75.0)
-"""A colour with a hue (degrees) between these is yellow; that of orange is below, and of green above."""
+"""A colour with a hue (degrees) between these is yellow; that of green is above."""
+ORANGE_HUES: Final = (14.0, 44.0)
+"""A colour with a hue (degrees) between these is orange; that of red is below."""
 MIN_SATURATION: Final = 0.3
 """A colour of less saturation is grey."""
 
 
 def label_of_colour(red: float, green: float, blue: float) -> int:
-    """Returns LEFT for a blue and RIGHT for a yellow colour, UNKNOWN for any other; the scale is free."""
+    """Return the label of a blue, yellow or orange colour, UNKNOWN of any other; the scale is free."""
     most, least = max(red, green, blue), min(red, green, blue)
     if not 0.0 < most < inf or not most - least > MIN_SATURATION * most:
         return UNKNOWN
@@ -164,4 +166,6 @@ def label_of_colour(red: float, green: float, blue: float) -> int:
         hue = 60.0 * (red - green) / chroma + 240.0
     if BLUE_HUES[0] <= hue <= BLUE_HUES[1]:
         return LEFT
+    if ORANGE_HUES[0] <= hue < ORANGE_HUES[1]:
+        return ORANGE
     return RIGHT if YELLOW_HUES[0] <= hue <= YELLOW_HUES[1] else UNKNOWN

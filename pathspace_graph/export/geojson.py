@@ -40,10 +40,11 @@ def write_geojson(file: Path, track: Map, step: float, plane: LocalPlane) -> Non
     """Writes a FeatureCollection with each boundary and, where both are curves, the centre line.
 
     A curve is a LineString of points `step` (m) apart, which ends where it begins if it is closed. Landmarks
-    are a MultiPoint.
+    are a MultiPoint, and so are orange cones of each label.
     """
     features = [
-        _boundary(NAMES[label], boundary, step, plane) for label, boundary in sorted(track.boundaries.items())
+        _boundary(NAMES[label], boundary, step, plane)
+        for label, boundary in sorted([*track.boundaries.items(), *track.points.items()])
     ]
     if all(isinstance(track.boundaries.get(label), SplineBoundary) for label in BOUNDARIES):
         features.append(_centre(track.centre_line(step), plane))

@@ -56,13 +56,13 @@ def write_profile(file: Path, track: Map, step: float, settings: SpeedSettings) 
 
 
 def write_points(file: Path, track: Map, step: float) -> None:
-    """Writes the boundaries as points in m, `step` (m) apart along each, to full precision.
+    """Writes the boundaries as points in m, `step` (m) apart along each, and orange cones, to full precision.
 
     The landmarks of a boundary that is no curve are written as they are.
     """
     lines = [
         f"{x!r},{y!r},{NAMES[label]}"
-        for label, boundary in sorted(track.boundaries.items())
+        for label, boundary in sorted([*track.boundaries.items(), *track.points.items()])
         for x, y in boundary_points(boundary, step).tolist()
     ]
     _write(file, [POINTS_HEADER, *lines])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.results import RunNoise
-from pathspace_graph.labels import UNKNOWN
+from pathspace_graph.labels import POINTS, UNKNOWN
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -39,6 +39,8 @@ COLOURLESS: Final = {
     False: "most detections have a colour again",
 }
 """These notices say that most colours are unknown from now on, or no longer."""
+NEAREST: Final = 2
+"""The vehicle drives between orange cones where this number of the nearest ones are orange."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,8 @@ class Reading:
     """These are the detections of the cycle."""
     seen_again: BoolArray
     """(m,) The flag is set when a detection lies where the cycles just before had one."""
+    orange: Detections
+    """Its detections of orange cones, which bound no road."""
     sensor_doubted: bool = False
     """The flag is set once the readings so far contradict the prior of the sensor's yaw or latency."""
     measured: MapperSettings | None = None
@@ -88,16 +92,19 @@ class FrontEnd:
         Its stamp is not admitted again as long as it lies in the window, whose poses have these stamps (s).
         """
         self.gate.use_late(detections.t, window)
+        detections = detections.where(~is_orange(detections))
         return self._sides.relabelled(detections, np.full(len(detections.labels), UNKNOWN))
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Returns the judged readings of a cycle: the twists since the last one, and its detections."""
         noise, twist = self.noise, odometry.twist[-1] if len(odometry.t) else np.zeros(3)
+        orange, in_lane = detections.where(is_orange(detections)), is_in_orange_lane(detections)
+        detections = detections.where(~is_orange(detections))
         checked = noise.for_check(detections, twist)
         motion = self._motion.update(odometry, checked, may_doubt=noise.is_settled)
         sides = self._sides
         swapped, colourless = sides.swapped, sides.colourless
-        labels = sides.update(self._motion.pose, motion.twists, checked).labels
+        labels = sides.update(self._motion.pose, motion.twists, checked, in_lane=in_lane).labels
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
         judged = replace(noise.for_map(detections), labels=labels)
@@ -106,6 +113,7 @@ class FrontEnd:
             motion,
             judged,
             self._motion.seen_again,
+            noise.for_map(orange),
             self._sensor_doubted and not noise.of_detections,
             self._measured(odometry, replace(detections, labels=labels), motion),
             notice="; ".join(notices),
@@ -143,6 +151,8 @@ class JudgedLog:
     """This is the motion from each cycle to the next."""
     cycles: Sequence[Detections]
     """These are the detections of each cycle."""
+    orange: Sequence[Detections]
+    """Those of orange cones."""
     settings: MapperSettings
     """Here the priors of the sensor are wide, if the readings contradict them."""
     noise: RunNoise
@@ -165,7 +175,19 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
     if readings[-1].sensor_doubted and settings.calibration.doubt < inf:
         settings = replace(settings, calibration=settings.calibration.widened())
     chain = chained([cycle.t for cycle in log.cycles], motions, settings.odometry)
-    return JudgedLog(chain, [reading.detections for reading in readings], settings, front_end.noise_used)
+    cycles, orange = ([r.detections for r in readings], [r.orange for r in readings])
+    return JudgedLog(chain, cycles, orange, settings, front_end.noise_used)
+
+
+def is_in_orange_lane(detections: Detections) -> bool:
+    """Return whether the nearest cones are orange: the vehicle comes to a track, or is at a gate."""
+    nearest = np.argsort(np.hypot(*detections.points_vehicle.T), kind="stable")[:NEAREST]
+    return len(nearest) == NEAREST and bool(is_orange(detections)[nearest].all())
+
+
+def is_orange(detections: Detections) -> BoolArray:
+    """Return which detections (m,) are of orange cones."""
+    return np.isin(detections.labels, POINTS)
 
 
 def measure_log(log: Log) -> MeasuredNoise | None:
@@ -185,6 +207,6 @@ def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
     front_end = FrontEnd(MapperSettings(), unknown)
     for odometry, detections in readings:
         reading = front_end.update(odometry, detections)
-        labelled = replace(detections, labels=reading.detections.labels)
+        labelled = replace(detections.where(~is_orange(detections)), labels=reading.detections.labels)
         cycles.append(SeenCycle(labelled, front_end.pose, reading.motion.odometry.twist))
     return cycles, twists

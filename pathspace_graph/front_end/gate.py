@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError, ReadingError
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, read_log
-from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.labels import LEFT, NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.scale.scene import scale_of
@@ -316,10 +316,11 @@ def _labels(values: Any, count: int) -> NDArray[np.int_]:
     labels = _array(values, field, (count,))
     if count and labels.dtype.kind not in "iu":
         raise ReadingError(field, "integers", labels.dtype)
-    good = (labels >= LEFT) & (labels <= UNKNOWN)
+    good = (labels >= LEFT) & (labels < len(NAMES))
     if not good.all():
         row = int(good.argmin())
-        raise ReadingError(field, f"{LEFT} (left), {RIGHT} (right) or {UNKNOWN} (unknown)", labels[row], row)
+        known = ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))
+        raise ReadingError(field, f"one of {known}", labels[row], row)
     return labels.astype(np.int_)
 
 

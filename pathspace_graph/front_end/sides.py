@@ -43,10 +43,13 @@ class SideJudge:
         self._agreeing = self._opposing = 0  # cones on the side of their colour, and on the other one
         self._known = self._unknown = 0.0  # newest detections with and without a colour
 
-    def update(self, pose: Array, twists: Array, detections: Detections) -> Detections:
+    def update(
+        self, pose: Array, twists: Array, detections: Detections, *, in_lane: bool = False
+    ) -> Detections:
         """Returns the detections of a cycle with the labels of their sides.
 
-        The pose (3,) is in the frame of the front end, and the vehicle came there with twists (k, 3).
+        The pose (3,) is in the frame of the front end, and the vehicle came there with twists (k, 3). In a
+        lane between orange cones it isn't on the road yet, and the colours of others prove nothing.
         """
         labels, self.colourless = detections.labels, self._is_colourless(detections.labels)
         if not self.colourless and self._agreeing + self._opposing >= self.settings.enough_votes:
@@ -58,7 +61,8 @@ class SideJudge:
         path = self._path.ahead(pose, self.settings.reach)
         points = to_map(detections.points_vehicle, pose[None])
         cones = self._cones.add(detections.t, points, labels)
-        self._judge_colours(path)
+        if not in_lane:
+            self._judge_colours(path)
         sides = self._sides(pose, path)[cones] if self.colourless else np.full(len(labels), UNKNOWN)
         return self.relabelled(detections, sides)
 

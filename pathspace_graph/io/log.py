@@ -112,7 +112,13 @@ class Detections:
     covariances: FloatArray
     """Each point has this covariance (m, 2, 2) in m^2, vehicle frame."""
     labels: IntArray
-    """Each point has the label LEFT, RIGHT or UNKNOWN (m,)."""
+    """Each point has a label (m,): LEFT, RIGHT, UNKNOWN, ORANGE or BIG_ORANGE."""
+
+    def where(self, chosen: NDArray[np.bool_]) -> Detections:
+        """Return the chosen detections of the cycle."""
+        if chosen.all():
+            return self
+        return Detections(self.t, self.points_vehicle[chosen], self.covariances[chosen], self.labels[chosen])
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES
+from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, POINTS
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
@@ -83,7 +83,7 @@ MapBoundary = SplineBoundary | PointBoundary
 class Map:
     """Holds what was mapped of a track."""
 
-    LENGTHS: ClassVar = {"boundaries": 0, "joint_covariance": 2}
+    LENGTHS: ClassVar = {"boundaries": 0, "joint_covariance": 2, "points": 0}
 
     closed: bool
     """The track was found to be a loop where this is true."""
@@ -94,6 +94,9 @@ class Map:
     joint_covariance: Array | None = None
     """This is the joint covariance (2m, 2m) in m^2 of the points of all boundaries, in the order of their
     labels; it is None where it isn't known."""
+
+    points: Mapping[int, PointBoundary] = field(default_factory=dict)
+    """Cones of no boundary by their label, ORANGE or BIG_ORANGE, each label with one covariance."""
 
     @property
     def size(self) -> int:
@@ -161,6 +164,8 @@ def map_to_json(track: Map) -> dict[str, Any]:
     if track.joint_covariance is not None and len(track.boundaries) == len(BOUNDARIES):
         left = 2 * track.boundaries[LEFT].size
         content["cross_covariance"] = track.joint_covariance[:left, left:].tolist()
+    if track.points:
+        content["points"] = {NAMES[label]: _boundary_to_json(own) for label, own in track.points.items()}
     return content
 
 
@@ -195,7 +200,7 @@ def map_from_json(content: Any, file: Path | str = MAP_FILE) -> Map:
         for label in BOUNDARIES
         if NAMES[label] in boundaries
     }
-    return Map(closed, mapped, reader.joint_covariance(top, mapped))
+    return Map(closed, mapped, reader.joint_covariance(top, mapped), reader.points(top))
 
 
 @dataclass(frozen=True)
@@ -268,6 +273,16 @@ class _Reader:
             message = f"expected a parameter from {low:g} to {high:g}, found {until:g}"
             raise self.error(f"{where}.confirmed_until: {message}")
         return until
+
+    def points(self, top: dict[str, Any]) -> dict[int, PointBoundary]:
+        """Returns the cones of no boundary by label; a file need not have any."""
+        names, found = {NAMES[label]: label for label in POINTS}, {}
+        for name, value in self.object(top.get("points", {}), "points").items():
+            own = self.boundary(value, f"points.{name}")
+            if name not in names or not isinstance(own, PointBoundary):
+                raise self.error(f"points: expected points of {', '.join(names)}, found {shown(name)}")
+            found[names[name]] = own
+        return found
 
     def spline(self, fields: dict[str, Any], where: str) -> BSpline:
         degree = self.integer(self.get(fields, "degree", where), f"{where}.degree", least=1)

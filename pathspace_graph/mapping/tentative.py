@@ -1,13 +1,19 @@
-"""Tentative tracks: cones that no curve or landmark explains yet, confirmed after enough detections."""
+"""Cones that no curve explains: tentative tracks, which one may explain later, and orange cones."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from math import inf
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
-from pathspace_graph.factors.se2 import move_points, rotated
+from pathspace_graph.factors.se2 import compose, move_points, rotated, to_map
+from pathspace_graph.factors.sensor import by_sensor
+from pathspace_graph.io.log import Detections
+from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.settings.growth import GrowthSettings
 
 Array = NDArray[np.float64]
@@ -141,3 +147,80 @@ def nearest_within(points: Array, known: Array, radius: float) -> tuple[IntArray
     distance = np.hypot(offset[:, :, 0], offset[:, :, 1])
     nearest = distance.argmin(axis=1)
     return nearest, distance[np.arange(len(points)), nearest] < radius
+
+
+# --- orange cones ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """Orange cones as they were detected in one cycle."""
+
+    cycle: int
+    """Number of the perception cycle."""
+    pose: Array
+    """(3,) Pose of the vehicle, map frame."""
+    twist: Array
+    """(3,) Twist of the vehicle (m/s, m/s, rad/s)."""
+    detections: Detections
+    """Detections of orange cones only."""
+
+
+class OrangeCones:
+    """Orange cones as points of the map: gates, and lanes that lead to a track.
+
+    They bound no road, so no curve goes through them, and they don't hold the vehicle. Each is the mean of
+    its detections, as the poses of their cycles place them.
+    """
+
+    MOST: Final = 500
+    """This number of cycles is remembered, the newest ones, to be placed again when poses are corrected."""
+
+    def __init__(self, settings: GrowthSettings, sigma: float) -> None:
+        """Keep how detections are merged, and a standard deviation (m) that none of them averages out."""
+        self._settings = replace(settings, forget_after=inf)
+        self._sigma = sigma
+        self._sightings: list[Sighting] = []
+        self._tracks: dict[int, TentativeTracks] = {}
+
+    def add(self, sighting: Sighting, sensor: Array) -> None:
+        """Add the detections of a cycle; `sensor` is the calibration (5,) of the sensor, or (0,)."""
+        if len(sighting.detections.labels):
+            self._sightings = [*self._sightings[1 - self.MOST :], sighting]
+            self._place(sighting, sensor)
+
+    def place_again(self, first: int, poses: Array, sensor: Array) -> None:
+        """Place all detections anew where the poses (P, 3) of the cycles from `first` on are better known."""
+        self._tracks = {}
+        for k, one in enumerate(self._sightings):
+            if first <= one.cycle < first + len(poses):
+                self._sightings[k] = replace(one, pose=poses[one.cycle - first].copy())
+            self._place(self._sightings[k], sensor)
+
+    def move(self, motion: Array) -> None:
+        """Move all cones by a rigid motion (3,) of the map frame."""
+        self._sightings = [replace(one, pose=compose(motion, one.pose)) for one in self._sightings]
+        for tracks in self._tracks.values():
+            tracks.move(motion)
+
+    def points(self) -> dict[int, PointBoundary]:
+        """Return the cones that were detected often enough, by label."""
+        found = {}
+        for label, tracks in sorted(self._tracks.items()):
+            known = tracks.confirmed()
+            if len(known):
+                blocks = np.linalg.inv(tracks.information[known]) + self._sigma**2 * np.eye(2)
+                found[label] = PointBoundary(tracks.points[known].copy(), block_diag(*blocks))
+        return found
+
+    def _place(self, sighting: Sighting, sensor: Array) -> None:
+        seen, pose = sighting.detections, sighting.pose
+        points = seen.points_vehicle
+        if len(sensor):
+            points = points + by_sensor(points, np.tile(sighting.twist, (len(points), 1))) @ sensor
+        in_map = to_map(points, pose[None])
+        covariances = rotated(seen.covariances, np.full(len(points), pose[2]))
+        for label in np.unique(seen.labels).tolist():
+            tracks = self._tracks.setdefault(label, TentativeTracks(self._settings))
+            own = seen.labels == label
+            tracks.add(in_map[own], covariances[own], seen.t)

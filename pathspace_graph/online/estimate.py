@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -19,6 +20,7 @@ from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import vehicle_state
+from pathspace_graph.mapping.tentative import OrangeCones
 from pathspace_graph.run import Readings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.ahead import CurveAhead, TrackAhead, track_ahead
@@ -39,6 +41,7 @@ class MapperEstimate:
     smoother: FixedLagSmoother[CurveMap]
     path: DrivenPath
     growth: Growth
+    orange: OrangeCones
     loop: TrackLoop
 
     # --- the map -----------------------------------------------------------------------------------------
@@ -49,7 +52,7 @@ class MapperEstimate:
         An open curve goes on beyond its confirmed end, as `outline` says.
         """
         with self.smoother.variables.looked_at():
-            return self._map()
+            return replace(self._map(), points=self.orange.points())
 
     def _map(self) -> Map:
         state, outlooks = self.smoother.map.state, self._outlooks()
@@ -96,7 +99,7 @@ class MapperEstimate:
                 spline = outlook.spline
                 until = spline.domain[1] if self.closed else outlook.confirmed_until
                 boundaries[label] = SplineBoundary(spline, NO_COVARIANCE, until)
-        return Map(self.closed, boundaries)
+        return Map(self.closed, boundaries, points=self.orange.points())
 
     def ahead(self, distance: float, step: float = 1.0) -> TrackAhead:
         """Returns the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.

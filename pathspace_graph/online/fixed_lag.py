@@ -34,6 +34,7 @@ from pathspace_graph.mapping.prediction import (
     smoother_settings,
 )
 from pathspace_graph.mapping.registration import passes_start, register
+from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.scale.door import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
@@ -82,7 +83,9 @@ class FixedLagMapper(MapperEstimate):
         """This is the path that the vehicle has driven."""
         self.growth = Growth(self.settings.growth)
         """The open curves grow through the tentative tracks that are collected here."""
-        self.smoother.followers = [self.smoother.map, self.path, self.growth]
+        self.orange = OrangeCones(self.settings.growth, self.settings.spline.sigma_shape)
+        """Orange cones are points of the map."""
+        self.smoother.followers = [self.smoother.map, self.path, self.growth, self.orange]
         self.loop = TrackLoop(self.smoother, self.path)
         """This closes the loop of the track, and looks after the closed map."""
         if self.settings.open_lap.prior == "window" or solver is not None:
@@ -170,6 +173,8 @@ class FixedLagMapper(MapperEstimate):
             self._simplify()
         watch.lap("simplify")
         jump, notice = self.loop.go_on(closes, watch.spent)
+        if jump is not None:
+            self._place_orange_again()
         watch.lap("swap")
         if self.loop.is_searching:
             jump, notice = self.loop.find_back()
@@ -270,10 +275,21 @@ class FixedLagMapper(MapperEstimate):
         reading = self.front_end.update(odometry, detections)
         motion, t = reading.motion, detections.t
         predict(self.smoother, self.path, motion, t, self.settings)
+        cycle, twist = self.smoother.next_cycle - 1, motion.odometry.twist
+        self.orange.add(Sighting(cycle, self.poses[-1].copy(), twist, reading.orange), self._sensor)
         self.loop.record.measured(t, motion, reading.detections)
         if self.solver is not None:
             self.smoother.submaps = None  # another solver's loop closure relinearizes no submap
         return reading
+
+    @property
+    def _sensor(self) -> Array:
+        return self.smoother.variables.sensor
+
+    def _place_orange_again(self) -> None:
+        """Places orange cones by the poses that the batch of the lap has corrected, and by the window's."""
+        self.orange.place_again(0, self.corrected_poses, self._sensor)
+        self.orange.place_again(self.smoother.first_cycle, self.poses, self._sensor)
 
     def _classify(self, reading: Reading) -> None:
         """Associates detections with the curves; those that no curve uses become tentative tracks."""

@@ -17,7 +17,7 @@ from pathspace_graph.convert.messages import (
     twist_of,
 )
 from pathspace_graph.convert.settings import LabelRule, label_of_colour
-from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.labels import LEFT, ORANGE, RIGHT, UNKNOWN
 
 from .bags import EPOCH, Messages
 
@@ -92,7 +92,7 @@ def test_markers_are_points_lists_or_neither(messages: Messages) -> None:
     )
     found = points_of(array, RULE)
     np.testing.assert_allclose(found.points, [[5.0, 1.5], [10.0, 1.0], [9.0, 0.0]], atol=1e-12)
-    assert found.labels.tolist() == [LEFT, RIGHT, UNKNOWN]
+    assert found.labels.tolist() == [LEFT, RIGHT, ORANGE]
     assert stamp_of(array) == EPOCH + 2.0
     assert frame_of(array) == "base_link"
     assert stamp_of(messages.markers([])) is None
@@ -107,7 +107,8 @@ def test_markers_are_points_lists_or_neither(messages: Messages) -> None:
         ((0.0, 0.5, 1.0), LEFT),
         ((1.0, 1.0, 0.0), RIGHT),
         ((255, 215, 0), RIGHT),
-        ((1.0, 0.5, 0.0), UNKNOWN),
+        ((1.0, 0.5, 0.0), ORANGE),
+        ((255, 165, 0), ORANGE),
         ((1.0, 0.0, 0.0), UNKNOWN),
         ((0.0, 1.0, 0.0), UNKNOWN),
         ((0.5, 0.5, 0.5), UNKNOWN),

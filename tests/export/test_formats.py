@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -17,8 +18,8 @@ from pathspace_graph.export.lanelet2 import write_lanelet2
 from pathspace_graph.export.local_plane import LocalPlane
 from pathspace_graph.export.tables import sampled, write_centre_line, write_points, write_profile
 from pathspace_graph.io.csv_table import read_table
-from pathspace_graph.io.map import Map, SplineBoundary
-from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
+from pathspace_graph.labels import BIG_ORANGE, LEFT, RIGHT
 from pathspace_graph.settings.speed import SpeedSettings
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.spline.speed import speed_profile
@@ -77,6 +78,21 @@ def test_points(make: Callable[[], Map], tmp_path: Path) -> None:
         points = points_of(track, label, 0.7)
         assert np.array_equal(table.stack(("x", "y"))[labels == name], points)
         assert np.linalg.norm(np.diff(points, axis=0), axis=1) == pytest.approx(0.7, abs=0.02)
+
+
+def test_orange_cones_are_points_of_their_own_label(tmp_path: Path) -> None:
+    gate = PointBoundary(np.array([[1.5, 2.0], [1.5, -2.0]]), 0.01 * np.eye(4))
+    track = replace(ring_map(), points={BIG_ORANGE: gate})
+    write_points(tmp_path / "points.csv", track, 1.0)
+    assert (tmp_path / "points.csv").read_text().splitlines()[-2:] == [
+        "1.5,2.0,big_orange",
+        "1.5,-2.0,big_orange",
+    ]
+    write_geojson(tmp_path / "map.geojson", track, 1.0, PLANE)
+    features = json.loads((tmp_path / "map.geojson").read_text())["features"]
+    own = next(one for one in features if one["properties"]["name"] == "big_orange")
+    assert own["geometry"]["type"] == "MultiPoint"
+    assert len(own["geometry"]["coordinates"]) == 2
 
 
 def test_landmarks_are_points_as_they_are(tmp_path: Path) -> None:

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.front_end.cones import NearCones
 from pathspace_graph.front_end.front_end import FrontEnd, judge_log
-from pathspace_graph.io.log import Detections, Log
-from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.labels import LEFT, ORANGE, RIGHT, UNKNOWN
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.front_end import SidesSettings
 from pathspace_graph.settings.mapper import MapperSettings
@@ -105,3 +106,23 @@ def test_a_cycle_without_detections_is_possible() -> None:
     odometry, _ = next(split_odometry(log))
     nothing = Detections(0.0, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp))
     assert front_end.update(odometry, nothing).detections.labels is nothing.labels
+
+
+def test_colours_beyond_a_lane_of_orange_cones_prove_nothing() -> None:
+    """The skidpad is entered past blue cones on the right of its lane, and yellow ones on its left."""
+    x = np.arange(1.0, 12.0, 3.0)
+    lane = np.concatenate([np.column_stack([x, np.full(4, side)]) for side in (1.5, -1.5)])
+    circles = np.array([[6.0, -4.0], [7.0, -5.0], [8.0, -6.0], [6.0, 4.0], [7.0, 5.0], [8.0, 6.0]])
+    points = np.concatenate([lane, circles])
+    labels = np.array([ORANGE] * 8 + [LEFT] * 3 + [RIGHT] * 3)
+    for lane_is_orange in (True, False):
+        front_end = FrontEnd(MapperSettings(), KnownNoise(np.array([0.25, 0.12, 0.035])))
+        seen = labels if lane_is_orange else np.where(labels == ORANGE, UNKNOWN, labels)
+        notices = []
+        for k in range(6):
+            t, covariances = 0.1 * (k + 1), np.tile(0.01 * np.eye(2), (14, 1, 1))
+            cycle = Detections(t, points - [0.2 * (k + 1), 0.0], covariances, seen)
+            reading = front_end.update(Odometry(np.array([t - 0.1]), np.array([[2.0, 0.0, 0.0]])), cycle)
+            notices.append(reading.notice)
+        assert any("swapped" in notice for notice in notices) != lane_is_orange
+        assert len(reading.orange.labels) == (8 if lane_is_orange else 0)

@@ -24,7 +24,7 @@ from pathspace_graph.io.map import (
     map_to_json,
     read_map,
 )
-from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.labels import LEFT, ORANGE, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 
 
@@ -246,3 +246,14 @@ def test_what_is_no_map_at_all_is_refused(tmp_path: Path) -> None:
     (tmp_path / "map.json").write_text("[1, 2]")
     with pytest.raises(InputError, match="object"):
         read_map(tmp_path)
+
+
+def test_cones_of_no_boundary_are_read_back() -> None:
+    cones = {ORANGE: PointBoundary(np.array([[1.0, 2.0]]), 0.04 * np.eye(2))}
+    content = json.loads(json.dumps(map_to_json(replace(spline_map(), points=cones))))
+    again = map_from_json(content).points
+    np.testing.assert_array_equal(again[ORANGE].points, cones[ORANGE].points)
+    np.testing.assert_array_equal(again[ORANGE].covariance, cones[ORANGE].covariance)
+    content["points"]["left"] = content["points"].pop("orange")
+    with pytest.raises(InputError, match="expected points of orange, big_orange, found 'left'"):
+        map_from_json(content)

@@ -7,7 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import rotation
-from pathspace_graph.mapping.tentative import TentativeTracks
+from pathspace_graph.io.log import Detections
+from pathspace_graph.labels import BIG_ORANGE, ORANGE
+from pathspace_graph.mapping.tentative import OrangeCones, Sighting, TentativeTracks
 from pathspace_graph.settings.growth import GrowthSettings
 
 Array = NDArray[np.float64]
@@ -190,3 +192,66 @@ def test_a_cone_that_is_taken_back_from_a_curve_is_confirmed_and_rather_certain(
     assert found.confirmed().tolist() == [0, 1]
     np.testing.assert_allclose(found.sigmas(np.arange(2)), 0.3)
     assert found.last_t.tolist() == [3.0, 3.0]
+
+
+# --- orange cones ----------------------------------------------------------------------------------------
+
+CONES = np.array([[5.0, 1.0], [5.0, -1.0], [8.0, 0.0]])
+LABELS = np.array([BIG_ORANGE, BIG_ORANGE, ORANGE])
+
+
+def seen_from(pose: Array, cycle: int) -> Sighting:
+    """The cones as a vehicle sees them, exactly, of which it is told a standard deviation of 0.2 m."""
+    local = (CONES - pose[:2]) @ rotation(pose[2])
+    detections = Detections(0.1 * cycle, local, np.tile(0.04 * np.eye(2), (3, 1, 1)), LABELS)
+    return Sighting(cycle, pose, np.zeros(3), detections)
+
+
+def test_orange_cones_are_points_once_they_were_seen_often_enough() -> None:
+    cones = OrangeCones(SETTINGS, 0.1)
+    for cycle in range(2):
+        cones.add(seen_from(np.array([cycle, 0.0, 0.1 * cycle]), cycle), np.zeros(0))
+    assert cones.points() == {}
+    cones.add(seen_from(np.array([2.0, 0.0, 0.2]), 2), np.zeros(0))
+    found = cones.points()
+    np.testing.assert_allclose(found[BIG_ORANGE].points, CONES[:2], atol=1e-12)
+    np.testing.assert_allclose(found[ORANGE].points, CONES[2:], atol=1e-12)
+    np.testing.assert_allclose(found[ORANGE].covariance, (0.04 / 3 + 0.01) * np.eye(2), atol=1e-12)
+
+
+def test_orange_cones_are_placed_again_where_poses_were_corrected() -> None:
+    """The drive had drifted by a metre in its last two cycles, and its heading by 0.1 rad."""
+    cones, wrong = OrangeCones(SETTINGS, 0.1), np.array([0.0, 1.0, 0.1])
+    true = [np.array([cycle, 0.0, 0.0]) for cycle in range(4)]
+    for cycle, pose in enumerate(true):
+        believed = pose + wrong * (cycle >= 2)
+        sighting = seen_from(pose, cycle)
+        cones.add(Sighting(cycle, believed, sighting.twist, sighting.detections), np.zeros(0))
+    cones.place_again(2, np.array(true[2:]), np.zeros(0))
+    np.testing.assert_allclose(cones.points()[BIG_ORANGE].points, CONES[:2], atol=1e-12)
+
+
+def test_orange_cones_move_with_the_map_behind_the_vehicle() -> None:
+    cones, motion = OrangeCones(SETTINGS, 0.1), np.array([1.0, 2.0, 0.5 * np.pi])
+    for cycle in range(3):
+        cones.add(seen_from(np.zeros(3), cycle), np.zeros(0))
+    cones.move(motion)
+    np.testing.assert_allclose(cones.points()[ORANGE].points, [[1.0, 10.0]], atol=1e-12)
+    cones.place_again(7, np.zeros((0, 3)), np.zeros(0))  # their poses have moved as well
+    np.testing.assert_allclose(cones.points()[ORANGE].points, [[1.0, 10.0]], atol=1e-12)
+
+
+def test_errors_of_the_sensor_are_taken_out_of_orange_cones() -> None:
+    """Ranges are a tenth too long, to first order."""
+    cones, sensor = OrangeCones(SETTINGS, 0.1), np.array([0.0, 0.0, 0.0, 0.1, 0.0])
+    for cycle in range(3):
+        cones.add(seen_from(np.zeros(3), cycle), sensor)
+    np.testing.assert_allclose(cones.points()[ORANGE].points, [[7.2, 0.0]], atol=1e-12)
+
+
+def test_only_the_newest_sightings_of_orange_cones_are_remembered() -> None:
+    cones = OrangeCones(SETTINGS, 0.1)
+    for cycle in range(OrangeCones.MOST + 20):
+        cones.add(seen_from(np.zeros(3), cycle), np.zeros(0))
+    assert len(cones._sightings) == OrangeCones.MOST
+    assert cones._sightings[-1].cycle == OrangeCones.MOST + 19

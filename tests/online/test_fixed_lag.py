@@ -15,7 +15,7 @@ from pathspace_graph.eval.metrics.trajectory import ate
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
-from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, OutliningEstimator, VehicleEstimator, split_odometry
 from pathspace_graph.settings.front_end import SidesSettings
@@ -426,3 +426,37 @@ def test_a_setting_out_of_range_is_named() -> None:
         GrowthSettings(reach=-1.0)
     with pytest.raises(SettingsError, match=r"^lag: expected a positive number, found nan"):
         MapperSettings(lag=float("nan"))
+
+
+# --- orange cones ----------------------------------------------------------------------------------------
+
+
+def test_orange_cones_are_points_of_the_map_and_change_nothing_else() -> None:
+    cones, labels = corridor(60.0)
+    gate = np.array([[20.0, 3.0], [20.0, -3.0], [24.0, 0.0]])
+    orange = np.array([BIG_ORANGE, BIG_ORANGE, ORANGE])
+    plain = exact_log(ahead(6.0, 5.0), cones, labels)
+    both = exact_log(ahead(6.0, 5.0), np.concatenate([cones, gate]), np.append(labels, orange))
+    (known, without), (found, with_orange) = map_log(plain), map_log(both)
+    np.testing.assert_array_equal(poses_of(without), poses_of(with_orange))
+    track = found.map()
+    np.testing.assert_allclose(track.points[BIG_ORANGE].points, gate[:2], atol=0.05)
+    np.testing.assert_allclose(track.points[ORANGE].points, gate[2:], atol=0.05)
+    assert found.outline().points.keys() == track.points.keys()
+    assert known.map().points == {}
+    assert [b.size for b in known.map().boundaries.values()] == [b.size for b in track.boundaries.values()]
+
+
+def test_orange_cones_of_a_gate_stay_where_they_are_when_the_loop_closes() -> None:
+    track = bean_track()
+    start, side = track.start, np.array([-np.sin(track.start[2]), np.cos(track.start[2])])
+    along = np.array([np.cos(start[2]), np.sin(start[2])])
+    gate = start[:2] + 6.0 * along + np.outer([2.6, -2.6], side)
+    labels = np.array([BIG_ORANGE, BIG_ORANGE])
+    log = lap_log(replace(track, other=gate, other_labels=labels), overrun=25.0)
+    mapper, results = map_log(log)
+    assert results[-1].closed
+    truth = truth_of(log)
+    np.testing.assert_allclose(
+        mapper.map().points[BIG_ORANGE].points, truth.cones[truth.cone_labels == BIG_ORANGE], atol=0.1
+    )
