@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from types import MethodType
 from typing import Any, Final
 
@@ -32,19 +33,41 @@ class Recovery:
         self.failures = failures
         """Number of calls that have failed."""
         self._copy: dict[str, Any] | None = None
-        self._calls: list[Callable[[], object]] = []
+        self._calls: list[partial[Any]] = []
+        self._doubtful: int | None = None  # the first call that may be made in another way yet
 
     def before(self, estimator: object, *shared: object) -> None:
         """Make a copy of an estimator before a call where one is due; it shares itself and some objects."""
-        if self._copy is None or len(self._calls) >= self.EVERY:
+        due = len(self._calls) >= self.EVERY and self._doubtful is None
+        if self._copy is None or due:
             self._copy, self._calls = self._held(vars(estimator), estimator, shared), []
 
-    def called(self, again: Callable[[], object]) -> None:
-        """Note a call that has changed the estimator: it is made again after a copy has taken its place."""
+    def called(self, again: partial[Any], *, is_doubtful: bool = False) -> None:
+        """Note a call that has changed the estimator: it is made again after a copy has taken its place.
+
+        From a doubtful call on until the next one that is not, no copy is made, so that `undo` can make all
+        of them in another way.
+        """
+        if not is_doubtful:
+            self._doubtful = None
+        elif self._doubtful is None:
+            self._doubtful = len(self._calls)
         self._calls.append(again)
+
+    def undo(
+        self, estimator: object, *shared: object, instead: Callable[[partial[Any]], partial[Any]]
+    ) -> None:
+        """Take an estimator back to before its doubtful calls, and make these `instead`."""
+        first = len(self._calls) if self._doubtful is None else self._doubtful
+        self._calls = [*self._calls[:first], *map(instead, self._calls[first:])]
+        self._doubtful = None
+        self._go_back(estimator, *shared)
 
     def take_back(self, estimator: object, *shared: object) -> None:
         """Take an estimator back to what it was after the last call that was noted."""
+        self._go_back(estimator, *shared)
+
+    def _go_back(self, estimator: object, *shared: object) -> None:
         if self._copy is None:
             raise RuntimeError("expected a copy of the estimator, found none")
         own = self._held(self._copy, estimator, shared)  # the copy stays, for the next failure
@@ -55,7 +78,7 @@ class Recovery:
                 again()
             except Exception:  # it did not fail before: something outside has changed
                 self._calls = self._calls[:done]
-                self.take_back(estimator, *shared)
+                self._go_back(estimator, *shared)
                 return
 
     def _held(

@@ -7,7 +7,7 @@ patience.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,8 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.registration import by_motion, sigma_of_information
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.crossing import boundaries_cross, polylines_cross, sampled
 
 from .recurrence import Recurrence
 from .system import Evaluation
@@ -78,6 +80,22 @@ def evidence(at: Evaluation, detections: DetectionTable, settings: MapperSetting
         overlap=min((_driven_again(state.pose_u[b], lengths[b]) for b in lengths), default=0.0),
         sigma=_sigma_of_motion(feet, settings.closing.sigma_reading),
     )
+
+
+def objection(found: Evidence, splines: Mapping[int, BSpline], poses: Array, settings: MapperSettings) -> str:
+    """Return what speaks against a map of closed curves around the poses (P, 3) of a lap; empty for nothing.
+
+    The boundaries of a road don't cross, the vehicle crosses neither, and the detections of the lap lie on
+    them.
+    """
+    step = settings.finding.sample
+    if boundaries_cross(splines, step):
+        return "its boundaries cross"
+    if any(polylines_cross(sampled(spline, step), poses[:, :2]) for spline in splines.values()):
+        return "the vehicle would have crossed a boundary"
+    if found.used < settings.batch.closure.used:
+        return f"only {found.used:.0%} of the detections lie on its boundaries".replace("%", " %")
+    return ""
 
 
 def is_true_closure(found: Evidence, settings: MapperSettings) -> bool:

@@ -32,7 +32,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 
 from .association import add_drive, associate, find_anywhere, locate_poses
-from .closure import evidence, is_true_closure
+from .closure import evidence, is_true_closure, objection
 from .dead_reckoning import start_odometry
 from .gauge import curve_gauge
 from .knots import boundary_of
@@ -103,6 +103,8 @@ class LapMarginal:
     """For each boundary, the cones that were detected are at these parameters (k,) of its curve (m)."""
     seconds: float
     """The solution took this wall time (s)."""
+    objection: str = ""
+    """What speaks against the map; empty where nothing does."""
 
 
 def solve_lap(lap: OpenLap) -> LapMarginal | None:
@@ -114,9 +116,8 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
     with threadpool_limits(limits=1):
         system, at, convergence = lap_optimum(lap)
         settings, detections = system.settings, system.detections
-        if isinstance(lap.start, Recurrence) and not is_true_closure(
-            evidence(at, detections, settings), settings
-        ):
+        found = evidence(at, detections, settings)
+        if isinstance(lap.start, Recurrence) and not is_true_closure(found, settings):
             return None
         few, change = simplified(at.state, detections, settings)
         information, mean = marginal_of(system, at, few, change, lap.first_kept)
@@ -135,6 +136,7 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
             scatter={label: scatter.sigma(label, b.abscissae) for label, b in few.boundaries.items()},
             cones=scatter.places,
             seconds=time.perf_counter() - begin,
+            objection=objection(found, few.splines, at.state.poses, settings),
         )
 
 

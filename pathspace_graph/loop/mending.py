@@ -19,9 +19,9 @@ from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import along_and_across
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.crossing import sampled
 
 from .contradictions import Contradictions, Stretch
-from .crossing import sampled
 from .finding import KnownLoop
 
 Array = NDArray[np.float64]

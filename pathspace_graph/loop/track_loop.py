@@ -19,9 +19,9 @@ from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import doubt_calibrations
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.crossing import boundaries_cross
 
 from .association import Gating
-from .crossing import boundaries_cross
 from .drive_record import LATE, DriveRecord, LapBatch
 from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
 from .gauge import hold_gauge
@@ -43,6 +43,10 @@ REST = 10.0
 
 LEARNED = "the drive contradicts the calibration, which is learned"
 """Notice of the cycle in which the priors of the calibrations are first doubted."""
+
+
+class LoopRefusedError(Exception):
+    """The batch of a lap speaks against its closing; `FixedLagMapper.update` takes the closing back."""
 
 
 class TrackLoop:
@@ -77,6 +81,11 @@ class TrackLoop:
         self._closing_tried = 0.0
         self._loop_tried, self._recognition_tried = 0.0, 0.0
         self._resumes = 0.0
+
+    @property
+    def is_hypothesis(self) -> bool:
+        """Returns whether the loop has closed, and the batch of its lap has not confirmed that yet."""
+        return self.closed and self._lap_batch is not None and self._settled is None
 
     @property
     def is_searching(self) -> bool:
@@ -239,6 +248,10 @@ class TrackLoop:
             return None, f"{OWN_PRIOR}: {marginal}" if self.closed and not mends else ""
         if mends and (not notice or self._crosses(marginal.splines) > self._boundaries_cross):
             return None, ""
+        if marginal.objection and not mends:
+            if self.closed:
+                raise LoopRefusedError(marginal.objection)
+            return None, f"the loop stays open: {marginal.objection}"
         if not self.closed:
             self._closes()
         self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds

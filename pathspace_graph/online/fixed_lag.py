@@ -25,7 +25,7 @@ from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.association import associate, associate_late
 from pathspace_graph.loop.closing import apply_correspondences, optimize_loop, simplify
-from pathspace_graph.loop.track_loop import TrackLoop
+from pathspace_graph.loop.track_loop import LoopRefusedError, TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import (
@@ -52,6 +52,11 @@ class Solver(Protocol):
 
     def step(self, smoother: CurveSmoother, sigma_step: float) -> None:
         """Moves the smoother's variables to the estimate, and leaves its `last_step` for gating."""
+
+
+def careful(process: partial[CycleResult]) -> partial[CycleResult]:
+    """Returns the call that processes the same cycle and leaves the loop as it is."""
+    return partial(process.func, *process.args, careful=True)
 
 
 @at_scale
@@ -136,10 +141,17 @@ class FixedLagMapper(MapperEstimate):
             cycle = replace(cycle, odometry=unused.followed_by(cycle.odometry))
         again = partial(self._process, cycle, factors)
         try:
-            result = again()
+            try:
+                result = again()
+            except LoopRefusedError as refusal:
+                again = careful(again)
+                self.recovery.undo(self, self.front_end.gate, instead=careful)
+                result = again()
+                notice = f"the loop is open again: {refusal}"
+                result = replace(result, notice="; ".join(filter(None, (notice, result.notice))))
         except Exception as error:  # a vehicle drives on, whatever has failed
             return cycle.counted(self._without(cycle, factors, error))
-        self.recovery.called(again)
+        self.recovery.called(again, is_doubtful=self.loop.is_hypothesis)
         self._unused = unused if cycle.late else None
         return cycle.counted(result)
 

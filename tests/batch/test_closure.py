@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.closure import Evidence, evidence, is_true_closure, is_worth_trying
+from pathspace_graph.batch.closure import Evidence, evidence, is_true_closure, is_worth_trying, objection
 from pathspace_graph.batch.dead_reckoning import start_odometry
 from pathspace_graph.batch.mapper import (
     BatchMapper,
@@ -22,8 +22,10 @@ from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
 from pathspace_graph.batch.system import BatchSystem, Biweight
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.io.log import Log
+from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.bspline import BSpline
 
 from ..scenes.batch import COURSE, course_log
 from ..scenes.drives import noisy
@@ -120,3 +122,39 @@ def test_a_denied_recurrence_gives_open_curves() -> None:
     at.begin(state)
     assert not any(boundary.periodic for boundary in state.boundaries.values())
     assert not evidence(at.evaluate(state), detections, SETTINGS).closed
+
+
+# --- what speaks against a closing -----------------------------------------------------------------------
+
+
+def ring(radius: float, centre: float = 0.0) -> BSpline:
+    """A closed curve about a circle around (centre, 0)."""
+    phi = np.arange(12) * np.pi / 6.0
+    points = radius * np.column_stack([np.cos(phi), np.sin(phi)]) + [centre, 0.0]
+    return BSpline(np.arange(-3.0, 16.0), np.concatenate([points, points[:3]]), 3, True)
+
+
+def circle(radius: float, centre: float = 0.0) -> Array:
+    """Poses once around."""
+    phi = np.linspace(0.0, 2.0 * np.pi, 60)
+    return np.column_stack([centre + radius * np.cos(phi), radius * np.sin(phi), phi + 0.5 * np.pi])
+
+
+def test_nothing_speaks_against_a_road_around_its_drive() -> None:
+    assert objection(BELIEVED, {LEFT: ring(18.0), RIGHT: ring(24.0)}, circle(20.0), SETTINGS) == ""
+
+
+def test_boundaries_that_cross_are_no_road() -> None:
+    against = objection(BELIEVED, {LEFT: ring(18.0), RIGHT: ring(24.0, 8.0)}, circle(15.0), SETTINGS)
+    assert against == "its boundaries cross"
+
+
+def test_a_vehicle_crosses_no_boundary() -> None:
+    against = objection(BELIEVED, {LEFT: ring(18.0), RIGHT: ring(24.0)}, circle(20.0, 4.0), SETTINGS)
+    assert against == "the vehicle would have crossed a boundary"
+
+
+def test_the_detections_of_a_lap_lie_on_its_boundaries() -> None:
+    few = replace(BELIEVED, used=0.62)
+    against = objection(few, {LEFT: ring(18.0), RIGHT: ring(24.0)}, circle(20.0), SETTINGS)
+    assert against == "only 62 % of the detections lie on its boundaries"

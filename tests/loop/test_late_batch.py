@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.io.log import Log
+from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
 from pathspace_graph.loop import drive_record
 from pathspace_graph.loop.mending import MENDED
@@ -293,3 +294,59 @@ def test_a_late_batch_is_sent_again_by_a_restored_mapper(
         assert mapper.update(*cycle).notice == restored.update(*cycle).notice == ""
     assert mapper.batches().ends == restored.batches().ends == (batch.due + 3,)  # type: ignore[union-attr]
     assert digest(restored) == digest(mapper)
+
+
+# --- a closing that its lap speaks against ---------------------------------------------------------------
+
+
+def test_a_closing_that_the_lap_speaks_against_is_taken_back(sent: list[Slow]) -> None:
+    """The mapper goes on as one that never closed there, and closes some metres later."""
+    mapper, notices, closed = FixedLagMapper(None, log().odometry_sigma), list[str](), list[bool]()
+    for odometry, detections in split_odometry(log()):
+        for batch in sent:
+            if not batch.done():
+                marginal = solve_lap(batch.lap)
+                assert marginal is not None
+                refused = replace(marginal, objection="its boundaries cross")
+                batch.set_result(refused if batch is sent[0] else marginal)
+        result = mapper.update(odometry, detections)
+        notices.append(result.notice)
+        closed.append(result.closed)
+    again = notices.index("the loop is open again: its boundaries cross")
+    first = closed.index(True)
+    assert first < again
+    assert closed[again - 1]
+    assert not closed[again]
+    assert mapper.closed
+    assert len(sent) == 2
+    assert mapper.recovery.failures == 0
+    sent.clear()
+    known = with_settings()
+    drive(known, sent, 0, log())
+    for label, boundary in known.map().boundaries.items():
+        own = mapper.map().boundaries[label]
+        assert isinstance(own, SplineBoundary)
+        assert isinstance(boundary, SplineBoundary)
+        assert own.spline.length() == pytest.approx(boundary.spline.length(), rel=0.01)
+
+
+def test_what_is_taken_back_is_as_if_it_had_not_been_closed(sent: list[Slow]) -> None:
+    """Up to the refusal, a mapper that may not close at all is the same to the last bit."""
+    cycles = [*split_odometry(log())]
+    mapper, careful = (FixedLagMapper(None, log().odometry_sigma) for _ in range(2))
+    first = None
+    for k, (odometry, detections) in enumerate(cycles):
+        if sent and not sent[0].done():
+            marginal = solve_lap(sent[0].lap)
+            assert marginal is not None
+            sent[0].set_result(replace(marginal, objection="its boundaries cross"))
+        result = mapper.update(odometry, detections)
+        first = k if first is None and result.closed else first
+        if "open again" in result.notice:
+            break
+    for j, (odometry, detections) in enumerate(cycles[: k + 1]):
+        if first is not None and j >= first:
+            careful.loop.pause()
+        careful.update(odometry, detections)
+    assert not careful.closed
+    assert digest(careful) == digest(mapper)

@@ -14,7 +14,6 @@ from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.contradictions import Stretch
-from pathspace_graph.loop.crossing import sampled
 from pathspace_graph.loop.finding import KnownLoop
 from pathspace_graph.loop.mending import MENDED, carried, led_through, newest_lap
 from pathspace_graph.loop.track_loop import TrackLoop
@@ -25,6 +24,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.faults import Faults, SensorFaults
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
+from pathspace_graph.spline.crossing import sampled
 
 from ..scenes.drives import map_log, true_poses
 from ..scenes.holes import cluttered, unseen

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.crossing import boundaries_cross, polylines_cross, sampled
 from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.crossing import boundaries_cross, polylines_cross, sampled
 
 Array = NDArray[np.float64]
 
