@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 POSE: Final = (1, 1, 0)
 """Powers of the length in a pose, or in a twist."""
-_METRES: Final = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?(?:e[+-]?\d+)?)(?= m\b)")
+_METRES: Final = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?(?:e[+-]?\d+)?)(?=(?: to [\d.e+-]+)? m\b)")
 
 
 def scaled(one: T, factor: float) -> T:

@@ -70,6 +70,14 @@ def noise_at(noise: Array | KnownNoise | None, scale: float) -> Array | KnownNoi
     return np.asarray(times(np.asarray(noise, float), POSE, 1.0 / scale))
 
 
+def in_scene(error: ReadingError, scale: float) -> ReadingError:
+    """Return an error of a cycle at scale 1 with the lengths of the scene."""
+    expected, found = times(error.expected, 1, scale), error.found
+    if expected != error.expected and isinstance(found, float):
+        found = found * scale
+    return type(error)(error.field, expected, found, error.row, error.t)
+
+
 def at_scale(estimator: C) -> C:
     """Let an online estimator map scenes of any size.
 
@@ -93,7 +101,10 @@ def at_scale(estimator: C) -> C:
     @wraps(step)
     def update(self: Any, odometry: Odometry, detections: Detections, *factors: Any, **named: Any) -> Any:
         door: FrontDoor = self._door
-        result = step(self, *door.inwards(odometry, detections), *factors, **named)
+        try:
+            result = step(self, *door.inwards(odometry, detections), *factors, **named)
+        except ReadingError as error:
+            raise in_scene(error, door.scene.value) from None
         if any(factors) or any(named.values()):
             door.scene.is_final = True  # the user's factors have lengths of this scale
         if door.see(odometry, detections):

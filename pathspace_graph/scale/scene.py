@@ -21,6 +21,8 @@ SCALES: Final = (0.1, 0.3, 1.0, 3.0, 10.0)
 """A scale is one of these: what is within a factor of 1.7 of one is mapped as well with it."""
 NEAREST: Final = 5
 """This number of cones of each side, the nearest ones, tell the scale."""
+FEWEST: Final = 3
+"""A cycle tells it where it has this number of cones of each side."""
 SAME: Final = 3.0
 """Two detections nearer to each other than this number of sigmas are of one cone."""
 FARTHEST: Final = 1e4
@@ -63,7 +65,7 @@ class SceneScale:
             self._driven = 0.0
             self._counted += 1
             self._gaps.append(gap)
-            self._widths += [] if np.isnan(width) else [width]
+            self._widths.append(width)
             if self._counted in JUDGED:
                 self.value = _nearest(self._widths, self._gaps)
         self.is_final = self._counted >= JUDGED[-1] or self._cycles >= PATIENCE
@@ -92,13 +94,12 @@ def width_and_gap(detections: Detections) -> tuple[float, float]:
         sides = labels
     covariances = detections.covariances[usable]
     rows = [_nearest_cones(points[sides == s], covariances[sides == s]) for s in (LEFT, RIGHT)]
-    nearest = [np.asarray(KDTree(row).query(row, k=2)[0])[:, 1] for row in rows if len(row) > 2]
-    gap = float(np.mean([np.median(gaps) for gaps in nearest])) if nearest else np.nan
+    if min(map(len, rows)) < FEWEST:
+        return np.nan, np.nan
+    nearest = [np.asarray(KDTree(row).query(row, k=2)[0])[:, 1] for row in rows]
     left, right = rows
-    if not len(left) or not len(right):
-        return np.nan, gap
     across = np.append(KDTree(right).query(left)[0], KDTree(left).query(right)[0])
-    return float(np.median(across)), gap
+    return float(np.median(across)), float(np.mean([np.median(gaps) for gaps in nearest]))
 
 
 def _nearest_cones(points: Array, covariances: Array) -> Array:

@@ -157,6 +157,8 @@ def test_each_number_changes_by_its_own_power() -> None:
 def test_a_text_has_metres_of_the_scene() -> None:
     said = CycleResult(0.0, np.zeros(3), (0, 0), 0, False, notice="12 control points on 34 m, at 3 m/s")
     assert scaled(said, 10.0).notice == "12 control points on 340 m, at 30 m/s"
+    far = scaled(replace(said, notice="expected a distance from 0.01 to 300 m, found 7"), 0.1)
+    assert far.notice == "expected a distance from 0.001 to 30 m, found 7"
     assert scaled(Health("lost", "the position is uncertain by 0.5 m"), 0.1).reason.endswith("by 0.05 m")
 
 
@@ -302,6 +304,13 @@ def test_no_detections_break_the_search_for_a_scale(seed: int, strange: float) -
         cycle = Detections(0.1 * (k + 1), points, covariances, rng.integers(0, 3, 12))
         result = mapper.update(Odometry(np.array([0.1 * k]), np.array([[5.0, 0.0, 0.1]])), cycle)
         assert np.isfinite(result.pose).all()
+
+
+def test_a_refusal_has_the_lengths_of_the_scene() -> None:
+    mapper = FixedLagMapper(MapperSettings(scale=0.1), ODOMETRY_SIGMA)
+    fast = Odometry(np.array([0.0]), np.array([[12.0, 0.0, 0.0]]))
+    with pytest.raises(ReadingError, match=r"vx from -10 to 10 m/s, found 12"):
+        mapper.update(fast, replace(road(0.3, 0.3), t=0.1))
 
 
 # --- metrics ---------------------------------------------------------------------------------------------
