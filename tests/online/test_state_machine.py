@@ -25,6 +25,7 @@ from pathspace_graph.factors.se2 import compose, se2_exp
 from pathspace_graph.graph.keys import pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.labels import NAMES
 from pathspace_graph.landmark.ckf import LandmarkCkf
 from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.loop.track_loop import TrackLoop
@@ -268,7 +269,7 @@ class Cycles(RuleBasedStateMachine):
             "points": (odometry, replace(two, points_vehicle=np.ones((2, 3)))),
             "covariances": (odometry, replace(two, covariances=np.ones((2, 2)))),
             "labels": (odometry, replace(two, labels=np.array([0, 1, 1]))),
-            "label": (odometry, replace(two, labels=np.array([0, 3]))),
+            "label": (odometry, replace(two, labels=np.array([0, len(NAMES)]))),
             "words": (odometry, replace(two, labels=np.array(["left", "right"]))),
             "twists": (replace(odometry, twist=odometry.twist[:, :2]), two),
             "none": (None, two),
