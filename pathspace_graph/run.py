@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunNoise, RunResult, VehicleState
-from pathspace_graph.lengths import POSE, scaled
+from pathspace_graph.lengths import POSE, times
 
 from .health import Health
 from .labels import LEFT, RIGHT
@@ -351,7 +351,7 @@ class _Run:
         self._waited += timed_wait(self._estimator)
         result, seconds = timed_update(self._estimator, odometry, detections)
         lap_before = self._laps.lap
-        lap = self._laps.update(scaled(result, 1.0 / scale(self._estimator)).pose)
+        lap = self._laps.update(times(np.asarray(result.pose), POSE, 1.0 / scale(self._estimator)))
         if lap > lap_before:
             self._lap_maps.append((lap_before, self._estimator.map()))
         self._poses.append(np.array(result.pose, dtype=float))

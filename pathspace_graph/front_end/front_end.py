@@ -98,8 +98,9 @@ class FrontEnd:
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Returns the judged readings of a cycle: the twists since the last one, and its detections."""
         noise, twist = self.noise, odometry.twist[-1] if len(odometry.t) else np.zeros(3)
-        orange, in_lane = detections.where(is_orange(detections)), is_in_orange_lane(detections)
-        detections = detections.where(~is_orange(detections))
+        of_orange = is_orange(detections)
+        in_lane = is_in_orange_lane(detections, of_orange)
+        orange, detections = detections.where(of_orange), detections.where(~of_orange)
         checked = noise.for_check(detections, twist)
         motion = self._motion.update(odometry, checked, may_doubt=noise.is_settled)
         sides = self._sides
@@ -179,10 +180,10 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
     return JudgedLog(chain, cycles, orange, settings, front_end.noise_used)
 
 
-def is_in_orange_lane(detections: Detections) -> bool:
+def is_in_orange_lane(detections: Detections, of_orange: BoolArray) -> bool:
     """Return whether the nearest cones are orange: the vehicle comes to a track, or is at a gate."""
     nearest = np.argsort(np.hypot(*detections.points_vehicle.T), kind="stable")[:NEAREST]
-    return len(nearest) == NEAREST and bool(is_orange(detections)[nearest].all())
+    return len(nearest) == NEAREST and bool(of_orange[nearest].all())
 
 
 def is_orange(detections: Detections) -> BoolArray:

@@ -189,12 +189,16 @@ class OrangeCones:
             self._sightings = [*self._sightings[1 - self.MOST :], sighting]
             self._place(sighting, sensor)
 
-    def place_again(self, first: int, poses: Array, sensor: Array) -> None:
-        """Place all detections anew where the poses (P, 3) of the cycles from `first` on are better known."""
+    def place_again(self, sensor: Array, *known: tuple[int, Array]) -> None:
+        """Place all detections anew by poses that are better known: a first cycle, and poses (P, 3) from it on.
+
+        Where several have a cycle, the last one counts.
+        """
         self._tracks = {}
         for k, one in enumerate(self._sightings):
-            if first <= one.cycle < first + len(poses):
-                self._sightings[k] = replace(one, pose=poses[one.cycle - first].copy())
+            for first, poses in known:
+                if first <= one.cycle < first + len(poses):
+                    self._sightings[k] = replace(one, pose=poses[one.cycle - first].copy())
             self._place(self._sightings[k], sensor)
 
     def move(self, motion: Array) -> None:

@@ -300,8 +300,8 @@ class FixedLagMapper(MapperEstimate):
 
     def _place_orange_again(self) -> None:
         """Places orange cones by the poses that the batch of the lap has corrected, and by the window's."""
-        self.orange.place_again(0, self.corrected_poses, self._sensor)
-        self.orange.place_again(self.smoother.first_cycle, self.poses, self._sensor)
+        window = self.smoother.first_cycle, self.poses
+        self.orange.place_again(self._sensor, (0, self.corrected_poses), window)
 
     def _classify(self, reading: Reading) -> None:
         """Associates detections with the curves; those that no curve uses become tentative tracks."""

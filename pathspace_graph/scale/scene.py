@@ -89,9 +89,7 @@ def width_and_gap(detections: Detections) -> tuple[float, float]:
     """
     usable = (np.abs(detections.points_vehicle) < FARTHEST).all(axis=1)  # the gate drops the others
     points, labels = detections.points_vehicle[usable], detections.labels[usable]
-    sides = np.where(labels == UNKNOWN, np.where(points[:, 1] > 0.0, LEFT, RIGHT), labels)
-    if (labels != UNKNOWN).any():
-        sides = labels
+    sides = labels if (labels != UNKNOWN).any() else np.where(points[:, 1] > 0.0, LEFT, RIGHT)
     covariances = detections.covariances[usable]
     rows = [_nearest_cones(points[sides == s], covariances[sides == s]) for s in (LEFT, RIGHT)]
     if min(map(len, rows)) < FEWEST:

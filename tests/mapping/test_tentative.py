@@ -227,7 +227,7 @@ def test_orange_cones_are_placed_again_where_poses_were_corrected() -> None:
         believed = pose + wrong * (cycle >= 2)
         sighting = seen_from(pose, cycle)
         cones.add(Sighting(cycle, believed, sighting.twist, sighting.detections), np.zeros(0))
-    cones.place_again(2, np.array(true[2:]), np.zeros(0))
+    cones.place_again(np.zeros(0), (2, np.array(true[2:])))
     np.testing.assert_allclose(cones.points()[BIG_ORANGE].points, CONES[:2], atol=1e-12)
 
 
@@ -237,7 +237,7 @@ def test_orange_cones_move_with_the_map_behind_the_vehicle() -> None:
         cones.add(seen_from(np.zeros(3), cycle), np.zeros(0))
     cones.move(motion)
     np.testing.assert_allclose(cones.points()[ORANGE].points, [[1.0, 10.0]], atol=1e-12)
-    cones.place_again(7, np.zeros((0, 3)), np.zeros(0))  # their poses have moved as well
+    cones.place_again(np.zeros(0), (7, np.zeros((0, 3))))  # their poses have moved as well
     np.testing.assert_allclose(cones.points()[ORANGE].points, [[1.0, 10.0]], atol=1e-12)
 
 
