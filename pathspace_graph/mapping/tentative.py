@@ -190,7 +190,7 @@ class OrangeCones:
             self._place(sighting, sensor)
 
     def place_again(self, sensor: Array, *known: tuple[int, Array]) -> None:
-        """Place all detections anew by poses that are better known: a first cycle, and poses (P, 3) from it on.
+        """Place all detections anew by better known poses: a first cycle, and poses (P, 3) from it on.
 
         Where several have a cycle, the last one counts.
         """
