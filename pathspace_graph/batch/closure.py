@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.labels import BOUNDARIES
@@ -24,6 +26,11 @@ from pathspace_graph.spline.crossing import boundaries_cross, polylines_cross, s
 
 from .recurrence import Recurrence
 from .system import Evaluation
+
+WIDER: Final = 2.5
+"""No point of a boundary is farther from the road driven than this number of times its distance beside it."""
+MOSTLY: Final = 95.0
+"""Percentile of the poses' distances: the drive may begin or end off the track."""
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -85,14 +92,19 @@ def evidence(at: Evaluation, detections: DetectionTable, settings: MapperSetting
 def objection(found: Evidence, splines: Mapping[int, BSpline], poses: Array, settings: MapperSettings) -> str:
     """Return what speaks against a map of closed curves around the poses (P, 3) of a lap; empty for nothing.
 
-    The boundaries of a road don't cross, the vehicle crosses neither, and the detections of the lap lie on
-    them.
+    The boundaries of a road don't cross, the vehicle crosses neither and has driven beside all of both, and
+    the detections of the lap lie on them.
     """
-    step = settings.finding.sample
+    step, driven = settings.finding.sample, poses[:, :2]
     if boundaries_cross(splines, step):
         return "its boundaries cross"
-    if any(polylines_cross(sampled(spline, step), poses[:, :2]) for spline in splines.values()):
-        return "the vehicle would have crossed a boundary"
+    for curve in (sampled(spline, step) for spline in splines.values()):
+        if polylines_cross(curve, driven):
+            return "the vehicle would have crossed a boundary"
+        aside = float(np.percentile(KDTree(curve).query(driven)[0], MOSTLY))
+        wider = float(KDTree(driven).query(curve)[0].max()) / aside
+        if wider > WIDER:
+            return f"a boundary would be {wider:.1f} times as far from the drive as it is beside it"
     if found.used < settings.batch.closure.used:
         return f"only {found.used:.0%} of the detections lie on its boundaries".replace("%", " %")
     return ""

@@ -154,6 +154,15 @@ def test_a_vehicle_crosses_no_boundary() -> None:
     assert against == "the vehicle would have crossed a boundary"
 
 
+def test_a_vehicle_has_driven_beside_all_of_a_boundary() -> None:
+    """A quarter of the circle was never driven: the curves only bridge it."""
+    driven = circle(20.0)[:45]
+    against = objection(BELIEVED, {LEFT: ring(18.0), RIGHT: ring(24.0)}, driven, SETTINGS)
+    assert against.startswith("a boundary would be ") and against.endswith(
+        " as far from the drive as it is beside it"
+    )
+
+
 def test_the_detections_of_a_lap_lie_on_its_boundaries() -> None:
     few = replace(BELIEVED, used=0.62)
     against = objection(few, {LEFT: ring(18.0), RIGHT: ring(24.0)}, circle(20.0), SETTINGS)
