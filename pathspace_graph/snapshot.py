@@ -1,9 +1,10 @@
 """Snapshots: a whole estimator as one file, from which it goes on as if it had never stopped.
 
-The file is an uncompressed NumPy archive (.npz) of two arrays of bytes: `structure`, JSON in UTF-8, and
-`numbers`, the memory of all arrays. The structure has the `format`, the `classes`, each as [name, layout,
-names of the attributes], the `nodes`, one for each object, and the `root`. A value is null, a boolean, a
-number or a text as in JSON, [7] for node 7, or ["nan"], ["inf"], ["-inf"]. A node is one of
+The file is a NumPy archive (.npz) of two arrays of bytes: `structure`, JSON in UTF-8, and `numbers`, the
+memory of all arrays. Its comment is the SHA-256 of all before, which is verified first. The structure has the
+`format`, the `classes`, each as [name, layout, names of the attributes], the `nodes`, one for each object, and
+the `root`. A value is null, a boolean, a number or a text as in JSON, [7] for node 7, or ["nan"], ["inf"],
+["-inf"]. A node is one of
 
     ["object", class, value, ...]      by the class's number, the attributes in its order
     ["array", dtype, shape, strides, offset in the numbers, writeable]
@@ -26,12 +27,13 @@ from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import fields, is_dataclass
 from functools import cache, cached_property
+from hashlib import sha256
 from inspect import unwrap
 from io import BytesIO
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final, TypeVar
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import gtsam
 import numpy as np
@@ -66,6 +68,7 @@ FORMAT_ERRORS: Final = (
 """Raised where a file does not fit together; `RecursionError` and `UnicodeError` are among them."""
 _DTYPES: Final = ("<f8", "<i8", "|b1", "<i4", "<u8", "|u1", "|i1")
 _ALIGNMENT: Final = 64
+_DIGEST_SIZE: Final = 64
 _FLOATS: Final = ("nan", "inf", "-inf")
 
 
@@ -98,20 +101,30 @@ def restore(path: Path | str, kind: type[E], check: Callable[[E], object]) -> E:
 def write(path: Path | str, structure: Structure, numbers: Bytes) -> None:
     """Write a structure and the memory of its arrays; an earlier file is kept as a backup."""
     text = json.dumps({"format": FORMAT, **structure}, allow_nan=False, separators=(",", ":")).encode()
-    with atomic_file(path) as temporary, temporary.open("wb") as stream:
-        np.savez(stream, structure=np.frombuffer(text, np.uint8), numbers=numbers)
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(archive(text, numbers))
+
+
+def archive(text: bytes, numbers: Bytes) -> bytes:
+    """Return the content of a file; its comment, which is its end, is the SHA-256 of all before."""
+    stream = BytesIO()
+    np.savez(stream, structure=np.frombuffer(text, np.uint8), numbers=numbers)
+    with ZipFile(stream, "a") as zipped:
+        zipped.comment = bytes(_DIGEST_SIZE)
+    content = stream.getvalue()[:-_DIGEST_SIZE]
+    return content + sha256(content).hexdigest().encode()
 
 
 def read(file: Path) -> tuple[Structure, Bytes]:
-    """Return structure and numbers of a file that agrees with its checksums; an InputError otherwise."""
+    """Return structure and numbers of a file; an InputError where it is not as it was written."""
     whole = read_bytes(file, "a snapshot")
     if whole.startswith(b"pathspace-snapshot/"):
         raise InputError(file, f"expected {FORMAT}, found {shown(whole[:20].decode(errors='replace'))}")
     try:
-        with np.load(BytesIO(whole), allow_pickle=False) as archive:
-            if any(member.compress_type for member in archive.zip.infolist()) or archive.zip.testzip():
-                raise ValueError
-            text, numbers = archive["structure"].tobytes().decode(), archive["numbers"]
+        if sha256(whole[:-_DIGEST_SIZE]).hexdigest().encode() != whole[-_DIGEST_SIZE:]:
+            raise ValueError
+        with np.load(BytesIO(whole), allow_pickle=False) as members:
+            text, numbers = members["structure"].tobytes().decode(), members["numbers"]
     except FORMAT_ERRORS:
         raise InputError(file, "expected a snapshot as it was written, found another content") from None
     structure = parse_json(text, file)

@@ -6,7 +6,6 @@ Bytes before the first section are the content of the target's first file. The r
 
 from __future__ import annotations
 
-import io
 import json
 import re
 from collections.abc import Callable, Mapping
@@ -23,7 +22,7 @@ from pathspace_graph.io.map import read_map
 from pathspace_graph.io.trajectory import read_trajectory
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.sim.track_files import read_track
-from pathspace_graph.snapshot import FORMAT
+from pathspace_graph.snapshot import FORMAT, archive
 
 SECTION = re.compile(rb"(?:\A|(?<=\n))=== ([a-z_]+\.[a-z]+)\n")
 
@@ -63,21 +62,19 @@ def read_tracks(folder: Path) -> None:
 
 
 def read_snapshots(folder: Path) -> None:
-    """Reads a snapshot as it is, or of a structure and numbers, with the checksums that belong to them."""
+    """Reads a snapshot as it is, or of a structure and numbers, with the digest that belongs to them."""
     structure = folder / "structure.json"
     if structure.exists():
-        text, numbers = structure.read_bytes(), (folder / "numbers.bin").read_bytes()
-        (folder / "mapper.snap").write_bytes(archive(text, numbers))
+        text, numbers = structure.read_bytes(), np.fromfile(folder / "numbers.bin", np.uint8)
+        (folder / "mapper.snap").write_bytes(archive(with_format(text), numbers))
     FixedLagMapper.restore(folder / "mapper.snap")
 
 
-def archive(text: bytes, numbers: bytes) -> bytes:
-    """The content of a snapshot of this structure, which is given the format unless it has another."""
+def with_format(text: bytes) -> bytes:
+    """The structure with the format of now, unless it has another."""
     with suppress(ValueError, TypeError, RecursionError):  # no structure at all is an input as well
-        text = json.dumps({"format": FORMAT, **json.loads(text)}).encode()
-    file = io.BytesIO()
-    np.savez(file, structure=np.frombuffer(text, np.uint8), numbers=np.frombuffer(numbers, np.uint8))
-    return file.getvalue()
+        return json.dumps({"format": FORMAT, **json.loads(text)}).encode()
+    return text
 
 
 LOG = {
