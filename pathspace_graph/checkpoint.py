@@ -16,11 +16,9 @@ from typing import Any, Final
 import gtsam
 import numpy as np
 
-_GRAPHS: Final = (gtsam.GaussianFactorGraph, gtsam.GaussianBayesNet)
-"""Factors are added to these in place."""
-_SHARED, _ARRAY, _SEQUENCE, _MAPPING, _GRAPH, _METHOD, _OBJECT = range(7)
-_KINDS: Final[dict[type, int]] = {}
-"""How instances of each type that was met are copied."""
+Memo = dict[int, Any]
+"""Copies by the `id` of what they are copies of."""
+Copier = Callable[[Any, Memo], Any]
 
 
 class Recovery:
@@ -70,9 +68,9 @@ class Recovery:
     def _go_back(self, estimator: object, *shared: object) -> None:
         if self._copy is None:
             raise RuntimeError("expected a copy of the estimator, found none")
-        own = self._held(self._copy, estimator, shared)  # the copy stays, for the next failure
+        attributes = self._held(self._copy, estimator, shared)  # the copy stays, for the next failure
         vars(estimator).clear()
-        vars(estimator).update(own)
+        vars(estimator).update(attributes)
         for done, again in enumerate(self._calls):
             try:
                 again()
@@ -88,88 +86,57 @@ class Recovery:
         return {name: copied(own, memo) for name, own in attributes.items()}
 
 
-def copied(value: Any, memo: dict[int, Any]) -> Any:
-    """Return a copy of a value; what is held twice is held twice in the copy.
-
-    `memo` has the copies by the `id` of what they are copies of.
-    """
-    kind = kind_of(value)
-    if kind == _SHARED:
+def copied(value: Any, memo: Memo) -> Any:
+    """Return a copy of a value; what is held twice is held twice in the copy."""
+    copier = _copier_of(value)
+    if copier is None:
         return value
     found = memo.get(id(value))
-    if found is not None:
-        return found
-    if kind == _ARRAY:
-        found = _array(value, memo)
-    elif kind == _SEQUENCE:
-        found = _sequence(value, memo)
-    elif kind == _MAPPING:
-        found = memo[id(value)] = value.copy()
-        for key, own in value.items():
-            found[key] = copied(own, memo)
-    elif kind == _GRAPH:
-        found = type(value)()
-        for i in range(value.size()):
-            found.push_back(value.at(i))
-    elif kind == _METHOD:
-        found = MethodType(value.__func__, copied(value.__self__, memo))
-    else:
-        found = memo[id(value)] = object.__new__(type(value))
-        for name, own in vars(value).items():
-            object.__setattr__(found, name, copied(own, memo))
-    memo[id(value)] = found
+    if found is None:
+        found = memo[id(value)] = copier(value, memo)
     return found
-
-
-def kind_of(value: object) -> int:
-    """Return how a value is copied; a frozen dataclass is shared unless it holds what may change."""
-    kind = _KINDS.get(type(value))
-    if kind is None:
-        kind = _KINDS[type(value)] = _kind(type(value))
-        if kind == _SHARED and hasattr(type(value), "__dataclass_params__"):
-            held = [own for own in vars(value).values() if type(own) is not np.ndarray]
-            kind = _KINDS[type(value)] = _SHARED if all(map(is_shared, held)) else _OBJECT
-    return kind
 
 
 def is_shared(value: object) -> bool:
     """Return whether copies share a value."""
-    if isinstance(value, tuple):
-        return all(map(is_shared, value))
-    return kind_of(value) == _SHARED
+    return all(map(is_shared, value)) if isinstance(value, tuple) else _copier_of(value) is None
 
 
-def _kind(type_: type) -> int:
-    if type_ is np.ndarray:
-        return _ARRAY
-    if type_ in _GRAPHS:
-        return _GRAPH
-    if issubclass(type_, (list, tuple, set, deque)):
-        return _SEQUENCE
-    if issubclass(type_, dict):
-        return _MAPPING
-    if type_ is MethodType:
-        return _METHOD
-    parameters = getattr(type_, "__dataclass_params__", None)
-    is_frozen = (parameters is not None and parameters.frozen) or getattr(type_, "constant", False)
-    return _OBJECT if type_.__module__.startswith(f"{__package__}.") and not is_frozen else _SHARED
+def _copier_of(value: object) -> Copier | None:
+    """Return how a value is copied; a frozen dataclass is shared unless it holds what may change."""
+    kind = type(value)
+    if kind not in _COPIERS:
+        copier = _COPIERS[kind] = _copier(kind)
+        if copier is None and hasattr(kind, "__dataclass_params__"):
+            held = [own for own in vars(value).values() if type(own) is not np.ndarray]
+            _COPIERS[kind] = None if all(map(is_shared, held)) else _object
+    return _COPIERS[kind]
 
 
-def _array(value: Any, memo: dict[int, Any]) -> Any:
+def _copier(kind: type) -> Copier | None:
+    if issubclass(kind, (list, tuple, set, deque)):
+        return _sequence
+    if issubclass(kind, dict):
+        return _mapping
+    parameters = getattr(kind, "__dataclass_params__", None)
+    is_frozen = (parameters is not None and parameters.frozen) or getattr(kind, "constant", False)
+    return _object if kind.__module__.startswith(f"{__package__}.") and not is_frozen else None
+
+
+def _array(value: Any, memo: Memo) -> Any:
     """Return a copy of an array in the same order; views of one array are views of its copy."""
     if not value.flags.writeable:
         return value
     base = value.base
     if type(base) is not np.ndarray:
         return value.copy(order="K")
-    own = copied(base, memo)
     begin = value.__array_interface__["data"][0] - base.__array_interface__["data"][0]
-    return np.ndarray(value.shape, value.dtype, own, begin, value.strides)
+    return np.ndarray(value.shape, value.dtype, copied(base, memo), begin, value.strides)
 
 
-def _sequence(value: Any, memo: dict[int, Any]) -> Any:
+def _sequence(value: Any, memo: Memo) -> Any:
     """Return a copy of a list, a tuple, a set or a deque; one of shared values is copied at once."""
-    if all(_KINDS.get(one) == _SHARED for one in set(map(type, value))):
+    if all(_COPIERS.get(kind, _object) is None for kind in set(map(type, value))):
         return value if type(value) is tuple else value.copy()
     if isinstance(value, tuple):
         items = [copied(one, memo) for one in value]
@@ -180,3 +147,33 @@ def _sequence(value: Any, memo: dict[int, Any]) -> Any:
     for one in value:
         add(copied(one, memo))
     return found
+
+
+def _mapping(value: Any, memo: Memo) -> Any:
+    found = memo[id(value)] = value.copy()
+    for key, own in value.items():
+        found[key] = copied(own, memo)
+    return found
+
+
+def _graph(value: Any, _: Memo) -> Any:
+    found = type(value)()
+    for i in range(value.size()):
+        found.push_back(value.at(i))
+    return found
+
+
+def _object(value: Any, memo: Memo) -> Any:
+    found = memo[id(value)] = object.__new__(type(value))
+    for name, own in vars(value).items():
+        object.__setattr__(found, name, copied(own, memo))
+    return found
+
+
+_COPIERS: Final[dict[type, Copier | None]] = {
+    np.ndarray: _array,
+    MethodType: lambda method, memo: MethodType(method.__func__, copied(method.__self__, memo)),
+    gtsam.GaussianFactorGraph: _graph,  # factors are added to these in place
+    gtsam.GaussianBayesNet: _graph,
+}
+"""How instances of each type that was met are copied; None where they are shared."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -16,6 +18,7 @@ DONE: Final = 0
 BAD_INPUT: Final = 2
 NOT_SOLVED: Final = 3
 INTERRUPTED: Final = 130
+TERMINATED: Final = 143
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Bad usage and bad input give one line on standard error and 2; an estimate that cannot be computed, 3.
     """
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(
+            signal.SIGTERM, lambda *_: sys.exit(TERMINATED)
+        )  # temporary files are removed on the way
     try:
         return _run(list(sys.argv[1:] if arguments is None else arguments))
     except SolveError as error:

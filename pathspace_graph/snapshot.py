@@ -1,106 +1,174 @@
 """Snapshots: a whole estimator as one file, from which it goes on as if it had never stopped.
 
-A file is data: classes are found by name in a table of those that estimators are made of, foreign types have
-codecs, and no code comes from the file. See `io.object_graph` and `io.snapshot`.
+The file is a NumPy archive (.npz) of two arrays of bytes: `structure`, JSON in UTF-8, and `numbers`, the
+memory of all arrays. Its comment is the SHA-256 of all before, which is verified first. The structure has the
+`format`, the `classes`, each as [name, layout, names of the attributes], the `nodes`, one for each object, and
+the `root`. A value is null, a boolean, a number or a text as in JSON, [7] for node 7, or ["nan"], ["inf"],
+["-inf"]. A node is one of
+
+    ["object", class, value, ...]      by the class's number, the attributes in its order
+    ["array", dtype, shape, strides, offset in the numbers, writeable]
+    ["number", value]                  a number of NumPy's, by its array
+    [type, value, ...]                 of another type of `TYPES`, by the parts that it is made of
+
+The walk needs no list of what to save, so no attribute is forgotten. What is held twice is held twice
+afterwards, circles through objects stay circles, and arrays that overlap in memory overlap again. No code
+comes from the file: an object is of a class of the rooms below, and made without its constructor.
 """
 
 from __future__ import annotations
 
+import dis
+import json
+import math
 import sys
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from copy import copy
+from dataclasses import fields, is_dataclass
+from functools import cache, cached_property
+from hashlib import sha256
+from inspect import unwrap
+from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final, TypeVar
+from zipfile import BadZipFile, ZipFile
 
 import gtsam
 import numpy as np
 from joblib.externals.loky import Future
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from pathspace_graph.factors.linear_arrays import (
-    conditional_of,
-    frontals_of,
-    hessian_factor_of,
-    hessian_matrix,
-    jacobian_factor_of,
-    jacobian_matrix,
-    keys_of_factor,
-)
+from pathspace_graph.factors import linear_arrays
 from pathspace_graph.graph.keys import sizes
-from pathspace_graph.io.object_graph import FORMAT_ERRORS, Codec, Decoder, Encoder
-from pathspace_graph.io.snapshot import read_snapshot, write_snapshot
+from pathspace_graph.io.files import atomic_file
+from pathspace_graph.io.limits import shown
+from pathspace_graph.io.parsing import parse_json, read_bytes
 
 from .checkpoint import Recovery
-from .errors import InputError, PathspaceError
+from .errors import InputError, PathspaceError, SettingsError
 
 E = TypeVar("E")
+Structure = dict[str, Any]
+Bytes = NDArray[np.uint8]
 
+FORMAT: Final = "pathspace-snapshot/2"
 PACKAGE: Final = "pathspace_graph."
 ROOMS: Final = (
-    "batch",
-    "ckf",
-    "factors",
-    "front_end",
-    "graph",
-    "health",
-    "io.log",
-    "landmark",
-    "loop",
-    "mapping",
-    "online",
-    "scale",
-    "settings",
-    "spline",
+    *("batch", "ckf", "factors", "front_end", "graph", "health", "io.log", "landmark", "loop", "mapping"),
+    *("online", "scale", "settings", "spline"),
 )
-"""Estimators are made of the classes of these rooms and modules."""
+"""Rooms and modules whose classes estimators are made of."""
+FORMAT_ERRORS: Final = (
+    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, MemoryError),
+    *(OSError, EOFError, BadZipFile),
+)
+"""Raised where a file does not fit together; `RecursionError` and `UnicodeError` are among them."""
+_DTYPES: Final = ("<f8", "<i8", "|b1", "<i4", "<u8", "|u1", "|i1")
+_ALIGNMENT: Final = 64
+_DIGEST_SIZE: Final = 64
+_FLOATS: Final = ("nan", "inf", "-inf")
 
 
 def save(estimator: object, path: Path | str) -> None:
-    """Writes all of an estimator to one file, and changes nothing of it.
+    """Write all of an estimator to one file, and change nothing of it.
 
     An earlier file is kept as a numbered backup. SettingsError where it holds something that cannot be saved.
     """
-    write_snapshot(path, *Encoder(known_classes(), CODECS).encode(estimator))
+    write(path, *Encoder(known_classes()).encode(estimator))
 
 
 def restore(path: Path | str, kind: type[E], check: Callable[[E], object]) -> E:
-    """Returns the estimator of a type that a file holds; an InputError of one line says why it cannot.
+    """Return the estimator of a type that a file holds; an InputError of one line says why it cannot.
 
     `check` is called with a second copy, and must raise nothing.
     """
     file = Path(path)
-    structure, data = read_snapshot(file)
+    structure, numbers = read(file)
     try:
-        check(_decoded(structure, data, kind))
-        return _decoded(structure, data, kind)
+        trial, found = (Decoder(known_classes()).decode(structure, numbers.copy()) for _ in range(2))
+        if type(found) is not kind:
+            raise TypeError(f"found a {type(found).__name__}")
+        check(trial)
     except (*FORMAT_ERRORS, PathspaceError) as error:
         told = " ".join(str(error).split())
         raise InputError(file, f"expected a {kind.__name__}: {type(error).__name__}: {told}"[:400]) from error
-
-
-def _decoded(structure: Any, data: bytes, kind: type[E]) -> E:
-    found = Decoder(known_classes(), CODECS).decode(structure, data)
-    if type(found) is not kind:
-        raise TypeError(f"found a {type(found).__name__}")
     return found
+
+
+def write(path: Path | str, structure: Structure, numbers: Bytes) -> None:
+    """Write a structure and the memory of its arrays; an earlier file is kept as a backup."""
+    text = json.dumps({"format": FORMAT, **structure}, allow_nan=False, separators=(",", ":")).encode()
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(archive(text, numbers))
+
+
+def archive(text: bytes, numbers: Bytes) -> bytes:
+    """Return the content of a file; its comment, which is its end, is the SHA-256 of all before."""
+    stream = BytesIO()
+    np.savez(stream, structure=np.frombuffer(text, np.uint8), numbers=numbers)
+    with ZipFile(stream, "a") as zipped:
+        zipped.comment = bytes(_DIGEST_SIZE)
+    content = stream.getvalue()[:-_DIGEST_SIZE]
+    return content + sha256(content).hexdigest().encode()
+
+
+def read(file: Path) -> tuple[Structure, Bytes]:
+    """Return structure and numbers of a file; an InputError where it is not as it was written."""
+    whole = read_bytes(file, "a snapshot")
+    if whole.startswith(b"pathspace-snapshot/"):
+        raise InputError(file, f"expected {FORMAT}, found {shown(whole[:20].decode(errors='replace'))}")
+    try:
+        if sha256(whole[:-_DIGEST_SIZE]).hexdigest().encode() != whole[-_DIGEST_SIZE:]:
+            raise ValueError
+        with np.load(BytesIO(whole), allow_pickle=False) as members:
+            text, numbers = members["structure"].tobytes().decode(), members["numbers"]
+    except FORMAT_ERRORS:
+        raise InputError(file, "expected a snapshot as it was written, found another content") from None
+    structure = parse_json(text, file)
+    if not isinstance(structure, dict) or structure.get("format") != FORMAT:
+        raise InputError(file, f"expected {FORMAT}, found {shown(structure)}")
+    return structure, numbers
+
+
+# --- the types ---------------------------------------------------------------------------------------------
 
 
 def known_classes() -> dict[str, type]:
-    """Returns every class of the modules that are loaded, by its name without the package's own."""
+    """Return every class of the rooms' modules that are loaded, by its name without the package's own."""
     rooms = tuple(PACKAGE + room for room in ROOMS)
-    found = {}
-    for name, module in [*sys.modules.items()]:
-        if module is not None and (name in rooms or name.startswith(tuple(f"{room}." for room in rooms))):
-            for one in vars(module).values():
-                if isinstance(one, type) and one.__module__ == name:
-                    found[f"{name}.{one.__qualname__}".removeprefix(PACKAGE)] = one
-    return found
+    return {
+        f"{name}.{one.__qualname__}".removeprefix(PACKAGE): one
+        for name, module in [*sys.modules.items()]
+        if name in rooms or name.startswith(tuple(f"{room}." for room in rooms))
+        for one in vars(module).values()
+        if isinstance(one, type) and one.__module__ == name
+    }
 
 
-def _graph(kind: Callable[[], Any]) -> tuple[Callable[[Any], tuple[Any, ...]], Callable[..., Any]]:
-    """Returns how a graph or a net is taken apart, and made again of its factors."""
+@cache
+def layout(kind: type) -> dict[str, str]:
+    """Return the names of the attributes that the code of a class sets, those of fields with their types.
 
-    def parts(graph: Any) -> tuple[Any, ...]:
-        return tuple(graph.at(i) for i in range(graph.size()))
+    A program whose class has another layout than the one in the file refuses the file.
+    """
+    members = [member for base in kind.__mro__ for member in vars(base).values()]
+    functions = [getattr(member, "fget", None) or getattr(member, "__func__", member) for member in members]
+    functions += [unwrap(function) for function in functions if hasattr(function, "__wrapped__")]
+    codes = [function.__code__ for function in functions if hasattr(function, "__code__")]
+    steps = chain.from_iterable(map(dis.get_instructions, codes))
+    names = dict.fromkeys(sorted({str(step.argval) for step in steps if step.opname == "STORE_ATTR"}), "")
+    return names | {one.name: str(one.type) for one in (fields(kind) if is_dataclass(kind) else ())}
+
+
+def _factors(graph: Any) -> list[Any]:
+    return [graph.at(i) for i in range(graph.size())]
+
+
+def _graph(kind: Callable[[], Any]) -> Callable[..., Any]:
+    """Return how a graph or a net is made of its factors."""
 
     def make(*factors: Any) -> Any:
         graph = kind()
@@ -108,34 +176,207 @@ def _graph(kind: Callable[[], Any]) -> tuple[Callable[[Any], tuple[Any, ...]], C
             graph.push_back(factor)
         return graph
 
-    return parts, make
+    return make
 
 
-def _conditional_parts(conditional: gtsam.GaussianConditional) -> tuple[Any, ...]:
-    keys = keys_of_factor(conditional)
-    return keys, frontals_of(conditional, sizes(keys).tolist()), jacobian_matrix(conditional)
+def _jacobian(factor: gtsam.JacobianFactor) -> tuple[Any, ...]:
+    return linear_arrays.keys_of_factor(factor), linear_arrays.jacobian_matrix(factor)
 
 
-CODECS: Final = {
-    "graph": Codec(gtsam.GaussianFactorGraph, *_graph(gtsam.GaussianFactorGraph)),
-    "net": Codec(gtsam.GaussianBayesNet, *_graph(gtsam.GaussianBayesNet)),
-    "conditional": Codec(
-        gtsam.GaussianConditional,
-        _conditional_parts,
-        lambda keys, frontals, matrix: conditional_of(keys, sizes(keys), frontals, matrix),
+def _conditional(conditional: gtsam.GaussianConditional) -> tuple[Any, ...]:
+    keys, matrix = _jacobian(conditional)
+    return keys, matrix, linear_arrays.frontals_of(conditional, sizes(keys).tolist())
+
+
+TYPES: Final[dict[type, tuple[Callable[[Any], Iterable[Any]], Callable[..., Any]]]] = {
+    list: (iter, lambda *values: [*values]),
+    tuple: (iter, lambda *values: values),
+    set: (lambda values: sorted(values, key=repr), lambda *values: {*values}),
+    frozenset: (lambda values: sorted(values, key=repr), lambda *values: frozenset(values)),
+    dict: (
+        lambda entries: chain.from_iterable(entries.items()),
+        lambda *values: dict(zip(values[::2], values[1::2], strict=True)),
     ),
-    "jacobian": Codec(
-        gtsam.JacobianFactor,
-        lambda factor: (keys_of_factor(factor), jacobian_matrix(factor)),
-        lambda keys, matrix: jacobian_factor_of(keys, sizes(keys), matrix),
+    deque: (lambda ring: (ring.maxlen, *ring), lambda longest, *values: deque(values, longest)),
+    slice: (lambda span: (span.start, span.stop, span.step), slice),
+    KDTree: (lambda tree: (np.array(tree.data),), KDTree),
+    Recovery: (lambda recovery: (recovery.failures,), Recovery),
+    Future: (lambda _: (), lambda: None),  # what a process is about to give is asked for again
+    gtsam.GaussianFactorGraph: (_factors, _graph(gtsam.GaussianFactorGraph)),
+    gtsam.GaussianBayesNet: (_factors, _graph(gtsam.GaussianBayesNet)),
+    gtsam.GaussianConditional: (
+        _conditional,
+        lambda keys, matrix, frontals: linear_arrays.conditional_of(keys, sizes(keys), frontals, matrix),
     ),
-    "hessian": Codec(
-        gtsam.HessianFactor,
-        lambda factor: (keys_of_factor(factor), hessian_matrix(factor)),
-        lambda keys, matrix: hessian_factor_of(keys, sizes(keys), matrix),
+    gtsam.JacobianFactor: (
+        _jacobian,
+        lambda keys, matrix: linear_arrays.jacobian_factor_of(keys, sizes(keys), matrix),
     ),
-    "tree": Codec(KDTree, lambda tree: (np.array(tree.data),), KDTree),
-    "recovery": Codec(Recovery, lambda recovery: (recovery.failures,), Recovery),
-    "future": Codec(Future, lambda _: (), lambda: None),
+    gtsam.HessianFactor: (
+        lambda factor: (linear_arrays.keys_of_factor(factor), linear_arrays.hessian_matrix(factor)),
+        lambda keys, matrix: linear_arrays.hessian_factor_of(keys, sizes(keys), matrix),
+    ),
 }
-"""Types of other packages by name; what another process is about to give is asked for again."""
+"""Containers and types of other packages: how an instance is taken apart, and made of its parts."""
+_MAKERS: Final = {kind.__name__: make for kind, (_, make) in TYPES.items()}
+
+
+# --- from objects to a structure ---------------------------------------------------------------------------
+
+
+class Encoder:
+    """Walk of the objects that can be reached from a root; each of them becomes one node."""
+
+    def __init__(self, classes: Mapping[str, type]) -> None:
+        self._names = {kind: name for name, kind in classes.items()}
+        self._rows: dict[tuple[type, tuple[str, ...]], int] = {}
+        self._reached: list[tuple[Any, str]] = []  # it keeps them alive, so that no `id` is used twice
+        self._numbers: dict[int, int] = {}
+        self._arrays: list[tuple[NDArray[Any], list[Any]]] = []
+        self._holder = ""
+
+    def encode(self, root: Any) -> tuple[Structure, Bytes]:
+        """Return the structure and the numbers; SettingsError where something cannot be saved."""
+        value, nodes = self._value(root), list[Any]()
+        for one, holder in self._reached:  # the list grows meanwhile
+            self._holder = holder
+            nodes.append(self._node(one))
+        rows = [[self._names[kind], layout(kind), [*names]] for kind, names in self._rows]
+        return {"root": value, "classes": rows, "nodes": nodes}, _lay_out(self._arrays)
+
+    def _value(self, value: Any) -> Any:
+        if value is None or type(value) in (bool, int, str):
+            return value
+        if type(value) is float:
+            return value if math.isfinite(value) else [str(value)]
+        if id(value) not in self._numbers:
+            self._numbers[id(value)] = len(self._reached)
+            self._reached.append((value, self._holder))
+        return [self._numbers[id(value)]]
+
+    def _node(self, value: Any) -> list[Any]:
+        kind = type(value)
+        if kind is np.ndarray and value.dtype.str in _DTYPES:
+            if value.size and 0 in value.strides:
+                value = value.copy()
+            node = ["array", value.dtype.str, [*value.shape], [*value.strides], 0, value.flags.writeable]
+            self._arrays.append((value, node))
+            return node
+        if isinstance(value, np.generic):
+            return ["number", self._value(np.asarray(value))]
+        if kind in self._names:
+            cached = {name for name in vars(value) if isinstance(getattr(kind, name, None), cached_property)}
+            held = {name: one for name, one in vars(value).items() if name not in cached}
+            self._holder = kind.__name__
+            number = self._rows.setdefault((kind, tuple(held)), len(self._rows))
+            return ["object", number, *map(self._value, held.values())]
+        if kind in TYPES:
+            return [kind.__name__, *map(self._value, TYPES[kind][0](value))]
+        found = f"{kind.__module__}.{kind.__qualname__} {getattr(value, 'dtype', '')}"
+        raise SettingsError(
+            f"snapshot: expected what can be saved in {self._holder}, found a {found.rstrip()}"
+        )
+
+
+def _lay_out(arrays: list[tuple[NDArray[Any], list[Any]]]) -> Bytes:
+    """Return the memory of all arrays, and note in the node of each where it begins.
+
+    Arrays that overlap in memory overlap here as well. Bytes that belong to no array are zero.
+    """
+    bounds, end = [_bounds(array) for array, _ in arrays], 0
+    for group in _overlapping(bounds):
+        begin, low = -(-end // _ALIGNMENT) * _ALIGNMENT, min(bounds[i][0] for i in group)
+        end = begin + max(bounds[i][1] for i in group) - low
+        for i in group:
+            arrays[i][1][4] = begin + arrays[i][0].__array_interface__["data"][0] - low
+    numbers = np.zeros(end, np.uint8)
+    for array, node in arrays:
+        _view(numbers, node)[...] = array
+    return numbers
+
+
+def _bounds(array: NDArray[Any]) -> tuple[int, int]:
+    """Return the address of the first byte of an array's memory, and of the one after its last."""
+    begin, reach = array.__array_interface__["data"][0], [0]
+    if array.size:
+        reach = [stride * (count - 1) for stride, count in zip(array.strides, array.shape, strict=True)]
+    low, high = sum(min(one, 0) for one in reach), sum(max(one, 0) for one in reach)
+    return begin + low, begin + high + (array.itemsize if array.size else 0)
+
+
+def _overlapping(bounds: list[tuple[int, int]]) -> list[list[int]]:
+    """Return the groups of intervals that overlap, by their indices in ascending order."""
+    groups, last = list[list[int]](), -1
+    for i in sorted(range(len(bounds)), key=bounds.__getitem__):
+        if bounds[i][0] >= last:
+            groups.append([])
+        groups[-1].append(i)
+        last = max(last, bounds[i][1])
+    return sorted(map(sorted, groups))
+
+
+def _view(numbers: Bytes, node: list[Any]) -> NDArray[Any]:
+    """Return the array of a node as a view of the numbers; ValueError or TypeError where it does not fit."""
+    _, dtype, shape, strides, offset, _ = node
+    if dtype not in _DTYPES:
+        raise ValueError(f"expected one of the types {', '.join(_DTYPES)}, found {shown(dtype)}")
+    if math.prod(shape) * np.dtype(dtype).itemsize > len(numbers):
+        raise ValueError(f"expected an array inside of {len(numbers)} bytes, found {shown(shape)}")
+    return np.empty(shape, dtype) if 0 in shape else np.ndarray(shape, dtype, numbers, offset, strides)
+
+
+# --- from a structure to objects ---------------------------------------------------------------------------
+
+
+class Decoder:
+    """Making of the objects of a structure: those of known classes first, so that circles can be closed."""
+
+    def __init__(self, classes: Mapping[str, type]) -> None:
+        self._known = classes
+        self._made: dict[int, Any] = {}
+
+    def decode(self, structure: Structure, numbers: Bytes) -> Any:
+        """Return the root of a structure; one of FORMAT_ERRORS where it does not fit together."""
+        self._nodes, self._numbers = structure["nodes"], numbers
+        rows = [self._row(*row) for row in structure["classes"]]
+        objects = {number: node for number, node in enumerate(self._nodes) if node[0] == "object"}
+        self._made |= {number: object.__new__(rows[node[1]][0]) for number, node in objects.items()}
+        for number, (_, row, *values) in objects.items():
+            vars(self._made[number]).update(zip(rows[row][1], map(self._value, values), strict=True))
+        for number in objects:
+            if hasattr(self._made[number], "__post_init__"):
+                copy(self._made[number]).__post_init__()  # settings must be in their ranges
+        return self._value(structure["root"])
+
+    def _row(self, name: str, stated: dict[str, str], names: list[str]) -> tuple[type, list[str]]:
+        """Return a known class and the names of its attributes, which must be among those that it sets."""
+        if name not in self._known:
+            raise ValueError(f"expected a known class, found {shown(name)}")
+        known = layout(self._known[name])
+        other = [one for one in {**known, **stated} if known.get(one) != stated.get(one)]
+        if other := other or [one for one in names if one not in known]:
+            raise ValueError(
+                f"expected the attributes of {name} in this version, found another {shown(other[0])}"
+            )
+        return self._known[name], names
+
+    def _value(self, value: Any) -> Any:
+        if not isinstance(value, list):
+            return value
+        (only,) = value
+        if only in _FLOATS:
+            return float(only)
+        if only not in self._made:
+            self._made[only] = self._make(self._nodes[only])
+        return self._made[only]
+
+    def _make(self, node: list[Any]) -> Any:
+        kind, *rest = node
+        if kind == "array":
+            array = _view(self._numbers, node)
+            if array.dtype == bool and array.size and array.view(np.uint8).max() > 1:
+                raise ValueError("expected flags of 0 and 1, found others")
+            array.flags.writeable = bool(node[-1])
+            return array
+        values = [self._value(one) for one in rest]
+        return values[0][()] if kind == "number" else _MAKERS[kind](*values)

@@ -1,7 +1,8 @@
-"""Snapshots of estimators: the table of classes, the codecs of foreign types, and what is no estimator."""
+"""Snapshots of estimators: the table of classes, foreign types, the file, and what is no estimator."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import gtsam
@@ -15,14 +16,14 @@ from pathspace_graph.ckf.mapper import CkfMapper
 from pathspace_graph.errors import InputError
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.graph.variables import Layout
-from pathspace_graph.io.object_graph import Decoder, Encoder
 from pathspace_graph.landmark.ckf import LandmarkCkf
 from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.run import split_odometry
-from pathspace_graph.snapshot import CODECS, known_classes, restore, save
+from pathspace_graph.snapshot import Decoder, Encoder, archive, known_classes, read, restore, save, write
 
 from .scenes.digest import digest
 from .scenes.drives import ODOMETRY_SIGMA, ahead, corridor, exact_log
+from .scenes.kills import dies
 
 Estimator = LandmarkFixedLag | CkfMapper | LandmarkCkf
 
@@ -49,8 +50,8 @@ def test_foreign_types_come_back() -> None:
     graph.push_back(gtsam.HessianFactor(graph))
     net.push_back(conditional)
     tree = KDTree(np.random.default_rng(1).normal(size=(50, 2)))
-    structure, data = Encoder({}, CODECS).encode([graph, net, tree, Future(), conditional])
-    found, found_net, found_tree, future, alone = Decoder({}, CODECS).decode(structure, data)
+    structure, numbers = Encoder({}).encode([graph, net, tree, Future(), conditional])
+    found, found_net, found_tree, future, alone = Decoder({}).decode(structure, numbers)
     assert [type(found.at(k)) for k in range(4)] == [type(graph.at(k)) for k in range(4)]
     for k in range(4):
         one, other = found.at(k).augmentedInformation(), graph.at(k).augmentedInformation()
@@ -90,3 +91,85 @@ def test_the_other_online_estimators_go_on_to_the_same_state(kind: type[Estimato
     for cycle in cycles[40:]:
         np.testing.assert_array_equal(restored.update(*cycle).pose, estimator.update(*cycle).pose)
     assert digest(restored) == digest(estimator)
+
+
+# --- the file --------------------------------------------------------------------------------------------
+
+STRUCTURE = {"root": [0], "text": "ä\n", "numbers": [1, -0.0, 5e-324, 1.7976931348623157e308]}
+
+
+@pytest.mark.parametrize("data", [b"", b"\n", b"\0\xff\n" * 5])
+def test_what_was_written_is_read(data: bytes, tmp_path: Path) -> None:
+    write(tmp_path / "a.snap", STRUCTURE, np.frombuffer(data, np.uint8))
+    structure, numbers = read(tmp_path / "a.snap")
+    assert structure == {"format": "pathspace-snapshot/2", **STRUCTURE}
+    assert numbers.tobytes() == data
+
+
+def test_it_is_an_archive_that_numpy_reads(tmp_path: Path) -> None:
+    save(CkfMapper(None, ODOMETRY_SIGMA), tmp_path / "a.snap")
+    with np.load(tmp_path / "a.snap", allow_pickle=False) as archive:
+        structure = json.loads(archive["structure"].tobytes())
+    assert structure["format"] == "pathspace-snapshot/2"
+
+
+def test_no_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.snap", tmp_path):
+        with pytest.raises(InputError, match="expected a snapshot, found"):
+            read(path)
+
+
+def test_the_format_before_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "a.snap").write_bytes(b"pathspace-snapshot/1\n" + b"0" * 64 + b"\n2\n{}\n\x80\x04\x95")
+    expected = r"a\.snap: expected pathspace-snapshot/2, found 'pathspace-snapshot/1'"
+    with pytest.raises(InputError, match=f"{expected}$"):
+        restore(tmp_path / "a.snap", CkfMapper, id)
+
+
+def test_a_pickle_is_never_read(tmp_path: Path) -> None:
+    file = tmp_path / "a.snap"
+    file.write_bytes(archive(b"", np.array([STRUCTURE], dtype=object)))
+    with pytest.raises(InputError, match="found another content"):
+        read(file)
+    with np.load(file, allow_pickle=True) as members:
+        assert members["numbers"][0] == STRUCTURE
+
+
+def test_every_flipped_bit_and_every_cut_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "a.snap"
+    write(file, STRUCTURE, np.arange(3, dtype=np.uint8))
+    good = file.read_bytes()
+    for at in range(len(good)):
+        for damaged in (good[:at], good[:at] + bytes([good[at] ^ 1 << at % 8]) + good[at + 1 :]):
+            file.write_bytes(damaged)
+            with pytest.raises(InputError, match=r"a\.snap: expected") as caught:
+                read(file)
+            assert "\n" not in str(caught.value)
+    file.write_bytes(good + b"\0")
+    with pytest.raises(InputError, match="another content"):
+        read(file)
+
+
+def test_a_number_that_json_does_not_have_is_no_structure(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="Out of range float"):
+        write(tmp_path / "a.snap", {"root": float("nan")}, np.zeros(0, np.uint8))
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_kill_at_any_step_leaves_the_old_file_or_the_new_one(tmp_path: Path) -> None:
+    file, step, kills = tmp_path / "a.snap", 0, 0
+    write(file, {"root": "old"}, np.zeros(1, np.uint8))
+    old = file.read_bytes()
+    killed = True
+    while killed:
+        step += 1
+        killed = dies(lambda: write(file, {"root": "new"}, np.zeros(1, np.uint8)), tmp_path, step)
+        kills += killed
+        assert read(file)[0]["root"] in ("old", "new")
+        for backup in tmp_path.glob("a.snap.~*"):
+            assert read(backup)
+            backup.unlink()
+        file.write_bytes(old)
+    assert kills > 3
+    write(file, {"root": "new"}, np.zeros(1, np.uint8))
+    assert {path.name for path in tmp_path.iterdir()} == {"a.snap", "a.snap.~1~"}

@@ -17,9 +17,9 @@ from pathspace_graph.eval.harness.workers import check_jobs, outcomes, workers
 from pathspace_graph.eval.metrics.cost import StageTime, stage_times
 from pathspace_graph.eval.metrics.ghosts import GhostSettings
 from pathspace_graph.eval.metrics.measures import measure, online_cycles
+from pathspace_graph.io.disk import is_temporary
 from pathspace_graph.io.log import LOG_FILE, Log
 from pathspace_graph.io.results import BatchRun, RunResult
-from pathspace_graph.io.temporary import is_temporary
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.plausibility.reading import read_plausible_log
 from pathspace_graph.settings.limits import LimitSettings

@@ -39,7 +39,8 @@ class Export:
     x, y and label (`points`), both boundaries with one lanelet as OSM XML (`lanelet2`), or the centre line
     with the speed that friction and curvature allow as CSV (`profile`)."""
     out: Path
-    """The result is written to this file; an earlier one is kept as a numbered backup."""
+    """The result is written to this file, or to standard output (`-`); an earlier file is kept as a numbered
+    backup."""
     step: float = 1.0
     """Points are this far apart along a curve (m)."""
     origin: tuple[float, float, float] | None = None

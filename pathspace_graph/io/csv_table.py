@@ -1,16 +1,16 @@
-"""CSV tables with a header: columns by name, and errors that name the row."""
+"""CSV tables with a header: columns by name, and errors that name row and column."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pathspace_graph.errors import InputError
 
@@ -20,67 +20,71 @@ from .parsing import read_text
 FloatArray = NDArray[np.float64]
 
 
+class Column(NamedTuple):
+    """What the numbers of a column must be."""
+
+    largest: float = MAX_COORDINATE
+    """Largest size of a number."""
+    unit: str = ""
+
+
 @dataclass(frozen=True)
 class Table:
-    """Holds the rows below a CSV header, as text, column by column."""
+    """Rows below a CSV header, as text, column by column."""
 
     file: Path
-    """The table was read from this file."""
     columns: dict[str, list[str]]
-    """Each column has its texts under its name, as they stand in the file."""
+    """Texts of each column, as they stand in the file."""
     lines: list[int]
-    """Each row stands on this line of the file; the header is line 1."""
+    """Line of each row in the file; the header is line 1."""
+    declared: Mapping[str, Column] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.lines)
 
     def fail(self, index: int, message: str) -> NoReturn:
-        """Raises the InputError of the row with this index."""
+        """Raise the InputError of the row with this index."""
         raise InputError(self.file, message, self.lines[index])
 
     def require(self, good: NDArray[np.bool_], message: str) -> None:
-        """Raises an InputError for the first row that is not good; `good` is (rows,)."""
+        """Raise an InputError for the first row that is not good; `good` is (rows,)."""
         if not good.all():
             self.fail(int(np.argmin(good)), message)
 
-    def numbers(self, name: str, largest: float = MAX_COORDINATE) -> FloatArray:
-        """Returns the column as numbers (rows,) of at most `largest` in size.
+    def numbers(self, name: str, largest: float | None = None) -> FloatArray:
+        """Return the column as numbers (rows,), at most as large as declared, or as `largest`.
 
         A word, NaN, infinity or a larger number is an InputError.
         """
-        texts = self.columns[name]
-        values = self._parsed(name)
-        bad = ~np.isfinite(values)
-        if bad.any():
-            index = int(np.argmax(bad))
-            self.fail(index, f"expected a finite number in column '{name}', found {shown(texts[index])}")
-        bad = np.abs(values) > largest
-        if bad.any():
-            index = int(np.argmax(bad))
-            expected = f"expected a number of at most {largest:g} in size in column '{name}'"
-            self.fail(index, f"{expected}, found {shown(texts[index])}")
-        return values
-
-    def _parsed(self, name: str) -> FloatArray:
-        """Returns the column as numbers (rows,), which may be NaN or infinite."""
-        texts = self.columns[name]
+        column, texts = self.declared.get(name, Column()), self.columns[name]
+        most, unit = largest or column.largest, f" {column.unit}".rstrip()
         try:
             values = np.array(list(map(float, texts)), dtype=float)
             good = is_plain("".join(texts))
         except ValueError:
             good = False
         if not good:
-            index = next(i for i, text in enumerate(texts) if not _is_number(text))
-            self.fail(index, f"expected a number in column '{name}', found {shown(texts[index].strip())}")
+            self._refuse(name, [*map(_is_number, texts)], "a number")
+        self._refuse(name, np.isfinite(values), "a finite number")
+        self._refuse(name, np.abs(values) <= most, f"a number of at most {most:g}{unit} in size")
         return values
 
-    def stack(self, names: Sequence[str], largest: float = MAX_COORDINATE) -> FloatArray:
-        """Returns the named columns side by side (rows, names), each number of at most `largest` in size."""
+    def _refuse(self, name: str, good: ArrayLike, expected: str) -> None:
+        """Raise an InputError for the first row whose text is not as expected; `good` is (rows,)."""
+        if not np.all(good):
+            index = int(np.argmin(good))
+            found = shown(self.columns[name][index].strip())
+            self.fail(index, f"expected {expected} in column '{name}', found {found}")
+
+    def stack(self, names: Sequence[str], largest: float | None = None) -> FloatArray:
+        """Return the named columns side by side (rows, names), see `numbers`."""
         return np.column_stack([self.numbers(name, largest) for name in names])
 
 
-def read_table(file: Path, required: Sequence[str], comment: str = "", most: int = MAX_FILE_BYTES) -> Table:
-    """Reads a CSV file with a header that holds at least the required columns, in any order.
+def read_table(
+    file: Path, required: Mapping[str, Column] | Sequence[str], comment: str = "", most: int = MAX_FILE_BYTES
+) -> Table:
+    """Read a CSV file with a header that holds at least the required columns, in any order.
 
     Quotes, blanks around fields, empty lines, Windows line ends and a byte-order mark are tolerated;
     `comment` is stripped from the front of the header. A file that is missing, empty or larger than `most`
@@ -98,7 +102,20 @@ def read_table(file: Path, required: Sequence[str], comment: str = "", most: int
         for row, line in zip(rows[1:], lines[1:], strict=True)
     ]
     columns = [list(column) for column in zip(*body, strict=True)] or [[] for _ in header]
-    return Table(file, dict(zip(header, columns, strict=True)), lines[1:])
+    declared = required if isinstance(required, Mapping) else {}
+    return Table(file, dict(zip(header, columns, strict=True)), lines[1:], declared)
+
+
+def write_table(file: Path, names: Iterable[str], *values: ArrayLike) -> None:
+    """Write a CSV file of columns (rows,), each of numbers or of texts, or of several side by side (rows, k).
+
+    Every number has the shortest text that reads back as the same one.
+    """
+    columns = [column for value in values for column in np.atleast_2d(np.asarray(value).T).tolist()]
+    with file.open("w", encoding="utf-8", newline="") as out:
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(names)
+        writer.writerows(zip(*columns, strict=True))
 
 
 def _read_rows(file: Path, most: int) -> tuple[list[list[str]], list[int]]:
@@ -115,7 +132,7 @@ def _read_rows(file: Path, most: int) -> tuple[list[list[str]], list[int]]:
     return rows, lines
 
 
-def _check_header(file: Path, header: list[str], required: Sequence[str], line: int) -> None:
+def _check_header(file: Path, header: list[str], required: Iterable[str], line: int) -> None:
     for name in required:
         if header.count(name) != 1:
             found = "none" if name not in header else "more than one"
@@ -133,7 +150,7 @@ def _fit(file: Path, row: list[str], width: int, line: int) -> list[str]:
 
 
 def is_plain(text: str) -> bool:
-    """Returns whether numbers are written in ASCII and without underscores, which Python would also read."""
+    """Return whether numbers are written in ASCII and without underscores, which Python would also read."""
     return text.isascii() and "_" not in text
 
 

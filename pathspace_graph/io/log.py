@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -17,43 +16,48 @@ from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise
 from pathspace_graph.labels import NAMES, label_from_name
 from pathspace_graph.lengths import POSE
 
-from .csv_table import FloatArray, Table, read_table
+from .csv_table import Column, FloatArray, Table, read_table, write_table
 from .files import atomic_folder
+from .header import POSITIVE, Header, noise_sections, to_toml, toml_text
 from .limits import (
     MAX_ANGLE,
     MAX_DETECTIONS,
     MAX_DRIVE,
-    MAX_HEADER_BYTES,
     MAX_HELD,
-    MAX_NOISE,
     MAX_RANGE,
     MAX_SPEED,
     MAX_STAMP,
     MAX_YAW_RATE,
-    shown,
 )
 from .manifest import verified
-from .noise import noise_from_toml, noise_to_toml
-from .parsing import parse_toml, read_text
 
 IntArray = NDArray[np.int_]
 
-FORMAT: Final = "pathspace-log/1"
 LOG_FILE: Final = "log.toml"
 ODOMETRY_FILE: Final = "odometry.csv"
 DETECTIONS_FILE: Final = "detections.csv"
 TRUTH_POSES_FILE: Final = "truth_poses.csv"
 TRUTH_CONES_FILE: Final = "truth_cones.csv"
 TRUTH_ASSOCIATIONS_FILE: Final = "truth_associations.csv"
-FILES: Final = (
-    LOG_FILE,
-    ODOMETRY_FILE,
-    DETECTIONS_FILE,
-    TRUTH_POSES_FILE,
-    TRUTH_CONES_FILE,
-    TRUTH_ASSOCIATIONS_FILE,
-)
-"""A log has these files, those of the truth only where it is known."""
+
+_STAMP: Final = {"t": Column(MAX_STAMP, "s")}
+_POINT: Final = {"x": Column(unit="m"), "y": Column(unit="m")}
+_SPEED: Final = Column(MAX_SPEED, "m/s")
+_RANGE: Final = Column(MAX_RANGE, "m")
+_COVARIANCE: Final = Column(MAX_RANGE**2, "m^2")
+COLUMNS: Final[dict[str, dict[str, Column]]] = {
+    ODOMETRY_FILE: {**_STAMP, "vx": _SPEED, "vy": _SPEED, "wz": Column(MAX_YAW_RATE, "rad/s")},
+    DETECTIONS_FILE: {
+        **_STAMP,
+        **{"x": _RANGE, "y": _RANGE, "label": Column()},
+        **dict.fromkeys(("xx", "xy", "yy"), _COVARIANCE),
+    },
+    TRUTH_POSES_FILE: {**_STAMP, **_POINT, "theta": Column(MAX_ANGLE, "rad")},
+    TRUTH_CONES_FILE: {**_POINT, "label": Column()},
+    TRUTH_ASSOCIATIONS_FILE: {"cone": Column()},
+}
+"""Columns of each table, in the order in which they are written; those of the truth are optional files."""
+FILES: Final = (LOG_FILE, *COLUMNS)
 
 CALIBRATION: Final = ("scale", "bias")
 """The true calibration of the odometry has these names in the log's header."""
@@ -64,6 +68,7 @@ NOISE: Final = ("sigma_vx", "sigma_vy", "sigma_wz", "slow_range", "slow_bearing"
 """The true noise has these names in the log's header, where it is not white as the log states it."""
 _TRUE_ERRORS: Final = {"calibration": CALIBRATION, "sensor": SENSOR, "noise": NOISE}
 """These fields of the truth are in the log's header, by the names of their entries."""
+_SENSOR_INFO: Final = ("range_max", "fov", "rate")
 
 MAX_HOLD: Final = 1.0
 """The last twist may be held for this time (s); a perception cycle later than that has no odometry."""
@@ -73,18 +78,17 @@ MIN_RELATIVE_DETERMINANT: Final = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Odometry:
-    """Holds the measured body twists, each of which is held until the next."""
+    """Measured body twists, each of which is held until the next."""
 
     LENGTHS: ClassVar = {"twist": POSE}
 
     t: FloatArray
-    """These are the stamps (N,) in s, strictly increasing."""
+    """Stamps (N,) in s, strictly increasing."""
     twist: FloatArray
-    """Each row is a twist [vx, vy, wz] (N, 3) in m/s, m/s, rad/s, vehicle frame."""
+    """Twists [vx, vy, wz] (N, 3) in m/s, m/s, rad/s, vehicle frame."""
 
     def between(self, start: float, end: float) -> Odometry:
-        """Returns the twists in force from `start` to `end` (s): the first from `start`, the last held until
-        `end`.
+        """Return the twists in force from `start` (s) on, the last of them held to `end` (s).
 
         Before the first row nothing moves; where no time passes there are no rows.
         """
@@ -94,25 +98,25 @@ class Odometry:
         return Odometry(np.maximum(self.t[first:stop], start), self.twist[first:stop])
 
     def followed_by(self, later: Odometry) -> Odometry:
-        """Returns these twists and the later ones that are newer."""
+        """Return these twists and the later ones that are newer."""
         new = later.t > self.t[-1] if len(self.t) else np.ones(len(later.t), bool)
         return Odometry(np.append(self.t, later.t[new]), np.concatenate([self.twist, later.twist[new]]))
 
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Holds the boundary points detected in one perception cycle."""
+    """Boundary points detected in one perception cycle."""
 
     LENGTHS: ClassVar = {"points_vehicle": 1, "covariances": 2}
 
     t: float
-    """This is the stamp of the cycle (s)."""
+    """Stamp of the cycle, s."""
     points_vehicle: FloatArray
-    """Each row is a detected point (m, 2) in m, vehicle frame."""
+    """Detected points (m, 2) in m, vehicle frame."""
     covariances: FloatArray
-    """Each point has this covariance (m, 2, 2) in m^2, vehicle frame."""
+    """Their covariances (m, 2, 2) in m^2, vehicle frame."""
     labels: IntArray
-    """Each point has a label (m,): LEFT, RIGHT, UNKNOWN, ORANGE or BIG_ORANGE."""
+    """Their labels (m,): LEFT, RIGHT, UNKNOWN, ORANGE or BIG_ORANGE."""
 
     def where(self, chosen: NDArray[np.bool_]) -> Detections:
         """Return the chosen detections of the cycle."""
@@ -123,21 +127,21 @@ class Detections:
 
 @dataclass(frozen=True)
 class SensorInfo:
-    """Holds what is known of the sensor; None stands where the log does not say."""
+    """What is known of the sensor; None where the log does not say."""
 
     LENGTHS: ClassVar = {"range_max": 1}
 
     range_max: float | None = None
-    """This is the greatest range (m)."""
+    """Greatest range, m."""
     fov: float | None = None
-    """This is the field of view, the whole angle (rad)."""
+    """Field of view, the whole angle, rad."""
     rate: float | None = None
-    """The sensor gives this number of perception cycles per second (Hz)."""
+    """Perception cycles per second, Hz."""
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Holds what a simulator or a survey knows, for evaluation only; what is not known has no rows."""
+    """What a simulator or a survey knows, for evaluation only; what is not known has no rows."""
 
     LENGTHS: ClassVar = {
         "poses": POSE,
@@ -147,31 +151,29 @@ class Truth:
     }
 
     pose_t: FloatArray
-    """These are the stamps of the true poses (N,) in s."""
+    """Stamps of the true poses (N,) in s."""
     poses: FloatArray
-    """Each row is a true pose [x, y, theta] (N, 3) in m, m, rad, map frame."""
+    """True poses [x, y, theta] (N, 3) in m, m, rad, map frame."""
     cones: FloatArray
-    """Each row is a true cone (M, 2) in m, map frame."""
+    """True cones (M, 2) in m, map frame."""
     cone_labels: IntArray
-    """Each true cone has the label LEFT, RIGHT or UNKNOWN (M,)."""
+    """Their labels (M,)."""
     associations: IntArray | None = None
-    """Each detection, in file order, is of the true cone with this index (R,), and of none at -1; None means
-    not known."""
+    """Index of the true cone of each detection in file order (R,), -1 for none."""
     calibration: FloatArray | None = None
-    """The odometry truly has this calibration (2,): scale error of the speeds (-), bias of the yaw rate
-    (rad/s). None means not known."""
+    """Calibration of the odometry (2,): scale error of the speeds (-), bias of the yaw rate (rad/s)."""
     sensor: FloatArray | None = None
     """Constant errors of the sensor (5,): yaw (rad), lateral offset (m), age of detections at their stamps
-    (s), scale error (-) and bias (m) of ranges. None means not known, or none."""
+    (s), scale error (-) and bias (m) of ranges."""
     noise: FloatArray | None = None
     """Noise that is not white (6,): the sigmas of white noise of a twist that drifts as much (m/s, m/s,
     rad/s), the shares of a range's and a bearing's variance that stay with a cone (-), and the correlation
-    time of those (s). None means not known, or white."""
+    time of those (s)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Holds all that a vehicle recorded on one drive."""
+    """All that a vehicle recorded on one drive."""
 
     LENGTHS: ClassVar = {
         "odometry": 0,
@@ -183,16 +185,13 @@ class Log:
     }
 
     odometry: Odometry
-    """These are the measured body twists."""
     cycles: tuple[Detections, ...]
-    """These are the perception cycles in order of time."""
+    """Perception cycles in order of time."""
     odometry_sigma: FloatArray
-    """These are the standard deviations (3,) of a measured twist in m/s, m/s, rad/s, white from sample to
-    sample."""
+    """Standard deviations (3,) of a twist in m/s, m/s, rad/s, white from sample to sample."""
     sensor: SensorInfo = SensorInfo()
-    """This is known of the sensor."""
     source: Mapping[str, str] = field(default_factory=dict)
-    """These free texts say where the log comes from."""
+    """Free texts that say where the log comes from."""
     odometry_stated: bool = True
     """Whether somebody has stated the noise of the odometry; otherwise it was measured or assumed."""
     detections_stated: bool = True
@@ -200,7 +199,6 @@ class Log:
     measured: MeasuredNoise | None = None
     """Noise and constant errors of the sensor, as the readings themselves show them."""
     truth: Truth | None = None
-    """This is the truth where there is any."""
 
     @property
     def noise(self) -> KnownNoise:
@@ -209,7 +207,7 @@ class Log:
 
 
 def read_log(folder: Path | str) -> Log:
-    """Reads and checks a log folder (FORMATS: A log).
+    """Read and check a log folder (FORMATS: A log).
 
     Anything wrong is an InputError that names the file, the row and what was expected.
     """
@@ -221,109 +219,65 @@ def read_log(folder: Path | str) -> Log:
 
 
 def _read_log(folder: Path) -> Log:
-    header = _read_toml(folder / LOG_FILE)
-    odometry = _read_odometry(folder / ODOMETRY_FILE)
-    table = read_table(folder / DETECTIONS_FILE, ("t", "x", "y", "label", "xx", "xy", "yy"))
+    header = Header(folder / LOG_FILE)
+    odometry = _read_odometry(_table(folder, ODOMETRY_FILE))
+    table = _table(folder, DETECTIONS_FILE)
     cycles = _cycles(table, float(odometry.t[0]), float(odometry.t[-1]))
+    sensor = [name for name in _SENSOR_INFO if name in header.section("sensor")]
     return Log(
         odometry=odometry,
         cycles=cycles,
-        odometry_sigma=_odometry_sigma(folder / LOG_FILE, header),
-        sensor=_sensor_info(folder / LOG_FILE, header),
-        source={key: str(value) for key, value in _section(folder / LOG_FILE, header, "source").items()},
-        **noise_from_toml(folder / LOG_FILE, _section(folder / LOG_FILE, header, "noise")),
-        truth=_read_truth(folder, len(table), _true_errors(folder / LOG_FILE, header)),
+        odometry_sigma=header.numbers("odometry", "sigma", 3, POSITIVE),
+        sensor=SensorInfo(**{name: header.numbers("sensor", name, 1, POSITIVE).item() for name in sensor}),
+        source={key: str(value) for key, value in header.section("source").items()},
+        **header.noise(),
+        truth=_read_truth(folder, len(table), _true_errors(header)),
     )
 
 
+def _table(folder: Path, name: str) -> Table:
+    return read_table(folder / name, COLUMNS[name])
+
+
 def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
-    """Writes a log folder that `read_log` gives back exactly.
+    """Write a log folder that `read_log` gives back exactly.
 
     A cycle without detections has no row in the file, so it is left out. The folder appears as a whole or not
     at all; an earlier log there is kept as a numbered backup. With `check`, a log that cannot be read is an
     InputError, and is not written.
     """
     with atomic_folder(folder, LOG_FILE) as target:
-        (target / LOG_FILE).write_text(_toml(log), encoding="utf-8", newline="\n")
-        odometry = np.column_stack([log.odometry.t, log.odometry.twist]).tolist()
-        _write_csv(target / ODOMETRY_FILE, "t,vx,vy,wz", odometry)
-        _write_csv(target / DETECTIONS_FILE, "t,x,y,label,xx,xy,yy", _detection_rows(log.cycles))
-        if log.truth is not None:
-            _write_truth(log.truth, target)
+        (target / LOG_FILE).write_text(to_toml(_sections(log)), encoding="utf-8", newline="\n")
+        for name, values in _columns(log).items():
+            write_table(target / name, COLUMNS[name], *values)
         if check:
             _read_log(target)
 
 
-def _read_toml(file: Path) -> dict[str, Any]:
-    header = parse_toml(read_text(file, most=MAX_HEADER_BYTES), file)
-    if header.get("format") != FORMAT:
-        raise InputError(file, f'expected format = "{FORMAT}", found {shown(header.get("format"))}')
-    return header
+def _true_errors(header: Header) -> dict[str, FloatArray]:
+    """Return the true calibration, errors of the sensor and noise, those of them that the header has."""
+    section = header.section("truth")
+    return {
+        name: np.array([header.numbers("truth", entry).item() for entry in entries])
+        for name, entries in _TRUE_ERRORS.items()
+        if section and (entries == CALIBRATION or not section.keys().isdisjoint(entries))
+    }
 
 
-def _section(file: Path, header: dict[str, Any], name: str) -> dict[str, Any]:
-    section = header.get(name, {})
-    if not isinstance(section, dict):
-        raise InputError(file, f"expected a section [{name}], found {shown(section)}")
-    return section
-
-
-def _odometry_sigma(file: Path, header: dict[str, Any]) -> FloatArray:
-    sigma = _section(file, header, "odometry").get("sigma")
-    good = isinstance(sigma, list) and len(sigma) == 3 and all(_is_positive(value) for value in sigma)
-    if not good:
-        raise InputError(file, f"expected three positive numbers as [odometry] sigma, found {shown(sigma)}")
-    return np.array(sigma, dtype=float)
-
-
-def _sensor_info(file: Path, header: dict[str, Any]) -> SensorInfo:
-    section = _section(file, header, "sensor")
-    values: dict[str, float | None] = {}
-    for name in ("range_max", "fov", "rate"):
-        value = section.get(name)
-        if value is not None and not _is_positive(value):
-            raise InputError(file, f"expected a positive number as [sensor] {name}, found {shown(value)}")
-        values[name] = None if value is None else float(value)
-    return SensorInfo(**values)
-
-
-def _true_errors(file: Path, header: dict[str, Any]) -> dict[str, FloatArray]:
-    """Returns the true calibration, errors of the sensor and noise, those of them that the header has."""
-    section = _section(file, header, "truth")
-    found = {}
-    for field_name, names in _TRUE_ERRORS.items():
-        values = [section.get(name) for name in names]
-        if section and (names == CALIBRATION or any(name in section for name in names)):
-            if not all(_is_number(value) for value in values):
-                expected = f"{', '.join(names[:-1])} and {names[-1]}"
-                raise InputError(file, f"expected numbers as [truth] {expected}, found {shown(values)}")
-            found[field_name] = np.array(values, dtype=float)
-    return found
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_NOISE
-
-
-def _is_positive(value: object) -> bool:
-    return isinstance(value, int | float) and _is_number(value) and value > 0
-
-
-def _read_odometry(file: Path) -> Odometry:
-    table = read_table(file, ("t", "vx", "vy", "wz"))
+def _read_odometry(table: Table) -> Odometry:
     if not len(table):
-        raise InputError(file, "expected at least one row, found a header only", 2)
-    t, speeds = _increasing_times(table), table.stack(("vx", "vy"), MAX_SPEED)
+        raise InputError(table.file, "expected at least one row, found a header only", 2)
+    t, speeds = _increasing_times(table), table.stack(("vx", "vy"))
     held = np.abs(speeds[:-1]).max(axis=1) * np.diff(t)
     held_far = f"expected a twist that moves the vehicle by at most {MAX_HELD:g} m until the next row"
     table.require(np.append(held <= MAX_HELD, True), held_far)
     too_long = f"expected a drive of at most {MAX_DRIVE:g} m up to the next row"
     table.require(np.append(np.cumsum(held) <= MAX_DRIVE, True), too_long)
-    return Odometry(t, np.column_stack([speeds, table.numbers("wz", MAX_YAW_RATE)]))
+    return Odometry(t, np.column_stack([speeds, table.numbers("wz")]))
 
 
 def _increasing_times(table: Table) -> FloatArray:
-    t = table.numbers("t", MAX_STAMP)
+    t = table.numbers("t")
     good = np.append(True, np.diff(t) > 0) if len(t) else np.ones(0, dtype=bool)
     table.require(good, "expected a time later than the row before")
     return t
@@ -332,12 +286,12 @@ def _increasing_times(table: Table) -> FloatArray:
 def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ...]:
     if not len(table):
         return ()
-    t = table.numbers("t", MAX_STAMP)
+    t = table.numbers("t")
     table.require(np.append(True, np.diff(t) >= 0), "expected a time not earlier than the row before")
     table.require(t >= t_first, f"expected a time not before the first odometry row ({t_first:g} s)")
     late = f"expected a time at most {MAX_HOLD:g} s after the last odometry row ({t_last:g} s)"
     table.require(t <= t_last + MAX_HOLD, late)
-    points = table.stack(("x", "y"), MAX_RANGE)
+    points = table.stack(("x", "y"))
     cycles = cycles_of(t, points, _covariances(table), _labels(table))
     counts = [len(cycle.labels) for cycle in cycles]
     if max(counts) > MAX_DETECTIONS:
@@ -349,19 +303,19 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
 def cycles_of(
     t: FloatArray, points_vehicle: FloatArray, covariances: FloatArray, labels: IntArray
 ) -> tuple[Detections, ...]:
-    """Returns the perception cycles of detections (m,): neighbours with the same stamp (s) are one cycle."""
+    """Return the perception cycles of detections (m,): neighbours with the same stamp (s) are one cycle."""
     starts = np.flatnonzero(np.diff(t, prepend=-np.inf))
     spans = [slice(a, b) for a, b in pairwise([*starts, len(t)])]
     return tuple(Detections(float(t[s.start]), points_vehicle[s], covariances[s], labels[s]) for s in spans)
 
 
 def covariances_of(xx: FloatArray, xy: FloatArray, yy: FloatArray) -> FloatArray:
-    """Returns covariances (m, 2, 2) from their entries (m,)."""
+    """Return covariances (m, 2, 2) from their entries (m,)."""
     return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
 
 
 def _covariances(table: Table) -> FloatArray:
-    xx, xy, yy = (table.numbers(name, MAX_RANGE**2) for name in ("xx", "xy", "yy"))
+    xx, xy, yy = table.stack(("xx", "xy", "yy")).T
     with np.errstate(over="ignore", invalid="ignore"):
         good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
     table.require(good, "expected a positive definite covariance (xx > 0, xx yy > xy^2)")
@@ -373,83 +327,65 @@ def _labels(table: Table) -> IntArray:
 
 
 def _read_truth(folder: Path, detection_count: int, errors: dict[str, FloatArray]) -> Truth | None:
-    files = (folder / TRUTH_POSES_FILE, folder / TRUTH_CONES_FILE, folder / TRUTH_ASSOCIATIONS_FILE)
-    if not errors and not any(file.exists() for file in files):
+    names = (TRUTH_POSES_FILE, TRUTH_CONES_FILE, TRUTH_ASSOCIATIONS_FILE)
+    poses, cones, associations = (
+        _table(folder, name) if (folder / name).exists() else None for name in names
+    )
+    if not errors and poses is None and cones is None and associations is None:
         return None
-    pose_t, poses = _read_truth_poses(files[0])
-    cones, cone_labels = _read_truth_cones(files[1])
-    associations = _read_associations(files[2], detection_count, len(cones))
-    return Truth(pose_t, poses, cones, cone_labels, associations, **errors)
+    points = np.zeros((0, 2)) if cones is None else cones.stack(("x", "y"))
+    return Truth(
+        np.zeros(0) if poses is None else _increasing_times(poses),
+        np.zeros((0, 3)) if poses is None else poses.stack(("x", "y", "theta")),
+        points,
+        np.zeros(0, dtype=int) if cones is None else _labels(cones),
+        None if associations is None else _associations(associations, detection_count, len(points)),
+        **errors,
+    )
 
 
-def _read_truth_poses(file: Path) -> tuple[FloatArray, FloatArray]:
-    if not file.exists():
-        return np.zeros(0), np.zeros((0, 3))
-    table = read_table(file, ("t", "x", "y", "theta"))
-    points, theta = table.stack(("x", "y")), table.numbers("theta", MAX_ANGLE)
-    return _increasing_times(table), np.column_stack([points, theta])
-
-
-def _read_truth_cones(file: Path) -> tuple[FloatArray, IntArray]:
-    if not file.exists():
-        return np.zeros((0, 2)), np.zeros(0, dtype=int)
-    table = read_table(file, ("x", "y", "label"))
-    return table.stack(("x", "y")), _labels(table)
-
-
-def _read_associations(file: Path, detection_count: int, cone_count: int) -> IntArray | None:
-    if not file.exists():
-        return None
-    table = read_table(file, ("cone",))
+def _associations(table: Table, detection_count: int, cone_count: int) -> IntArray:
     if len(table) != detection_count:
-        raise InputError(file, f"expected a row for each of {detection_count} detections, found {len(table)}")
+        expected = f"expected a row for each of {detection_count} detections"
+        raise InputError(table.file, f"{expected}, found {len(table)}")
     cones = table.numbers("cone")
     good = (cones == np.floor(cones)) & (cones >= -1) & (cones < cone_count)
     table.require(good, f"expected -1 or the index of one of {cone_count} true cones")
     return cones.astype(int)
 
 
-def _toml(log: Log) -> str:
-    sigma = ", ".join(repr(float(value)) for value in log.odometry_sigma)
-    sensor = {"range_max": log.sensor.range_max, "fov": log.sensor.fov, "rate": log.sensor.rate}
-    lines = [f'format = "{FORMAT}"', "", "[odometry]", f"sigma = [{sigma}]", "", "[sensor]"]
-    lines += [f"{name} = {float(value)!r}" for name, value in sensor.items() if value is not None]
-    lines += noise_to_toml(log.odometry_stated, log.detections_stated, log.measured)
-    lines += ["", "[source]"]
-    lines += [f"{_toml_text(key)} = {_toml_text(value)}" for key, value in log.source.items()]
-    errors = {names: getattr(log.truth, name, None) for name, names in _TRUE_ERRORS.items()}
-    known = {names: values for names, values in errors.items() if values is not None}
-    lines += ["", "[truth]"] if known else []
-    for names, values in known.items():
-        lines += [f"{name} = {value!r}" for name, value in zip(names, values.tolist(), strict=True)]
-    return "\n".join(lines) + "\n"
+def _sections(log: Log) -> dict[str, dict[str, Any]]:
+    """Return the sections of the header."""
+    sensor = {name: getattr(log.sensor, name) for name in _SENSOR_INFO}
+    truth = dict[str, Any]()
+    for name, entries in _TRUE_ERRORS.items():
+        values = getattr(log.truth, name, None)
+        truth |= {} if values is None else dict(zip(entries, values.tolist(), strict=True))
+    return {
+        "odometry": {"sigma": [float(value) for value in log.odometry_sigma]},
+        "sensor": {name: float(value) for name, value in sensor.items() if value is not None},
+        **noise_sections(log.odometry_stated, log.detections_stated, log.measured),
+        "source": {toml_text(key): value for key, value in log.source.items()},
+        **({"truth": truth} if truth else {}),
+    }
 
 
-def _toml_text(text: str) -> str:
-    # a JSON string is a TOML string, but for the delete character
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _detection_rows(cycles: Iterable[Detections]) -> Iterable[list[object]]:
-    for cycle in cycles:
-        points, covariances = cycle.points_vehicle.tolist(), cycle.covariances.tolist()
-        for (x, y), label, ((xx, xy), (_, yy)) in zip(
-            points, cycle.labels.tolist(), covariances, strict=True
-        ):
-            yield [float(cycle.t), x, y, NAMES[label], xx, xy, yy]
-
-
-def _write_truth(truth: Truth, target: Path) -> None:
-    poses = np.column_stack([truth.pose_t, truth.poses]).tolist()
-    _write_csv(target / TRUTH_POSES_FILE, "t,x,y,theta", poses)
-    labels = [NAMES[label] for label in truth.cone_labels]
-    cones = ([x, y, label] for (x, y), label in zip(truth.cones.tolist(), labels, strict=True))
-    _write_csv(target / TRUTH_CONES_FILE, "x,y,label", cones)
-    if truth.associations is not None:
-        _write_csv(target / TRUTH_ASSOCIATIONS_FILE, "cone", ([cone] for cone in truth.associations.tolist()))
-
-
-def _write_csv(file: Path, header: str, rows: Iterable[list[Any]]) -> None:
-    # str of a Python float is the shortest text that reads back as the same number
-    text = "".join(",".join(map(str, row)) + "\n" for row in rows)
-    file.write_text(f"{header}\n{text}", encoding="utf-8", newline="\n")
+def _columns(log: Log) -> dict[str, tuple[Any, ...]]:
+    """Return the columns of each table, see `COLUMNS`."""
+    cycles, truth = log.cycles, log.truth
+    covariances = np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in cycles)])
+    columns: dict[str, tuple[Any, ...]] = {
+        ODOMETRY_FILE: (log.odometry.t, log.odometry.twist),
+        DETECTIONS_FILE: (
+            [float(cycle.t) for cycle in cycles for _ in cycle.labels],
+            np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in cycles)]),
+            [NAMES[label] for cycle in cycles for label in cycle.labels],
+            covariances[:, [0, 0, 1], [0, 1, 1]],
+        ),
+    }
+    if truth is not None:
+        columns[TRUTH_POSES_FILE] = truth.pose_t, truth.poses
+        columns[TRUTH_CONES_FILE] = truth.cones, [NAMES[label] for label in truth.cone_labels]
+        if truth.associations is not None:
+            columns[TRUTH_ASSOCIATIONS_FILE] = (truth.associations,)
+    return columns

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
@@ -17,7 +16,7 @@ from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.lengths import POSE, scaled
 
-from .csv_table import read_table
+from .csv_table import read_table, write_table
 from .files import atomic_folder, write_json
 from .log import CALIBRATION
 from .manifest import verified
@@ -237,20 +236,9 @@ def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, An
     with atomic_folder(Path(folder), marker=MAP_FILE) as temporary:
         write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
         write_trajectory(temporary / TRAJECTORY_FILE, result.trajectory_t, result.trajectory)
-        _write_cycles(temporary / CYCLES_FILE, result.cycles)
+        columns = [[getattr(record, name) for record in result.cycles] for name in _CYCLE_COLUMNS]
+        write_table(temporary / CYCLES_FILE, _CYCLE_COLUMNS, *columns)
         write_json(temporary / "summary.json", summary)
-
-
-def _write_cycles(file: Path, cycles: Iterable[CycleRecord]) -> None:
-    with file.open("w", encoding="utf-8", newline="") as out:
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(_CYCLE_COLUMNS)
-        writer.writerows(_cycle_row(record) for record in cycles)
-
-
-def _cycle_row(record: CycleRecord) -> list[float | int | str]:
-    values = (getattr(record, column) for column in _CYCLE_COLUMNS)
-    return [value.item() if isinstance(value, np.generic) else value for value in values]
 
 
 def read_health(file: Path) -> list[str]:

@@ -40,6 +40,13 @@ def test_the_trajectory_is_copied_to_the_byte_and_an_earlier_file_kept(tmp_path:
     assert (tmp_path / "out.tum.~1~").read_text() == "mine"
 
 
+def test_a_minus_is_standard_output(tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
+    source = folder(tmp_path / "map", ring_map())
+    assert main(["export", str(source), "--as", "tum", "--out", "-"]) == 0
+    assert capfdbinary.readouterr().out == (source / "trajectory.tum").read_bytes()
+    assert [path.name for path in tmp_path.iterdir()] == ["map"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

@@ -6,20 +6,23 @@ Bytes before the first section are the content of the target's first file. The r
 
 from __future__ import annotations
 
-import hashlib
+import json
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from pathspace_graph.eval.study.file import read_study
 from pathspace_graph.io.log import read_log
 from pathspace_graph.io.manifest import verify_all
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.snapshot import FORMAT
 from pathspace_graph.io.trajectory import read_trajectory
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.sim.track_files import read_track
+from pathspace_graph.snapshot import FORMAT, archive
 
 SECTION = re.compile(rb"(?:\A|(?<=\n))=== ([a-z_]+\.[a-z]+)\n")
 
@@ -59,18 +62,19 @@ def read_tracks(folder: Path) -> None:
 
 
 def read_snapshots(folder: Path) -> None:
-    """Reads a snapshot as it is, or a structure and numbers with the digest that belongs to them."""
+    """Reads a snapshot as it is, or of a structure and numbers, with the digest that belongs to them."""
     structure = folder / "structure.json"
     if structure.exists():
-        text, data = structure.read_bytes(), (folder / "numbers.bin").read_bytes()
-        (folder / "mapper.snap").write_bytes(signed(text, data))
+        text, numbers = structure.read_bytes(), np.fromfile(folder / "numbers.bin", np.uint8)
+        (folder / "mapper.snap").write_bytes(archive(with_format(text), numbers))
     FixedLagMapper.restore(folder / "mapper.snap")
 
 
-def signed(text: bytes, data: bytes) -> bytes:
-    """The content of a snapshot of this structure, with its digest."""
-    content = b"%d\n%s\n%s" % (len(text), text, data)
-    return f"{FORMAT}\n{hashlib.sha256(content).hexdigest()}\n".encode() + content
+def with_format(text: bytes) -> bytes:
+    """The structure with the format of now, unless it has another."""
+    with suppress(ValueError, TypeError, RecursionError):  # no structure at all is an input as well
+        return json.dumps({"format": FORMAT, **json.loads(text)}).encode()
+    return text
 
 
 LOG = {

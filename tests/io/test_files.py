@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +100,125 @@ def test_single_file_that_fails(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no"), atomic_file(tmp_path / "deep" / "plot.png") as path:
         path.write_text("half")
         raise ValueError("no")
+    assert names(tmp_path) == []
+
+
+# --- what is not a regular file ----------------------------------------------------------------------------
+
+
+def test_links_are_followed(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    for name in ("file", "folder", "new"):
+        (tmp_path / name).symlink_to(tmp_path / "there" / name)
+    write_result(tmp_path / "there" / "folder", "1")
+    (tmp_path / "there" / "file").write_text("1")
+    write_result(tmp_path / "folder", "2")
+    for name in ("file", "new"):
+        with atomic_file(tmp_path / name) as path:
+            path.write_text("2")
+    assert all((tmp_path / name).is_symlink() for name in ("file", "folder", "new"))
+    assert names(tmp_path) == ["file", "folder", "new", "there"]
+    assert names(tmp_path / "there") == ["file", "file.~1~", "folder", "folder.~1~", "new"]
+    assert (tmp_path / "folder" / "marker").read_text() == (tmp_path / "file").read_text() == "2"
+
+
+def test_a_link_to_itself_is_not_lost(tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to("loop")
+    with atomic_file(tmp_path / "loop") as path:
+        path.write_text("1")
+    assert (tmp_path / "loop").read_text() == "1"
+    assert (tmp_path / "loop.~1~").is_symlink()
+
+
+def test_a_pipe_is_written_in_place(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.txt")
+    reader = os.open(tmp_path / "pipe.txt", os.O_RDONLY | os.O_NONBLOCK)
+    with atomic_file(tmp_path / "pipe.txt") as path:
+        assert path.suffix == ".txt"
+        path.write_text("through")
+    assert os.read(reader, 100) == b"through"
+    os.close(reader)
+    assert names(tmp_path) == ["pipe.txt"] and (tmp_path / "pipe.txt").is_fifo()
+
+
+def test_a_device_is_written_in_place() -> None:
+    before = sorted(Path("/dev").iterdir())
+    with atomic_file("/dev/null") as path:
+        path.write_text("nothing")
+    assert Path("/dev/null").is_char_device()
+    assert sorted(Path("/dev").iterdir()) == before
+
+
+def test_a_minus_is_standard_output(tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
+    with atomic_file("-") as path:
+        path.write_bytes(b"\x00\xff")
+    assert capfdbinary.readouterr().out == b"\x00\xff"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_device_is_named() -> None:
+    message = r"^/dev/full: can't be written: No space left on device$"
+    with pytest.raises(OutputError, match=message), atomic_file("/dev/full") as path:
+        path.write_text("much")
+
+
+FULL = """
+import resource, signal, sys
+from pathlib import Path
+from pathspace_graph.errors import OutputError
+from pathspace_graph.io.files import atomic_file, atomic_folder, write_text
+
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+write = {"file": atomic_file, "folder": lambda target: atomic_folder(target, "marker")}
+for name in ("file", "folder", "text"):
+    target = Path(sys.argv[1], name)
+    try:
+        if name == "text":
+            write_text(target, 2000 * "x")
+        else:
+            with write[name](target) as temporary:
+                (temporary if name == "file" else temporary / "marker").write_text(2000 * "x")
+    except OutputError as error:
+        print(error)
+"""
+
+
+def test_a_full_disk_names_the_file_and_leaves_nothing(tmp_path: Path) -> None:
+    run = subprocess.run([sys.executable, "-c", FULL, tmp_path], capture_output=True, text=True, check=True)
+    for line, name in zip(run.stdout.splitlines(), ("file", "folder", "text"), strict=True):
+        assert line == f"{tmp_path / name}: can't be written: File too large"
+    assert names(tmp_path) == []
+
+
+def test_an_error_of_reading_meanwhile_is_not_one_of_writing(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), atomic_file(tmp_path / "out.txt") as path:
+        path.write_text((tmp_path / "none.txt").read_text())
+    assert names(tmp_path) == []
+
+
+TERMINATED = """
+import sys, time
+from pathlib import Path
+from pathspace_graph import cli
+from pathspace_graph.io.files import atomic_file, atomic_folder
+
+def work(_):
+    with atomic_folder(Path(sys.argv[1], "new", "out"), "marker"), atomic_file(Path(sys.argv[1], "f")):
+        print("ready", flush=True)
+        time.sleep(60.0)
+
+cli._run = work
+sys.exit(cli.main())
+"""
+
+
+def test_nothing_hidden_stays_where_a_command_is_terminated(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", TERMINATED, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        assert len(names(tmp_path)) == 2
+        process.terminate()
+    assert process.returncode == 143
     assert names(tmp_path) == []
 
 

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from pathspace_graph.io import disk, files
+from pathspace_graph.errors import OutputError
+from pathspace_graph.io import disk
+from pathspace_graph.io.disk import is_temporary
 from pathspace_graph.io.files import atomic_file, atomic_folder, check_target, write_text
-from pathspace_graph.io.temporary import is_temporary
 
 from ..scenes.kills import leftovers
 
@@ -69,19 +70,18 @@ def test_a_folder_with_leftovers_only_is_an_empty_one(tmp_path: Path) -> None:
     assert not is_temporary(".study.json") and not is_temporary("study.0123abcd.tmp.json")
 
 
-def test_an_exchange_is_one_step_and_says_where_there_is_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("has_exchange", [True, False])
+def test_an_exchange_is_one_step_or_goes_by_way_of_a_spare_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_exchange: bool
 ) -> None:
+    if not has_exchange:
+        monkeypatch.setattr(disk, "_RENAMEAT2", None)
     for name in "ab":
         (tmp_path / name).mkdir()
         (tmp_path / name / "file").write_text(name)
-    if disk._RENAMEAT2 is not None:
-        assert disk.exchange(tmp_path / "a", tmp_path / "b")
-        assert (tmp_path / "a" / "file").read_text() == "b"
-        with pytest.raises(FileNotFoundError):
-            disk.exchange(tmp_path / "a", tmp_path / "none")
-    monkeypatch.setattr(disk, "_RENAMEAT2", None)
-    assert not disk.exchange(tmp_path / "a", tmp_path / "b")
+    disk.exchange(tmp_path / "a", tmp_path / "b", tmp_path / "spare")
+    assert (tmp_path / "a" / "file").read_text() == "b"
+    assert (tmp_path / "b" / "file").read_text() == "a"
     assert not disk.rename_new(tmp_path / "a", tmp_path / "b")
     assert disk.rename_new(tmp_path / "a", tmp_path / "c")
     assert names(tmp_path) == ["b", "c"]
@@ -105,12 +105,12 @@ def test_results_are_kept_where_the_system_can_not_exchange(
 
 
 def test_a_failed_exchange_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> bool:
+    def fail(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied")
 
     write_text(tmp_path / "f.txt", "1")
-    monkeypatch.setattr(files.disk, "exchange", fail)
-    with pytest.raises(files.OutputError, match="Permission denied"), atomic_file(tmp_path / "f.txt") as file:
+    monkeypatch.setattr(disk, "exchange", fail)
+    with pytest.raises(OutputError, match="Permission denied"), atomic_file(tmp_path / "f.txt") as file:
         file.write_text("2")
     assert names(tmp_path) == ["f.txt"]
     assert (tmp_path / "f.txt").read_text() == "1"
