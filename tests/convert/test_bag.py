@@ -396,9 +396,14 @@ def test_a_sensor_of_another_frame_is_told_until_its_mounting_is_stated(
     bag = write_bag(tmp_path, "mcap", make("lidar"))
     convert(bag, tmp_path / "log")
     assert "in frame lidar, the odometry is of base_link: --mounting" in capsys.readouterr().out
-    log = convert(bag, tmp_path / "other", "--mounting", "1", "2", str(np.pi / 2))
+    noise = ("--sigma-range", "1", "--sigma-range-growth", "0", "--sigma-bearing", "0.01")
+    log = convert(bag, tmp_path / "other", "--mounting", "1", "2", "0.3", *noise)
     assert "--mounting" not in capsys.readouterr().out
-    np.testing.assert_allclose(log.cycles[0].points_vehicle, [[1.0 - 1.5, 2.0 + 5.0]])
+    bearing, distance = np.arctan2(1.5, 5.0) + 0.3, np.hypot(5.0, 1.5)
+    ray, left = (np.array([np.cos(angle), np.sin(angle)]) for angle in (bearing, bearing + np.pi / 2))
+    np.testing.assert_allclose(log.cycles[0].points_vehicle, [[1.0, 2.0] + distance * ray])
+    expected = np.outer(ray, ray) + (0.01 * distance) ** 2 * np.outer(left, left)
+    np.testing.assert_allclose(log.cycles[0].covariances, [expected])
     (tmp_path / "map").mkdir()
     line = refused(write_bag(tmp_path / "map", "mcap", make("odom")), tmp_path / "new", capsys, *TOPICS)
     assert "found them in odom, the frame of its pose" in line

@@ -33,7 +33,8 @@ def refused(folder: Path, capsys: pytest.CaptureFixture[str], *options: str) -> 
 
 ODOMETRY = "stamp,speed,yaw\n1000000000,2000,90\n1100000000,2000,-90\n1200000000,2000,0\n"
 DETECTIONS = (
-    "stamp,cone_x,cone_y,colour\n1050000000,5000,1500,7\n1050000000,4000,-1500,8\n1150000000,3000,0,9\n"
+    "stamp,cone_x,cone_y,colour,xx,xy,yy\n1050000000,5000,1500,7,20000,-10000,30000\n"
+    "1050000000,4000,-1500,8,40000,0,10000\n1150000000,3000,0,9,10000,0,10000\n"
 )
 RENAMED = ["--columns", "t=stamp", "vx=speed", "wz=yaw", "x=cone_x", "y=cone_y", "label=colour"]
 UNITS = ["--units", "length=mm", "angle=deg", "time=ns"]
@@ -47,6 +48,8 @@ def test_columns_units_and_labels_are_as_they_were_named(tmp_path: Path) -> None
     np.testing.assert_allclose(log.odometry.twist, [[2, 0, quarter], [2, 0, -quarter], [2, 0, 0]])
     assert [cycle.t for cycle in log.cycles] == pytest.approx([1.05, 1.15])
     np.testing.assert_allclose(log.cycles[0].points_vehicle, [[5.0, 1.5], [4.0, -1.5]])
+    in_square_metres = [[[0.02, -0.01], [-0.01, 0.03]], [[0.04, 0.0], [0.0, 0.01]]]
+    np.testing.assert_allclose(log.cycles[0].covariances, in_square_metres)
     assert log.cycles[0].labels.tolist() == [LEFT, RIGHT]
     assert log.cycles[1].labels.tolist() == [UNKNOWN]
 

@@ -27,15 +27,26 @@ def one(x: float, y: float, covariance: object = np.nan) -> Points:
 
 
 def test_points_and_covariances_go_to_the_vehicle_frame() -> None:
-    covariance = np.array([[4.0, 1.0], [1.0, 2.0]])
-    log = to_log(record(one(2.0, 1.0, covariance)), Frames((1.0, 0.5, np.pi / 2)), NoiseSettings(), FILE)
-    np.testing.assert_allclose(log.cycles[0].points_vehicle, [[1.0 - 1.0, 0.5 + 2.0]], atol=1e-12)
-    np.testing.assert_allclose(log.cycles[0].covariances[0], [[2.0, -1.0], [-1.0, 4.0]], atol=1e-12)
+    """The sensor is turned to the left by 0.3 rad: its long axis, which leads to the cone, turns with it."""
+    c, s, ray = np.cos(0.3), np.sin(0.3), np.array([0.8, 0.6])
+    turned = np.array([0.8 * c - 0.6 * s, 0.8 * s + 0.6 * c])
+    covariance = 4.0 * np.outer(ray, ray) + 0.01 * np.eye(2)
+    log = to_log(record(one(4.0, 3.0, covariance)), Frames((1.0, 0.5, 0.3)), NoiseSettings(), FILE)
+    np.testing.assert_allclose(log.cycles[0].points_vehicle, [[1.0, 0.5] + 5.0 * turned], atol=1e-12)
+    expected = 4.0 * np.outer(turned, turned) + 0.01 * np.eye(2)
+    np.testing.assert_allclose(log.cycles[0].covariances[0], expected, atol=1e-12)
 
 
 def test_the_sensor_is_flipped_before_it_is_mounted() -> None:
-    log = to_log(record(one(2.0, 1.0)), Frames((1.0, 0.5, np.pi), "left", "right"), NoiseSettings(), FILE)
-    np.testing.assert_allclose(log.cycles[0].points_vehicle, [[-1.0, 1.5]], atol=1e-12)
+    """What is at (4, 3) with y to the right is at (4, -3) before the sensor's turn by 0.3 rad."""
+    c, s, ray = np.cos(0.3), np.sin(0.3), np.array([0.8, 0.6])
+    turned = np.array([0.8 * c + 0.6 * s, 0.8 * s - 0.6 * c])
+    covariance = 4.0 * np.outer(ray, ray) + 0.01 * np.eye(2)
+    frames = Frames((1.0, 0.5, 0.3), "left", "right")
+    log = to_log(record(one(4.0, 3.0, covariance)), frames, NoiseSettings(), FILE)
+    np.testing.assert_allclose(log.cycles[0].points_vehicle, [[1.0, 0.5] + 5.0 * turned], atol=1e-12)
+    expected = 4.0 * np.outer(turned, turned) + 0.01 * np.eye(2)
+    np.testing.assert_allclose(log.cycles[0].covariances[0], expected, atol=1e-12)
     np.testing.assert_array_equal(log.odometry.twist[0], [1.0, 0.2, 0.3])
 
 
@@ -43,8 +54,10 @@ def test_a_covariance_that_is_missing_is_made_at_the_sensor() -> None:
     noise = NoiseSettings(sigma_range=0.1, sigma_range_growth=0.02, sigma_bearing=0.03)
     covariance = default_covariances(np.array([[0.0, 5.0]]), noise)[0]
     np.testing.assert_allclose(covariance, [[(5 * 0.03) ** 2, 0.0], [0.0, 0.2**2]], atol=1e-15)
-    mounted = to_log(record(one(0.0, 5.0)), Frames((3.0, 0.0, np.pi / 2)), noise, FILE)
-    np.testing.assert_allclose(mounted.cycles[0].covariances[0], covariance[::-1, ::-1], atol=1e-15)
+    mounted = to_log(record(one(0.0, 5.0)), Frames((3.0, 0.0, 0.3)), noise, FILE)
+    ray = np.array([-np.sin(0.3), np.cos(0.3)])
+    expected = 0.2**2 * np.outer(ray, ray) + (5 * 0.03) ** 2 * (np.eye(2) - np.outer(ray, ray))
+    np.testing.assert_allclose(mounted.cycles[0].covariances[0], expected, atol=1e-15)
     assert positive_definite(default_covariances(np.zeros((1, 2)), noise)).all()
 
 

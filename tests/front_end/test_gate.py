@@ -10,15 +10,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pathspace_graph import ReadingError
 from pathspace_graph.errors import InputError, PathspaceError
+from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.front_end.gate import Admitted, Gate, Newest, admit, read_usable_log
 from pathspace_graph.io.log import Detections, Odometry, write_log
 from pathspace_graph.settings.limits import LimitSettings
 
 from ..scenes.drives import ahead, corridor, exact_log
 
+Array = NDArray[np.float64]
 LIMITS = LimitSettings()
 NEWEST = Newest(1.0, np.array([4.0, 0.1, 0.2]))
 STAMPS = np.array([1.0, 1.02, 1.06])
@@ -39,7 +42,7 @@ def detections(t: Any = 1.1, **changes: Any) -> Detections:
     return replace(good, **changes)
 
 
-def with_entry(array: np.ndarray[Any, Any], index: Any, value: float) -> np.ndarray[Any, Any]:
+def with_entry(array: np.ndarray[Any, Any], index: Any, value: Any) -> np.ndarray[Any, Any]:
     changed = array.copy()
     changed[index] = value
     return changed
@@ -285,12 +288,25 @@ def test_one_stamp_far_ahead_is_an_error_and_two_that_agree_are_a_vehicle_that_w
 
 # --- what is dropped -------------------------------------------------------------------------------------
 
+
+def turned(x: float, y: float) -> Array:
+    """A vector in axes that are turned by 0.5 rad."""
+    return np.asarray(rotation(0.5) @ [x, y])
+
+
+def axes(along: float, across: float) -> Array:
+    """The covariance (2, 2) with these standard deviations (m) in axes that are turned by 0.5 rad."""
+    return np.asarray(rotation(0.5) @ np.diag(np.square([along, across])) @ rotation(0.5).T)
+
+
 COVARIANCES = detections().covariances
 POINTS = detections().points_vehicle
 DROPPED = {
     "NaN": {"points_vehicle": with_entry(POINTS, (1, 0), np.nan)},
     "infinity": {"points_vehicle": with_entry(POINTS, (1, 1), -np.inf)},
+    "beyond the sensor": {"points_vehicle": with_entry(POINTS, 1, turned(1.001 * LIMITS.range_max, 0.0))},
     "far beyond the sensor": {"points_vehicle": with_entry(POINTS, (1, 0), 1e200)},
+    "too near": {"points_vehicle": with_entry(POINTS, 1, turned(0.999 * LIMITS.range_min, 0.0))},
     "at the vehicle": {"points_vehicle": with_entry(POINTS, 1, 0.0)},
     "NaN as a covariance": {"covariances": with_entry(COVARIANCES, (1, 0, 0), np.nan)},
     "infinite covariance": {"covariances": with_entry(COVARIANCES, 1, np.inf)},
@@ -298,6 +314,8 @@ DROPPED = {
     "negative covariance": {"covariances": with_entry(COVARIANCES, 1, -0.01)},
     "indefinite covariance": {"covariances": with_entry(COVARIANCES, (1, slice(None), slice(None)), 0.02)},
     "asymmetric covariance": {"covariances": with_entry(COVARIANCES, (1, 0, 1), 0.005)},
+    "long covariance": {"covariances": with_entry(COVARIANCES, 1, axes(1.001 * LIMITS.sigma_max, 1.0))},
+    "thin covariance": {"covariances": with_entry(COVARIANCES, 1, axes(1.0, 0.999 * LIMITS.sigma_min))},
     "huge covariance": {"covariances": with_entry(COVARIANCES, (1, 0, 0), 1e308)},
     "tiny covariance": {"covariances": with_entry(COVARIANCES, (1, 0, 0), 1e-300)},
 }
@@ -314,9 +332,24 @@ def test_a_single_impossible_detection_is_dropped(name: str) -> None:
     assert admitted.notice.endswith("in row 1")
 
 
-def test_correlated_and_long_covariances_are_possible() -> None:
-    covariances = np.array([[[4.0, 1.999], [1.999, 1.0]], [[25.0, 0.0], [0.0, 1e-6]], [[1e-8, 0], [0, 1e-8]]])
+@pytest.mark.parametrize(
+    ("along", "across"),
+    [
+        (0.999 * LIMITS.sigma_max, 0.5 * LIMITS.sigma_max),
+        (0.999 * LIMITS.sigma_max, 1e-3),
+        (1.001 * LIMITS.sigma_min, 1.001 * LIMITS.sigma_min),
+        (0.1, 1.001 * LIMITS.sigma_min),
+    ],
+)
+def test_long_and_thin_covariances_are_possible_up_to_the_limits(along: float, across: float) -> None:
+    covariances = with_entry(COVARIANCES, 1, axes(along, across))
     assert through(cycle=detections(covariances=covariances)).dropped == 0
+
+
+@pytest.mark.parametrize("distance", [1.001 * LIMITS.range_min, 0.999 * LIMITS.range_max])
+def test_detections_are_possible_up_to_the_limits_of_the_range(distance: float) -> None:
+    points = with_entry(POINTS, 1, turned(distance, 0.0))
+    assert through(cycle=detections(points_vehicle=points)).dropped == 0
 
 
 def test_the_notice_comes_once_in_a_row() -> None:

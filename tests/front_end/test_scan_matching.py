@@ -9,9 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pathspace_graph.factors.se2 import to_vehicle
-from pathspace_graph.front_end.scan_matching import RecentDetections, match
+from pathspace_graph.factors.se2 import to_map, to_vehicle
+from pathspace_graph.front_end.scan_matching import MOST_MISFIT, RecentDetections, match, misfit_at
 from pathspace_graph.settings.front_end import MotionSettings
+
+from ..scenes.jacobians import numeric_jacobian
 
 SETTINGS = MotionSettings()
 CONES = np.array([[2.0, 2.0], [6.0, 2.2], [10.0, 2.0], [2.5, -1.9], [7.0, -2.0], [11.0, -2.1]])
@@ -47,30 +49,52 @@ def test_exact_detections_give_the_exact_motion(x: float, y: float, theta: float
     assert found.is_certain
 
 
-def test_the_information_is_that_of_two_detections_of_every_cone() -> None:
-    """Each offset has the variance of two detections and of the cone: `2 * 0.01 + sigma_cone^2`."""
-    found = match(seen_once(), CONES, np.full(6, 0.01), np.zeros(3), SETTINGS, reaches(1))
-    precision = 1.0 / (2 * 0.01 + SETTINGS.sigma_cone**2)
-    assert found.information[0, 0] == pytest.approx(6 * precision)
-    assert found.information[2, 2] == pytest.approx(precision * (CONES**2).sum())
-    assert found.information[1, 2] == pytest.approx(precision * CONES[:, 0].sum())
+# the information, where no coordinate, heading, weight or variance is a special one
+POSE = np.array([3.0, -2.0, 0.7])
+ASYMMETRIC = np.array([[8.0, 1.0], [4.0, 5.5], [12.0, 9.0], [5.0, -4.0], [2.5, 1.0]])
+VARIANCES = np.array([0.01, 0.04, 0.02, 0.09, 0.03])
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_the_information_is_that_of_one_detection_and_the_mean_of_n(n: int) -> None:
+    """Each offset has the variance `v (1 + 1/n) + sigma_cone^2`; its derivatives are numeric ones."""
+    seen = detected(POSE, ASYMMETRIC)
+    recent = seen_once(np.tile(ASYMMETRIC, (n, 1)))
+    found = match(recent, seen, VARIANCES, POSE, SETTINGS, reaches(1)[-1:])
+    jacobian = numeric_jacobian(lambda pose: to_map(seen, np.tile(pose, (len(seen), 1))).ravel(), POSE)
+    precision = np.repeat(1.0 / (VARIANCES * (1.0 + 1.0 / n) + SETTINGS.sigma_cone**2), 2)
+    expected = jacobian.T @ (precision[:, None] * jacobian)
+    assert np.abs(expected[2, :2]).min() > 100.0  # x and y are told together with the heading
+    np.testing.assert_allclose(found.information, expected, rtol=1e-6, atol=1e-6)
     assert found.misfit == pytest.approx(0.0, abs=1e-12)
 
 
 def test_the_covariance_is_that_of_many_noisy_matches() -> None:
-    rng, sigma = np.random.default_rng(0), 0.1
+    """Errors that are whitened by the claimed covariance have the covariance 1, cross terms included."""
+    rng, sigma, n = np.random.default_rng(0), 0.02, 3
     settings = MotionSettings(sigma_cone=1e-6, huber=np.inf)
-    errors = []
+    seen, errors = detected(POSE, ASYMMETRIC), []
     for _ in range(400):
         recent = RecentDetections(settings)
-        remember(recent, 0.0, CONES + sigma * rng.standard_normal(CONES.shape))
-        points = CONES + sigma * rng.standard_normal(CONES.shape)
-        found = match(recent, points, np.full(6, sigma**2), np.zeros(3), settings, reaches(4))
-        errors.append(found.pose)
-    covariance = np.linalg.inv(found.information)
-    np.testing.assert_allclose(
-        np.cov(np.array(errors).T), covariance, atol=0.15 * covariance.max(), rtol=0.25
-    )
+        for k in range(n):
+            remember(recent, 0.1 * k, ASYMMETRIC + sigma * rng.standard_normal(ASYMMETRIC.shape))
+        points = seen + sigma * rng.standard_normal(seen.shape)
+        found = match(recent, points, np.full(len(seen), sigma**2), POSE, settings, [0.4] * 2)
+        errors.append(np.linalg.cholesky(found.information).T @ (found.pose - POSE))
+    np.testing.assert_allclose(np.cov(np.array(errors).T), np.eye(3), atol=0.2)
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_the_misfit_at_a_pose_is_the_mean_square_of_the_whitened_distances(n: int) -> None:
+    """One detection is 0.2 m off, one counts as much as is allowed, and one is of nothing."""
+    seen = detected(POSE, ASYMMETRIC[:4])
+    recent = seen_once(np.tile(ASYMMETRIC[:3], (n, 1)))
+    variances = np.array([0.04, 0.02, 1e-6, 0.01])
+    off = np.array([[0.0, 0.2], [0.0, 0.0], [0.0, 0.2], [0.0, 0.0]])
+    weight = n * np.exp(-0.5 * (0.2 / SETTINGS.reach_last) ** 2)
+    square = 0.2**2 / (0.04 * (1.0 + 1.0 / weight) + SETTINGS.sigma_cone**2)
+    found = misfit_at(recent, seen + off, variances, POSE, SETTINGS)
+    assert found == pytest.approx((square + 0.0 + 2.0 * MOST_MISFIT) / 4.0)
 
 
 def test_a_detection_of_nothing_has_no_say() -> None:

@@ -10,16 +10,18 @@ import pytest
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.front_end.cones import NearCones
 from pathspace_graph.front_end.front_end import FrontEnd, judge_log
+from pathspace_graph.front_end.sides import SideJudge
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, ORANGE, RIGHT, UNKNOWN
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.front_end import SidesSettings
+from pathspace_graph.settings.growth import PathSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.faults import Faults, SensorFaults, VehicleFaults
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.vehicle import VehicleSettings
 
-from ..scenes.drives import bean_track
+from ..scenes.drives import bean_track, detections
 
 
 def drive(faults: Faults | None = None, wrong_colour: float = 0.01) -> Log:
@@ -35,6 +37,48 @@ def labels_of(log: Log) -> tuple[np.ndarray, np.ndarray]:
     judged = np.concatenate([c.labels for c in judge_log(log, log.noise, MapperSettings()).cycles])
     real = truth.associations >= 0
     return judged[real], truth.cone_labels[truth.associations[real]]
+
+
+PLACES = np.array([[x, y] for x in (1.0, 2.5, 4.0, 5.5, 7.0) for y in (2.0, -2.0, 4.0, -4.0, 6.0, -6.0)])
+"""Thirty cones beside a straight, less than the reach ahead, and farther from each other than one cone is."""
+
+
+def is_swapped(judge: SideJudge, lap: int, agreeing: int, opposing: int) -> bool:
+    """Whether a judge swaps the colours of cones that were not seen before, with so many on either side."""
+    points = PLACES[: agreeing + opposing]
+    on_side = np.where(points[:, 1] > 0.0, LEFT, RIGHT)
+    labels = np.where(np.arange(len(points)) < opposing, LEFT + RIGHT - on_side, on_side)
+    cycle = detections(float(lap), points, labels)
+    found = judge.update(np.array([20.0 * lap, 0.0, 0.0]), np.array([[5.0, 0.0, 0.0]]), cycle)
+    swapped = bool((found.labels == LEFT + RIGHT - labels).all())
+    assert swapped or (found.labels == labels).all()
+    return swapped
+
+
+@pytest.mark.parametrize(
+    ("agreeing", "opposing", "swapped"),
+    [
+        (0, 2, False),
+        (0, 3, True),
+        (3, 3, False),
+        (4, 10, False),
+        (4, 11, True),
+        (20, 2, False),
+        (9, 0, False),
+    ],
+)
+def test_colours_are_swapped_by_a_clear_majority(agreeing: int, opposing: int, swapped: bool) -> None:
+    """Three cones at least, and more than 2.5 times as many as on the side of their own colour."""
+    judge = SideJudge(SidesSettings(), PathSettings())
+    assert is_swapped(judge, 0, agreeing, opposing) is swapped
+
+
+@pytest.mark.parametrize(("agreeing", "swapped"), [(7, True), (8, False)])
+def test_colours_are_swapped_back_by_as_clear_a_majority(agreeing: int, swapped: bool) -> None:
+    """Three cones were on the other side."""
+    judge = SideJudge(SidesSettings(), PathSettings())
+    assert is_swapped(judge, 0, 0, 3)
+    assert is_swapped(judge, 1, agreeing, 0) is swapped
 
 
 def test_right_colours_are_left_as_they_are() -> None:

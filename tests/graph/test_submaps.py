@@ -24,6 +24,7 @@ from ..scenes.graph import columns_of, dense_rows, schur
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
+NOTHING = np.zeros(0, np.intp)
 KEYFRAME, END = pose_key(2), pose_key(6)
 POINTS = np.append(control_keys(0, np.array([4, 5])), control_keys(1, np.array([2])))
 KEYS = np.concatenate([[CALIBRATION_KEY], POINTS, [END]])
@@ -192,13 +193,20 @@ def odometry_rows(drive: Drive, k: int, rng: np.random.Generator) -> Rows:
     return Rows(keys, jacobian / 0.05, residual[0] / 0.05, np.full(POSE, k))
 
 
-def drive_on(drive: Drive, groups: list[list[Rows]], interval: float) -> tuple[Submaps, Array, Array]:
-    """Returns submaps of all poses but the last, added oldest first, and the dense A and b."""
+def drive_on(
+    drive: Drive, groups: list[list[Rows]], interval: float, cut: int = -1, gone: IntArray = NOTHING
+) -> tuple[Submaps, Array, Array]:
+    """Returns submaps of all poses but the last, added oldest first, and the dense A and b.
+
+    Before the pose `cut`, the information about the points `gone` is removed.
+    """
     variables = drive.variables
     known = np.array([CALIBRATION_KEY, drive.poses[0]])
     A, b = np.diag(np.arange(1.0, 6.0)), np.linspace(-1.0, 1.0, 5)
     submaps = Submaps(graph_of(jacobian_factor(known, A, b)), interval)
     for k, own in enumerate(groups):
+        if k == cut:
+            submaps.remove_information(gone, variables)
         graph = graph_of(jacobian_factors(own, variables)[k].linear)
         submaps.add_pose(int(drive.poses[k]), graph, variables)
         variables.remove(drive.poses[k : k + 1])
@@ -264,16 +272,40 @@ def test_a_whole_drive_turned_with_its_start_is_known_as_well_as_before(interval
     np.testing.assert_allclose(turned, rotations @ negative_gradient, atol=1e-9 * scale)
 
 
-def test_submaps_go_on_after_information_is_removed() -> None:
-    rng = np.random.default_rng(9)
-    drive = random_drive(rng, 0)
+@pytest.mark.parametrize("interval", [2.5, 100.0])
+def test_submaps_go_on_after_information_is_removed_in_the_middle_of_one(interval: float) -> None:
+    """What was known of a point is gone, what is measured later counts, and all else is the dense marginal.
+
+    The point was seen in the unfinished submap alone.
+    """
+    rng, cut = np.random.default_rng(9), 5
+    drive = random_drive(rng, 3)
+    variables, keys = drive.variables, drive.variables.keys
+    gone, moved = keys[3:4], variables.values - variables.reference
+    assert gone in np.concatenate(drive.seen[3:cut]) and gone in np.concatenate(drive.seen[cut:8])
     groups = [[detection_rows(drive, k, rng), odometry_rows(drive, k, rng)] for k in range(8)]
-    submaps, *_ = drive_on(drive, groups, 2.5)
-    gone = control_keys(1, np.array([1, 2]))
-    assert any(np.isin(gone, submap.keys.keys).any() for submap in submaps.finished)
-    submaps.remove_information(gone, drive.variables)
-    assert not any(np.isin(gone, submap.keys.keys).any() for submap in submaps.finished)
-    assert all(control_keys(0, np.array(0)) in submap.keys.keys for submap in submaps.finished)
+    submaps, A, b = drive_on(drive, groups, interval, cut, gone)
+
+    hessian, vector = np.zeros((len(moved), len(moved))), np.zeros(len(moved))
+    first = columns_of(np.array([CALIBRATION_KEY, drive.poses[0]]), keys)
+    hessian[np.ix_(first, first)], vector[first] = A.T @ A, A.T @ b
+    for k, own in enumerate(groups):
+        if k == cut:
+            known, at = np.flatnonzero(np.diagonal(hessian)), columns_of(gone, keys)
+            less = schur(hessian[np.ix_(known, known)], vector[known], np.searchsorted(known, at))
+            hessian[:], vector[:], rest = 0.0, 0.0, np.setdiff1d(known, at)
+            hessian[np.ix_(rest, rest)], vector[rest] = less
+        J, r, _ = dense_rows(own, keys)
+        hessian, vector = hessian + J.T @ J, vector + J.T @ (J @ moved - r)
+    information, negative_gradient = schur(hessian, vector, columns_of(drive.poses[:-1], keys))
+
+    submaps.insert_keyframes(variables)
+    graph = submaps.graph(variables)
+    whole = Layout(keys_of(graph))
+    keyframes = whole.entries(np.array(sorted(submaps.keyframes)))
+    found, found_descent = schur(*normal_equations(graph, whole), keyframes)
+    np.testing.assert_allclose(found, information, atol=1e-6 * np.abs(information).max())
+    np.testing.assert_allclose(found_descent, negative_gradient, atol=1e-6 * np.abs(negative_gradient).max())
 
 
 def test_a_drive_without_a_pose_has_no_submap() -> None:

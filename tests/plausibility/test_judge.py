@@ -12,16 +12,56 @@ from pathspace_graph.eval.hints.good import GOOD, backs_up, in_unix_time, one_bo
 from pathspace_graph.eval.hints.measure import causes_of
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import UNKNOWN
-from pathspace_graph.sim.mistakes import MISTAKES, in_frame, with_points, with_twists
+from pathspace_graph.sim.mistakes import MISTAKES, in_frame, late, with_points, with_twists
 
 from ..scenes.drives import ahead, corridor, exact_log, short_drive
 
+SAID = {
+    "positions in millimetres": ("in millimetres", "multiply x and y by 0.001"),
+    "speeds in mm/s": ("in mm/s", "multiply vx and vy by 0.001"),
+    "all lengths in millimetres": ("positions are in millimetres", "speeds are in mm/s", "are in mm^2"),
+    "yaw rate in degrees per second": ("in degrees per second", "multiply it by 0.017453"),
+    "bearings in degrees": ("bearings in degrees were taken for radians",),
+    "y to the right": ("y points to the right", "negate column y"),
+    "stamps in nanoseconds": ("in nanoseconds", "multiply column t by 1e-09"),
+    "stamps of the odometry in nanoseconds": ("in nanoseconds", "multiply column t by 1e-09"),
+    "stamps of the detections in nanoseconds": ("in nanoseconds", "multiply column t by 1e-09"),
+    "sensor frame: x to the right, y ahead": ("x to the right and y ahead", "y into column x and -x into"),
+    "sensor frame: x to the left": ("x to the left and y to the rear", "-y into column x and x into"),
+    "sensor frame: x to the rear": ("x to the rear and y to the right", "-x into column x and -y into"),
+    "sensor frame: turned by 30 degrees": ("degrees to the left in",),
+    "sensor frame: turned by 10 degrees": ("degrees to the right in",),
+    "sensor frame: camera, z ahead": ("z ahead, x to the right and y down", "z into column x and -x into"),
+    "sensor frame: x and y swapped": ("x and y are swapped", "y into column x and x into column y"),
+    "sensor frame: 2 m ahead": ("whose origin is not the vehicle's",),
+    "positions in centimetres": ("in centimetres", "multiply x and y by 0.01"),
+    "speeds in km/h": ("in km/h", "multiply vx and vy by 0.27778"),
+    "yaw rate to the right": ("positive to the right", "negate column wz"),
+    "stamps in milliseconds": ("in milliseconds", "multiply column t by 0.001"),
+    "odometry is a pose": ("is a pose (x, y, heading)",),
+    "speeds in the map frame": ("along the axes of a fixed frame",),
+    "detections in the map frame": ("in the frame of the map",),
+    "detections 1 s late": ("about 1 s too late",),
+    "covariances in mm^2": ("are in mm^2",),
+    "covariances of zero": ("no covariances at all",),
+    "all labels left": ("not turned into left and right",),
+    "y to the right, yaw rate in degrees": ("y points to the right", "multiply it by 0.017453"),
+}
+"""The hints of each mistake say this, with its figure and its direction."""
+
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_each_mistake_is_told_by_its_cause(mistake: str) -> None:
+def test_each_mistake_is_told_by_its_cause_and_its_figure(mistake: str) -> None:
     found = hints(MISTAKES[mistake](short_drive()))
     assert {hint.cause for hint in found} & set(causes_of(mistake)), found
+    said = " ".join(f"{hint.likely}; {hint.advice}" for hint in found)
+    assert [words for words in SAID[mistake] if words not in said] == [], said
     assert all("\n" not in hint.line for hint in found)
+
+
+def test_detections_that_are_stamped_too_early_are_told() -> None:
+    (found,) = hints(late(short_drive(), -0.5))
+    assert (found.cause, found.likely) == ("clocks", "the detections are stamped about 0.5 s too early")
 
 
 def test_good_logs_are_not_accused() -> None:
