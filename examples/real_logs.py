@@ -20,9 +20,9 @@ from scipy.stats import t as student
 
 from pathspace_graph import Log, MapperSettings, RunResult, run_online, write_log, write_result
 from pathspace_graph.commands.convert import with_measured_noise
-from pathspace_graph.convert.csv_files import Columns, Units, read_csv
 from pathspace_graph.convert.recording import to_log
 from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings
+from pathspace_graph.convert.text_files import Columns, Units, read_csv
 from pathspace_graph.estimators import DEFAULT, DEFAULT_BATCH, make_batch, make_online
 from pathspace_graph.eval.metrics.curves import crossings
 from pathspace_graph.eval.metrics.gap import aligned_distance

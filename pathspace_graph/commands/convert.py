@@ -1,22 +1,21 @@
 """`convert`: a ROS bag, CSV files of one's own or a known data set as a log."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from math import inf
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from rich.console import Console
 from tyro.conf import Positional, arg
 
 from pathspace_graph.convert.bag import BagOptions, read_bag
-from pathspace_graph.convert.csv_files import Columns, Units, read_csv
 from pathspace_graph.convert.recording import Recording, to_log, windowed
 from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings, Side, Window
+from pathspace_graph.convert.text_files import Columns, Units, read_csv, read_json_lines
 from pathspace_graph.convert.victoria_park import read_victoria_park
-from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.errors import InputError, PathspaceError, SettingsError
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import LOG_FILE, Log, write_log
@@ -31,97 +30,136 @@ from pathspace_graph.scale.scene import scale_of
 from .online import tell
 from .simulate import describe
 
-Kind = Literal["bag", "csv", "victoria-park"]
+Kind = Literal["bag", "csv", "jsonl", "victoria-park"]
+ODOMETRY_FILE: Final = "odometry.csv"
+SUFFIXES: Final = {"bag": (".bag", ".mcap", ".db3"), "jsonl": (".jsonl", ".json")}
+"""Endings of records in a folder of several."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Convert:
-    """Writes a ROS bag, two CSV files or a known data set as a log, in order of time and in the vehicle
-    frame. It says what was left out, and why."""
+    """Write a ROS bag, CSV files, JSON lines or a known data set as a log, in order of time and in the
+    vehicle frame, and say what was left out, and why. A folder of several records becomes a folder of
+    logs."""
 
     source: Positional[Path | None] = None
-    """The record is read from this bag (a file, or a folder with metadata.yaml), or from this folder of CSV
-    files. `victoria-park` needs none, since GTSAM brings its file."""
+    """Bag (a file, or a folder with metadata.yaml), folder of CSV files, file of JSON lines, or a folder of
+    several of these. `victoria-park` needs none, since GTSAM brings its file."""
     out: Path
-    """The log is written to this folder; an earlier log there is kept as a numbered backup."""
+    """Folder of the log; an earlier log there is kept as a numbered backup."""
     kind: Annotated[Kind, arg(name="from")] = "bag"
-    """The record is a ROS bag, CSV files, or the data set Victoria Park."""
+    """Kind of the record."""
     odometry: str | None = None
-    """This is the topic of the odometry in a bag: nav_msgs/Odometry, geometry_msgs/TwistStamped or
-    TwistWithCovarianceStamped; with --imu also std_msgs/Float32, Float64 or
-    ackermann_msgs/AckermannDriveStamped, whose number is the speed. For CSV it is a file in the folder, by
-    default odometry.csv."""
+    """Topic of the odometry in a bag: any message with a twist, with a speed (then --imu or --wheelbase gives
+    the yaw rate), or with a pose. For CSV a file in the folder, by default odometry.csv."""
     detections: str | None = None
-    """This is the topic of the detections in a bag: sensor_msgs/PointCloud2 with a field for the label,
-    visualization_msgs/MarkerArray (blue is left, yellow is right), or any message with lists of cones. For
-    CSV it is a file in the folder, by default detections.csv."""
+    """Topic of the detections in a bag: a point cloud with a field for the label, an array of markers (blue
+    is left, yellow is right), or any message with lists of cones. For CSV a file in the folder, by default
+    detections.csv."""
     imu: str | None = None
-    """The yaw rate is of this topic of sensor_msgs/Imu, whose z axis points up."""
+    """Topic of the yaw rate, sensor_msgs/Imu, whose z axis points up."""
+    wheelbase: float | None = None
+    """Wheelbase (m), by which speed and steering angle give the yaw rate."""
     definition: tuple[str, ...] = ()
-    """These files define messages that the bag does not define itself, as PACKAGE/msg/NAME=FILE or as a path
-    that ends in PACKAGE/msg/NAME.msg."""
+    """Files of messages that the bag does not define itself, as PACKAGE/msg/NAME=FILE or as a path that ends
+    in PACKAGE/msg/NAME.msg."""
     label_field: str | None = None
-    """The label of a detection in a bag is in this field; `none` means that there are no labels."""
+    """Field of the label of a detection in a bag; `none` means that there are no labels."""
     labels: tuple[str, ...] = ()
-    """These values mean a label: left=0 right=1 is the default. Words are read as well, blue as left and
+    """Values of the labels: left=0 right=1 is the default. Words are read as well, blue_cone as left and
     yellow as right; anything else is unknown."""
     columns: tuple[str, ...] = ()
-    """These columns of the CSV files hold a quantity: t=stamp vx=speed vy=v wz=yaw_rate of the odometry, t,
-    x, y (or range and bearing), label, xx, xy and yy of the detections. A minus changes the sign
-    (wz=-yaw_rate). Where both files name t in another way, detections.t=time is of one of them."""
+    """Columns of the CSV files: t=stamp vx=speed vy=v wz=yaw_rate of the odometry, t, x, y (or range and
+    bearing), label, xx, xy and yy of the detections. A minus changes the sign (wz=-yaw_rate). Where both
+    files name t in another way, detections.t=time is of one of them."""
     units: tuple[str, ...] = ()
-    """The CSV files have these units: length=mm angle=deg time=ns, also speed=km/h and yaw_rate=deg/s, which
+    """Units of the CSV files: length=mm angle=deg time=ns, also speed=km/h and yaw_rate=deg/s, which
     otherwise follow length and angle. Without them it is m, rad and s."""
     mounting: tuple[float, float, float] | None = None
-    """The sensor has this pose X Y YAW (m, m, rad) in the vehicle frame: x forward, y left, yaw
-    counterclockwise. Detections and their covariances are moved by it."""
+    """Pose X Y YAW (m, m, rad) of the sensor in the vehicle frame: x forward, y left, yaw counterclockwise.
+    Without it that of a bag's /tf_static is used, where there is one."""
     y: Side = "left"
-    """The y axis of the record points to this side. With `right`, angles are positive clockwise, so that y,
+    """Side to which the y axis of the record points. With `right`, angles are positive clockwise, so that y,
     vy, wz and bearings change their sign."""
     y_odometry: Side | None = None
-    """The y axis of the odometry points to this side, where it is another one than `y`."""
+    """Side to which the y axis of the odometry points, where it is another one than `y`."""
     from_poses: bool = False
-    """The twists are made from the poses of nav_msgs/Odometry, for a publisher that leaves its twist zero."""
+    """Make the twists from the poses of the odometry, for a publisher that leaves its twist zero."""
     received: bool = False
-    """Stamps are the times at which messages were received, also where they have a stamp of their own."""
+    """Take the times at which messages were received as stamps, also where they have one of their own."""
     range_max: float | None = None
-    """Detections farther from the sensor than this (m) are left out."""
+    """Largest distance from the sensor of a detection that counts (m)."""
     time_offset: float = 0.0
-    """This time (s) is added to the stamps of the detections: it is negative where they are too late."""
+    """Time (s) that is added to the stamps of the detections: negative where they are too late."""
+    start: float = 0.0
+    """Time after the first odometry at which the log begins (s)."""
+    end: float = inf
+    """Time after the first odometry at which the log ends (s)."""
     noise: Annotated[NoiseSettings, arg(name="")] = field(default_factory=NoiseSettings)
-    """These settings describe noise that the record does not state."""
+    """Noise that the record does not state."""
 
     def run(self) -> None:
-        """Reads, converts, writes and reports."""
-        check_target(self.out, LOG_FILE)
-        frames = Frames(self.mounting or (0.0, 0.0, 0.0), self.y_odometry or self.y, self.y)
-        rule, window = LabelRule(self.labels), Window(self.range_max, self.time_offset)
+        """Convert one record, or each of a folder, and name those that are refused in one line."""
+        records = self._records()
+        if not records:
+            self._convert(self.source, self.out)
+            return
+        refused = []
+        for record in records:
+            try:
+                self._convert(record, self.out / record.stem)
+            except PathspaceError as error:
+                refused.append(str(error))
+        if refused:
+            some = f"{len(refused)} of {len(records)} records were refused"
+            raise PathspaceError(f"{some}: {'; '.join(refused)}")
+
+    def _records(self) -> list[Path]:
+        """Return the records in the source where it is a folder of several, none where it is one itself."""
+        folder = self.source
+        if folder is None or not folder.is_dir() or (folder / "metadata.yaml").exists():
+            return []
+        if self.kind == "csv":
+            file = self.odometry or ODOMETRY_FILE
+            return [] if (folder / file).exists() else sorted(one.parent for one in folder.glob(f"*/{file}"))
+        known = [one for one in folder.iterdir() if one.suffix in SUFFIXES.get(self.kind, ())]
+        bags = [one.parent for one in folder.glob("*/metadata.yaml")] if self.kind == "bag" else []
+        return sorted({*known, *bags})
+
+    def _convert(self, source: Path | None, out: Path) -> None:
+        """Read, convert, write and report."""
+        check_target(out, LOG_FILE)
+        frames = Frames(self.mounting, self.y_odometry or self.y, self.y)
+        rule = LabelRule(self.labels)
+        window = Window(self.range_max, self.time_offset, self.start, self.end)
         with progress("converting"):
-            record = windowed(self._read(rule), window)
-            file = self.source or Path(self.kind)
+            record = windowed(self._read(source, rule), window)
+            file = source or Path(self.kind)
             log = with_measured_noise(to_log(record, frames, self.noise, file))
-            write_checked(log, self.out, file)
-        report(record.notes, log, self.out)
+            write_checked(log, out, file)
+        report(record.notes, rule, log, out)
         tell(hints(log))
 
-    def _read(self, rule: LabelRule) -> Recording:
+    def _read(self, source: Path | None, rule: LabelRule) -> Recording:
         if self.kind == "victoria-park":
-            return read_victoria_park(self.source)
-        if self.source is None:
-            raise SettingsError(
-                f"convert: expected a SOURCE to read, which --from {self.kind} needs, found none"
-            )
+            return read_victoria_park(source)
+        if source is None:
+            expected = f"expected a SOURCE to read, which --from {self.kind} needs"
+            raise SettingsError(f"convert: {expected}, found none")
+        if self.kind == "jsonl":
+            return read_json_lines(source, rule)
         if self.kind == "csv":
-            odometry, detections = self.odometry or "odometry.csv", self.detections or "detections.csv"
+            odometry, detections = self.odometry or ODOMETRY_FILE, self.detections or "detections.csv"
             columns, units = Columns(self.columns), Units(self.units)
-            return read_csv(self.source / odometry, self.source / detections, columns, units, rule)
-        return read_bag(self.source, self._bag_options(), rule)
+            return read_csv(source / odometry, source / detections, columns, units, rule)
+        return read_bag(source, self._bag_options(), rule)
 
     def _bag_options(self) -> BagOptions:
         return BagOptions(
             odometry=self.odometry,
             detections=self.detections,
             imu=self.imu,
+            wheelbase=self.wheelbase,
             definitions=self.definition,
             label_field=self.label_field,
             from_poses=self.from_poses,
@@ -131,7 +169,7 @@ class Convert:
 
 
 def with_measured_noise(log: Log) -> Log:
-    """Returns a log whose noise is measured where nobody has stated it."""
+    """Return a log whose noise is measured where nobody has stated it."""
     if log.odometry_stated and log.detections_stated:
         return log
     scale = scale_of(log)
@@ -151,7 +189,7 @@ def with_measured_noise(log: Log) -> Log:
 
 
 def write_checked(log: Log, out: Path, source: Path) -> None:
-    """Writes a log, or raises an InputError of its source where it would be refused when it is read."""
+    """Write a log, or raise an InputError of its source where it would be refused when it is read."""
     try:
         write_log(log, out, check=True)
     except InputError as error:
@@ -161,19 +199,22 @@ def write_checked(log: Log, out: Path, source: Path) -> None:
         raise InputError(source, f"its log would be refused ({where}): {why}") from None
 
 
-def report(notes: Counter[str], log: Log, out: Path) -> None:
-    """Prints the length of the log, and how often something was left out or assumed."""
+def report(notes: Counter[str], rule: LabelRule, log: Log, out: Path) -> None:
+    """Print what the labels were taken for, what was left out or assumed how often, and the log in short."""
     console = Console()
     for text, count in notes.items():
         if count:
             console.print(f"{count} {text}", highlight=False, soft_wrap=True, markup=False)
     measured = [] if log.measured is None else [measured_line(log.measured)]
-    for line in (outline(log), *measured, f"{out}: {describe(log)}"):
+    labels = [rule.told()] if rule.met else []
+    if hint := rule.hint():
+        Console(stderr=True).print(f"hint: {hint}", highlight=False, soft_wrap=True, markup=False)
+    for line in (*labels, outline(log), *measured, f"{out}: {describe(log)}"):
         console.print(line, highlight=False, soft_wrap=True, markup=False)
 
 
 def outline(log: Log) -> str:
-    """Returns in a line what a look at the log should show first: rates, speeds, ranges and labels."""
+    """Return in a line what a look at the log should show first: rates, speeds, ranges and labels."""
     twists, seconds = log.odometry.twist, max(float(np.ptp(log.odometry.t)), np.finfo(float).tiny)
     ranges = np.concatenate([np.hypot(*cycle.points_vehicle.T) for cycle in log.cycles])
     labels = np.bincount(np.concatenate([cycle.labels for cycle in log.cycles]), minlength=len(NAMES))

@@ -1,7 +1,5 @@
 """ROS bags, read without ROS: rosbag1, and rosbag2 as sqlite3 and mcap."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -11,166 +9,200 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError
 
 from .messages import MessageError, Points, frame_of, points_of, pose_of, stamp_of, twist_of, yaw_rate_of
-from .poses import twists_between
-from .recording import Recording
+from .recording import Recording, twists_between
 from .settings import LabelRule
 
 Array = NDArray[np.float64]
 
 INSTALL: Final = "pip install 'pathspace-graph[ros]'"
-"""This installs the package that reads bags."""
-ODOMETRY: Final = "nav_msgs/msg/Odometry"
-"""A message of this type has a pose beside its twist."""
-TWIST_TYPES: Final = (
-    ODOMETRY,
-    "geometry_msgs/msg/TwistStamped",
-    "geometry_msgs/msg/TwistWithCovarianceStamped",
-)
-"""Messages of these types have a twist."""
-SPEED_TYPES: Final = (
-    "std_msgs/msg/Float32",
-    "std_msgs/msg/Float64",
-    "ackermann_msgs/msg/AckermannDriveStamped",
-)
-"""Messages of these types have a speed alone, so that the yaw rate must come from an IMU."""
-IMU_TYPES: Final = ("sensor_msgs/msg/Imu",)
-"""Messages of these types have a yaw rate."""
-SUPPORTED: Final = (
-    "sensor_msgs/msg/PointCloud2, visualization_msgs/msg/MarkerArray, or a list of cones with points"
-)
-"""Detections are in messages of these types."""
+"""Installs the package that reads bags."""
+SUPPORTED: Final = {
+    "--odometry": "a twist, a speed or a pose",
+    "--imu": "an angular velocity",
+    "--detections": "a point cloud, an array of markers, or a list of cones with points",
+    "transforms": "transforms",
+}
+"""What a message must hold, by the option of its topic."""
+STATIC: Final = "/tf_static"
+"""Topic of the transforms between frames that are fixed to the vehicle."""
+BODIES: Final = ("base_link", "base_footprint")
+"""Frames of a vehicle whose odometry names none."""
+LEVEL: Final = 0.98
+"""A sensor's frame is level where its z axis and the vehicle's have at least this cosine."""
+LATE: Final = 0.1
+"""Messages received this time (s) after or before their stamps, in the median, are worth a word."""
 UNDEFINED: Final = "a type without a definition"
-"""This says that neither the bag, nor ROS, nor a file that was handed over defines a message."""
+"""Neither the bag, nor ROS, nor a file that was handed over defines a message."""
 
 
 @dataclass(frozen=True)
 class BagOptions:
-    """Describes what is read of a bag."""
+    """What is read of a bag."""
 
     odometry: str | None
-    """This is the topic of the odometry."""
+    """Topic of the odometry."""
     detections: str | None
-    """This is the topic of the detections."""
+    """Topic of the detections."""
     imu: str | None = None
-    """The yaw rate is of this topic, where it is not that of the odometry."""
+    """Topic of the yaw rate, where it is not that of the odometry."""
+    wheelbase: float | None = None
+    """Wheelbase (m), by which a steering angle gives the yaw rate."""
     definitions: Sequence[str] = ()
-    """These are files of message definitions, each as `TYPE=FILE` or as a path that ends in
-    `PACKAGE/msg/NAME.msg`."""
+    """Files of message definitions, each as `TYPE=FILE` or as a path that ends in `PACKAGE/msg/NAME.msg`."""
     label_field: str | None = None
-    """The label of a detection is in this field; None takes the first that is known."""
+    """Field of the label of a detection; None takes the first that is known."""
     from_poses: bool = False
-    """The twists are made from the poses of `nav_msgs/Odometry`."""
+    """Make the twists from poses, also where the messages have twists."""
     received: bool = False
-    """Stamps are the times at which messages were received, also where they have one of their own."""
+    """Take the times of receipt as stamps, also where messages have one of their own."""
     mounted: bool = False
     """The pose of the sensor was stated, so that frames of other names are no surprise."""
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Holds what was taken of the messages of one topic, in the order of the bag."""
+    """What was taken of the messages of one topic, in the order of the bag."""
 
-    topic: str
-    """This is the topic."""
-    kind: str
-    """This is their type."""
+    name: str
+    """Topic and type of the messages."""
     t: Array
-    """(N,) These are their stamps (s)."""
+    """(N,) Stamps (s)."""
     values: list[Any]
-    """This was taken of each message."""
+    """What was taken of each message."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What a message says of the vehicle's motion."""
+
+    twist: Array | None
+    """(3,) Twist in m/s, m/s and rad/s, NaN where it is not known."""
+    pose: Array | None
+    """(3,) Pose in m, m and rad."""
+    world: str
+    """Frame of the pose."""
+    body: str
+    """Frame of the twist."""
 
 
 def read_bag(path: Path, options: BagOptions, rule: LabelRule) -> Recording:
-    """Returns what the topics of a bag have of a drive.
+    """Return what the topics of a bag have of a drive.
 
     What is wrong is an InputError: a topic that is not there lists those that are, with types and rates.
     """
     notes: Counter[str] = Counter()
+
+    def motion(message: Any) -> Motion:
+        twist = twist_of(message, options.wheelbase)
+        return Motion(twist, pose_of(message), frame_of(message), frame_of(message, "child_frame_id"))
+
+    def points(message: Any) -> tuple[str, Points]:
+        return frame_of(message), points_of(message, rule, options.label_field)
+
     with Bag.opened(path, options.definitions) as bag:
-        odometry = bag.samples(options.odometry, "--odometry", TWIST_TYPES + SPEED_TYPES, options, notes)
-        imu = None if options.imu is None else bag.samples(options.imu, "--imu", IMU_TYPES, options, notes)
-        t, twists = _twists(odometry, imu, options, path)
-
-        def points(message: Any) -> tuple[str, Points]:
-            return frame_of(message), points_of(message, rule, options.label_field)
-
-        detections = bag.samples(options.detections, "--detections", (), options, notes, points)
-    if not options.mounted:
-        _judge_frames(odometry, detections, notes, path)
-    source = {"bag": path.name, "odometry": _named(odometry), "detections": _named(detections)}
+        odometry = bag.samples(options.odometry, "--odometry", options, notes, motion)
+        imu = bag.samples(options.imu, "--imu", options, notes, yaw_rate_of) if options.imu else None
+        detections = bag.samples(options.detections, "--detections", options, notes, points)
+        static = [] if options.mounted else bag.transforms(options)
+    t, twists = _twists(odometry, imu, options, notes, path)
+    mounting = None if options.mounted else _mounting(odometry, detections, static, notes, path)
+    source = {"bag": path.name, "odometry": odometry.name, "detections": detections.name}
     if imu is not None:
-        source["imu"] = _named(imu)
-    scans = [found for _, found in detections.values]
-    return Recording(t, twists, detections.t, scans, source, notes)
+        source["imu"] = imu.name
+    scans = [scan for _, scan in detections.values]
+    return Recording(t, twists, detections.t, scans, source, notes, mounting=mounting)
 
 
-def _named(samples: Samples) -> str:
-    return f"{samples.topic} ({samples.kind})"
+# --- where the sensor is ---------------------------------------------------------------------------------
 
 
-def _judge_frames(odometry: Samples, detections: Samples, notes: Counter[str], path: Path) -> None:
-    """Notes detections in another frame than the vehicle's; those in the frame of its pose are refused."""
-    world, body = frame_of(odometry.values[0]), frame_of(odometry.values[0], "child_frame_id")
-    frames = {frame for frame, _ in detections.values} - {"", body}
-    if odometry.kind != ODOMETRY or not body or not frames:
-        return
-    if world in frames:
-        expected = f"expected detections in a frame of the vehicle, such as {body}"
-        found = f"found them in {world}, the frame of its pose"
+def _mounting(
+    odometry: Samples, detections: Samples, static: list[Any], notes: Counter[str], path: Path
+) -> tuple[float, float, float] | None:
+    """Return the pose of the sensor by the bag's transforms; detections in the world's frame are refused."""
+    first, frames = odometry.values[0], {frame for frame, _ in detections.values} - {""}
+    if first.pose is not None and first.body and first.world in frames - {first.body}:
+        expected = f"expected detections in a frame of the vehicle, such as {first.body}"
+        found = f"found them in {first.world}, the frame of its pose"
         otherwise = "if they are in the vehicle's for all that, --mounting 0 0 0 says so"
-        raise InputError(path, f"{_named(detections)}: {expected}, {found}; {otherwise}")
+        raise InputError(path, f"{detections.name}: {expected}, {found}; {otherwise}")
+    named = {one.header.frame_id.lstrip("/") for one in static}
+    body = first.body or next((name for name in BODIES if name in named), "")
+    others = sorted(frames - {body})
+    if not body or not others:
+        return None
+    place = transform_between(static, body, others[0]) if len(others) == 1 else None
+    if place is not None and place[2, 2] > LEVEL:
+        (x, y), yaw = place[:2, 3], np.arctan2(place[1, 0], place[0, 0])
+        told = f"which {STATIC} puts at {x:.3g} {y:.3g} {yaw:.3g} (m, m, rad) in {body}"
+        notes[f"messages with detections are in frame {others[0]}, {told}"] += len(detections.values)
+        return float(x), float(y), float(yaw)
     notes[
-        f"messages with detections are in frame {', '.join(sorted(frames))}, the odometry is of {body}: "
-        "--mounting says where the sensor is"
+        f"messages with detections are in frame {', '.join(others)}, the odometry is of {body}: --mounting "
+        "says where the sensor is"
     ] += len(detections.values)
+    return None
+
+
+def transform_between(static: list[Any], body: str, sensor: str) -> Array | None:
+    """Return `body_T_sensor` (4, 4) by `TransformStamped`s between frames, None if nothing connects them."""
+    edges: dict[str, list[tuple[str, Array]]] = {}
+    for one in static:
+        parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
+        q, p = one.transform.rotation, one.transform.translation
+        step = np.eye(4)
+        step[:3, :3], step[:3, 3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), (p.x, p.y, p.z)
+        edges.setdefault(parent, []).append((child, step))
+        edges.setdefault(child, []).append((parent, np.linalg.inv(step)))
+    known, waiting = {body: np.eye(4)}, [body]
+    while waiting:
+        frame = waiting.pop()
+        for other, step in edges.get(frame, []):
+            if other not in known:
+                known[other] = known[frame] @ step
+                waiting.append(other)
+    return known.get(sensor)
 
 
 # --- twists ----------------------------------------------------------------------------------------------
 
 
-def _twists(odometry: Samples, imu: Samples | None, options: BagOptions, path: Path) -> tuple[Array, Array]:
-    """Returns the stamps (n,) in s and the twists (n, 3) of the vehicle."""
-    if options.from_poses:
-        t, twists = _from_poses(odometry, path)
+def _twists(
+    odometry: Samples, imu: Samples | None, options: BagOptions, notes: Counter[str], path: Path
+) -> tuple[Array, Array]:
+    """Return the stamps (n,) in s and the twists (n, 3) of the vehicle."""
+    measured = [motion.twist for motion in odometry.values if motion.twist is not None]
+    poses = np.array([motion.pose for motion in odometry.values if motion.pose is not None])
+    whole = len(poses) == len(odometry.values)
+    if options.from_poses or not measured:
+        if not whole:
+            raise InputError(path, f"--from-poses: expected messages with a pose, found {odometry.name}")
+        t, first = np.unique(odometry.t, return_index=True)
+        if len(t) < 2:
+            raise InputError(path, f"--from-poses: expected two poses at least, found {len(t)}")
+        if not options.from_poses:
+            notes["odometry samples are differences of poses, whose noise is not white"] += len(t) - 1
+        t, twists = t[:-1], twists_between(t, poses[first])
     else:
-        t, twists = odometry.t, np.array([twist_of(message) for message in odometry.values])
-        _check_motion(odometry, twists, path)
-    if imu is None:
-        if odometry.kind in SPEED_TYPES:
-            raise InputError(path, f"{_named(odometry)}: expected --imu TOPIC for the yaw rate, found none")
-        return t, twists
-    return with_yaw_rate(t, twists, imu.t, np.array([yaw_rate_of(message) for message in imu.values]))
-
-
-def _check_motion(odometry: Samples, twists: Array, path: Path) -> None:
-    """Raises an InputError where the twists are all zero and the poses are not."""
-    if odometry.kind == ODOMETRY and not np.any(twists):
-        poses = np.array([pose_of(message) for message in odometry.values])
-        if np.ptp(poses, axis=0).any():
-            raise InputError(
-                path,
-                f"{_named(odometry)}: expected twists, found zeros while the pose moves; --from-poses "
-                "makes the twists from the poses",
-            )
-
-
-def _from_poses(odometry: Samples, path: Path) -> tuple[Array, Array]:
-    """Returns the stamps and twists that lead from each pose to the next."""
-    if odometry.kind != ODOMETRY:
-        raise InputError(path, f"--from-poses: expected a topic of {ODOMETRY}, found {_named(odometry)}")
-    t, first = np.unique(odometry.t, return_index=True)
-    if len(t) < 2:
-        raise InputError(path, f"--from-poses: expected two poses at least, found {len(t)}")
-    poses = np.array([pose_of(odometry.values[index]) for index in first])
-    return t[:-1], twists_between(t, poses)
+        t, twists = odometry.t, np.array(measured)
+        if whole and not twists.any() and np.ptp(poses, axis=0).any():
+            found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
+            raise InputError(path, f"{odometry.name}: expected twists, {found}")
+    if imu is not None:
+        return with_yaw_rate(t, twists, imu.t, np.array(imu.values))
+    if np.isnan(twists[:, 2]).all():
+        expected = "expected --imu TOPIC for the yaw rate, or --wheelbase where there is a steering angle"
+        raise InputError(path, f"{odometry.name}: {expected}, found neither")
+    return t, twists
 
 
 def with_yaw_rate(t: Array, twists: Array, imu_t: Array, rates: Array) -> tuple[Array, Array]:
-    """Returns the twists with the mean yaw rate of an IMU until the next of them.
+    """Return the twists with the mean yaw rate of an IMU until the next of them.
 
     The heading is then that of the IMU, whichever of both is faster. Twists outside its time are left out.
     """
@@ -195,7 +227,7 @@ def with_yaw_rate(t: Array, twists: Array, imu_t: Array, rates: Array) -> tuple[
 
 
 class Bag:
-    """Reads a bag by the package `rosbags`, and turns its errors into InputErrors."""
+    """Read a bag by the package `rosbags`, and turn its errors into InputErrors."""
 
     def __init__(self, path: Path, reader: Any, definitions: dict[str, Any]) -> None:
         self.path = path
@@ -205,8 +237,8 @@ class Bag:
 
     @staticmethod
     @contextmanager
-    def opened(path: Path, definitions: Sequence[str] = ()) -> Iterator[Bag]:
-        """Yields a bag that is closed afterwards."""
+    def opened(path: Path, definitions: Sequence[str] = ()) -> "Iterator[Bag]":
+        """Yield a bag that is closed afterwards."""
         if not path.exists():
             raise InputError(path, "expected a bag, found none")
         rosbag1, rosbag2, _ = _rosbags()
@@ -226,32 +258,35 @@ class Bag:
         self,
         topic: str | None,
         option: str,
-        kinds: tuple[str, ...],
         options: BagOptions,
         notes: Counter[str],
-        take: Callable[[Any], Any] = lambda message: message,
+        take: Callable[[Any], Any],
     ) -> Samples:
-        """Returns what to `take` of the messages of a topic, which is of one of the `kinds`, if any.
-
-        A message may be large, so only what is taken of it is kept.
-        """
-        connections = [entry for entry in self._reader.connections if entry.topic == topic]
+        """Return what to `take` of the messages of a topic; a message may be large, and is not kept."""
+        connections = self._connections(topic)
         if not connections:
             found = "found none" if topic is None else f"found {topic}"
             raise self._error(f"{option}: expected a topic of the bag, {found}")
-        kind = connections[0].msgtype
-        if kinds and kind not in kinds:
-            expected = f"expected a topic of one of the types {', '.join(kinds)}"
-            raise self._error(f"{option}: {expected}, found {topic} ({kind})")
-        received, stamps, values = self._read(connections, kind, take, option)
+        received, stamps, values = self._read(connections, take, option)
         if not values:
             raise self._error(f"{option}: expected messages of {topic}, found none")
         if options.received:
             stamps = [None] * len(stamps)
-        return _stamped(str(topic), kind, stamps, received, values, notes)
+        return _stamped(str(topic), connections[0].msgtype, stamps, received, values, notes)
+
+    def transforms(self, options: BagOptions) -> list[Any]:
+        """Return the `TransformStamped`s between frames fixed to the vehicle, of which there may be none."""
+        connections = self._connections(STATIC)
+        if not connections:
+            return []
+        _, _, messages = self._read(connections, lambda message: list(message.transforms), "transforms")
+        return [one for message in messages for one in message]
+
+    def _connections(self, topic: str | None) -> list[Any]:
+        return [entry for entry in self._reader.connections if entry.topic == topic]
 
     def _error(self, message: str) -> InputError:
-        """Returns an InputError that also lists all topics with type, number of messages and rate."""
+        """Return an InputError that also lists all topics with type, number of messages and rate."""
         seconds = 1e-9 * (self._reader.end_time - self._reader.start_time)
         topics = [
             f"{name} ({topic.msgtype}, {topic.msgcount} messages, {topic.msgcount / seconds:.3g} Hz)"
@@ -264,10 +299,10 @@ class Bag:
         return InputError(self.path, f"{message}; {listed}")
 
     def _read(
-        self, connections: list[Any], kind: str, take: Callable[[Any], Any], option: str
+        self, connections: list[Any], take: Callable[[Any], Any], option: str
     ) -> tuple[list[float], list[float | None], list[Any]]:
-        """Returns the times of receipt, the stamps and what was taken of all messages of a topic."""
-        store = self._store(connections[0])
+        """Return the times of receipt, the stamps and what was taken of all messages of a topic."""
+        store, kind = self._store(connections[0]), connections[0].msgtype
         decode = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
         received: list[float] = []
         stamps: list[float | None] = []
@@ -280,14 +315,14 @@ class Bag:
                 received.append(1e-9 * time)
         except MessageError as error:
             where = f"{option} {connections[0].topic} ({kind})"
-            raise InputError(self.path, f"{where}: {error}; supported are {SUPPORTED}") from None
+            raise self._error(f"{where}: {error}; supported is what has {SUPPORTED[option]}") from None
         except Exception as error:
             where = f"message {len(values) + 1} of {connections[0].topic} ({kind})"
             raise InputError(self.path, f"{where}: expected one that can be read ({error})") from None
         return received, stamps, values
 
     def _store(self, connection: Any) -> Any:
-        """Returns the types of a topic: those of the bag, or else those handed over and those of ROS."""
+        """Return the types of a topic: those of the bag, or else those handed over and those of ROS."""
         *_, typesys = _rosbags()
         ros = typesys.Stores.ROS1_NOETIC if self._is_ros1 else typesys.Stores.ROS2_HUMBLE
         try:
@@ -303,7 +338,7 @@ class Bag:
 
 
 def is_ros1(path: Path) -> bool:
-    """Returns whether a bag is one of rosbag1: a file. A folder is a bag of rosbag2, whatever its name."""
+    """Return whether a bag is one of rosbag1: a file. A folder is a bag of rosbag2, whatever its name."""
     return path.suffix == ".bag" and not path.is_dir()
 
 
@@ -315,22 +350,27 @@ def _stamped(
     values: list[Any],
     notes: Counter[str],
 ) -> Samples:
-    """Returns samples with header stamps where most have one, else with the times of receipt.
+    """Return samples with header stamps where most have one, else with the times of receipt.
 
     Both are not mixed, since they may be of different clocks: a message without a stamp among others that
     have one is left out.
     """
+    name = f"{topic} ({kind})"
     stamped = [index for index, stamp in enumerate(stamps) if stamp is not None]
     if 2 * len(stamped) <= len(stamps):
         notes[f"messages of {topic} have the time at which they were received"] += len(values)
-        return Samples(topic, kind, np.array(received), values)
+        return Samples(name, np.array(received), values)
     notes[f"messages of {topic} without a stamp were left out"] += len(stamps) - len(stamped)
     t = np.array([stamps[index] for index in stamped], dtype=float)
-    return Samples(topic, kind, t, [values[index] for index in stamped])
+    late = float(np.median(np.array(received)[stamped] - t))
+    if abs(late) > LATE:
+        told = f"messages of {topic} were received {late:.3g} s after their stamps, in the median"
+        notes[f"{told} (--received takes the times of receipt)"] += len(stamped)
+    return Samples(name, t, [values[index] for index in stamped])
 
 
 def _types_of(connection: Any, typesys: Any) -> dict[str, Any]:
-    """Returns the types that the bag itself defines for a topic; an old bag defines none."""
+    """Return the types that the bag itself defines for a topic; an old bag defines none."""
     text, form = connection.msgdef.data, connection.msgdef.format.name
     if form == "MSG":
         return dict(typesys.get_types_from_msg(text, connection.msgtype))
@@ -363,7 +403,7 @@ def _given_definitions(definitions: Sequence[str]) -> dict[str, Any]:
 
 
 def _type_and_file(entry: str) -> tuple[str, Path]:
-    """Returns the type `PACKAGE/msg/NAME` and the file of `TYPE=FILE`, or of a path that ends like a type."""
+    """Return the type `PACKAGE/msg/NAME` and the file of `TYPE=FILE`, or of a path that ends like a type."""
     name, equals, path = entry.rpartition("=")
     file = Path(path)
     parts = name.split("/") if equals else [*file.absolute().parts[-3:-1], file.stem]
@@ -374,7 +414,7 @@ def _type_and_file(entry: str) -> tuple[str, Path]:
 
 
 def _rosbags() -> tuple[Any, Any, Any]:
-    """Returns the modules of `rosbags`, which is an optional package."""
+    """Return the modules of `rosbags`, which is an optional package."""
     try:
         from rosbags import rosbag1, rosbag2, typesys  # noqa: PLC0415
     except ImportError:

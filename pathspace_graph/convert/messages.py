@@ -1,6 +1,4 @@
-"""ROS messages as arrays, told by their fields, so that those of `rosbags` and of `rclpy` are read alike."""
-
-from __future__ import annotations
+"""ROS messages as arrays by their fields, so that those of `rosbags` and of `rclpy` are read alike."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
@@ -25,21 +23,23 @@ LIST_NAMES: Final = {
     "yellow": RIGHT,
     "right": RIGHT,
 }
-"""A list of cones with such a word in its name has cones of this label."""
-LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type")
-"""The label of a detection is in the first of these fields, unless one is named."""
+"""Labels of the cones in a list with such a word in its name."""
+LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
+"""Fields that may hold the label of a detection, the first one that is there."""
 NO_LABEL: Final = "none"
-"""Where this is named as the field of the label, all detections are without one."""
+"""Name of a label field that says there are no labels."""
 CLOUD_TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""The field of a point cloud with this `datatype` is of this type of numpy."""
+"""Type of numpy by the `datatype` of a field of a point cloud."""
 POINT_MARKERS: Final = (1, 2, 3, 10)
-"""A marker of these types (cube, sphere, cylinder, mesh) is one point."""
+"""Types of markers that are one point: cube, sphere, cylinder, mesh."""
 LIST_MARKERS: Final = (6, 7, 8)
-"""A marker of these types (cubes, spheres, points) is a list of points."""
+"""Types of markers that are lists of points: cubes, spheres, points."""
 ADDED: Final = 0
-"""A marker with this action is added; others are taken away."""
-POSITIONS: Final = ("point", "position", "location", "center", "pose")
-"""A cone has its place in the first of these fields, or in its own `x` and `y`."""
+"""Action of a marker that is added; others are taken away."""
+POSITIONS: Final = ("point", "position", "location", "center", "pose", "bbox")
+"""Fields that lead to the position of a cone that has no `x` and `y` itself."""
+SPEEDS: Final = ("speed", "data")
+"""Fields of a speed alone."""
 
 
 class MessageError(PathspaceError):
@@ -48,29 +48,29 @@ class MessageError(PathspaceError):
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Holds the detected points of one message, in the frame of its sensor."""
+    """Detected points of one message, in the frame of its sensor."""
 
     points: Array
-    """Each row is a point (m, 2) in m."""
+    """(m, 2) Points in m."""
     covariances: Array
-    """Each point has this covariance (m, 2, 2) in m^2; it is NaN where the message does not give it."""
+    """(m, 2, 2) Covariances in m^2, NaN where the message does not give them."""
     labels: IntArray
-    """Each point has the label LEFT, RIGHT or UNKNOWN (m,)."""
+    """(m,) Labels."""
 
-    def where(self, chosen: NDArray[np.bool_]) -> Points:
-        """Returns some of the points."""
+    def where(self, chosen: NDArray[np.bool_]) -> "Points":
+        """Return some of the points."""
         return Points(self.points[chosen], self.covariances[chosen], self.labels[chosen])
 
 
 def header_of(message: Any) -> Any:
-    """Returns the header of a message, which is that of its first point in an array of markers, or None."""
+    """Return the header of a message, of the first point of an array of markers, or None."""
     if hasattr(message, "markers"):
         return next((marker.header for marker in _added(message.markers)), None)
     return getattr(message, "header", None)
 
 
 def stamp_of(message: Any) -> float | None:
-    """Returns the stamp of a message's header (s), or None where it has none or the stamp is zero."""
+    """Return the stamp of a message's header (s), or None where it has none or the stamp is zero."""
     header = header_of(message)
     if header is None or (header.stamp.sec == 0 and header.stamp.nanosec == 0):
         return None
@@ -78,7 +78,7 @@ def stamp_of(message: Any) -> float | None:
 
 
 def frame_of(message: Any, name: str = "frame_id") -> str:
-    """Returns the frame of a message by its header, or by this field of its own; empty where it has none."""
+    """Return the frame of a message by its header, or by this field of its own; empty where it has none."""
     frame = getattr(message, name, None) or getattr(header_of(message), name, "")
     return str(frame).lstrip("/")
 
@@ -86,34 +86,48 @@ def frame_of(message: Any, name: str = "frame_id") -> str:
 # --- odometry --------------------------------------------------------------------------------------------
 
 
-def twist_of(message: Any) -> Array:
-    """Returns the twist [vx, vy, wz] (3,) of `Odometry`, `TwistStamped`, `TwistWithCovarianceStamped`, or of
-    a wheel speed (`Float64`, `AckermannDriveStamped`), whose vy and wz are 0.
+def twist_of(message: Any, wheelbase: float | None = None) -> Array | None:
+    """Return the twist [vx, vy, wz] (3,) of a message in m/s, m/s and rad/s, None of one with a pose alone.
+
+    A speed alone, as in `Float64`, has vy = 0 and an unknown wz, which is NaN. With a steering angle delta,
+    as in `AckermannDriveStamped`, it is `wz = v tan(delta) / wheelbase` where the wheelbase (m) is known.
+    MessageError where there is no motion at all in the message.
     """
-    if hasattr(message, "drive"):
-        return np.array([message.drive.speed, 0.0, 0.0], dtype=float)
-    if hasattr(message, "data"):
-        return np.array([message.data, 0.0, 0.0], dtype=float)
     twist = message
     while hasattr(twist, "twist"):
         twist = twist.twist
-    if not hasattr(twist, "linear"):
-        raise MessageError(f"expected a message with a twist, found one of {_names(message)}")
-    return np.array([twist.linear.x, twist.linear.y, twist.angular.z], dtype=float)
+    if hasattr(twist, "linear") and hasattr(twist, "angular"):
+        return np.array([twist.linear.x, twist.linear.y, twist.angular.z], dtype=float)
+    drive = getattr(message, "drive", message)
+    speed = next((getattr(drive, name) for name in SPEEDS if hasattr(drive, name)), None)
+    if speed is not None:
+        steering = getattr(drive, "steering_angle", None)
+        known = steering is not None and wheelbase is not None
+        return np.array([speed, 0.0, speed * np.tan(steering) / wheelbase if known else np.nan], dtype=float)
+    if pose_of(message) is None:
+        raise MessageError(f"expected a message with a twist, a speed or a pose, found {_names(message)}")
+    return None
 
 
-def pose_of(message: Any) -> Array:
-    """Returns the pose [x, y, yaw] (3,) of `Odometry`, in m and rad."""
-    pose = message.pose.pose
-    return np.array([pose.position.x, pose.position.y, _yaw(pose.orientation)], dtype=float)
+def pose_of(message: Any) -> Array | None:
+    """Return the pose [x, y, yaw] (3,) of a message in m and rad, or None where it has none."""
+    pose = message
+    while hasattr(pose, "pose"):
+        pose = pose.pose
+    if not (hasattr(pose, "position") and hasattr(pose, "orientation")):
+        return None
+    return np.array([pose.position.x, pose.position.y, yaw_of(pose.orientation)], dtype=float)
 
 
 def yaw_rate_of(message: Any) -> float:
-    """Returns the yaw rate of an `Imu` (rad/s), whose z axis points up."""
+    """Return the yaw rate of an `Imu` (rad/s), whose z axis points up."""
+    if not hasattr(message, "angular_velocity"):
+        raise MessageError(f"expected a message with an angular_velocity, found {_names(message)}")
     return float(message.angular_velocity.z)
 
 
-def _yaw(quaternion: Any) -> float:
+def yaw_of(quaternion: Any) -> float:
+    """Return the yaw of a quaternion with x, y, z and w (rad)."""
     x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     return float(np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z))
 
@@ -122,7 +136,7 @@ def _yaw(quaternion: Any) -> float:
 
 
 def points_of(message: Any, rule: LabelRule, label_field: str | None = None) -> Points:
-    """Returns the points of a point cloud, an array of markers, or a message with lists of cones.
+    """Return the points of a point cloud, an array of markers, or a message with lists of cones.
 
     Anything else is a MessageError.
     """
@@ -134,21 +148,25 @@ def points_of(message: Any, rule: LabelRule, label_field: str | None = None) -> 
 
 
 def cloud_points(cloud: Any, rule: LabelRule, label_field: str | None = None) -> Points:
-    """Returns the points of a `PointCloud2` by its fields `x`, `y` and that of the label.
+    """Return the points of a `PointCloud2` by its fields `x`, `y` and that of the label.
 
     The fields `xx`, `xy` and `yy` are the covariance, where the cloud has them.
     """
     columns = _cloud_columns(cloud)
-    name = _label_field(columns, label_field, "a point cloud with labels")
     points = np.column_stack([columns["x"], columns["y"]]).astype(float)
     covariances = np.full((len(points), 2, 2), np.nan)
     if {"xx", "xy", "yy"} <= columns.keys():
         entries = [columns[entry] for entry in ("xx", "xy", "xy", "yy")]
         covariances = np.stack(entries, axis=-1).astype(float).reshape(-1, 2, 2)
     labels = np.full(len(points), UNKNOWN)
-    if name is not None:
-        values, place = np.unique(columns[name], return_inverse=True)
-        labels = np.array([rule.of(value) for value in values.tolist()], dtype=int)[place]
+    if label_field != NO_LABEL:
+        asked = (label_field,) if label_field else LABEL_FIELDS
+        name = next((name for name in asked if name in columns), None)
+        if name is None:
+            wanted = f"'{label_field}'" if label_field else f"one of {', '.join(LABEL_FIELDS)}"
+            found = f"found {', '.join(columns)} (--label-field names it, `{NO_LABEL}` does without)"
+            raise MessageError(f"expected a point cloud with labels in the field {wanted}, {found}")
+        labels = rule.of_all(columns[name])
     return Points(points, covariances, labels)
 
 
@@ -159,39 +177,34 @@ def _cloud_columns(cloud: Any) -> dict[str, NDArray[Any]]:
         raise MessageError(f"expected a point cloud with the fields x and y, found {', '.join(known)}")
     if not cloud.width * cloud.height:
         return {name: np.zeros(0) for name in known}
-    layout = _layout(cloud, known, order)
-    rows = np.frombuffer(bytes(cloud.data), np.uint8)
-    needed = cloud.height * cloud.row_step
+    layout = {
+        "names": list(known),
+        "formats": [order + CLOUD_TYPES[field.datatype] for field in known.values()],
+        "offsets": [field.offset for field in known.values()],
+        "itemsize": cloud.point_step,
+    }
+    try:
+        of_a_point = np.dtype(layout)  # type: ignore[call-overload]
+    except ValueError as error:
+        expected = f"expected fields inside the {cloud.point_step} bytes of a point"
+        raise MessageError(f"{expected}: {error}") from None
+    rows, needed = np.frombuffer(bytes(cloud.data), np.uint8), cloud.height * cloud.row_step
     if cloud.row_step < cloud.width * cloud.point_step or len(rows) < needed:
         raise MessageError(f"expected a point cloud of {needed} bytes, found {len(rows)}")
     rows = rows[:needed].reshape(cloud.height, cloud.row_step)[:, : cloud.width * cloud.point_step]
-    points = np.ascontiguousarray(rows).reshape(-1).view(layout)
+    points = np.ascontiguousarray(rows).reshape(-1).view(of_a_point)
     return {name: points[name] for name in known}
 
 
-def _layout(cloud: Any, fields: dict[str, Any], order: str) -> np.dtype[Any]:
-    """Returns how the numbers of a point lie in its bytes."""
-    types = [order + CLOUD_TYPES[field.datatype] for field in fields.values()]
-    offsets = [field.offset for field in fields.values()]
-    try:
-        return np.dtype(
-            {"names": list(fields), "formats": types, "offsets": offsets, "itemsize": cloud.point_step}
-        )
-    except ValueError as error:
-        raise MessageError(
-            f"expected fields inside the {cloud.point_step} bytes of a point: {error}"
-        ) from None
-
-
 def marker_points(array: Any, rule: LabelRule) -> Points:
-    """Returns the points of a `MarkerArray` that are added: blue ones are left, yellow ones right.
+    """Return the points of a `MarkerArray` that are added: blue ones are left, yellow ones right.
 
     Text, arrows, lines and triangles are no points. A marker that is a list has a colour for each of its
     points, or one for all.
     """
-    found = [row for marker in _added(array.markers) for row in _of_marker(marker, rule)]
-    points = np.array([row[:2] for row in found], dtype=float).reshape(-1, 2)
-    labels = np.array([row[2] for row in found], dtype=int)
+    rows = [row for marker in _added(array.markers) for row in _of_marker(marker, rule)]
+    points = np.array([row[:2] for row in rows], dtype=float).reshape(-1, 2)
+    labels = np.array([row[2] for row in rows], dtype=int)
     return Points(points, np.full((len(points), 2, 2), np.nan), labels)
 
 
@@ -205,7 +218,7 @@ def _of_marker(marker: Any, rule: LabelRule) -> Iterator[tuple[float, float, int
     if marker.type in POINT_MARKERS:
         yield place.x, place.y, rule.of(marker.color)
         return
-    yaw = _yaw(marker.pose.orientation)
+    yaw = yaw_of(marker.pose.orientation)
     c, s = np.cos(yaw), np.sin(yaw)
     one_each = len(marker.colors) == len(marker.points)
     for index, point in enumerate(marker.points):
@@ -214,50 +227,48 @@ def _of_marker(marker: Any, rule: LabelRule) -> Iterator[tuple[float, float, int
 
 
 def cone_points(message: Any, rule: LabelRule, label_field: str | None = None) -> Points:
-    """Returns the cones in all lists of a message, such as `ConeArrayWithCovariance` and `Track`.
+    """Return the cones in all lists of a message, as in `ConeArrayWithCovariance` and `Detection3DArray`.
 
-    A list whose name has a word of `LIST_NAMES` in it gives all its cones that label. In other
-    lists a cone has its own. Its covariance has 4 (x, y), 9 (x, y, z) or 36 entries (a pose), row by row.
+    A list whose name has a word of `LIST_NAMES` in it gives all its cones that label. In other lists a cone
+    has its own. Its covariance has 4 (x, y), 9 (x, y, z) or 36 entries (a pose), row by row.
     """
     lists = {name: getattr(message, name) for name in _names(message)}
     lists = {name: listed for name, listed in lists.items() if _is_list(listed)}
     if not lists:
         raise MessageError(f"expected a message with a list of cones, found the fields {_names(message)}")
     cones = [(name, cone) for name, listed in lists.items() for cone in listed]
-    found = [
-        (*_place(cone), _covariance(cone), _cone_label(name, cone, rule, label_field)) for name, cone in cones
-    ]
-    points = np.array([row[:2] for row in found], dtype=float).reshape(-1, 2)
-    covariances = np.array([row[2] for row in found], dtype=float).reshape(-1, 2, 2)
-    return Points(points, covariances, np.array([row[3] for row in found], dtype=int))
+    points = np.array([_position(cone) for _, cone in cones], dtype=float).reshape(-1, 2)
+    covariances = np.array([_covariance(cone) for _, cone in cones], dtype=float).reshape(-1, 2, 2)
+    labels = [_cone_label(name, cone, rule, label_field) for name, cone in cones]
+    return Points(points, covariances, np.array(labels, dtype=int))
 
 
 def _is_list(value: Any) -> bool:
     return isinstance(value, list | tuple) and not (value and isinstance(value[0], str | int | float | bytes))
 
 
-def _place(cone: Any) -> tuple[float, float]:
-    """Returns the place of a cone (m), which may lie some fields deep, as in a pose with covariance."""
+def _path(cone: Any) -> Iterator[Any]:
+    """Yield a cone and what its position lies in, from the outside to the inside."""
     at = cone
-    while not (hasattr(at, "x") and hasattr(at, "y")):
+    while at is not None:
+        yield at
         name = next((name for name in POSITIONS if hasattr(at, name)), None)
-        if name is None:
-            raise MessageError(
-                f"expected a cone with one of the fields {', '.join(POSITIONS)}, found {_names(cone)}"
-            )
-        at = getattr(at, name)
+        at = None if name is None else getattr(at, name)
+
+
+def _position(cone: Any) -> tuple[float, float]:
+    """Return the position of a cone (m), which may lie some fields deep, as in a pose with covariance."""
+    at = next((at for at in _path(cone) if hasattr(at, "x") and hasattr(at, "y")), None)
+    if at is None:
+        expected = f"expected a cone with one of the fields {', '.join(POSITIONS)}"
+        raise MessageError(f"{expected}, found {_names(cone)}")
     return float(at.x), float(at.y)
 
 
 def _covariance(cone: Any) -> Array:
-    """Returns the covariance (2, 2) of a cone's place (m^2), which is NaN where it has none."""
-    holder = cone
-    while not hasattr(holder, "covariance"):
-        name = next((name for name in POSITIONS if hasattr(holder, name)), None)
-        if name is None:
-            return np.full((2, 2), np.nan)
-        holder = getattr(holder, name)
-    entries = np.asarray(holder.covariance, dtype=float).ravel()
+    """Return the covariance (2, 2) of a cone's position (m^2), which is NaN where it has none."""
+    holder = next((at for at in _path(cone) if hasattr(at, "covariance")), None)
+    entries = np.zeros(0) if holder is None else np.asarray(holder.covariance, dtype=float).ravel()
     side = {4: 2, 9: 3, 36: 6}.get(len(entries))
     return np.full((2, 2), np.nan) if side is None else entries.reshape(side, side)[:2, :2]
 
@@ -266,24 +277,22 @@ def _cone_label(name: str, cone: Any, rule: LabelRule, label_field: str | None) 
     for word, label in LIST_NAMES.items():
         if word in name.lower():
             return label
-    field = label_field or next((field for field in LABEL_FIELDS if hasattr(cone, field)), None)
-    return rule.of(getattr(cone, field)) if field is not None and hasattr(cone, field) else UNKNOWN
+    value = _label_value(cone, (label_field,) if label_field else LABEL_FIELDS)
+    return UNKNOWN if value is None else rule.of(value)
 
 
-def _label_field(names: Iterable[str], asked: str | None, expected: str) -> str | None:
-    names = list(names)
-    if asked == NO_LABEL:
-        return None
-    name = next((name for name in ([asked] if asked else LABEL_FIELDS) if name in names), None)
-    if name is None:
-        wanted = f"'{asked}'" if asked else f"one of {', '.join(LABEL_FIELDS)}"
-        found = f"found {', '.join(names)} (--label-field names it, `{NO_LABEL}` does without)"
-        raise MessageError(f"expected {expected} in the field {wanted}, {found}")
-    return name
+def _label_value(holder: Any, names: Sequence[str]) -> Any:
+    """Return the value of the first label field, also inside the first of several hypotheses."""
+    name = next((name for name in names if hasattr(holder, name)), None)
+    value = None if name is None else getattr(holder, name)
+    if _is_list(value):
+        value = value[0] if value else None
+    inside = _label_value(value, LABEL_FIELDS) if value is not None else None
+    return value if inside is None else inside
 
 
 def _names(message: Any) -> Sequence[str]:
-    """Returns the names of a message's fields."""
+    """Return the names of a message's fields."""
     if is_dataclass(message):
         return [field.name for field in fields(message)]
     if hasattr(message, "get_fields_and_field_types"):

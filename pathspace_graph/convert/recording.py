@@ -1,17 +1,17 @@
 """A record as it was found, in any order and with gaps, becomes a log, and what was left out is counted."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.factors.se2 import rotation
+from pathspace_graph.factors.se2 import relative, rotation
 from pathspace_graph.io.limits import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 from pathspace_graph.io.log import (
     MAX_HOLD,
@@ -30,62 +30,86 @@ Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 MAX_ASYMMETRY: Final = 1e-3
-"""The entries xy and yx of a covariance differ by at most this share of the larger variance; messages may
-have them in single precision."""
+"""Largest difference of the entries xy and yx of a covariance, by the larger variance; messages may have
+single precision."""
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
 """Note of covariances that the record does not have."""
 MIN_RANGE_OF_BEARING: Final = 1.0
-"""Nearer than this (m), a bearing's standard deviation across counts as at this range, so that a detection at
-the sensor itself has a covariance that is positive definite."""
+"""Least range (m) at which a bearing's standard deviation counts across, so that the covariance of a
+detection at the sensor itself is positive definite."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Holds what a record has of a drive, in its own order and its own frames."""
+    """What a record has of a drive, in its own order and its own frames."""
 
     t: Array
-    """(N,) These are the stamps of the twists (s)."""
+    """(N,) Stamps of the twists (s)."""
     twists: Array
-    """(N, 3) Each row is a twist in m/s, m/s and rad/s."""
+    """(N, 3) Twists in m/s, m/s and rad/s."""
     scan_t: Array
-    """(M,) These are the stamps of the messages with detections (s)."""
+    """(M,) Stamps of the messages with detections (s)."""
     scans: list[Points]
-    """These are the detections of each message, in the frame of the sensor."""
+    """Detections of each message, in the frame of the sensor."""
     source: dict[str, str]
-    """These texts say where the record comes from."""
+    """Where the record comes from, in words."""
     notes: Counter[str] = field(default_factory=Counter)
-    """Each of these texts says what was done, with the number of times."""
+    """What was done, in words, with the number of times."""
     truth: Truth | None = None
-    """This is known of the drive, for evaluation only."""
+    """What is known of the drive, for evaluation only."""
     odometry_sigma: Array | None = None
-    """(3,) The record states these standard deviations of a twist (m/s, m/s, rad/s)."""
+    """(3,) Standard deviations of a twist (m/s, m/s, rad/s), where the record states them."""
+    mounting: tuple[float, float, float] | None = None
+    """Pose of the sensor in the vehicle frame (m, m, rad), where the record states it."""
+
+
+def twists_of(moves: Array) -> Array:
+    """Return the logarithm (n, 3) of relative poses (n, 3): the twists that lead there in 1 s."""
+    return np.array([gtsam.Pose2.Logmap(gtsam.Pose2(*move)) for move in moves]).reshape(-1, 3)
+
+
+def twists_between(t: Array, poses: Array) -> Array:
+    """Return the constant twists (n - 1, 3) that lead from each pose (n, 3) at t (n,) in s to the next."""
+    moves = np.array([relative(one, other) for one, other in pairwise(poses)])
+    return twists_of(moves) / np.diff(t)[:, None]
 
 
 def windowed(record: Recording, window: Window) -> Recording:
-    """Returns a record with other stamps of its detections, and without those that are too far away.
+    """Return the part of a record that counts, with the stamps of its detections corrected.
 
-    Its truth then says no longer which cone each detection is of.
+    Its truth then no longer says which cone each detection is of, and there is none of a later beginning,
+    where the map has another origin.
     """
     if window == Window():
         return record
-    scans, most = record.scans, window.range_max
+    scans, most, notes = record.scans, window.range_max, record.notes
     if most is not None:
         with np.errstate(over="ignore"):
-            far = [np.hypot(*scan.points.T) > most for scan in scans]
-        record.notes[f"detections farther from the sensor than {most:g} m were left out"] += int(
-            sum(one.sum() for one in far)
-        )
-        scans = [scan.where(~one) for scan, one in zip(scans, far, strict=True)]
-    truth = None if record.truth is None else replace(record.truth, associations=None)
-    return replace(record, scan_t=record.scan_t + window.time_offset, scans=scans, truth=truth)
+            near = [np.hypot(*scan.points.T) <= most for scan in scans]
+        left_out = sum(int((~one).sum()) for one in near)
+        notes[f"detections farther from the sensor than {most:g} m were left out"] += left_out
+        scans = [scan.where(one) for scan, one in zip(scans, near, strict=True)]
+    scan_t, begin = record.scan_t + window.time_offset, float(np.nanmin(record.t, initial=np.inf))
+    kept, seen = (
+        (t >= begin + window.start) & (t <= begin + window.end) if window.is_cut else np.ones(len(t), bool)
+        for t in (record.t, scan_t)
+    )
+    notes["odometry samples outside --start and --end were left out"] += int((~kept).sum())
+    notes["messages with detections outside --start and --end were left out"] += int((~seen).sum())
+    scans = [scan for scan, one in zip(scans, seen.tolist(), strict=True) if one]
+    truth = None if record.truth is None or window.start else replace(record.truth, associations=None)
+    t, twists = record.t[kept], record.twists[kept]
+    return replace(record, t=t, twists=twists, scan_t=scan_t[seen], scans=scans, truth=truth)
 
 
 def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) -> Log:
-    """Returns the log of a record, in order of time and in the vehicle frame; it counts in `record.notes`
+    """Return the log of a record, in order of time and in the vehicle frame; it counts in `record.notes`
     what was left out.
 
     A record without a usable twist, or without a detection in its time, is an InputError of the `file`.
     """
+    if frames.mounting is None and record.mounting is not None:
+        frames = replace(frames, mounting=record.mounting)
     odometry = _odometry(record, frames, file)
     cycles = _cycles(record, odometry, frames, noise, file)
     stated = SIGMA_ODOMETRY if record.odometry_sigma is None else record.odometry_sigma
@@ -169,7 +193,7 @@ def _expected(t: Array, begin: float, end: float, notes: Counter[str]) -> str:
 
 
 def _add(scans: list[Points], points: Points, notes: Counter[str]) -> None:
-    """Adds the points of a message to those of the same stamp, unless it is the same message again."""
+    """Add the points of a message to those of the same stamp, unless it is the same message again."""
     if any(
         np.array_equal(scan.points, points.points) and np.array_equal(scan.labels, points.labels)
         for scan in scans
@@ -183,7 +207,7 @@ def _add(scans: list[Points], points: Points, notes: Counter[str]) -> None:
 
 
 def join(scans: list[Points]) -> Points:
-    """Returns the points of several messages as those of one."""
+    """Return the points of several messages as those of one."""
     if len(scans) == 1:
         return scans[0]
     return Points(
@@ -194,7 +218,7 @@ def join(scans: list[Points]) -> Points:
 
 
 def usable(points: Points, notes: Counter[str]) -> Points:
-    """Returns the points that are finite and in the range of the format."""
+    """Return the points that are finite and in the range of the format."""
     finite = np.asarray(np.isfinite(points.points).all(axis=1))
     inside = ~finite | (np.abs(points.points) <= MAX_RANGE).all(axis=1)
     notes["detections that are not finite were left out"] += int((~finite).sum())
@@ -206,7 +230,7 @@ def usable(points: Points, notes: Counter[str]) -> Points:
 def in_vehicle_frame(
     t: float, found: Points, frames: Frames, noise: NoiseSettings, notes: Counter[str]
 ) -> Detections:
-    """Returns detections as a perception cycle in the vehicle frame.
+    """Return detections as a perception cycle in the vehicle frame.
 
     A point `q` with covariance `K` is at `R(yaw) q + (x, y)` with `R K R^T`. Where a covariance is missing or
     not positive definite, it is made from range and bearing at the sensor.
@@ -218,14 +242,15 @@ def in_vehicle_frame(
     known = positive_definite(covariances) & (not noise.replace_covariances)
     notes[ASSUMED] += int((~known).sum())
     covariances = np.where(known[:, None, None], covariances, default_covariances(points, noise))
-    turn = rotation(frames.mounting[2])
+    mounting = frames.mounting or (0.0, 0.0, 0.0)
+    turn = rotation(mounting[2])
     turned = turn @ covariances @ turn.T
     symmetric = 0.5 * (turned + turned.transpose(0, 2, 1))
-    return Detections(t, points @ turn.T + np.array(frames.mounting[:2]), symmetric, found.labels)
+    return Detections(t, points @ turn.T + np.array(mounting[:2]), symmetric, found.labels)
 
 
 def positive_definite(covariances: Array) -> BoolArray:
-    """Returns which covariances (m, 2, 2) are finite, symmetric and positive definite, as the format asks."""
+    """Return which covariances (m, 2, 2) are finite, symmetric and positive definite, as the format asks."""
     xx, yy = covariances[:, 0, 0], covariances[:, 1, 1]
     xy, yx = covariances[:, 0, 1], covariances[:, 1, 0]
     finite = np.isfinite(covariances).all(axis=(1, 2))
@@ -237,7 +262,7 @@ def positive_definite(covariances: Array) -> BoolArray:
 
 
 def default_covariances(points: Array, noise: NoiseSettings) -> Array:
-    """Returns the covariances (m, 2, 2) of points by the standard deviations of range and bearing.
+    """Return the covariances (m, 2, 2) of points by the standard deviations of range and bearing.
 
     Along the ray it is `(sigma_range + sigma_range_growth r)^2`, across it `(r sigma_bearing)^2`.
     """
@@ -249,7 +274,7 @@ def default_covariances(points: Array, noise: NoiseSettings) -> Array:
 
 
 def polar_covariances(bearings: Array, along: Array, across: Array) -> Array:
-    """Returns the covariances (m, 2, 2) with these variances along and across the rays at bearings (rad)."""
+    """Return the covariances (m, 2, 2) with these variances along and across the rays at bearings (rad)."""
     c, s = np.cos(bearings), np.sin(bearings)
     xx, yy = c * c * along + s * s * across, s * s * along + c * c * across
     xy = c * s * (along - across)

@@ -1,17 +1,17 @@
 """What a record does not say of itself: noise, where the sensor is mounted, and which way y points."""
 
-from __future__ import annotations
-
+import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, pi
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError, check_numbers
-from pathspace_graph.labels import LEFT, NAMES, ORANGE, RIGHT, UNKNOWN, label_from_name
+from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, ORANGE, RIGHT, UNKNOWN
 
 Side = Literal["left", "right"]
 """The y axis points to this side of the x axis."""
@@ -27,7 +27,7 @@ SIGMA_DETECTIONS: Final = (0.05, 0.012, pi / 200.0)
 
 @dataclass(frozen=True)
 class NoiseSettings:
-    """Describes the noise of a record that does not state it."""
+    """Noise of a record that does not state it."""
 
     sigma_odometry: tuple[float, float, float] | None = None
     """Each sample of [vx, vy, wz] has these standard deviations (m/s, m/s, rad/s), white from sample to
@@ -57,84 +57,125 @@ class NoiseSettings:
 
     @property
     def sigmas(self) -> tuple[float, ...]:
-        """Returns sigmas of the range at range 0 (m), of its growth (m/m), and of the bearing (rad)."""
+        """Return sigmas of the range at range 0 (m), of its growth (m/m), and of the bearing (rad)."""
         return tuple(
             default if own is None else own for own, default in zip(self._own, SIGMA_DETECTIONS, strict=True)
         )
 
     @property
     def states_detections(self) -> bool:
-        """Returns whether the noise of the detections is stated here."""
+        """Return whether the noise of the detections is stated here."""
         return any(own is not None for own in self._own)
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Describes the frames in which odometry and detections were recorded."""
+    """Frames in which odometry and detections were recorded."""
 
-    mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """The sensor has this pose [x, y, yaw] (m, m, rad) in the vehicle frame, where x points forward and y to
-    the left."""
+    mounting: tuple[float, float, float] | None = None
+    """Pose [x, y, yaw] (m, m, rad) of the sensor in the vehicle frame, x forward and y to the left. None
+    takes that of the record, or else the vehicle frame itself."""
     y_odometry: Side = "left"
-    """The y axis of the odometry points to this side. Where it is the right one, angles are positive
-    clockwise."""
+    """Side to which the y axis of the odometry points. With the right one, angles are positive clockwise."""
     y_detections: Side = "left"
-    """The y axis of the detections points to this side, before they are moved to the vehicle frame."""
+    """Side to which the y axis of the detections points, before they are moved to the vehicle frame."""
 
     def __post_init__(self) -> None:
+        if self.mounting is None:
+            return
         if not all(map(isfinite, self.mounting)) or abs(self.mounting[2]) > 2.0 * pi:
             expected = "--mounting: expected X Y YAW in m, m and rad, with a yaw of at most 2 pi"
             raise SettingsError(f"{expected}, found {' '.join(f'{value:g}' for value in self.mounting)}")
 
     @property
     def flip(self) -> NDArray[np.float64]:
-        """Returns by what a twist [vx, vy, wz] (3,) is multiplied, so that its y axis points to the left."""
+        """Return by what a twist [vx, vy, wz] (3,) is multiplied, so that its y axis points to the left."""
         return np.array([1.0, 1.0, 1.0] if self.y_odometry == "left" else [1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
 class Window:
-    """Says which detections of a record count, and when they were measured."""
+    """Which part of a record counts, and when its detections were measured."""
 
     range_max: float | None = None
-    """Detections farther from the sensor than this (m) are left out."""
+    """Largest distance from the sensor of a detection that counts (m)."""
     time_offset: float = 0.0
-    """This time (s) is added to the stamps of the detections."""
+    """Time (s) that is added to the stamps of the detections."""
+    start: float = 0.0
+    """Time after the first odometry at which the log begins (s)."""
+    end: float = inf
+    """Time after the first odometry at which the log ends (s)."""
 
     def __post_init__(self) -> None:
+        if not 0.0 <= self.start < self.end:
+            found = f"found {self.start:g} and {self.end:g}"
+            raise SettingsError(f"--start, --end: expected times of at least 0 in this order, {found}")
         if self.range_max is not None and not 0.0 < self.range_max < inf:
             raise SettingsError(f"--range-max: expected a positive number, found {self.range_max:g}")
         if not isfinite(self.time_offset):
             raise SettingsError(f"--time-offset: expected a number, found {self.time_offset:g}")
 
+    @property
+    def is_cut(self) -> bool:
+        """Return whether a part of the drive is left out."""
+        return self.start > 0.0 or self.end < inf
+
 
 class LabelRule:
-    """Tells the label of a number, a word or a colour.
+    """The labels of numbers, words and colours, and a count of the values that were met.
 
-    `left=0 right=1 right=7` gives labels to values. Any other word is read as the log's own format reads it.
+    `left=0 right=1 right=7` gives labels to values. Any other word is read by its parts: `blue_cone`,
+    `yellow-cone`, `b`, `large_orange_cone`. A text may stand in the field `data` of a message.
     """
 
     def __init__(self, pairs: Sequence[str] = ()) -> None:
         self._labels: dict[str, int] = {}
+        self.met: Counter[tuple[str, int]] = Counter()
+        """Times that each value was met, by its text and the label it was taken for."""
         for pair in pairs or DEFAULT_LABELS:
             name, equals, value = pair.partition("=")
             if not equals or name not in NAMES or not value:
                 raise SettingsError(f"--labels: expected LABEL=VALUE with a LABEL of {NAMES}, found '{pair}'")
             self._labels[value] = NAMES.index(name)
 
-    def of(self, value: object) -> int:
-        """Returns the label of a value: a number, a text, or a colour with `r`, `g` and `b`."""
+    def of(self, value: Any) -> int:
+        """Return the label of a value: a number, a text, or a colour with `r`, `g` and `b`."""
+        value = getattr(value, "data", value)
         if hasattr(value, "r") and hasattr(value, "g") and hasattr(value, "b"):
-            return label_of_colour(float(value.r), float(value.g), float(value.b))
-        text = str(value).strip()
-        if text in self._labels:
-            return self._labels[text]
-        number = _whole(text)
-        return self._labels[number] if number in self._labels else label_from_name(text)
+            r, g, b = (float(channel) for channel in (value.r, value.g, value.b))
+            text, label = f"colour ({r:.3g}, {g:.3g}, {b:.3g})", label_of_colour(r, g, b)
+        else:
+            text = _whole(str(value).strip())
+            label = self._labels[text] if text in self._labels else label_of_words(text)
+        self.met[text, label] += 1
+        return label
+
+    def of_all(self, values: NDArray[Any]) -> NDArray[np.int_]:
+        """Return the labels (m,) of values (m,)."""
+        texts, place, counts = np.unique(values, return_inverse=True, return_counts=True)
+        labels = np.array([self.of(text) for text in texts.tolist()], dtype=int)
+        for text, label, count in zip(texts.tolist(), labels.tolist(), counts.tolist(), strict=True):
+            self.met[_whole(str(text).strip()), label] += count - 1
+        return labels[place]
+
+    def told(self) -> str:
+        """Return in a line what the most frequent values were taken for; empty where there are none."""
+        most = self.met.most_common(MOST_TOLD)
+        values = [f"{text or 'empty'} is {NAMES[label]} ({count})" for (text, label), count in most]
+        return f"labels: {', '.join(values)}{', ...' * (len(self.met) > len(most))}" if values else ""
+
+    def hint(self) -> str:
+        """Return which values may mean a side that nobody has said; empty where there are none."""
+        unknown = [text for (text, label), _ in self.met.most_common() if label == UNKNOWN]
+        unmapped = [text for text in unknown if label_words(text).isdisjoint(UNKNOWN_WORDS) and text]
+        if not unmapped:
+            return ""
+        told = f"labels {', '.join(unmapped[:MOST_TOLD])} are taken for unknown"
+        return f"{told}: --labels left={unmapped[0]} says what they mean"
 
 
 def _whole(text: str) -> str:
-    """Returns the text of a whole number as `1`, also where it is written as `1.0`; else the text."""
+    """Return the text of a whole number as `1`, also where it is written as `1.0`; else the text."""
     try:
         number = float(text)
     except ValueError:
@@ -142,6 +183,27 @@ def _whole(text: str) -> str:
     return str(int(number)) if isfinite(number) and number == int(number) else text
 
 
+def label_words(text: str) -> set[str]:
+    """Return the words of a text in lower case: those of `Blue-cone` are blue and cone."""
+    return set(re.findall(r"[a-z]+", text.lower()))
+
+
+def label_of_words(text: str) -> int:
+    """Return the label of a text by its words; UNKNOWN where none or several are of a side."""
+    words = label_words(text)
+    if words & ORANGE_WORDS:
+        return BIG_ORANGE if words & BIG_WORDS else ORANGE
+    sides = [label for label, names in SIDE_WORDS.items() if words & names]
+    return sides[0] if len(sides) == 1 else UNKNOWN
+
+
+SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
+ORANGE_WORDS: Final = {"orange", "o"}
+BIG_WORDS: Final = {"big", "large"}
+UNKNOWN_WORDS: Final = {"unknown", "none", "other", "undefined", "uncolored", "colourless", "colour"}
+"""Words of values that mean no side, and of colours, whose hue has decided."""
+MOST_TOLD: Final = 12
+"""Number of values of labels that a line lists."""
 BLUE_HUES: Final = (190.0, 265.0)
 """A colour with a hue (degrees) between these is blue."""
 YELLOW_HUES: Final = (44.0, 75.0)

@@ -1,7 +1,5 @@
 """ROS messages as they arrive, as perception cycles for an online estimator."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from typing import Any, Final
 
@@ -45,7 +43,10 @@ class MessageStream:
     def take_odometry(self, message: Any, received: float) -> None:
         """Buffers the twist of a message that was received at this time (s)."""
         try:
-            t, twist = _stamp(message, received), twist_of(message) * self.frames.flip
+            t, twist = _stamp(message, received), twist_of(message)
+            if twist is None:
+                raise ValueError("odometry: expected a message with a twist, found a pose alone")
+            twist = twist * self.frames.flip
             if not np.isfinite([t, *twist]).all() or (self._twists and t <= self._twists[-1][0]):
                 raise ValueError("odometry: expected finite numbers and a stamp later than the one before")
             self._twists.append((t, twist.tolist()))
@@ -54,7 +55,7 @@ class MessageStream:
             self.refused[str(error)] += 1
 
     def take_detections(self, message: Any, received: float) -> tuple[Odometry, Detections] | None:
-        """Returns a perception cycle with the twists since the last one that was used, or None.
+        """Return a perception cycle with the twists since the last one that was used, or None.
 
         A late cycle comes without twists, which the cycles in order have had already. The caller says by
         `use` that the estimator took the cycle; until then its twists are kept.
@@ -77,7 +78,7 @@ class MessageStream:
             self._twists.popleft()
 
     def _odometry_until(self, t: float) -> Odometry:
-        """Returns the buffered twists up to t (s); there are none for a late cycle."""
+        """Return the buffered twists up to t (s); there are none for a late cycle."""
         rows = [] if t <= self._newest else [row for row in self._twists if row[0] <= t]
         twists = np.array([twist for _, twist in rows]).reshape(-1, 3)
         return Odometry(np.array([stamp for stamp, _ in rows]), twists)

@@ -5,8 +5,6 @@ trees are given to one boundary. Its associations of trees are used for the refe
 optimum of GTSAM and stands in the log as truth, since no survey of the park is in the file.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -22,8 +20,7 @@ from pathspace_graph.io.parsing import read_text
 from pathspace_graph.labels import LEFT
 
 from .messages import Points
-from .poses import twists_of
-from .recording import Recording
+from .recording import Recording, twists_of
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int_]
@@ -66,7 +63,7 @@ class Drive:
 
 
 def read_victoria_park(file: Path | None = None) -> Recording:
-    """Returns the drive of a file, by default of the one that GTSAM brings, with the reference as truth."""
+    """Return the drive of a file, by default of the one that GTSAM brings, with the reference as truth."""
     file = example_file() if file is None else file
     drive = _read(file)
     t = np.asarray(PERIOD * np.arange(len(drive.moves) + 1), dtype=float)
@@ -86,7 +83,7 @@ def read_victoria_park(file: Path | None = None) -> Recording:
 
 
 def example_file() -> Path:
-    """Returns the file that GTSAM brings."""
+    """Return the file that GTSAM brings."""
     find: Any = gtsam.findExampleDataFile
     return Path(find(EXAMPLE))
 
@@ -153,7 +150,7 @@ def _numbers(file: Path, words: list[str], number: int) -> list[float]:
 
 
 def _reference(drive: Drive, t: Array) -> Truth:
-    """Returns the optimum of GTSAM with the associations of the file."""
+    """Return the optimum of GTSAM with the associations of the file."""
     values = _optimum(drive)
     poses = [values.atPose2(_x(index)) for index in range(len(t))]
     trees = np.array([values.atPoint2(_l(index)) for index in range(int(drive.tree.max()) + 1)])
@@ -189,7 +186,7 @@ def _optimum(drive: Drive) -> Any:
 
 
 def _sighting(drive: Drive, row: int) -> Any:
-    """Returns the factor of a detection: its covariance is turned to the bearing and the range."""
+    """Return the factor of a detection: its covariance is turned to the bearing and the range."""
     point, distance = drive.points[row], float(np.hypot(*drive.points[row]))
     along = point / distance
     to_polar = np.array([[-along[1] / distance, along[0] / distance], along])

@@ -297,6 +297,31 @@ def test_a_wheel_speed_goes_with_the_yaw_rate_of_an_imu(
     np.testing.assert_allclose(log.odometry.twist[:-1, 2], expected, atol=1e-5)
 
 
+def steered(messages: Messages, t: float) -> Any:
+    motion = messages.make("ackermann_msgs/msg/AckermannDrive", speed=3.0, steering_angle=0.2)
+    return messages.make("ackermann_msgs/msg/AckermannDriveStamped", header=messages.header(t), drive=motion)
+
+
+def test_speed_and_steering_angle_give_the_yaw_rate_by_the_wheelbase(tmp_path: Path) -> None:
+    log = convert(written(tmp_path, steered), tmp_path / "log", "--wheelbase", "1.5")
+    expected = np.tile([3.0, 0.0, 3.0 * np.tan(0.2) / 1.5], (11, 1))
+    np.testing.assert_allclose(log.odometry.twist, expected, rtol=1e-6)
+
+
+def test_poses_alone_are_differentiated_and_that_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def posed(messages: Messages, t: float) -> Any:
+        name = "geometry_msgs/msg/Pose"
+        turned = messages.make("geometry_msgs/msg/Quaternion", w=1.0)
+        pose = messages.make(name, position=messages.vector("Point", 3.0 * t, 0.0), orientation=turned)
+        return messages.make(f"{name}Stamped", header=messages.header(t, "map"), pose=pose)
+
+    log = convert(written(tmp_path, posed), tmp_path / "log")
+    np.testing.assert_allclose(log.odometry.twist, np.tile([3.0, 0.0, 0.0], (10, 1)), atol=1e-5)
+    assert "10 odometry samples are differences of poses" in capsys.readouterr().out
+
+
 def test_a_slow_imu_gives_its_heading_all_the_same() -> None:
     t, imu_t = np.arange(21) / 20.0, np.array([0.0, 0.5, 1.0])
     stamps, twists = with_yaw_rate(t, np.ones((21, 3)), imu_t, np.array([1.0, 3.0, 0.0]))
@@ -409,6 +434,70 @@ def test_a_sensor_of_another_frame_is_told_until_its_mounting_is_stated(
     assert "found them in odom, the frame of its pose" in line
 
 
+def transform(messages: Messages, parent: str, child: str, x: float, y: float, yaw: float) -> Any:
+    turned = messages.make("geometry_msgs/msg/Quaternion", z=np.sin(yaw / 2), w=np.cos(yaw / 2))
+    moved = messages.make(
+        "geometry_msgs/msg/Transform", translation=messages.vector(x=x, y=y), rotation=turned
+    )
+    stamped = "geometry_msgs/msg/TransformStamped"
+    header = messages.header(0.0, parent)
+    return messages.make(stamped, header=header, child_frame_id=child, transform=moved)
+
+
+def test_the_transforms_of_a_bag_say_where_the_sensor_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The sensor is on a roof 1 m ahead of the body, whose transform is given the other way round."""
+
+    def make(messages: Messages) -> list[Written]:
+        tree = [
+            transform(messages, "roof", "base_link", -1.0, 0.0, 0.0),
+            transform(messages, "roof", "lidar", 0.5, 0.2, np.pi / 2),
+        ]
+        static = messages.make("tf2_msgs/msg/TFMessage", transforms=tree)
+        twists = [(t, "/odom", messages.odometry(t, TWIST)) for t in (0.0, 0.1, 0.2)]
+        return [(0.0, "/tf_static", static), *twists, one_cone(messages, 0.1, frame="lidar")]
+
+    bag = write_bag(tmp_path, "mcap", make)
+    log = convert(bag, tmp_path / "log")
+    assert "/tf_static puts at 1.5 0.2 1.57" in capsys.readouterr().out
+    np.testing.assert_allclose(log.cycles[0].points_vehicle, [[1.5 - 1.5, 0.2 + 5.0]], atol=1e-9)
+    log = convert(bag, tmp_path / "stated", "--mounting", "0", "0", "0")
+    np.testing.assert_allclose(log.cycles[0].points_vehicle, [[5.0, 1.5]])
+
+
+def test_stamps_and_times_of_receipt_that_differ_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def make(messages: Messages) -> list[Written]:
+        twists = [(t, "/odom", messages.odometry(t, TWIST)) for t in np.arange(11) / 10.0]
+        return [*twists, one_cone(messages, 0.5, written=0.9)]
+
+    convert(write_bag(tmp_path, "mcap", make), tmp_path / "log")
+    assert "messages of /cones were received 0.4 s after their stamps" in capsys.readouterr().out
+
+
+def test_a_folder_of_bags_becomes_a_folder_of_logs_and_bad_ones_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "drives"
+    for name, topic in (("one", "/cones"), ("two", "/cones"), ("bad", "/other")):
+        (source / name).mkdir(parents=True)
+
+        def make(messages: Messages, topic: str = topic) -> list[Written]:
+            twists = [(t, "/odom", messages.odometry(t, TWIST)) for t in np.arange(11) / 10.0]
+            return [*twists, (0.5, topic, one_cone(messages, 0.5)[2])]
+
+        write_bag(source / name, "mcap", make).rename(source / f"{name}_bag")
+        (source / name).rmdir()
+    assert main(["convert", str(source), "--out", str(tmp_path / "logs"), *TOPICS]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1 and "1 of 3 records were refused" in line and "found /cones" in line
+    for name in ("one_bag", "two_bag"):
+        assert len(read_log(tmp_path / "logs" / name).cycles) == 1
+    assert not (tmp_path / "logs" / "bad_bag").exists()
+
+
 # --- what is refused -------------------------------------------------------------------------------------
 
 
@@ -423,8 +512,11 @@ def test_a_wrong_topic_lists_all_with_types_counts_and_rates(
             "--odometry: expected a topic of the bag, found /odm",
         ),
         (["--odometry", "/odom"], "--detections: expected a topic of the bag, found none"),
-        (["--odometry", "/cones", "--detections", "/cones"], "expected a topic of one of the types nav_msgs"),
-        ([*TOPICS, "--imu", "/odom"], "expected a topic of one of the types sensor_msgs/msg/Imu"),
+        (
+            ["--odometry", "/cones", "--detections", "/cones"],
+            "expected a message with a twist, a speed or a pose",
+        ),
+        ([*TOPICS, "--imu", "/odom"], "expected a message with an angular_velocity"),
     )
     for options, said in cases:
         line = refused(bag, tmp_path / "log", capsys, *options)
@@ -436,7 +528,7 @@ def test_a_wrong_topic_lists_all_with_types_counts_and_rates(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--odometry", "/odom", "--detections", "/odom"], "supported are sensor_msgs/msg/PointCloud2"),
+        (["--odometry", "/odom", "--detections", "/odom"], "supported is what has a point cloud"),
         ([*TOPICS, "--label-field", "klass"], "in the field 'klass', found x, y, label"),
         ([*TOPICS, "--labels", "blue=0"], "--labels: expected LABEL=VALUE"),
         ([*TOPICS, "--mounting", "0", "0", "90"], "--mounting: expected X Y YAW in m, m and rad"),

@@ -17,7 +17,7 @@ from pathspace_graph.convert.messages import (
     twist_of,
 )
 from pathspace_graph.convert.settings import LabelRule, label_of_colour
-from pathspace_graph.labels import LEFT, ORANGE, RIGHT, UNKNOWN
+from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
 from .bags import EPOCH, Messages
 
@@ -166,6 +166,49 @@ def test_what_has_no_cones_is_refused(message: Any, said: str) -> None:
 def test_a_message_without_a_twist_is_refused(messages: Messages) -> None:
     with pytest.raises(MessageError, match="with a twist"):
         twist_of(messages.vector())
+
+
+def test_detections_of_objects_have_their_label_in_a_hypothesis() -> None:
+    """`vision_msgs/Detection3DArray`, by its fields."""
+
+    def detection(x: float, name: str) -> SimpleNamespace:
+        center = SimpleNamespace(position=point(x, 1.0), orientation=None)
+        hypothesis = SimpleNamespace(class_id=name, score=0.9)
+        return SimpleNamespace(
+            bbox=SimpleNamespace(center=center), results=[SimpleNamespace(hypothesis=hypothesis)]
+        )
+
+    message = SimpleNamespace(detections=[detection(1.0, "blue_cone"), detection(2.0, "yellow_cone")])
+    found = points_of(message, RULE)
+    np.testing.assert_array_equal(found.points, [[1.0, 1.0], [2.0, 1.0]])
+    assert found.labels.tolist() == [LEFT, RIGHT]
+
+
+def test_the_values_of_labels_are_counted_with_what_they_were_taken_for() -> None:
+    rule = LabelRule(["left=3"])
+    assert rule.of_all(np.array([3, 3, 4])).tolist() == [LEFT, LEFT, UNKNOWN]
+    assert rule.of(SimpleNamespace(data="Yellow-cone")) == RIGHT
+    assert rule.told() == "labels: 3 is left (2), 4 is unknown (1), Yellow-cone is right (1)"
+    assert "--labels left=4" in rule.hint()
+    assert LabelRule().hint() == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "label"),
+    [
+        ("blue_cone", LEFT),
+        ("yellow-cone", RIGHT),
+        ("b", LEFT),
+        ("Y", RIGHT),
+        ("orange_cone", ORANGE),
+        ("large_orange_cone", BIG_ORANGE),
+        ("unknown_cone", UNKNOWN),
+        ("blue or yellow", UNKNOWN),
+        ("bluebird", UNKNOWN),
+    ],
+)
+def test_words_inside_a_text_are_labels(text: str, label: int) -> None:
+    assert RULE.of(text) == label
 
 
 @pytest.mark.parametrize(

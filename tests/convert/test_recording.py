@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 from pathspace_graph.convert.messages import Points
-from pathspace_graph.convert.poses import twists_between, twists_of
-from pathspace_graph.convert.recording import Recording, default_covariances, positive_definite, to_log
+from pathspace_graph.convert.recording import (
+    Recording,
+    default_covariances,
+    positive_definite,
+    to_log,
+    twists_between,
+    twists_of,
+)
 from pathspace_graph.convert.settings import Frames, NoiseSettings
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.se2 import compose, se2_exp

@@ -149,3 +149,43 @@ def test_files_of_other_names_are_named(tmp_path: Path, capsys: pytest.CaptureFi
 def test_a_source_is_needed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["convert", "--from", "csv", "--out", str(tmp_path / "log")]) == 2
     assert "expected a SOURCE" in capsys.readouterr().err
+
+
+# --- JSON lines ------------------------------------------------------------------------------------------
+
+
+LINES = """{"t": 0.0, "twist": [1.0, 0.0, 0.1]}
+{"t": 0.5, "twist": [1.5, 0.1, 0.2], "detections": [{"x": 4.0, "y": 1.0, "label": "blue_cone"}]}
+
+{"t": 1.0, "detections": [{"range": 5.0, "bearing": 0.5, "covariance": [[0.04, 0.01], [0.01, 0.02]]}]}
+{"t": 1.0, "twist": [1.0, 0.0, 0.0]}
+"""
+
+
+def test_json_lines_become_a_log(tmp_path: Path) -> None:
+    (tmp_path / "drive.jsonl").write_text(LINES)
+    assert (
+        main(["convert", str(tmp_path / "drive.jsonl"), "--from", "jsonl", "--out", str(tmp_path / "log")])
+        == 0
+    )
+    log = read_log(tmp_path / "log")
+    np.testing.assert_array_equal(log.odometry.twist, [[1.0, 0.0, 0.1], [1.5, 0.1, 0.2], [1.0, 0.0, 0.0]])
+    assert [cycle.t for cycle in log.cycles] == [0.5, 1.0]
+    assert [cycle.labels.tolist() for cycle in log.cycles] == [[LEFT], [UNKNOWN]]
+    np.testing.assert_allclose(log.cycles[1].points_vehicle, [[5.0 * np.cos(0.5), 5.0 * np.sin(0.5)]])
+    np.testing.assert_allclose(log.cycles[1].covariances, [[[0.04, 0.01], [0.01, 0.02]]])
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["{", "[]", '{"twist": [1, 2, 3]}', '{"t": 0, "twist": [1, 2]}', '{"t": 0, "detections": [{"x": 1}]}'],
+)
+def test_a_bad_line_is_named(line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "drive.jsonl").write_text(f"{LINES}{line}\n")
+    assert (
+        main(["convert", str(tmp_path / "drive.jsonl"), "--from", "jsonl", "--out", str(tmp_path / "log")])
+        == 2
+    )
+    told = capsys.readouterr().err
+    assert "drive.jsonl" in told and "6" in told and told.count("\n") == 1
+    assert not (tmp_path / "log").exists()

@@ -1,20 +1,20 @@
-"""CSV files with columns of any names and units: one of the odometry, and one of the detections."""
+"""Text files: CSV with columns of any names and units, and JSON lines."""
 
-from __future__ import annotations
-
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import pi
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.io.csv_table import Table, read_table
-from pathspace_graph.io.limits import MAX_STAMP
+from pathspace_graph.io.limits import MAX_STAMP, shown
 from pathspace_graph.io.log import covariances_of
+from pathspace_graph.io.parsing import read_text
 from pathspace_graph.labels import UNKNOWN
 
 from .messages import Points
@@ -39,9 +39,9 @@ QUANTITIES: Final = {
         "yy": "length",
     },
 }
-"""Each file has columns for these, which are of these quantities; a covariance is of the square of one."""
+"""Columns of each file and their quantities; a covariance is of the square of one."""
 COVARIANCE: Final = ("xx", "xy", "yy")
-"""These columns hold the covariance of a detection, if there is one."""
+"""Columns of the covariance of a detection, if there is one."""
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3},
@@ -49,30 +49,30 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "speed": {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/s": 1e3, "km/h": 1.0 / 3.6, "mph": 0.44704},
     "yaw_rate": {"rad/s": 1.0, "deg/s": pi / 180.0},
 }
-"""Each quantity may be in these units, each of which is this number of the SI unit."""
+"""Units of each quantity, in SI units."""
 MAX_BEARING: Final = 2.0 * pi
-"""A bearing is at most this (rad); more are degrees."""
+"""Largest bearing (rad); more are degrees."""
 LARGEST: Final = 1e30
-"""A number of a file is at most this; stamps in nanoseconds are large."""
+"""Largest number of a file; stamps in nanoseconds are large."""
+UNSTATED: Final = ((np.nan, np.nan), (np.nan, np.nan))
+"""Covariance of a detection that states none."""
 MIN_PERIOD: Final = 1e-5
-"""Samples are on average at least this far apart (s); less is a wrong unit of time."""
+"""Least mean period of samples (s); less is a wrong unit of time."""
 MAX_PERIOD: Final = 1e3
-"""Samples are on average at most this far apart (s); more is a wrong unit of time."""
+"""Largest mean period of samples (s); more is a wrong unit of time."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """Names a column of a file, whose numbers may change their sign."""
+    """Column of a file, whose numbers may change their sign."""
 
     name: str
-    """This is its name in the file."""
     sign: float = 1.0
-    """The numbers are multiplied by this, which is 1 or -1."""
 
 
 class Columns:
-    """Tells the column of each quantity: `vx=speed`, `y=-cone_y` with the sign changed, `detections.t=stamp`
-    for one of both files only.
+    """Columns of the quantities: `vx=speed`, `y=-cone_y` with the sign changed, `detections.t=stamp` for one
+    of both files only.
 
     A quantity that is not named is in the column of its own name.
     """
@@ -93,23 +93,22 @@ class Columns:
                 self._named[kind, key] = column
 
     def of(self, kind: str, key: str) -> Column:
-        """Returns the column of a quantity in a file of this kind."""
+        """Return the column of a quantity in a file of this kind."""
         return self._named.get((kind, key), Column(key))
 
     def is_named(self, kind: str, key: str) -> bool:
-        """Returns whether the column of a quantity was named."""
+        """Return whether the column of a quantity was named."""
         return (kind, key) in self._named
 
 
 class Units:
-    """Tells the unit of each quantity: `length=mm angle=deg time=ns`, and `speed` and `yaw_rate`.
+    """Units of the quantities: `length=mm angle=deg time=ns`, and `speed` and `yaw_rate`.
 
     A speed is in the unit of length, and a yaw rate in that of angle, for each second, unless it has its own.
     """
 
     def __init__(self, pairs: Sequence[str] = ()) -> None:
         self.names = {"time": "s", "length": "m", "angle": "rad"}
-        """Each quantity has this unit."""
         for pair in pairs:
             quantity, equals, unit = pair.partition("=")
             check_name(quantity, UNITS, f"--units: expected one of {', '.join(UNITS)} in '{pair}'")
@@ -126,7 +125,7 @@ class Units:
         }
 
     def factor(self, quantity: str) -> float:
-        """Returns by what a number is multiplied for the SI unit."""
+        """Return by what a number is multiplied for the SI unit."""
         return UNITS[quantity][self.names[quantity]]
 
     def __str__(self) -> str:
@@ -134,7 +133,7 @@ class Units:
 
 
 def read_csv(odometry: Path, detections: Path, columns: Columns, units: Units, rule: LabelRule) -> Recording:
-    """Returns what two CSV files have of a drive; an InputError names file, row and column."""
+    """Return what two CSV files have of a drive; an InputError names file, row and column."""
     twists = _File.read(ODOMETRY, odometry, columns, units)
     found = _File.read(DETECTIONS, detections, columns, units)
     t = twists.stamps()
@@ -146,31 +145,27 @@ def read_csv(odometry: Path, detections: Path, columns: Columns, units: Units, r
 
 @dataclass(frozen=True)
 class _File:
-    """Holds one of the files, whose columns are read by quantity and in SI units."""
+    """One of the files, whose columns are read by quantity and in SI units."""
 
     kind: str
-    """This is `odometry` or `detections`."""
     table: Table
-    """These are its rows."""
     columns: Columns
-    """These are the names of its columns."""
     units: Units
-    """These are their units."""
 
     @staticmethod
-    def read(kind: str, file: Path, columns: Columns, units: Units) -> _File:
-        """Returns a file of this kind, which has one row at least."""
+    def read(kind: str, file: Path, columns: Columns, units: Units) -> "_File":
+        """Return a file of this kind, which has one row at least."""
         table = read_table(file, ())
         if not len(table):
             raise InputError(file, "expected at least one row, found a header only", 2)
         return _File(kind, table, columns, units)
 
     def has(self, key: str) -> bool:
-        """Returns whether the file has the column of a quantity; one that was named must be there."""
+        """Return whether the file has the column of a quantity; one that was named must be there."""
         return self.columns.is_named(self.kind, key) or key in self.table.columns
 
     def column(self, key: str) -> Column:
-        """Returns the column of a quantity; an InputError lists the columns that are there."""
+        """Return the column of a quantity; an InputError lists the columns that are there."""
         column = self.columns.of(self.kind, key)
         if column.name not in self.table.columns:
             raise InputError(
@@ -182,17 +177,17 @@ class _File:
         return column
 
     def numbers(self, key: str, power: int = 1) -> Array:
-        """Returns a column (rows,) in the SI unit, or in its square where `power` is 2."""
+        """Return a column (rows,) in the SI unit, or in its square where `power` is 2."""
         column = self.column(key)
         factor = self.units.factor(QUANTITIES[self.kind][key]) ** power
         return np.asarray(column.sign * factor * self.table.numbers(column.name, LARGEST))
 
     def optional(self, key: str) -> Array:
-        """Returns a column (rows,) in the SI unit, or zeros where the file has none."""
+        """Return a column (rows,) in the SI unit, or zeros where the file has none."""
         return self.numbers(key) if self.has(key) else np.zeros(len(self.table))
 
     def stamps(self) -> Array:
-        """Returns the stamps (rows,) in s, whose unit has to be plausible."""
+        """Return the stamps (rows,) in s, whose unit has to be plausible."""
         t, unit = self.numbers("t"), self.units.names["time"]
         name = self.columns.of(self.kind, "t").name
         self.table.require(
@@ -211,7 +206,7 @@ class _File:
 
 
 def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
-    """Returns the stamps of the perception cycles (n,) in s, and the points of each, in the file's order."""
+    """Return the stamps of the perception cycles (n,) in s, and the points of each, in the file's order."""
     t, points, covariances, labels = file.stamps(), _points(file), _covariances(file), _labels(file, rule)
     stamps, first, cycle = np.unique(t, return_index=True, return_inverse=True)
     order = np.argsort(first)
@@ -239,7 +234,7 @@ def _points(file: _File) -> Array:
 
 
 def _covariances(file: _File) -> Array:
-    """Returns the covariances (rows, 2, 2) in m^2, which are NaN where the file has none."""
+    """Return the covariances (rows, 2, 2) in m^2, which are NaN where the file has none."""
     if not any(map(file.has, COVARIANCE)):
         return np.full((len(file.table), 2, 2), np.nan)
     xx, xy, yy = (file.numbers(key, power=2) for key in COVARIANCE)
@@ -249,5 +244,48 @@ def _covariances(file: _File) -> Array:
 def _labels(file: _File, rule: LabelRule) -> NDArray[np.int_]:
     if not file.has("label"):
         return np.full(len(file.table), UNKNOWN)
-    words, place = np.unique(file.table.columns[file.column("label").name], return_inverse=True)
-    return np.array([rule.of(word) for word in words.tolist()], dtype=int)[place]
+    return rule.of_all(file.table.columns[file.column("label").name])
+
+
+# --- JSON lines ------------------------------------------------------------------------------------------
+
+
+def read_json_lines(file: Path, rule: LabelRule) -> Recording:
+    """Return what a file of JSON lines has of a drive, in SI units; an InputError names file and line.
+
+    A line is `{"t": s, "twist": [vx, vy, wz]}` or `{"t": s, "detections": [{"x": m, "y": m, "label": "blue",
+    "covariance": [[xx, xy], [xy, yy]]}, ...]}`, with `range` and `bearing` in place of `x` and `y` where one
+    likes; label and covariance are optional. A line may have both.
+    """
+    t, twists, scan_t, scans = [], [], [], []
+    for row, line in enumerate(read_text(file).splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            entry = json.loads(line)
+            stamp = float(entry["t"])
+            if "twist" in entry:
+                t.append(stamp)
+                twists.append(np.array(entry["twist"], dtype=float).reshape(3))
+            if "detections" in entry:
+                scan_t.append(stamp)
+                scans.append(_points_of_objects(entry["detections"], rule))
+        except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:
+            expected = "expected a line with t, and with twist [vx, vy, wz] or a list of detections"
+            raise InputError(
+                file, f"{expected}, found {shown(line)} ({type(error).__name__}: {error})", row
+            ) from None
+    source = {"file": file.name}
+    return Recording(np.array(t), np.array(twists).reshape(-1, 3), np.array(scan_t), scans, source)
+
+
+def _points_of_objects(objects: list[dict[str, Any]], rule: LabelRule) -> Points:
+    points, covariances, labels = [], [], []
+    for one in objects:
+        r, bearing = (one.get(key) for key in ("range", "bearing"))
+        place = (one["x"], one["y"]) if r is None else (r * np.cos(bearing), r * np.sin(bearing))
+        points.append(np.array(place, dtype=float))
+        covariances.append(np.array(one.get("covariance", UNSTATED), dtype=float).reshape(2, 2))
+        labels.append(rule.of(one["label"]) if "label" in one else UNKNOWN)
+    shaped = np.array(points).reshape(-1, 2), np.array(covariances).reshape(-1, 2, 2)
+    return Points(*shaped, np.array(labels, dtype=int))
