@@ -44,6 +44,7 @@ def test_the_trajectory_is_copied_to_the_byte_and_an_earlier_file_kept(tmp_path:
     ("arguments", "said"),
     [
         (["--as", "geojson"], "--origin: expected LATITUDE LONGITUDE HEADING in degrees"),
+        (["--as", "points", "--stop"], "--start-speed, --stop: expected --as profile"),
         (["--as", "lanelet2"], "which --as lanelet2 needs"),
         (["--as", "lanelet2", "--origin", "95", "0", "0"], "expected a latitude"),
         (["--as", "points", "--step", "0"], "--step: expected a number of at least"),
