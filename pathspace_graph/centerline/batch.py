@@ -23,7 +23,8 @@ from pathspace_graph.io.results import BatchRun
 from pathspace_graph.run import settings_dict
 from pathspace_graph.scale.door import log_at_scale
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.ribbon import SIDE, Ribbon, along_ribbon, ribbon_between
+from pathspace_graph.spline.centre_line import find_line
+from pathspace_graph.spline.ribbon import SIDE, Ribbon
 
 from .edges import map_of
 from .graph import EdgeDetections, edge_factors, ribbon_covariance, ribbon_keys, shape_factors
@@ -119,19 +120,19 @@ def begin(start: BatchResult, spacing: float) -> tuple[Ribbon, EdgeDetections]:
     if len(splines) < len(SIDE):
         raise SettingsError(f"a centre line: expected both boundaries, found {len(splines)}")
     left, right = splines.values()
-    ribbon, *tables = ribbon_between(left, right, state.closed, spacing)
+    line = find_line(left, right, state.closed, spacing)
     rows, sides, u = [], [], []
-    for (label, spline), along in zip(splines.items(), tables, strict=True):
+    for side, label in enumerate(splines):
         projected = start.optimum.projected[label]
         used = start.system.scale(projected) > 0.0
         rows.append(projected.rows[used])
         sides.append(np.full(int(used.sum()), SIDE[label]))
-        u.append(along_ribbon(along, projected.foot.u[used], spline, ribbon))
-    row, side, at = (np.concatenate(parts) for parts in (rows, sides, u))
+        u.append(line.ribbon_parameters(side, projected.foot.u[used]))
+    row, edge, at = (np.concatenate(parts) for parts in (rows, sides, u))
     order = np.lexsort((row, table.cycle[row]))
-    row, side, at = row[order], side[order], at[order]
-    return ribbon, EdgeDetections(
-        table.cycle[row], side, at, table.measured[row], table.covariance[row], table.twist[row]
+    row, edge, at = row[order], edge[order], at[order]
+    return line.ribbon, EdgeDetections(
+        table.cycle[row], edge, at, table.measured[row], table.covariance[row], table.twist[row]
     )
 
 
@@ -143,7 +144,7 @@ def _values(start: BatchResult, ribbon: Ribbon) -> gtsam.Values:
         values.insert(key, gtsam.Pose2(*pose))
     calibrations = variables.gtsam_values(variables.calibration_keys)
     values.insert(calibrations)
-    for key, point in zip(ribbon_keys(ribbon), ribbon.distinct, strict=True):
+    for key, point in zip(ribbon_keys(ribbon), ribbon.distinct_control_points, strict=True):
         values.insert(key, point)
     return values
 

@@ -79,12 +79,14 @@ def shape_factors(ribbon: Ribbon, poses: Array, settings: MapperSettings) -> Ite
     In the map frame they would turn with the map (`batch.gauge:CurveGauge`).
     """
     keys, batch = ribbon_keys(ribbon), settings.batch
-    offset = ribbon.distinct[:, None, :2] - poses[:, :2]
+    offset = ribbon.distinct_control_points[:, None, :2] - poses[:, :2]
     nearest = (offset**2).sum(axis=2).argmin(axis=1)
     sigma_bend = batch.sigma_smoothness * ribbon.spacing
     sigmas = np.array([sigma_bend, sigma_bend, settings.centerline.sigma_width])
     for j, key in enumerate(keys):
-        yield _beside_factor(key, int(nearest[j]), ribbon.distinct[j], poses[nearest[j]], batch.sigma_slide)
+        yield _beside_factor(
+            key, int(nearest[j]), ribbon.distinct_control_points[j], poses[nearest[j]], batch.sigma_slide
+        )
     for j, row in enumerate(ribbon.bending):
         middle = (j + 1) % ribbon.size
         three = [keys[(j + k) % ribbon.size] for k in range(3)]

@@ -20,7 +20,7 @@ from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE, read_log
 from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map
 from pathspace_graph.io.trajectory import TRAJECTORY_FILE, read_trajectory, write_trajectory
 from pathspace_graph.settings.speed import SpeedSettings
-from pathspace_graph.spline.centre_line import LEAST_STEP, MOST_POINTS
+from pathspace_graph.spline.planning import LEAST_STEP, MOST_POINTS
 
 Format = Literal["centerline", "tum", "geojson", "points", "lanelet2", "profile"]
 ON_EARTH = ("geojson", "lanelet2")
@@ -49,6 +49,11 @@ class Export:
     `lanelet2` need them."""
     speed: SpeedSettings = field(default_factory=SpeedSettings)
     """These settings describe the vehicle of a `profile`."""
+    start_speed: float | None = None
+    """The `profile` of an open track begins at this speed (m/s), by default as fast as its curvature
+    allows."""
+    stop: bool = False
+    """The `profile` of an open track ends at a standstill."""
 
     def run(self) -> None:
         """Reads the map and writes the file."""
@@ -57,6 +62,8 @@ class Export:
             raise SettingsError(
                 f"--step: expected a number of at least {LEAST_STEP:g} m, found {self.step:g}"
             )
+        if self.format != "profile" and (self.stop or self.start_speed is not None):
+            raise SettingsError(f"--start-speed, --stop: expected --as profile, found --as {self.format}")
         plane = self._plane()
         if self.format == "tum" and not (self.map / MAP_FILE).exists() and (self.map / LOG_FILE).exists():
             write_true_path(self.map, self.out)
@@ -74,7 +81,7 @@ class Export:
         if self.format == "centerline":
             write_centre_line(file, track, self.step)
         elif self.format == "profile":
-            write_profile(file, track, self.step, self.speed)
+            write_profile(file, track, self.step, self.speed, self.start_speed, self.stop)
         elif self.format == "points":
             write_points(file, track, self.step)
         elif self.format == "tum":

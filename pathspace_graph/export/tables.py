@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary
 from pathspace_graph.labels import NAMES
 from pathspace_graph.settings.speed import SpeedSettings
@@ -36,13 +37,26 @@ def write_centre_line(file: Path, track: Map, step: float) -> None:
     _write(file, [CENTRE_LINE_HEADER, *(",".join(map(repr, row)) for row in rows.tolist())])
 
 
-def write_profile(file: Path, track: Map, step: float, settings: SpeedSettings) -> None:
+def write_profile(
+    file: Path,
+    track: Map,
+    step: float,
+    settings: SpeedSettings,
+    start: float | None = None,
+    stop: bool = False,
+) -> None:
     """Writes the centre line with heading, curvature, speed and acceleration (m, rad, 1/m, m/s, m/s^2).
 
-    The columns are those of TUM's trajectories. The heading is measured from the x axis of the map.
+    The columns are those of TUM's trajectories. The heading is measured from the x axis of the map. An open
+    line begins at the speed `start` (m/s), where it is given, and may end at a stop. SettingsError is raised
+    where the vehicle cannot begin so fast.
     """
     line = track.centre_line(step)
-    profile = speed_profile(line, settings)
+    profile = speed_profile(line, settings, start, 0.0 if stop else None)
+    if start is not None and profile.speed[0] < start:
+        raise SettingsError(
+            f"expected a start speed of at most {profile.speed[0]:.3g} m/s on this line, found {start:g}"
+        )
     columns = (
         line.arc_length,
         line.points,

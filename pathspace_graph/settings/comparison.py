@@ -122,5 +122,3 @@ class CenterlineSettings(Positive):
     """Each round takes at most this number of iterations."""
     tolerance: float = 1e-5
     """A round ends where an iteration lowers the error by less than this share."""
-    sigma_edge: float = 0.05
-    """This is the standard deviation (m) of what an edge cannot follow of a mapped boundary, online."""

@@ -18,7 +18,8 @@ from pathspace_graph.factors.se2 import left_of, to_vehicle, wrap_angle
 from pathspace_graph.factors.spans import SpanPolynomials
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
-from .centre_line import LEAST_STEP, MOST_POINTS, points_across
+from .centre_line import points_across
+from .planning import LEAST_STEP, MOST_POINTS
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

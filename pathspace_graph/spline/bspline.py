@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Final, Literal
+from typing import ClassVar, Final, Literal, Self
 
 import numpy as np
 from scipy.interpolate import BSpline as ScipyBSpline
@@ -42,6 +42,7 @@ class BSpline:
     """
 
     LENGTHS: ClassVar = {"knots": 1, "control_points": 1}
+    DIMENSION: ClassVar = 2
 
     knots: Floats
     """(n + p + 1,) The knots never decrease."""
@@ -64,10 +65,10 @@ class BSpline:
         points, knots = self.control_points, self.knots
         if self.degree < 1:
             raise SettingsError(f"a spline's degree must be at least 1, not {self.degree}")
-        if points.ndim != 2 or points.shape[1] != 2 or len(points) <= self.degree:
+        if points.ndim != 2 or points.shape[1] != self.DIMENSION or len(points) <= self.degree:
+            shape = f"(n > {self.degree}, {self.DIMENSION})"
             raise SettingsError(
-                f"a spline of degree {self.degree} needs control points of shape (n > {self.degree}, 2), "
-                f"not {points.shape}"
+                f"a spline of degree {self.degree} needs control points of shape {shape}, not {points.shape}"
             )
         if knots.shape != (len(points) + self.degree + 1,):
             raise SettingsError(
@@ -103,7 +104,7 @@ class BSpline:
     @classmethod
     def open_uniform(
         cls, control_points: Floats, degree: int = 3, interval: float = 1.0, start: float = 0.0
-    ) -> BSpline:
+    ) -> Self:
         """Returns a curve on equally spaced knots with floating (unclamped) ends, which begins at `start`."""
         return cls(uniform_knots(len(control_points), degree, interval, start), control_points, degree)
 
@@ -113,7 +114,7 @@ class BSpline:
         return cls(clamped_knots(breaks, degree), control_points, degree)
 
     @classmethod
-    def periodic_from(cls, breaks: Floats, control_points: Floats, degree: int = 3) -> BSpline:
+    def periodic_from(cls, breaks: Floats, control_points: Floats, degree: int = 3) -> Self:
         """Returns a closed curve on one period of breaks (m + 1,) with m distinct control points."""
         if len(breaks) != len(control_points) + 1 or len(control_points) <= degree:
             raise SettingsError(
@@ -148,7 +149,7 @@ class BSpline:
         """Returns the basis as polynomials on each span."""
         return SpanPolynomials(self.knots, self.degree, self.periodic)
 
-    def with_points(self, distinct: Floats) -> BSpline:
+    def with_points(self, distinct: Floats) -> Self:
         """Returns the spline of the same basis with other distinct control points (m, 2)."""
         points = np.concatenate([distinct, distinct[: self.degree]]) if self.periodic else distinct
         spline = replace(self, control_points=points)
@@ -177,6 +178,10 @@ class BSpline:
         first = self.evaluate(u, 1)
         norm = np.linalg.norm(first, axis=1, keepdims=True)
         return np.asarray(np.divide(first, norm, out=np.zeros_like(first), where=norm > 0.0))
+
+    def normal_unit(self, u: Floats) -> Floats:
+        """Returns the unit normals (k, 2) to the left, which are zero where S' vanishes."""
+        return left_of(self.tangent_unit(u))
 
     def curvature(self, u: Floats) -> Floats:
         """Returns (x' y'' - y' x'') / |S'|^3 (k,) in 1/m: positive in a left turn, zero where S' vanishes."""

@@ -1,301 +1,366 @@
-"""The centre line between two boundaries: the points that are equally far from both."""
+"""The centre line between two boundaries: the curve whose normals cross them equally far to both sides."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_array, csr_array, diags_array
+from scipy.sparse.linalg import SuperLU, splu
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.footpoint import FootPoints, refine_foot_points
+from pathspace_graph.factors.gauge import greville, smoothness_coefficients
+from pathspace_graph.factors.ribbon import RIBBON
 from pathspace_graph.factors.se2 import left_of
 
 from .bspline import BSpline
+from .ribbon import Ribbon
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
-LEAST_STEP: Final = 0.01
-"""Points of the line are at least this far apart (m)."""
-MOST_POINTS: Final = 200_000
-"""A line has at most this number of fine points, which bounds the memory."""
-_FINE_STEP: Final = 0.25
-"""The line is found at points that are at most this far apart (m)."""
-_SEARCH_STEP: Final = 0.5
-"""The points across are searched among samples of the boundaries that are this far apart (m)."""
-_CHUNK: Final = 1 << 20
-"""At most this number of distances between samples are held in memory at once."""
-_SETTLING_STEPS: Final = 6
-"""A point is moved to equal distances from both boundaries by this number of Newton steps."""
-_RESAMPLINGS: Final = 3
-"""The points are spaced evenly by arc length this number of times."""
-_SETTLED: Final = 1e-6
-"""A point is on the line where its foot points are perpendicular, and its distances equal, to this (m)."""
-_LEAST_COSINE: Final = 0.1
-"""Boundaries that diverge by more than the angle of this cosine are treated as if it were this one."""
+SPACING: Final = 3.0
+"""Distance of the knots of a planner's line (m); shorter kinks of the boundaries are smoothed."""
+MOST_SAMPLES: Final = 200_000
+"""Largest number of samples of a boundary, which bounds the memory."""
+SAMPLE_STEP: Final = 0.5
+"""Distance of the samples of boundaries and line (m)."""
+_FEWEST: Final = 4
+"""Smallest number of samples of a boundary and of knot intervals of a line."""
+_STARTS: Final = 200
+"""Number of samples of the left boundary among which the march begins."""
+_NEAR: Final = 12
+"""Segments up to this many samples away from a pair are tested for a crossing."""
+_ROUNDS: Final = 3
+"""Number of times that the line is moved to the middle between the crossings of its normals."""
+_SMOOTHNESS: Final = 1e-3
+"""Weight of second differences in the fit, which decides only what the samples leave open."""
 _CROSSING_STEPS: Final = 8
-"""The crossing of a normal of the line and a boundary is found by this number of Newton steps."""
-_LONGEST: Final = 3.0
-"""A centre line that is longer than this many times its boundaries has run astray."""
-_LARGEST_GAP: Final = 4.0
-"""Neighbours are at most this many mean distances apart; farther ones are on both sides of a break."""
-_FEWEST_POINTS: Final = 4
-"""A line has at least this number of fine points."""
-
-_NOT_SIDE_BY_SIDE: Final = "expected boundaries side by side, the left one on the left, found none such"
+"""Number of Newton steps to the crossing of a normal and a boundary."""
+_CROSSED: Final = 1e-6
+"""A normal crosses a boundary where the point found is this close to it (m)."""
+_LEAST_COSINE: Final = 0.1
+"""Least cosine of the angle between boundary and line at a crossing."""
+_FARTHEST: Final = 1.5
+"""A crossing farther away than this many times the paired sample belongs to another stretch."""
 
 
 @dataclass(frozen=True, eq=False)
-class Stations:
-    """Holds points of the centre line with their foot points on both boundaries."""
+class CentreCurve:
+    """A ribbon between two boundaries, with samples that lead from its parameter to theirs."""
 
-    points: Array
-    """Each point (n, 2), in m, is equally far from both boundaries."""
-    left: FootPoints
-    """These are the foot points on the left boundary; its distances are negative."""
-    right: FootPoints
-    """These are the foot points on the right boundary; its distances are positive."""
-
-    def where(self, rows: Bools | NDArray[np.intp] | slice) -> Stations:
-        """Returns some of the stations."""
-        return Stations(self.points[rows], self.left.where(rows), self.right.where(rows))
+    ribbon: Ribbon
+    u: Array
+    """(k,) Parameters of the ribbon, about evenly spaced; those of a loop end before its beginning."""
+    sides: tuple[BSpline, BSpline]
+    """Left and right boundary."""
+    beside: tuple[Array, Array]
+    """(k,) Their parameters beside each sample, not wrapped."""
 
     @property
-    def tangent(self) -> Array:
-        """Returns the unit tangents (n, 2): the line bisects the angle between the boundaries' tangents."""
-        return _unit(self.left.tangent_unit + self.right.tangent_unit)
+    def size(self) -> int:
+        """Number of control points of both boundaries."""
+        return self.sides[0].size + self.sides[1].size
 
-    @property
-    def normal(self) -> Array:
-        """Returns the unit normals (n, 2) to the left."""
-        return left_of(self.tangent)
+    def table(self, side: int) -> Array:
+        """Return the pairs (n, 2) of parameters of a boundary, ascending, and of the ribbon, once round."""
+        u, own = self.u, self.beside[side]
+        if self.ribbon.periodic:
+            (low, high), (begin, end) = self.sides[side].domain, self.ribbon.domain
+            u, own = np.append(u, u[0] + end - begin), np.append(own, own[0] + high - low)
+        return np.column_stack([np.maximum.accumulate(own), u])
 
-    @property
-    def on_line(self) -> Bools:
-        """Returns where (n,) a point is between both boundaries, perpendicular to both and equally far."""
-        good = np.abs(self.left.distance + self.right.distance) <= _SETTLED
-        good &= (self.left.distance < 0.0) & (self.right.distance > 0.0)
-        for foot in (self.left, self.right):
-            along = np.einsum("kd,kd->k", self.points - foot.position, foot.tangent_unit)
-            good &= np.abs(along) <= _SETTLED
-        return np.asarray(good)
+    def ribbon_parameters(self, side: int, u: Array) -> Array:
+        """Return the parameters (k,) of the ribbon beside the parameters u (k,) of a boundary."""
+        table = self.table(side)
+        if self.ribbon.periodic:
+            low, high = self.sides[side].domain
+            u = table[0, 0] + np.mod(u - table[0, 0], high - low)
+        return np.interp(u, table[:, 0], table[:, 1])
+
+    def crossings(self, u: Array) -> list[Crossing]:
+        """Return where the normals at parameters u (k,) of the line cross the left and the right boundary."""
+        found = []
+        for side, spline in enumerate(self.sides):
+            own, at = self.table(side).T
+            found.append(_crossing(self.ribbon, u, spline, np.interp(u, at, own), 1.0 - 2.0 * side))
+        return found
+
+    @cached_property
+    def by_boundaries(self) -> Array:
+        """Derivatives (3m, 2M) of the ribbon's control points by the M of both boundaries, left ones first.
+
+        At fixed normals a crossing moves by N . dS / (N . n) along the normal n, where N is the normal of its
+        boundary. The line follows the mean of both, half the width half the difference.
+        """
+        left, right = self.crossings(self.u)
+        moves = left.along_normal(0, self.size), right.along_normal(left.spline.size, self.size)
+        normal = self.ribbon.centre.normal_unit(self.u)
+        across, half = 0.5 * (moves[0] + moves[1]), 0.5 * (moves[0] - moves[1])
+        parts = (diags_array(normal[:, 0]) @ across, diags_array(normal[:, 1]) @ across, half)
+        fit = _Fit(self.ribbon, self.u)
+        solved = np.stack([fit.solve(part.toarray()) for part in parts], axis=1)
+        return np.asarray(solved.reshape(RIBBON * self.ribbon.size, -1))
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
-    """Holds a centre line without its uncertainty: its fine points, and which of them a planner is given."""
+class Crossing:
+    """The points where normals of a line cross a boundary."""
 
-    stations: Stations
-    """The fine points (k,) are evenly spaced by arc length."""
-    arc_length: Array
-    """This is the arc length (k,) from the first point, in m."""
-    length: float
-    """The whole line has this length (m), the way back to the first point included where it is closed."""
-    every: int
-    """Every so-manyth fine point is a point of the result."""
-    closed: bool
-    """The line is a loop where this is true."""
+    spline: BSpline
+    u: Array
+    """(k,) Parameters of the boundary, not wrapped; of the sample beside where a normal misses it."""
+    normal: Array
+    """(k, 2) Unit normals of the line, to the left."""
+    offset: Array
+    """(k,) Signed distance along the normal, positive to the left (m)."""
+    good: Bools
+    """(k,) Whether the normal crosses the boundary there."""
+
+    @cached_property
+    def own_normal(self) -> Array:
+        """Normals N (k, 2) of the boundary over N . n, the cosine of its angle to the line."""
+        own = self.spline.normal_unit(self.u)
+        facing = np.einsum("kd,kd->k", own, self.normal)
+        return np.asarray(own / np.maximum(facing, _LEAST_COSINE)[:, None])
+
+    def along_normal(self, first: int, size: int) -> csr_array:
+        """Return the derivatives (k, 2s) of the offset by control points, its boundary's from `first` on."""
+        values, columns = self.spline.local_basis(self.u)
+        entries = (values[:, :, None] * self.own_normal[:, None, :]).reshape(-1)
+        at = (2 * (columns + first)[:, :, None] + np.arange(2)).reshape(-1)
+        of = np.repeat(np.arange(len(self.u)), 2 * values.shape[1])
+        return csr_array((entries, (of, at)), shape=(len(self.u), 2 * size))
 
 
-def find_line(left: BSpline, right: BSpline, closed: bool, step: float) -> Line:
-    """Returns the points that are equally far from both boundaries, `step` (m) apart along the line.
+def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = SPACING) -> CentreCurve:
+    """Return the line between two boundaries, on knots about `spacing` (m) apart.
 
-    An open line leads from where both boundaries begin to where both end. A line has a whole number of steps,
-    as near to `step` as can be. SettingsError is raised where the step is out of its range, the line
-    would be too long, or the boundaries aren't side by side.
+    Samples of both boundaries are paired along the strip between them, always over the shorter diagonal. A
+    ribbon is fitted to the middles of the pairs. Then each sample is moved to the middle between the points
+    where its normal crosses the boundaries, and the ribbon is fitted again. An open line leads from where
+    both boundaries begin to where both end. SettingsError is raised where a boundary is too long, the left
+    one is not on the left, or they cross.
     """
-    if not LEAST_STEP <= step < np.inf:
-        raise SettingsError(f"step: expected a number of at least {LEAST_STEP:g} m, found {step:g}")
-    if max(left.length(), right.length()) > MOST_POINTS * min(step, _FINE_STEP):
+    longest = max(left.length(), right.length())
+    if not longest <= MOST_SAMPLES * SAMPLE_STEP:
         raise SettingsError(
-            f"expected boundaries of at most {MOST_POINTS * min(step, _FINE_STEP):g} m at this step, "
-            f"found {max(left.length(), right.length()):.6g} m"
+            f"expected boundaries of at most {MOST_SAMPLES * SAMPLE_STEP:g} m, found {longest:.6g} m"
         )
-    every = int(np.ceil(step / _FINE_STEP))
-    stations = _in_order(left, right, _first_stations(left, right, closed), closed)
-    for _ in range(_RESAMPLINGS):
-        lengths = arc_lengths(stations, closed)
-        if not lengths[-1] < _LONGEST * max(left.length(), right.length()):
-            raise SettingsError(_NOT_SIDE_BY_SIDE)
-        count = max(round(lengths[-1] / step), _FEWEST_POINTS) * every
-        stations = _resampled(left, right, stations, lengths, count, closed)
-    lengths = arc_lengths(stations, closed)
-    _check(stations, closed)
-    return Line(stations, lengths[: len(stations.points)], float(lengths[-1]), every, closed)
+    sides = (left, right)
+    samples = [_samples(spline, closed) for spline in sides]
+    points = [spline.evaluate(u) for spline, u in zip(sides, samples, strict=True)]
+    i, j = _paired(sides, samples, points, closed)
+    _check_apart(points[0], points[1], i, j, closed)
+    a, b = points[0][i % len(points[0])], points[1][j % len(points[1])]
+    paired = tuple(
+        _unwrapped(u, k, spline, closed) for u, k, spline in zip(samples, (i, j), sides, strict=True)
+    )
+    values = np.column_stack([0.5 * (a + b), 0.5 * np.hypot(*(a - b).T)])
+    lengths = np.append(0.0, np.cumsum(np.hypot(*np.diff(values[:, :2], axis=0).T)))
+    blank = _blank(lengths[-1], closed, spacing)
+    count = max(int(np.ceil(lengths[-1] / SAMPLE_STEP)), RIBBON * (len(blank.breaks) - 1))
+    u = np.linspace(0.0, lengths[-1], count + 1)[: count if closed else None]
+    middles = np.column_stack([np.interp(u, lengths, column) for column in values.T])
+    beside = np.interp(u, lengths, paired[0]), np.interp(u, lengths, paired[1])
+    fit = _Fit(blank, u)
+    line = CentreCurve(blank.with_points(fit.solve(middles)), u, sides, beside)
+    for _ in range(_ROUNDS):
+        line = _centred(line, fit, middles)
+    return line
 
 
-def _check(stations: Stations, closed: bool) -> None:
-    """Raises a SettingsError where the line breaks, since the boundaries cross or one runs astray."""
-    points = stations.points
-    ahead = np.roll(points, -1, axis=0) if closed else np.concatenate([points[1:], points[-1:]])
-    gaps = np.linalg.norm(ahead - points, axis=1)
-    bad = ~stations.on_line | (gaps > _LARGEST_GAP * gaps.mean())
-    if bad.any():
-        x, y = points[np.argmax(bad)]
-        raise SettingsError(f"{_NOT_SIDE_BY_SIDE} near x = {x:.1f} m, y = {y:.1f} m")
+def _centred(line: CentreCurve, fit: _Fit, middles: Array) -> CentreCurve:
+    """Return the line moved to the middle between the crossings of its normals, where these cross both."""
+    left, right = line.crossings(line.u)
+    good = left.good & right.good
+    middle = 0.5 * (left.offset + right.offset)[:, None] * left.normal + line.ribbon.centre.evaluate(line.u)
+    half = 0.5 * (left.offset - right.offset)
+    values = np.where(good[:, None], np.column_stack([middle, half]), middles)
+    beside = tuple(np.where(good, one.u, old) for one, old in zip((left, right), line.beside, strict=True))
+    return CentreCurve(line.ribbon.with_points(fit.solve(values)), line.u, line.sides, (beside[0], beside[1]))
 
 
-def crossing(spline: BSpline, points: Array, normal: Array, foot: FootPoints) -> tuple[Array, Array]:
-    """Returns where the normals of the line through points (n, 2) cross a boundary.
-
-    These are the parameters (n,) and the signed offsets (n,) from the points, positive to the left. A normal
-    that doesn't cross the boundary near the foot point has that and its distance in their place.
-    """
-    tangent = np.column_stack([normal[:, 1], -normal[:, 0]])
-    u = foot.u
+def _crossing(ribbon: Ribbon, at: Array, spline: BSpline, u: Array, side: float) -> Crossing:
+    """Return the crossings with the normals at parameters `at` (k,), found from the parameters u (k,)."""
+    points, tangent = ribbon.centre.evaluate(at), ribbon.centre.tangent_unit(at)
+    normal, begin, (low, high) = left_of(tangent), u, spline.domain
+    far = _FARTHEST * np.linalg.norm(spline.evaluate(u) - points, axis=1)
     for _ in range(_CROSSING_STEPS):
         slope = np.einsum("kd,kd->k", spline.evaluate(u, 1), tangent)
         ahead = np.einsum("kd,kd->k", spline.evaluate(u) - points, tangent)
-        u = spline.tables.inside(u - np.divide(ahead, slope, out=np.zeros_like(u), where=slope != 0.0))
+        u = u - np.divide(ahead, slope, out=np.zeros_like(u), where=slope != 0.0)
+        u = u if spline.periodic else np.minimum(np.maximum(u, low), high)
     offset = spline.evaluate(u) - points
     across = np.einsum("kd,kd->k", offset, normal)
-    good = np.abs(np.einsum("kd,kd->k", offset, tangent)) <= _SETTLED
-    good &= np.abs(across) <= np.abs(foot.distance) / _LEAST_COSINE
+    good = np.abs(np.einsum("kd,kd->k", offset, tangent)) <= _CROSSED
+    good &= (side * across > 0.0) & (np.abs(across) <= far)
     good &= np.einsum("kd,kd->k", spline.tangent_unit(u), tangent) >= _LEAST_COSINE
-    return np.where(good, u, foot.u), np.where(good, across, -foot.distance)
+    return Crossing(
+        spline, np.where(good, u, begin), normal, np.where(good, across, side * ribbon.half_width(at)), good
+    )
 
 
-# --- the first points ------------------------------------------------------------------------------------
+# --- the fit ---------------------------------------------------------------------------------------------
 
 
-def _first_stations(left: BSpline, right: BSpline, closed: bool) -> Stations:
-    """Returns stations, in no order, from the points across of samples of each boundary."""
-    samples = [_samples(spline) for spline in (left, right)]
-    lefts, rights = (spline.evaluate(u) for spline, u in zip((left, right), samples, strict=True))
-    tangents = left.tangent_unit(samples[0]), right.tangent_unit(samples[1])
-    lengths = left.arc_length(samples[0]), right.arc_length(samples[1])
-    # an open map may overlap itself before its loop is closed
-    apart = np.inf if closed else 0.5 * min(left.length(), right.length())
-    i, j = points_across((lefts, rights), tangents, lengths, apart)
-    k, h = points_across((rights, lefts), (-tangents[1], -tangents[0]), lengths[::-1], apart)
-    if not len(i) + len(k):
-        raise SettingsError(_NOT_SIDE_BY_SIDE)
-    on_right, on_left = _refined(right, lefts[i], samples[1][j]), _refined(left, rights[k], samples[0][h])
-    middles = 0.5 * np.concatenate([lefts[i] + on_right.position, on_left.position + rights[k]])
-    u, v = np.append(samples[0][i], on_left.u), np.append(on_right.u, samples[1][k])
-    return _settled(left, right, middles, u, v)
+def _blank(length: float, closed: bool, spacing: float) -> Ribbon:
+    """Return a ribbon from 0 to a length (m), with evenly spaced knots and all control points at zero."""
+    count = max(round(length / spacing), _FEWEST)
+    if closed:
+        return Ribbon.periodic_from(np.linspace(0.0, length, count + 1), np.zeros((count, RIBBON)))
+    return Ribbon.open_uniform(np.zeros((count + 3, RIBBON)), interval=length / count)
 
 
-def _samples(spline: BSpline) -> Array:
-    """Returns parameters (k,) about evenly spaced by arc length, both ends of the domain included."""
+class _Fit:
+    """The least-squares fit of a ribbon's control points to values at parameters u (k,)."""
+
+    def __init__(self, ribbon: Ribbon, u: Array) -> None:
+        values, columns = ribbon.local_basis(u)
+        rows = np.repeat(np.arange(len(u)), values.shape[1])
+        self._basis = csr_array((values.ravel(), (rows, columns.ravel())), shape=(len(u), ribbon.size))
+        period = ribbon.tables.length if ribbon.periodic else None
+        bending = smoothness_coefficients(greville(ribbon.knots, ribbon.degree)[: ribbon.size], period)
+        rows = np.repeat(np.arange(len(bending)), bending.shape[1])
+        columns = (np.arange(len(bending))[:, None] + np.arange(bending.shape[1])) % ribbon.size
+        D = csr_array((bending.ravel(), (rows, columns.ravel())), shape=(len(bending), ribbon.size))
+        self._factor: SuperLU = splu(csc_array(self._basis.T @ self._basis + _SMOOTHNESS**2 * (D.T @ D)))
+
+    def solve(self, values: Array) -> Array:
+        """Return the control points (m, d) nearest to values (k, d)."""
+        return np.asarray(self._factor.solve(np.asarray(self._basis.T @ values)))
+
+
+# --- pairs along the strip -------------------------------------------------------------------------------
+
+
+def _samples(spline: BSpline, closed: bool) -> Array:
+    """Return parameters (k,) evenly spaced by arc length, without the last one of a loop."""
     length = spline.length()
-    count = max(int(np.ceil(length / _SEARCH_STEP)), _FEWEST_POINTS)
-    return spline.parameters_at(np.linspace(0.0, length, count + 1))
+    count = max(int(np.ceil(length / SAMPLE_STEP)), _FEWEST)
+    return spline.parameters_at(np.linspace(0.0, length, count + 1)[: count if closed else None])
+
+
+def _unwrapped(u: Array, index: Ints, spline: BSpline, closed: bool) -> Array:
+    """Return the parameters of samples whose indices go on past the end of a loop."""
+    low, high = spline.domain
+    return np.asarray(u[index % len(u)] + (high - low) * (index // len(u)) if closed else u[index])
+
+
+def _paired(
+    sides: tuple[BSpline, BSpline], samples: list[Array], points: list[Array], closed: bool
+) -> tuple[Ints, Ints]:
+    """Return the samples of both boundaries that face each other, in the direction of travel."""
+    i, j = _first_pair(sides, samples, points, closed)
+    lefts, rights = ([tuple(point) for point in side.tolist()] for side in points)
+    if closed:
+        lefts, rights = lefts[i:] + lefts[: i + 1], rights[j:] + rights[: j + 1]
+        ahead = np.array(_march(lefts, rights, True))
+        left, right = ahead[:, 0] + i, ahead[:, 1] + j
+        # the line begins beside the beginning of the left boundary, whichever pair is the nearest
+        begin, (n, m) = int(np.argmax(left >= len(points[0]))), (len(points[0]), len(points[1]))
+        left = np.append(left[begin:-1] - n, left[: begin + 1])
+        right = np.append(right[begin:-1], right[: begin + 1] + m)
+        return left, right - m * (right[0] // m)
+    back = -np.array(_march(lefts[i::-1], rights[j::-1], False))[:0:-1]
+    ahead = np.array(_march(lefts[i:], rights[j:], False))
+    pairs = np.concatenate([back.reshape(-1, 2), ahead])
+    return pairs[:, 0] + i, pairs[:, 1] + j
+
+
+def _first_pair(
+    sides: tuple[BSpline, BSpline], samples: list[Array], points: list[Array], closed: bool
+) -> tuple[int, int]:
+    """Return the nearest pair of samples that face each other, the left one on the left."""
+    some = np.unique(np.linspace(0, len(samples[0]) - 1, _STARTS).astype(int))
+    lengths = [spline.arc_length(u) for spline, u in zip(sides, samples, strict=True)]
+    tangents = [spline.tangent_unit(u) for spline, u in zip(sides, samples, strict=True)]
+    # an open map may overlap itself before its loop is closed
+    apart = np.inf if closed else 0.5 * min(spline.length() for spline in sides)
+    i, j = points_across(
+        (points[0][some], points[1]),
+        (tangents[0][some], tangents[1]),
+        (lengths[0][some], lengths[1]),
+        apart,
+    )
+    if not len(i):
+        raise SettingsError("expected the left boundary to the left of the right one, found none such")
+    best = int(((points[0][some[i]] - points[1][j]) ** 2).sum(axis=1).argmin())
+    return int(some[i[best]]), int(j[best])
 
 
 def points_across(
     points: tuple[Array, Array], tangents: tuple[Array, Array], lengths: tuple[Array, Array], apart: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Returns the samples of the first curve that have a point across, and that sample of the second curve.
+) -> tuple[Ints, Ints]:
+    """Return the samples of the first curve that have a point across, and that sample of the second curve.
 
     The point across is the nearest one to the right of the first curve, which is to the left of the second
     and goes the same way. Their arc lengths differ by at most `apart` (m).
     """
-    nearest, found = np.zeros(len(points[0]), np.intp), np.zeros(len(points[0]), bool)
     normals = left_of(tangents[0]), left_of(tangents[1])
-    own = np.einsum("kd,kd->k", points[0], normals[0])
-    other = np.einsum("kd,kd->k", points[1], normals[1])
-    rows = max(_CHUNK // len(points[1]), 1)
-    for begin in range(0, len(points[0]), rows):
-        of = slice(begin, begin + rows)
-        square = ((points[0][of, None] - points[1]) ** 2).sum(axis=2)
-        good = normals[0][of] @ points[1].T < own[of, None]
-        good &= points[0][of] @ normals[1].T > other
-        good &= tangents[0][of] @ tangents[1].T > 0.0
-        good &= np.abs(lengths[0][of, None] - lengths[1]) <= apart
-        nearest[of] = np.where(good, square, np.inf).argmin(axis=1)
-        found[of] = good.any(axis=1)
-    return np.flatnonzero(found), nearest[found]
+    square = ((points[0][:, None] - points[1]) ** 2).sum(axis=2)
+    good = normals[0] @ points[1].T < np.einsum("kd,kd->k", points[0], normals[0])[:, None]
+    good &= points[0] @ normals[1].T > np.einsum("kd,kd->k", points[1], normals[1])
+    good &= tangents[0] @ tangents[1].T > 0.0
+    good &= np.abs(lengths[0][:, None] - lengths[1]) <= apart
+    found = np.flatnonzero(good.any(axis=1))
+    return found, np.where(good, square, np.inf).argmin(axis=1)[found]
 
 
-def _settled(left: BSpline, right: BSpline, points: Array, u: Array, v: Array) -> Stations:
-    """Moves points (n, 2) across the line until they are equally far from both boundaries.
+def _march(
+    lefts: list[tuple[float, ...]], rights: list[tuple[float, ...]], to_the_end: bool
+) -> list[tuple[int, int]]:
+    """Return the pairs of a march along two rows, which always goes on over the shorter diagonal.
 
-    The foot points are followed downhill from the parameters u and v (n,).
+    It ends at the end of both rows or, by default, of the one where the other row comes no nearer.
     """
-    for _ in range(_SETTLING_STEPS):
-        feet = _refined(left, points, u), _refined(right, points, v)
-        u, v = feet[0].u, feet[1].u
-        normal = _unit(feet[0].normal_unit + feet[1].normal_unit)
-        cosine = np.maximum(np.einsum("kd,kd->k", normal, feet[0].normal_unit), _LEAST_COSINE)
-        points = points - normal * (0.5 * (feet[0].distance + feet[1].distance) / cosine)[:, None]
-    return Stations(points, _refined(left, points, u), _refined(right, points, v))
+    i = j = 0
+    pairs = [(0, 0)]
+    last = len(lefts) - 1, len(rights) - 1
+    while i < last[0] or j < last[1]:
+        by_left = _square(lefts[i + 1], rights[j]) if i < last[0] else np.inf
+        by_right = _square(lefts[i], rights[j + 1]) if j < last[1] else np.inf
+        at_end = i == last[0] or j == last[1]
+        if at_end and not to_the_end and min(by_left, by_right) >= _square(lefts[i], rights[j]):
+            break
+        if by_left <= by_right:
+            i += 1
+        else:
+            j += 1
+        pairs.append((i, j))
+    return pairs
 
 
-def _refined(spline: BSpline, points: Array, u: Array) -> FootPoints:
-    low, high = (np.full(len(u), end) for end in spline.domain)
-    return refine_foot_points(spline.tables, spline.control_points, points, u, low, high)
+def _square(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2
 
 
-# --- order and spacing -----------------------------------------------------------------------------------
+def _check_apart(lefts: Array, rights: Array, i: Ints, j: Ints, closed: bool) -> None:
+    """Raise a SettingsError where the boundaries cross near a pair of samples that face each other."""
+    near = j[:, None] + np.arange(-_NEAR, _NEAR + 1)
+    p, q = _segments(lefts, i[:, None], closed)
+    r, s = _segments(rights, near, closed)
+    cross = (_turn(p, q, r) * _turn(p, q, s) < 0.0) & (_turn(r, s, p) * _turn(r, s, q) < 0.0)
+    if cross.any():
+        x, y = p[np.flatnonzero(cross.any(axis=1))[0], 0]
+        raise SettingsError(
+            f"expected boundaries that do not cross, found them crossing near x = {x:.1f} m, y = {y:.1f} m"
+        )
 
 
-def _in_order(left: BSpline, right: BSpline, stations: Stations, closed: bool) -> Stations:
-    """Returns the stations that are on the line, in the direction of travel: both foot points advance."""
-    stations = stations.where(stations.on_line)
-    if len(stations.points) < _FEWEST_POINTS:
-        raise SettingsError(_NOT_SIDE_BY_SIDE)
-    along = left.arc_length(stations.left.u), right.arc_length(stations.right.u)
-    order = _turns(along, (left.length(), right.length())) if closed else along[0] + along[1]
-    stations = stations.where(np.argsort(order, kind="stable"))
-    moved = np.linalg.norm(np.diff(stations.points, axis=0), axis=1) > _SETTLED
-    return stations.where(np.append(True, moved))
-
-
-def _turns(along: tuple[Array, Array], lengths: tuple[float, float]) -> Array:
-    """Returns how far round a loop the stations (n,) are, by the arc lengths of both foot points.
-
-    The boundaries begin at different places, by the circular mean of the differences. Without them a station
-    has about the same angle on both, so that their seams don't matter.
-    """
-    angles = [2 * np.pi * s / length for s, length in zip(along, lengths, strict=True)]
-    ahead = np.exp(1j * (angles[1] - angles[0]))
-    return np.asarray(angles[0] + 0.5 * np.angle(ahead * np.conj(ahead.mean())))
-
-
-def arc_lengths(stations: Stations, closed: bool) -> Array:
-    """Returns the arc length (n,) at each station, in m, and one more (n + 1,) for the way back of a loop.
-
-    Between two stations the line is a circular arc: chord * a / sin a, where the heading turns by 2 a.
-    """
-    points, tangent = stations.points, stations.tangent
+def _segments(points: Array, index: Ints, closed: bool) -> tuple[Array, Array]:
+    """Return both ends of the segments that begin at some indices; beyond an open end they are points."""
     if closed:
-        points, tangent = np.concatenate([points, points[:1]]), np.concatenate([tangent, tangent[:1]])
-    cross = tangent[:-1, 0] * tangent[1:, 1] - tangent[:-1, 1] * tangent[1:, 0]
-    half = 0.5 * np.arctan2(cross, np.einsum("kd,kd->k", tangent[:-1], tangent[1:]))
-    chord = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    return np.append(0.0, np.cumsum(chord / np.sinc(half / np.pi)))
+        return points[index % len(points)], points[(index + 1) % len(points)]
+    last = len(points) - 1
+    return points[np.clip(index, 0, last)], points[np.clip(index + 1, 0, last)]
 
 
-def _resampled(
-    left: BSpline, right: BSpline, stations: Stations, lengths: Array, count: int, closed: bool
-) -> Stations:
-    """Returns `count` stations evenly spaced on a closed line, or one more from end to end of an open one."""
-    at = np.linspace(0.0, lengths[-1], count + 1)[: count if closed else count + 1]
-    u = _interpolated(at, lengths, stations.left.u, left, closed)
-    v = _interpolated(at, lengths, stations.right.u, right, closed)
-    points = np.concatenate([stations.points, stations.points[:1]]) if closed else stations.points
-    between = np.column_stack([np.interp(at, lengths, points[:, d]) for d in range(2)])
-    stations = _settled(left, right, between, u, v)
-    if closed:
-        return stations
-    good = np.flatnonzero(stations.on_line)
-    if len(good) < _FEWEST_POINTS:
-        raise SettingsError(_NOT_SIDE_BY_SIDE)
-    return stations.where(slice(good[0], good[-1] + 1))
-
-
-def _interpolated(at: Array, lengths: Array, u: Array, spline: BSpline, closed: bool) -> Array:
-    """Returns the parameters of foot points between those of stations, across the seam of a closed curve."""
-    if closed:
-        low, high = spline.domain
-        u = np.unwrap(np.append(u, u[0]), period=high - low)
-        return spline.tables.inside(np.interp(at, lengths, u))
-    return np.interp(at, lengths, u)
-
-
-def _unit(vectors: Array) -> Array:
-    norm = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.asarray(np.divide(vectors, norm, out=np.zeros_like(vectors), where=norm > 0.0))
+def _turn(p: Array, q: Array, point: Array) -> Array:
+    """Return on which side of the lines from p to q the points lie: positive on the left."""
+    along, to = q - p, point - p
+    return np.asarray(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])

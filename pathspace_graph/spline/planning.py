@@ -2,27 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, diags_array
 
-from pathspace_graph.factors.footpoint import FootPoints
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.se2 import left_of
 
 from .bspline import BSpline
-from .centre_line import Line, Stations, crossing, find_line
+from .centre_line import CentreCurve, Crossing, find_line
 
 Array = NDArray[np.float64]
+
+LEAST_STEP: Final = 0.01
+"""Least distance of the points of a line (m)."""
+MOST_POINTS: Final = 200_000
+"""Largest number of points of a line, which bounds the memory."""
+_FEWEST: Final = 4
+"""Smallest number of points of a line."""
+_NEIGHBOURS: Final = 10
+"""Normals of points up to this number apart do not cross."""
+_SHORT: Final = 0.95
+"""Share of the way to where two normals would cross that is left to both widths."""
 
 
 @dataclass(frozen=True, eq=False)
 class CentreLine:
     """Holds the centre line of a track at n points, evenly spaced, in the map frame.
 
-    Each point is equally far from both boundaries. A standard deviation is that of the quantity where the
-    line crosses its normal at the point; it is NaN where the map has no covariance.
+    The line is in the middle between the boundaries, and smooth (`find_line`). A standard deviation is that
+    of the quantity where the line crosses its normal at the point; it is NaN where the map has no covariance.
     """
 
     points: Array
@@ -34,9 +45,10 @@ class CentreLine:
     arc_length: Array
     """This is the length (n,) of the line from its first point, in m."""
     width_left: Array
-    """This is the distance (n,) along the normal to the left boundary, in m."""
+    """Distance (n,) along the normal to the left boundary (m), or less where the normal would cross a
+    neighbour's."""
     width_right: Array
-    """This is the distance (n,) along the normal to the right boundary, in m."""
+    """Distance (n,) along the normal to the right boundary (m), or less in the same way."""
     closed: bool
     """The line is a loop where this is true."""
     length: float
@@ -60,210 +72,113 @@ class CentreLine:
 def centre_line(
     left: BSpline, right: BSpline, covariance: Array | None, closed: bool, step: float
 ) -> CentreLine:
-    """Returns the centre line between two boundaries at points `step` (m) apart, see `find_line`.
+    """Return the centre line between two boundaries at points `step` (m) apart, see `find_line`.
 
-    The joint covariance is of the distinct control points of the left and then the right boundary, in the
-    order x0, y0, x1, y1 and so on (m^2). It is propagated to first order.
+    A line has a whole number of steps, as near to `step` as can be. The joint covariance is of the distinct
+    control points of the left and then the right boundary, in the order x0, y0, x1, y1 and so on (m^2). It is
+    propagated to first order. SettingsError is raised where the step is out of its range, and by `find_line`.
     """
-    line = find_line(left, right, closed, step)
-    sides = (_Side(left, line.stations.left, 0), _Side(right, line.stations.right, left.size))
-    fine = _Centre(line.stations, *sides, left.size + right.size)
-    rows = np.arange(0, len(line.arc_length), line.every)
-    centre = fine.where(rows)
-    tangent = centre.stations.tangent
-    offsets = [centre.offset(side) for side in (centre.left, centre.right)]
-    jacobians = (centre.across, centre.heading, centre.bend, *(jacobian for _, jacobian in offsets))
-    sigmas = [_sigma(jacobian, covariance) for jacobian in jacobians]
-    lengths = _sigma(_length_rows(fine, line, rows), covariance)
+    if not LEAST_STEP <= step < np.inf:
+        raise SettingsError(f"step: expected a number of at least {LEAST_STEP:g} m, found {step:g}")
+    most, longest = MOST_POINTS * step, max(left.length(), right.length())
+    if longest > most:
+        raise SettingsError(f"expected boundaries of at most {most:g} m at this step, found {longest:.6g} m")
+    line = find_line(left, right, closed)
+    centre = line.ribbon.centre
+    length = centre.length()
+    count = max(round(length / step), _FEWEST)
+    arc_length = np.linspace(0.0, length, count + 1)
+    u = centre.parameters_at(arc_length)
+    tangent, crossings = centre.tangent_unit(u), line.crossings(u)
+    sigmas = _sigmas(line, u, crossings, covariance)
+    own = slice(count if closed else None)
+    widths = _uncrossed(
+        centre.evaluate(u)[own], left_of(tangent)[own], [np.abs(one.offset[own]) for one in crossings], closed
+    )
     return CentreLine(
-        points=centre.stations.points,
-        heading=np.arctan2(tangent[:, 1], tangent[:, 0]),
-        curvature=centre.curvature,
-        arc_length=line.arc_length[rows],
-        width_left=offsets[0][0],
-        width_right=-offsets[1][0],
+        points=centre.evaluate(u)[own],
+        heading=np.arctan2(tangent[own, 1], tangent[own, 0]),
+        curvature=centre.curvature(u)[own],
+        arc_length=arc_length[own],
+        width_left=widths[0],
+        width_right=widths[1],
         closed=closed,
-        length=line.length,
-        points_sigma=sigmas[0],
-        heading_sigma=sigmas[1],
-        curvature_sigma=sigmas[2],
-        arc_length_sigma=lengths[:-1],
-        width_left_sigma=sigmas[3],
-        width_right_sigma=sigmas[4],
-        length_sigma=float(lengths[-1]),
+        length=length,
+        points_sigma=sigmas[0][own],
+        heading_sigma=sigmas[1][own],
+        curvature_sigma=sigmas[2][own],
+        arc_length_sigma=sigmas[3][own],
+        width_left_sigma=sigmas[4][own],
+        width_right_sigma=sigmas[5][own],
+        length_sigma=float(sigmas[3][-1]),
     )
 
 
-# --- derivatives by the control points -------------------------------------------------------------------
+def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) -> list[Array]:
+    """Return the widths to the left and right, shortened so that no two normals of neighbours meet.
 
-
-@dataclass(frozen=True, eq=False)
-class _Side:
-    """Holds a boundary at the foot points (n,) of the stations."""
-
-    spline: BSpline
-    foot: FootPoints
-    first: int
-    """The boundary's control points begin at this one of all."""
-
-    @property
-    def speed(self) -> Array:
-        return np.asarray(np.linalg.norm(self.spline.evaluate(self.foot.u, 1), axis=1))
-
-    @property
-    def curvature(self) -> Array:
-        return self.spline.curvature(self.foot.u)
-
-    @property
-    def offset_curvature(self) -> Array:
-        """Returns k / (1 - k d): the curvature of the parallel curve at the signed distance d."""
-        return self.curvature / self.spread
-
-    @property
-    def spread(self) -> Array:
-        """Returns 1 - k d (n,): the length of the parallel curve for each length of the boundary."""
-        spread = 1.0 - self.curvature * self.foot.distance
-        return np.where(np.abs(spread) > np.finfo(float).eps, spread, np.finfo(float).eps)
-
-    @property
-    def curvature_slope(self) -> Array:
-        """Returns the derivative (n,) of the curvature by the arc length of the boundary, in 1/m^2."""
-        first, second, third = (self.spline.evaluate(self.foot.u, order) for order in (1, 2, 3))
-        speed = self.speed
-        along = np.einsum("kd,kd->k", first, second) / speed**2
-        by_parameter = _cross(first, third) / speed**3 - 3.0 * self.curvature * along
-        return np.asarray(by_parameter / speed)
-
-
-@dataclass(frozen=True, eq=False)
-class _Centre:
-    """Holds how the line at its stations (n,) changes with the control points of both boundaries.
-
-    Each Jacobian is sparse (n, 2 m), by x0, y0, x1, y1 and so on. It is taken where the line crosses its old
-    normal, so that points move across the line only.
+    The normals p + a n and q + b m meet where a n - b m = q - p.
     """
-
-    stations: Stations
-    left: _Side
-    right: _Side
-    size: int
-
-    def where(self, rows: NDArray[np.intp]) -> _Centre:
-        """Returns the same at some of the stations."""
-        left, right = (replace(side, foot=side.foot.where(rows)) for side in (self.left, self.right))
-        return _Centre(self.stations.where(rows), left, right, self.size)
-
-    @property
-    def cosine(self) -> Array:
-        """Returns the cosine (n,) of half the angle between the boundaries."""
-        return np.asarray(np.einsum("kd,kd->k", self.stations.normal, self.left.foot.normal_unit))
-
-    @property
-    def curvature(self) -> Array:
-        """Returns (cos a / 2) (K_l + K_r), where a is half the angle between the boundaries.
-
-        K_l and K_r are the curvatures of their parallel curves through the station.
-        """
-        return 0.5 * self.cosine * (self.left.offset_curvature + self.right.offset_curvature)
-
-    @property
-    def across(self) -> csr_array:
-        """Returns e = (n_l . dS_l + n_r . dS_r) / (2 cos a): the move of the line along its normal."""
-        moves = self._moved(self.left) + self._moved(self.right)
-        return _scaled(0.5 / self.cosine, moves)
-
-    @property
-    def heading(self) -> csr_array:
-        """Returns the change of the heading: the mean of those of both boundaries at their foot points."""
-        return csr_array(0.5 * (self._turned(self.left)[0] + self._turned(self.right)[0]))
-
-    @property
-    def bend(self) -> csr_array:
-        """Returns the change of the curvature."""
-        left, right = self._turned(self.left), self._turned(self.right)
-        normal, tangent = self.stations.normal, self.left.foot.tangent_unit
-        sine = np.einsum("kd,kd->k", normal, tangent)
-        total = self.left.offset_curvature + self.right.offset_curvature
-        opened = _scaled(-0.25 * sine * total, left[0] - right[0])
-        bent = self._bent(self.left, left[1]) + self._bent(self.right, right[1])
-        return csr_array(opened + _scaled(0.5 * self.cosine, bent))
-
-    def offset(self, side: _Side) -> tuple[Array, csr_array]:
-        """Returns the signed offset (n,) at which the normal crosses a boundary, and its Jacobian.
-
-        The crossing at c + o n stays on the boundary: N . (dS - e n - o dn) = do N . n, with dn = -t dtheta.
-        """
-        normal = self.stations.normal
-        u, offset = crossing(side.spline, self.stations.points, normal, side.foot)
-        own = left_of(side.spline.tangent_unit(u))
-        facing = np.einsum("kd,kd->k", own, normal)
-        turn = offset * np.einsum("kd,kd->k", own, self.stations.tangent) / facing
-        moved = self._rows(side, u, 0, own / facing[:, None])
-        return offset, moved + _scaled(turn, self.heading) - self.across
-
-    def _moved(self, side: _Side) -> csr_array:
-        return self._rows(side, side.foot.u, 0, side.foot.normal_unit)
-
-    def _turned(self, side: _Side) -> tuple[csr_array, csr_array]:
-        """Returns how the boundary's heading changes at the foot point, and how far that moves along it.
-
-        Of the condition T . (c - S) = 0 follows (1 - k d) ds = T . (dc - dS) + d phi, where
-        phi = N . dS' / |S'| is the turn at a fixed parameter.
-        """
-        foot = side.foot
-        turned = self._rows(side, foot.u, 1, foot.normal_unit / side.speed[:, None])
-        along = np.einsum("kd,kd->k", foot.tangent_unit, self.stations.normal)
-        pushed = _scaled(along, self.across) - self._rows(side, foot.u, 0, foot.tangent_unit)
-        moved = _scaled(1.0 / side.spread, pushed + _scaled(foot.distance, turned))
-        return turned + _scaled(side.curvature, moved), moved
-
-    def _bent(self, side: _Side, moved: csr_array) -> csr_array:
-        """Returns the change of k / (1 - k d), which is (dk + k^2 dd) / (1 - k d)^2."""
-        foot, speed, curvature = side.foot, side.speed, side.curvature
-        first, second = (side.spline.evaluate(foot.u, order) for order in (1, 2))
-        cube = (speed**3)[:, None]
-        by_first = -left_of(second) / cube - 3.0 * (curvature / speed)[:, None] * foot.tangent_unit
-        bent = self._rows(side, foot.u, 1, by_first) + self._rows(side, foot.u, 2, left_of(first) / cube)
-        bent = bent + _scaled(side.curvature_slope, moved)
-        distance = _scaled(self.cosine, self.across) - self._moved(side)
-        return _scaled(1.0 / side.spread**2, bent + _scaled(curvature**2, distance))
-
-    def _rows(self, side: _Side, u: Array, derivative: int, along: Array) -> csr_array:
-        """Returns the Jacobian of a . S^(r)(u) at a fixed parameter, where a (n, 2) is `along`."""
-        values, columns = side.spline.local_basis(u, derivative)
-        entries = (values[:, :, None] * along[:, None, :]).reshape(-1)
-        at = (2 * (columns + side.first)[:, :, None] + np.arange(2)).reshape(-1)
-        of = np.repeat(np.arange(len(u)), 2 * values.shape[1])
-        return csr_array((entries, (of, at)), shape=(len(u), 2 * self.size))
+    left, right = (width.copy() for width in widths)
+    count = len(points)
+    for apart in range(1, min(_NEIGHBOURS, count - 1) + 1):
+        i = np.arange(count if closed else count - apart)
+        j = (i + apart) % count
+        turn, way = _cross(normal[i], normal[j]), points[j] - points[i]
+        known = np.abs(turn) > np.finfo(float).eps
+        a = np.divide(_cross(way, normal[j]), turn, out=np.full(len(i), np.inf), where=known)
+        b = np.divide(_cross(way, normal[i]), turn, out=np.full(len(i), np.inf), where=known)
+        for width, side in ((left, 1.0), (right, -1.0)):
+            meet = (side * a > 0.0) & (side * b > 0.0) & (side * a <= width[i]) & (side * b <= width[j])
+            np.minimum.at(width, i[meet], _SHORT * np.abs(a[meet]))
+            np.minimum.at(width, j[meet], _SHORT * np.abs(b[meet]))
+    return [left, right]
 
 
-def _length_rows(fine: _Centre, line: Line, rows: NDArray[np.intp]) -> csr_array:
-    """Returns the Jacobian of the arc length at the points and, in a last row, of the whole length.
+# --- standard deviations ---------------------------------------------------------------------------------
 
-    A line that moves by e(s) along its normal changes its length by the integral of -k e, by the trapezoidal
-    rule over the fine points.
+
+def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: Array | None) -> list[Array]:
+    """Return the standard deviations (n,) across, of heading, curvature, arc length, and both widths.
+
+    Each is taken where the line crosses its old normal at u (n,). There, with dC = B dc and the signed speed
+    of the shift -t . dC along the line, the derivatives by the control points of the boundaries are
+
+        e = n . dC,   dtheta = n . dC' / |C'| - k t . dC,   ds = t . dC - t . dC(0) - integral of k e,
+        do = N . dS / (N . n) + o (N . t) / (N . n) dtheta - e.
     """
-    interval = np.diff(line.arc_length, append=line.length)
-    shorter = _scaled(-fine.curvature, fine.across)
-    following = shorter[np.r_[1 : len(interval), 0]]
-    pieces = _scaled(0.5 * interval, shorter + following)
-    number = np.searchsorted(rows, np.arange(len(interval)), side="right")
-    sums = csr_array(
-        (np.ones(len(number)), (number, np.arange(len(number)))), shape=(len(rows) + 1, len(number))
-    )
-    return csr_array(np.cumsum((sums @ pieces).toarray(), axis=0))
-
-
-def _scaled(factors: Array, rows: csr_array) -> csr_array:
-    return csr_array(diags_array(factors) @ rows)
-
-
-def _sigma(jacobian: csr_array, covariance: Array | None) -> Array:
-    """Returns sqrt(diag(J P J^T)) (n,), and NaN without a covariance P."""
     if covariance is None:
-        return np.full(jacobian.shape[0], np.nan)
-    variance = np.asarray(jacobian.multiply(jacobian @ covariance).sum(axis=1)).ravel()
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+        return [np.full(len(u), np.nan)] * 6
+    centre, by_control = line.ribbon.centre, line.by_boundaries.reshape(line.ribbon.size, 3, -1)
+    basis = [centre.basis_matrix(u, order) for order in range(3)]
+    moved = [np.einsum("kj,jdm->kdm", B, by_control[:, :2]) for B in basis]
+    tangent = centre.tangent_unit(u)
+    normal, curvature = left_of(tangent), centre.curvature(u)[:, None]
+    first, second, third = (centre.evaluate(u, order) for order in (1, 2, 3))
+    speed = np.linalg.norm(first, axis=1)
+    across, along = _dot(normal, moved[0]), _dot(tangent, moved[0])
+    heading = _dot(normal, moved[1]) / speed[:, None] - curvature * along
+    cube = (speed**3)[:, None]
+    bent = _dot(-left_of(second) / cube - 3.0 * curvature / speed[:, None] * tangent, moved[1])
+    bent = bent + _dot(left_of(first) / cube, moved[2])
+    by_parameter = _cross(first, third) / cube[:, 0]
+    by_parameter -= 3.0 * curvature[:, 0] * np.einsum("kd,kd->k", first, second) / speed**2
+    bent = bent - (by_parameter / speed)[:, None] * along
+    intervals = centre.arc_length(u)
+    shorter = -curvature * across
+    pieces = 0.5 * np.diff(intervals)[:, None] * (shorter[1:] + shorter[:-1])
+    lengths = np.concatenate([np.zeros((1, pieces.shape[1])), np.cumsum(pieces, axis=0)])
+    rows = [across, heading, bent, lengths]
+    for one, begin in zip(crossings, (0, line.sides[0].size), strict=True):
+        turn = one.offset * np.einsum("kd,kd->k", one.own_normal, tangent)
+        rows.append(one.along_normal(begin, line.size) + turn[:, None] * heading - across)
+    root = np.asarray(covariance)
+    return [np.sqrt(np.maximum(np.einsum("km,km->k", row @ root, row), 0.0)) for row in rows]
+
+
+def _dot(a: Array, moved: Array) -> Array:
+    """Return a . dC (n, M) of vectors a (n, 2) and derivatives (n, 2, M)."""
+    return np.asarray(np.einsum("kd,kdm->km", a, moved))
 
 
 def _cross(a: Array, b: Array) -> Array:

@@ -65,12 +65,16 @@ def speed_profile(
     forward and a backward pass bound v_next^2 by v^2 + 2 a ds (Kapania et al., J. Dyn. Syst. Meas. Control
     138, 2016). A closed line begins and ends at the same speed. An open one may begin and end at given speeds
     (m/s), by default as fast as its curvature allows. SettingsError is raised where a line has fewer
-    than two points, or a speed is not a number from 0 on.
+    than two points, a speed is not a number from 0 on, or one is given for a closed line.
     """
     settings = settings or SpeedSettings()
     count = len(line.curvature)
     if count < 2:
         raise SettingsError(f"a speed profile: expected a line of at least 2 points, found {count}")
+    if line.closed and (begin is not None or end is not None):
+        raise SettingsError(
+            "a speed profile: expected an open line for a first or a last speed, found a loop"
+        )
     bend = np.abs(line.curvature) / settings.lateral
     squares = np.minimum(1.0 / np.maximum(bend, np.finfo(float).tiny), settings.top**2)
     steps = np.diff(line.arc_length)

@@ -23,7 +23,8 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.ribbon import Ribbon, ribbon_between
+from pathspace_graph.spline.centre_line import find_line
+from pathspace_graph.spline.ribbon import Ribbon
 
 from ..scenes.drives import bean_track, lap_log, noisy
 from ..scenes.maps import SIGMA, ring_map
@@ -40,7 +41,7 @@ def log() -> Log:
 
 def ring_ribbon(spacing: float = 4.0) -> Ribbon:
     left, right = (ring_map().curve(label, "a test").spline for label in BOUNDARIES)
-    return ribbon_between(left, right, True, spacing)[0]
+    return find_line(left, right, True, spacing).ribbon
 
 
 def test_the_batch_maps_a_lap(log: Log) -> None:
@@ -99,7 +100,7 @@ def test_a_ribbon_is_found_again_from_its_own_edges() -> None:
     u = np.linspace(0.0, ribbon.tables.high, 100)
     radius = np.hypot(*fitted.ribbon.centre.evaluate(u).T)
     np.testing.assert_allclose(radius, 20.0, atol=0.01)
-    width = fitted.ribbon.basis_matrix(u) @ fitted.ribbon.distinct[:, 2]
+    width = fitted.ribbon.half_width(u)
     np.testing.assert_allclose(width, 2.0, atol=0.01)
     assert fitted.covariance is not None
     again = map_of(fitted.ribbon, fitted.covariance, 0.0, {})
@@ -134,7 +135,7 @@ def test_the_weak_priors_jacobians() -> None:
     values = gtsam.Values()
     for k, pose in enumerate(poses + rng.normal(0.0, 0.1, poses.shape)):
         values.insert(pose_key(k), gtsam.Pose2(*pose))
-    for key, point in zip(ribbon_keys(ribbon), ribbon.distinct, strict=True):
+    for key, point in zip(ribbon_keys(ribbon), ribbon.distinct_control_points, strict=True):
         values.insert(key, point + rng.normal(0.0, 0.3, 3))
     factors = list(shape_factors(ribbon, poses, SETTINGS))
     assert len(factors) == 2 * ribbon.size

@@ -51,6 +51,7 @@ def test_a_minus_is_standard_output(tmp_path: Path, capfdbinary: pytest.CaptureF
     ("arguments", "said"),
     [
         (["--as", "geojson"], "--origin: expected LATITUDE LONGITUDE HEADING in degrees"),
+        (["--as", "points", "--stop"], "--start-speed, --stop: expected --as profile"),
         (["--as", "lanelet2"], "which --as lanelet2 needs"),
         (["--as", "lanelet2", "--origin", "95", "0", "0"], "expected a latitude"),
         (["--as", "points", "--step", "0"], "--step: expected a number of at least"),

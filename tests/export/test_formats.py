@@ -65,7 +65,19 @@ def test_the_speed_profile(make: Callable[[], Map], tmp_path: Path) -> None:
     expected = (line.arc_length, *line.points.T, line.heading, line.curvature, profile.speed)
     assert np.array_equal(rows, np.array([*expected, profile.acceleration]))
     if line.closed:  # a circle of 20 m
-        assert rows[5] == pytest.approx(np.sqrt(4.0 * 20.0), rel=1e-3)
+        assert rows[5] == pytest.approx(np.sqrt(4.0 * 20.0), rel=2e-3)
+
+
+def test_the_profile_of_an_open_track_begins_at_a_speed_and_ends_at_a_stop(tmp_path: Path) -> None:
+    file, settings = tmp_path / "profile.csv", SpeedSettings(forward=2.0, braking=3.0)
+    write_profile(file, open_map(), 0.7, settings, start=3.0, stop=True)
+    speed = np.loadtxt(file, comments="#", delimiter=",").T[5]
+    assert (speed[0], speed[-1]) == (3.0, 0.0)
+    assert 3.0 < speed.max() < settings.top
+    with pytest.raises(SettingsError, match=r"start speed of at most .*, found 99"):
+        write_profile(file, open_map(), 0.7, settings, start=99.0)
+    with pytest.raises(SettingsError, match=r"expected an open line .* found a loop"):
+        write_profile(file, ring_map(), 0.7, settings, stop=True)
 
 
 @every_map

@@ -150,7 +150,7 @@ def test_a_drive_sees_its_centre_line_and_is_not_changed_by_looking() -> None:
         line = looked.outline().centre_line(0.1)
         distance, nearest = KDTree(line.points).query(to_map(ahead.points, pose))
         sure = ahead.confirmed
-        assert distance[sure].max(initial=0.0) < 0.06
+        assert distance[sure].max(initial=0.0) < 0.1  # the whole line is smoothed over a few metres
         assert distance.max() < 0.3  # another curve leads through the same cones that are not confirmed
         for own, other in ((ahead.width_left, line.width_left), (ahead.width_right, line.width_right)):
             np.testing.assert_allclose(own[sure], other[nearest][sure], atol=0.06)

@@ -9,8 +9,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.centre_line import find_line
+from pathspace_graph.spline.crossing import boundaries_cross
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
 from ..scenes.maps import circle
@@ -69,7 +70,8 @@ def where_it_crosses(line: CentreLine, base: CentreLine) -> dict[str, Array]:
     result = {name: curve(getattr(line, name))(s) for name in ("curvature", "width_left", "width_right")}
     result["points"] = (off * normal).sum(axis=1)
     result["heading"] = curve(np.unwrap(line.heading), turns)(s)
-    return result | {"arc_length": s - s[0]}
+    ahead = s - s[0]  # a loop may begin a little later
+    return result | {"arc_length": np.mod(ahead + 1e-6, line.length) - 1e-6 if line.closed else ahead}
 
 
 @pytest.mark.parametrize("turn", [1.0, -1.0])
@@ -78,14 +80,14 @@ def test_between_concentric_circles(turn: float, step: float) -> None:
     left, right = (circle(20.0 - 2.0 * turn, turn=turn), circle(20.0 + 2.0 * turn, 150, turn))
     line = centre_line(left, right, None, True, step)
     assert len(line.points) == round(40 * np.pi / step)
-    assert np.hypot(*line.points.T) == pytest.approx(20.0, abs=1e-6)
-    assert line.length == pytest.approx(40 * np.pi, abs=1e-5)
-    assert line.curvature == pytest.approx(turn / 20.0, abs=1e-5)
-    assert line.width_left == pytest.approx(2.0, abs=1e-6)
-    assert line.width_right == pytest.approx(2.0, abs=1e-6)
-    assert np.diff(line.arc_length) == pytest.approx(line.length / len(line.points), abs=1e-6)
+    assert np.hypot(*line.points.T) == pytest.approx(20.0, abs=1e-4)
+    assert line.length == pytest.approx(40 * np.pi, abs=2e-4)
+    assert line.curvature == pytest.approx(turn / 20.0, abs=2e-4)
+    assert line.width_left == pytest.approx(2.0, abs=1e-4)
+    assert line.width_right == pytest.approx(2.0, abs=1e-4)
+    assert np.diff(line.arc_length) == pytest.approx(line.length / len(line.points), abs=1e-9)
     angle = np.arctan2(line.points[:, 1], line.points[:, 0])
-    assert np.cos(line.heading - angle - turn * np.pi / 2) == pytest.approx(1.0, abs=1e-10)
+    assert np.cos(line.heading - angle - turn * np.pi / 2) == pytest.approx(1.0, abs=1e-8)
     assert np.isnan(line.points_sigma).all()
 
 
@@ -101,9 +103,9 @@ def test_along_a_straight_from_where_both_begin_to_where_both_end() -> None:
     assert line.points[-1, 0] == pytest.approx(high, abs=0.3)
     assert line.heading == pytest.approx(0.0, abs=1e-9)
     assert line.curvature == pytest.approx(0.0, abs=1e-9)
-    assert line.width_left == pytest.approx(2.0, abs=1e-9)
-    assert line.width_right == pytest.approx(2.0, abs=1e-9)
-    assert line.arc_length == pytest.approx(line.points[:, 0] - line.points[0, 0], abs=1e-9)
+    assert line.width_left == pytest.approx(2.0, abs=2e-3)
+    assert line.width_right == pytest.approx(2.0, abs=2e-3)
+    assert line.arc_length == pytest.approx(line.points[:, 0] - line.points[0, 0], abs=0.01)
 
 
 def test_sigmas_of_a_straight_by_hand() -> None:
@@ -134,8 +136,8 @@ def test_sigmas_of_circles_by_hand() -> None:
     assert line.width_right_sigma == pytest.approx(0.1, abs=1e-6)
     assert line.curvature_sigma == pytest.approx(0.2 / 20.0**2, abs=1e-5)
     assert line.heading_sigma == pytest.approx(0.0, abs=1e-6)
-    assert line.arc_length_sigma == pytest.approx(0.2 / 20.0 * line.arc_length, abs=1e-5)
-    assert line.length_sigma == pytest.approx(0.2 * 2 * np.pi, abs=1e-5)
+    assert line.arc_length_sigma == pytest.approx(0.2 / 20.0 * line.arc_length, abs=1e-3)
+    assert line.length_sigma == pytest.approx(0.2 * 2 * np.pi, abs=1e-3)
 
 
 @pytest.mark.parametrize("closed", [True, False])
@@ -149,10 +151,10 @@ def test_each_sigma_is_the_numeric_derivative_along_a_random_change(closed: bool
         where_it_crosses(centre_line(*moved(splines, e * d), None, closed, 0.25), base) for e in (step, -step)
     )
     for name in QUANTITIES:
-        error = np.abs(forth[name] - back[name]) / (2 * step) - getattr(base, f"{name}_sigma")
-        # the curvature has kinks at the knots, across which the numbers are interpolated
-        assert np.median(np.abs(error[2:-2])) < 1e-4, name
-        assert np.abs(error[2:-2]).max() < 1e-2, name
+        sigma = getattr(base, f"{name}_sigma")[2:-2]
+        error = np.abs(forth[name] - back[name])[2:-2] / (2 * step) - sigma
+        # the samples turn with the line, which is of second order in the angle between the boundaries
+        assert np.sqrt(np.mean(error**2)) < 0.05 * np.sqrt(np.mean(sigma**2)), name
 
 
 def test_sigmas_are_those_of_a_monte_carlo() -> None:
@@ -168,14 +170,18 @@ def test_sigmas_are_those_of_a_monte_carlo() -> None:
     for name in QUANTITIES:
         drawn = np.array([run[name] for run in runs])
         ratio = np.std(drawn, axis=0)[1:] / getattr(base, f"{name}_sigma")[1:]
-        assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.08), name
+        assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.15), name
 
 
-def test_every_point_is_equally_far_from_both_boundaries() -> None:
-    left, right = wavy(18.0, 24, True, 1), wavy(22.0, 27, True, 2)
-    points = find_line(left, right, True, 1.0).stations.points
-    far = [np.linalg.norm(points - spline.foot_points(points).position, axis=1) for spline in (left, right)]
-    assert far[0] == pytest.approx(far[1], abs=1e-8)
+@pytest.mark.parametrize("seed", range(5))
+def test_a_point_is_in_the_middle_where_its_normal_crosses_the_boundaries(seed: int) -> None:
+    left, right = wavy(18.0, 24, True, 2 * seed), wavy(22.0, 27, True, 2 * seed + 1)
+    line = centre_line(left, right, None, True, 1.0)
+    normal = np.column_stack([-np.sin(line.heading), np.cos(line.heading)])
+    for spline, width in ((left, line.width_left), (right, -line.width_right)):
+        crossed = spline.foot_points(line.points + width[:, None] * normal)
+        assert crossed.distance == pytest.approx(0.0, abs=1e-6)
+    assert line.width_left == pytest.approx(line.width_right, abs=0.05)
 
 
 def test_a_lap_that_overlaps_its_beginning_is_one_line() -> None:
@@ -193,12 +199,66 @@ def test_boundaries_that_cross_are_refused_with_the_place() -> None:
     left = circle(18.0, 40)
     points = left.distinct_control_points.copy()
     points[9:12] *= 1.4  # at the top, beyond the right boundary
-    with pytest.raises(SettingsError, match=r"near x = -?\d+\.\d m, y = "):
+    with pytest.raises(SettingsError, match=r"do not cross, found them crossing near x = -?\d+\.\d m, y = "):
         centre_line(left.with_points(points), circle(22.0), None, True, 1.0)
 
 
+def crossing_normals(line: CentreLine, horizon: int = 10) -> int:
+    """Counts the pairs of neighbours whose normals meet within the widths, as TUM's planners do."""
+    normal = np.column_stack([-np.sin(line.heading), np.cos(line.heading)])
+    count, met = len(line.points), 0
+    for i in range(count):
+        for j in range(i + 1, i + 1 + horizon):
+            if j < count or line.closed:
+                j %= count  # noqa: PLW2901
+                A = np.column_stack([normal[i], -normal[j]])
+                if abs(np.linalg.det(A)) > 1e-8:
+                    a, b = np.linalg.solve(A, line.points[j] - line.points[i])
+                    within = -line.width_right[i] <= a <= line.width_left[i]
+                    met += within and -line.width_right[j] <= b <= line.width_left[j]
+    return met
+
+
+def rough(seed: int, closed: bool) -> tuple[BSpline, BSpline]:
+    """A narrow, winding track whose boundaries have corners of their own."""
+    rng = np.random.default_rng(seed)
+    angle = np.linspace(0.0, 2 * np.pi, 40, endpoint=False)
+    base = 14.0 + 5.0 * np.sin(3 * angle + rng.uniform(0, 6))
+    half = 1.6 + rng.uniform(-0.5, 0.5, (2, 40))
+    out = np.column_stack([np.cos(angle), np.sin(angle)])
+    inner, outer = (base - half[0])[:, None] * out, (base + half[1])[:, None] * out
+    if closed:
+        inner, outer = (BSpline.periodic_from(np.arange(41.0), points) for points in (inner, outer))
+        return inner, outer
+    return BSpline.open_uniform(inner), BSpline.open_uniform(outer)
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("seed", range(6))
+def test_no_map_is_refused_and_no_normals_meet(seed: int, closed: bool) -> None:
+    left, right = rough(seed, closed)
+    assert not boundaries_cross({LEFT: left, RIGHT: right}, 0.05)
+    line = centre_line(left, right, None, closed, 1.0)
+    assert crossing_normals(line) == 0
+    assert np.abs(np.diff(np.unwrap(line.heading))).max() < 0.6
+    for spline, way in ((left, 1.0), (right, -1.0)):
+        assert (way * spline.foot_points(line.points).distance < 0.0).all()
+
+
+@pytest.mark.filterwarnings("ignore:Arrays of 2-dimensional vectors")
+def test_planners_of_tum_find_no_crossing_normals() -> None:
+    helpers = pytest.importorskip("trajectory_planning_helpers")
+    for seed in range(4):
+        left, right = rough(seed, True)
+        line = centre_line(left, right, None, True, 1.0)
+        track = np.column_stack([line.points, line.width_right, line.width_left])
+        path = np.concatenate([line.points, line.points[:1]])
+        normal = helpers.calc_splines.calc_splines(path)[3]
+        assert not helpers.check_normals_crossing.check_normals_crossing(track, normal)
+
+
 def test_what_has_no_centre_line() -> None:
-    with pytest.raises(SettingsError, match="side by side, the left one on the left"):
+    with pytest.raises(SettingsError, match="the left boundary to the left of the right one"):
         centre_line(circle(22.0), circle(18.0), None, True, 1.0)
     for step in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(SettingsError, match="step: expected"):
