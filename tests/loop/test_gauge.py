@@ -76,15 +76,17 @@ def mid() -> float:
     return float(log().cycles[len(log().cycles) // 2].t)
 
 
-def test_holding_moves_nothing_and_keeps_what_is_known_of_the_motion() -> None:
+def test_holding_moves_nothing_and_keeps_what_is_known_of_map_and_pose() -> None:
+    """Nothing that is relative to the map changes by holding it, and no covariance does at that moment."""
     mapper = run(np.inf, mid())
     smoother = mapper.smoother
     assert mapper.closed and smoother.held is None
     keys, rows = across(smoother.map.state)
-    before = smoother.covariance(keys)
+    newest = np.array([mapper.next_pose_key - 1])
+    before, of_pose = smoother.covariance(keys), smoother.covariance(newest)
     hold_gauge(smoother)
-    after = smoother.covariance(keys)
-    np.testing.assert_allclose(after, before, atol=1e-6 * before.max())
+    np.testing.assert_allclose(smoother.covariance(keys), before, atol=1e-6 * before.max())
+    np.testing.assert_allclose(smoother.covariance(newest), of_pose, rtol=0.02, atol=1e-8)
     pinned = smoother._covariance(keys)
     assert np.trace(rows @ pinned @ rows.T) < 1e-3 * np.trace(rows @ before @ rows.T)
 
@@ -102,16 +104,6 @@ def test_a_step_of_a_held_map_is_that_of_a_free_one_given_that_the_whole_does_no
     expected = expected - P @ C.T @ np.linalg.solve(C @ P @ C.T, C @ expected)
     np.testing.assert_allclose(moved, expected, atol=1e-5)
     np.testing.assert_allclose(C @ moved, 0.0, atol=1e-6)
-
-
-def test_a_pose_is_as_uncertain_as_the_map_beside_it() -> None:
-    """Nothing that is relative to the map changes by holding it, and no covariance does at that moment."""
-    mapper = run(np.inf, mid())
-    smoother = mapper.smoother
-    newest = np.array([mapper.next_pose_key - 1])
-    before = smoother.covariance(newest)
-    hold_gauge(smoother)
-    np.testing.assert_allclose(smoother.covariance(newest), before, rtol=0.02, atol=1e-8)
 
 
 def test_the_map_is_held_after_the_laps_that_were_set_and_its_shape_is_not() -> None:
