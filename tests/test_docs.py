@@ -26,6 +26,7 @@ from pathspace_graph import FixedLagMapper, Log
 from pathspace_graph.cli import COMMANDS, parse_command
 from pathspace_graph.errors import InputError
 from pathspace_graph.eval.study.overrides import leaves
+from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import write_log
 from pathspace_graph.io.results import write_result
 from pathspace_graph.run import run_online, split_odometry
@@ -218,7 +219,14 @@ def test_the_graph_is_asked_as_the_architecture_page_does(log: Log) -> None:
     for odometry, detections in split_odometry(log):
         mapper.update(odometry, detections)
     (block,) = blocks(ROOT / "docs" / "architecture.md", "python")
-    exec(compile(block, "architecture.md", "exec"), {"mapper": mapper, "gtsam": gtsam})
+    make, show, *asks = ast.parse(block).body
+    names: dict[str, Any] = {"mapper": mapper, "gtsam": gtsam}
+    exec(compile(ast.Module([make, show], []), "architecture.md", "exec"), names)
+    assert names["graph"].size() > 0 and set(names["graph"].keyVector()) == set(names["values"].keys())
+    own, in_map = (eval(ast.unparse(ask), names) for ask in asks)
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(mapper.poses[-1, 2])
+    np.testing.assert_allclose(turn @ own @ turn.T, in_map, rtol=0.02, atol=1e-3 * np.abs(in_map).max())
 
 
 def test_each_step_of_the_paper_is_two_calls_from_the_update() -> None:

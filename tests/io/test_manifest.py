@@ -50,6 +50,9 @@ def test_what_has_changed_or_is_missing_is_named(folder: Path, name: str) -> Non
 def test_only_what_is_read_is_verified(folder: Path) -> None:
     (folder / "figures" / "a.png").write_bytes(b"b")
     verify(folder, ["marker", "unlisted"])
+    with pytest.raises(InputError, match="as it was written") as changed:
+        verify(folder, ["marker", "figures/a.png"])
+    assert changed.value.file == folder / "figures" / "a.png"
     (folder / "marker").unlink()
     verify(folder, ["marker"])
 
@@ -57,7 +60,11 @@ def test_only_what_is_read_is_verified(folder: Path) -> None:
 def test_what_a_user_adds_is_left_alone(folder: Path) -> None:
     (folder / "notes.txt").write_text("mine")
     (folder / ".hidden").write_text("mine")
+    verify(folder, ["notes.txt", ".hidden"])
     assert verify_all(folder) == 4
+    (folder / "marker").write_text("mine")
+    with pytest.raises(InputError, match="as it was written"):
+        verify_all(folder)
 
 
 def test_a_folder_without_a_manifest_is_read_as_before(folder: Path) -> None:
@@ -69,15 +76,21 @@ def test_a_folder_without_a_manifest_is_read_as_before(folder: Path) -> None:
 
 
 def test_the_manifest_of_another_program_is_left_alone(folder: Path) -> None:
-    (folder / MANIFEST_FILE).write_text('{"name": "an app", "icons": []}')
+    other = '{"name": "an app", "icons": []}'
+    (folder / MANIFEST_FILE).write_text(other)
+    (folder / "marker").write_text("2")
     assert read_manifest(folder) is None
     verify(folder, ["marker"])
+    assert (folder / MANIFEST_FILE).read_text() == other
 
 
 def test_a_manifest_that_was_written_anew_holds_for_what_is_there_now(folder: Path) -> None:
     (folder / "marker").write_text("2")
     write_manifest(folder)
     assert verify_all(folder) == 4
+    (folder / "marker").write_text("1")  # as it was at first
+    with pytest.raises(InputError, match="as it was written"):
+        verify_all(folder)
 
 
 def test_an_error_of_the_content_keeps_its_row_and_says_that_the_file_has_changed(folder: Path) -> None:

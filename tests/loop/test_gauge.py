@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.io.log import Log
 from pathspace_graph.loop.gauge import hold_gauge, motion_across
+from pathspace_graph.mapping.state import State
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -62,9 +63,8 @@ def run(laps: float, until: float) -> FixedLagMapper:
     return mapper
 
 
-def across(mapper: FixedLagMapper) -> tuple[Array, Array]:
+def across(state: State) -> tuple[Array, Array]:
     """The keys of the control points, and the rows that give the motion across the curves."""
-    state = mapper.smoother.map.state
     order = np.argsort(state.map_keys)
     tangent = np.concatenate([state.spline(b).tangent_unit(c.abscissae) for b, c in state.boundaries.items()])
     normals = np.column_stack([-tangent[:, 1], tangent[:, 0]])
@@ -76,38 +76,41 @@ def mid() -> float:
     return float(log().cycles[len(log().cycles) // 2].t)
 
 
-def test_holding_moves_nothing_and_keeps_what_is_known_of_the_motion() -> None:
-    mapper = run(np.inf, mid())
-    smoother = mapper.smoother
-    assert mapper.closed and smoother.held is None
-    keys, rows = across(mapper)
-    before = smoother.covariance(keys)
-    hold_gauge(smoother)
-    after = smoother.covariance(keys)
-    np.testing.assert_allclose(after, before, atol=1e-6 * before.max())
-    pinned = smoother._covariance(keys)
-    assert np.trace(rows @ pinned @ rows.T) < 1e-3 * np.trace(rows @ before @ rows.T)
-    free = run(np.inf, mid()).smoother
-    for one in (smoother, free):
-        one.step()
-    np.testing.assert_allclose(smoother.variables.of(keys), free.variables.of(keys), atol=1e-2)
-
-
-def test_a_pose_is_as_uncertain_as_the_map_beside_it() -> None:
+def test_holding_moves_nothing_and_keeps_what_is_known_of_map_and_pose() -> None:
     """Nothing that is relative to the map changes by holding it, and no covariance does at that moment."""
     mapper = run(np.inf, mid())
     smoother = mapper.smoother
+    assert mapper.closed and smoother.held is None
+    keys, rows = across(smoother.map.state)
     newest = np.array([mapper.next_pose_key - 1])
-    before = smoother.covariance(newest)
+    before, of_pose = smoother.covariance(keys), smoother.covariance(newest)
     hold_gauge(smoother)
-    np.testing.assert_allclose(smoother.covariance(newest), before, rtol=0.02, atol=1e-8)
+    np.testing.assert_allclose(smoother.covariance(keys), before, atol=1e-6 * before.max())
+    np.testing.assert_allclose(smoother.covariance(newest), of_pose, rtol=0.02, atol=1e-8)
+    pinned = smoother._covariance(keys)
+    assert np.trace(rows @ pinned @ rows.T) < 1e-3 * np.trace(rows @ before @ rows.T)
+
+
+def test_a_step_of_a_held_map_is_that_of_a_free_one_given_that_the_whole_does_not_move() -> None:
+    """With the covariance P of the points and the rows C the free step is conditioned on `C dx = 0`."""
+    smoother, free = (run(np.inf, mid()).smoother for _ in range(2))
+    keys, C = across(smoother.map.state)
+    P, before = smoother.covariance(keys), smoother.variables.of(keys)
+    hold_gauge(smoother)
+    for one in (smoother, free):
+        one.step()
+    moved, expected = (one.variables.of(keys) - before for one in (smoother, free))
+    assert np.abs(C @ expected).max() > 1e-4
+    expected = expected - P @ C.T @ np.linalg.solve(C @ P @ C.T, C @ expected)
+    np.testing.assert_allclose(moved, expected, atol=1e-5)
+    np.testing.assert_allclose(C @ moved, 0.0, atol=1e-6)
 
 
 def test_the_map_is_held_after_the_laps_that_were_set_and_its_shape_is_not() -> None:
     held, free = run(0.4, np.inf), run(np.inf, np.inf)
     assert held.smoother.held is not None and free.smoother.held is None
     known, early = held.smoother.held, run(0.4, held_since(held))
-    keys, rows = across(early)
+    keys, rows = across(early.smoother.map.state)
     moved = held.smoother.variables.of(keys) - early.smoother.variables.of(keys)
     sigma = np.sqrt(np.diag(rows @ known.covariance @ rows.T))
     assert (np.abs(rows @ moved) < 0.1 * sigma).all()

@@ -115,10 +115,16 @@ def test_the_figure_has_a_panel_for_each_fault_and_a_look_for_each_fate(frame: p
     assert [text.get_text() for text in visible[0].get_xticklabels()] == ["20", "50"]
 
 
-def test_a_suite_without_any_map_can_still_be_drawn(frame: pd.DataFrame) -> None:
+def test_runs_without_a_map_are_crosses_on_the_upper_edge(frame: pd.DataFrame) -> None:
     frame["rmse"] = np.nan
     figure = plot_faults(outcomes(STUDY, frame))
     figure.draw_without_rendering()
+    (axes,) = [axes for axes in figure.axes if axes.get_visible()]
+    crosses = [line for line in axes.lines if line.get_label() == "no map"]
+    places = np.concatenate([line.get_xydata() for line in crosses])
+    np.testing.assert_allclose(places, [[-0.15, 0.95], [0.15, 0.95], [1.0, 0.95]])
+    assert all(line.get_transform() == axes.get_xaxis_transform() for line in crosses)
+    assert {line.get_label() for line in axes.lines}.isdisjoint({"mean", "not lost", "lost at the end"})
 
 
 def test_the_files_hold_every_value(frame: pd.DataFrame, tmp_path: Path) -> None:
@@ -130,7 +136,13 @@ def test_the_files_hold_every_value(frame: pd.DataFrame, tmp_path: Path) -> None
     assert [entry["strength"] for entry in found["faults"]] == [0.0, 20.0, 50.0]
     assert found["faults"][2]["ratio_mean"] is None
     flat = pd.read_csv(tmp_path / "faults.csv")
-    assert list(flat) == list(found["faults"][0])
+    expected = [outcome.values() for outcome in outcomes(STUDY, frame)]
+    assert list(flat) == list(expected[0])
+    for entry, row in zip(found["faults"], expected, strict=True):
+        known = {name: value for name, value in row.items() if not pd.isna(value)}
+        assert entry == dict.fromkeys(row) | known
+    for name in flat.select_dtypes("number"):
+        np.testing.assert_allclose(flat[name], [row[name] for row in expected], err_msg=name)
     assert json.loads(flat["said"][1]) == {"a notice": 1}
     written = {file.name for file in tmp_path.iterdir()}
     forms = {f"faults.{suffix}" for suffix in ("txt", "md", "tex", "csv", "json", "png", "pdf")}
