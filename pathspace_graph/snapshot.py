@@ -1,10 +1,10 @@
 """Snapshots: a whole estimator as one file, from which it goes on as if it had never stopped.
 
 The file is a NumPy archive (.npz) of two arrays of bytes: `structure`, JSON in UTF-8, and `numbers`, the
-memory of all arrays. Its comment is the SHA-256 of all before, which is verified first. The structure has the
-`format`, the `classes`, each as [name, layout, names of the attributes], the `nodes`, one for each object, and
-the `root`. A value is null, a boolean, a number or a text as in JSON, [7] for node 7, or ["nan"], ["inf"],
-["-inf"]. A node is one of
+memory of all arrays. Its comment is the SHA-256 of all before, which is verified first. The structure has
+`format`, `classes`, each as [name, layout, names of the attributes], `nodes`, one for an object, and `root`.
+A value is null, a boolean, a number or a text as in JSON, [7] for node 7, or ["nan"], ["inf"], ["-inf"]. A
+node is one of
 
     ["object", class, value, ...]      by the class's number, the attributes in its order
     ["array", dtype, shape, strides, offset in the numbers, writeable]
@@ -26,7 +26,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import fields, is_dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from hashlib import sha256
 from inspect import unwrap
 from io import BytesIO
@@ -167,16 +167,11 @@ def _factors(graph: Any) -> list[Any]:
     return [graph.at(i) for i in range(graph.size())]
 
 
-def _graph(kind: Callable[[], Any]) -> Callable[..., Any]:
-    """Return how a graph or a net is made of its factors."""
-
-    def make(*factors: Any) -> Any:
-        graph = kind()
-        for factor in factors:
-            graph.push_back(factor)
-        return graph
-
-    return make
+def _graph(kind: Callable[[], Any], *factors: Any) -> Any:
+    graph = kind()
+    for factor in factors:
+        graph.push_back(factor)
+    return graph
 
 
 def _jacobian(factor: gtsam.JacobianFactor) -> tuple[Any, ...]:
@@ -202,8 +197,8 @@ TYPES: Final[dict[type, tuple[Callable[[Any], Iterable[Any]], Callable[..., Any]
     KDTree: (lambda tree: (np.array(tree.data),), KDTree),
     Recovery: (lambda recovery: (recovery.failures,), Recovery),
     Future: (lambda _: (), lambda: None),  # what a process is about to give is asked for again
-    gtsam.GaussianFactorGraph: (_factors, _graph(gtsam.GaussianFactorGraph)),
-    gtsam.GaussianBayesNet: (_factors, _graph(gtsam.GaussianBayesNet)),
+    gtsam.GaussianFactorGraph: (_factors, partial(_graph, gtsam.GaussianFactorGraph)),
+    gtsam.GaussianBayesNet: (_factors, partial(_graph, gtsam.GaussianBayesNet)),
     gtsam.GaussianConditional: (
         _conditional,
         lambda keys, matrix, frontals: linear_arrays.conditional_of(keys, sizes(keys), frontals, matrix),
@@ -297,11 +292,12 @@ def _lay_out(arrays: list[tuple[NDArray[Any], list[Any]]]) -> Bytes:
 
 def _bounds(array: NDArray[Any]) -> tuple[int, int]:
     """Return the address of the first byte of an array's memory, and of the one after its last."""
-    begin, reach = array.__array_interface__["data"][0], [0]
-    if array.size:
-        reach = [stride * (count - 1) for stride, count in zip(array.strides, array.shape, strict=True)]
-    low, high = sum(min(one, 0) for one in reach), sum(max(one, 0) for one in reach)
-    return begin + low, begin + high + (array.itemsize if array.size else 0)
+    begin = int(array.__array_interface__["data"][0])
+    if array.size == 0:
+        return begin, begin
+    ends = [stride * (count - 1) for stride, count in zip(array.strides, array.shape, strict=True)]
+    low, high = (sum(one for one in ends if one * sign > 0) for sign in (-1, 1))
+    return begin + low, begin + high + array.itemsize
 
 
 def _overlapping(bounds: list[tuple[int, int]]) -> list[list[int]]:

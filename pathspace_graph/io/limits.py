@@ -14,49 +14,27 @@ from typing import Any, Final
 from pathspace_graph.errors import InputError
 
 MAX_FILE_BYTES: Final = 2**30
-"""A file of data has at most this size (bytes)."""
-MAX_HEADER_BYTES: Final = 2**22
-"""A header or a study has at most this size (bytes)."""
+MAX_HEADER_BYTES: Final = 2**22  # also of a study
 MAX_TRACK_BYTES: Final = 2**23
-"""A track file has at most this size (bytes)."""
-MAX_DEPTH: Final = 32
-"""Lists and tables are nested at most this deep."""
+MAX_DEPTH: Final = 32  # of lists and tables in each other
 MAX_INTEGER: Final = 2**63 - 1
-"""A whole number is at most this large, which has 19 digits."""
-MAX_VARIANTS: Final = 10_000
-"""A grid of a study has at most this number of combinations."""
+MAX_VARIANTS: Final = 10_000  # of a study's grid
 
-MAX_STAMP: Final = 1e10
-"""A stamp is at most this (s), which is 300 years; stamps in milliseconds or nanoseconds are beyond it."""
-MAX_SPEED: Final = 1e3
-"""A measured speed is at most this (m/s)."""
-MAX_YAW_RATE: Final = 1e3
-"""A measured yaw rate is at most this (rad/s)."""
-MAX_HELD: Final = 1e3
-"""A twist that is held until the next row moves the vehicle by at most this (m)."""
-MAX_DRIVE: Final = 1e6
-"""A drive is at most this long (m)."""
-MAX_RANGE: Final = 1e4
-"""Each coordinate of a detection is at most this (m), vehicle frame."""
-MAX_DETECTIONS: Final = 10_000
-"""A perception cycle has at most this number of detections."""
-MAX_COORDINATE: Final = 1e8
-"""A coordinate of a map, a trajectory or a track is at most this (m); any geodetic grid has room in it."""
+MAX_STAMP: Final = 1e10  # s: 300 years; stamps in milliseconds or nanoseconds are beyond it
+MAX_SPEED: Final = 1e3  # m/s
+MAX_YAW_RATE: Final = 1e3  # rad/s
+MAX_HELD: Final = 1e3  # m, moved by a twist until the next row
+MAX_DRIVE: Final = 1e6  # m
+MAX_RANGE: Final = 1e4  # m, each coordinate of a detection
+MAX_DETECTIONS: Final = 10_000  # of one perception cycle
+MAX_COORDINATE: Final = 1e8  # m, of a map, a trajectory or a track; any geodetic grid has room in it
 MAX_DEGREE: Final = 20
-"""A spline has at most this degree."""
-MAX_ANGLE: Final = 1e6
-"""A heading that was not wrapped is at most this (rad)."""
-MAX_NOISE: Final = 1e6
-"""A standard deviation, a range or a rate in a log's header is at most this, in its own unit."""
-MAX_TRACK_LENGTH: Final = 3e4
-"""A track is at most this long (m); its rows are matched in a time that grows with the square of it."""
-MAX_TRACK_WIDTH: Final = 100.0
-"""A boundary is at most this far from the middle of a track (m)."""
-MAX_CONES: Final = 6_000
-"""Each boundary of a track has at most this number of cones."""
-
-SHOWN_CHARACTERS: Final = 120
-"""A message shows at most this number of characters of what was found."""
+MAX_ANGLE: Final = 1e6  # rad, of a heading that was not wrapped
+MAX_NOISE: Final = 1e6  # a number in a log's header, in its own unit
+MAX_TRACK_LENGTH: Final = 3e4  # m; rows are matched in a time that grows with its square
+MAX_TRACK_WIDTH: Final = 100.0  # m, from the middle of a track to a boundary
+MAX_CONES: Final = 6_000  # of each boundary of a track
+SHOWN_CHARACTERS: Final = 120  # of what was found, in a message
 
 
 def _short() -> Repr:
@@ -69,13 +47,13 @@ _SHORT: Final = _short()
 
 
 def shown(value: Any) -> str:
-    """Returns a value as a message shows it: short, whatever it holds."""
+    """Return a value as a message shows it: short, whatever it holds."""
     text = _SHORT.repr(value)
     return text if len(text) <= SHOWN_CHARACTERS else text[: SHOWN_CHARACTERS - 3] + "..."
 
 
 def check_content(content: Any, file: Path) -> None:
-    """Raises an InputError where the content of a file is nested too deep or has too large a whole number."""
+    """Raise an InputError where the content of a file is nested too deep or has too large a whole number."""
     level, seen = [content], set[int]()
     for _ in range(MAX_DEPTH):
         values = list(chain.from_iterable(map(_children, level)))
@@ -92,7 +70,7 @@ def check_content(content: Any, file: Path) -> None:
 
 
 def too_deep() -> str:
-    """Returns the message for a file that is nested deeper than allowed."""
+    """Return the message for a file that is nested deeper than allowed."""
     return f"expected lists and tables nested at most {MAX_DEPTH} deep, found deeper ones"
 
 

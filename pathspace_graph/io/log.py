@@ -16,19 +16,10 @@ from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise
 from pathspace_graph.labels import NAMES, label_from_name
 from pathspace_graph.lengths import POSE
 
+from . import limits
 from .csv_table import Column, FloatArray, Table, read_table, write_table
 from .files import atomic_folder
 from .header import POSITIVE, Header, noise_sections, to_toml, toml_text
-from .limits import (
-    MAX_ANGLE,
-    MAX_DETECTIONS,
-    MAX_DRIVE,
-    MAX_HELD,
-    MAX_RANGE,
-    MAX_SPEED,
-    MAX_STAMP,
-    MAX_YAW_RATE,
-)
 from .manifest import verified
 
 IntArray = NDArray[np.int_]
@@ -40,19 +31,19 @@ TRUTH_POSES_FILE: Final = "truth_poses.csv"
 TRUTH_CONES_FILE: Final = "truth_cones.csv"
 TRUTH_ASSOCIATIONS_FILE: Final = "truth_associations.csv"
 
-_STAMP: Final = {"t": Column(MAX_STAMP, "s")}
+_STAMP: Final = {"t": Column(limits.MAX_STAMP, "s")}
 _POINT: Final = {"x": Column(unit="m"), "y": Column(unit="m")}
-_SPEED: Final = Column(MAX_SPEED, "m/s")
-_RANGE: Final = Column(MAX_RANGE, "m")
-_COVARIANCE: Final = Column(MAX_RANGE**2, "m^2")
+_SPEED: Final = Column(limits.MAX_SPEED, "m/s")
+_RANGE: Final = Column(limits.MAX_RANGE, "m")
+_COVARIANCE: Final = Column(limits.MAX_RANGE**2, "m^2")
 COLUMNS: Final[dict[str, dict[str, Column]]] = {
-    ODOMETRY_FILE: {**_STAMP, "vx": _SPEED, "vy": _SPEED, "wz": Column(MAX_YAW_RATE, "rad/s")},
+    ODOMETRY_FILE: {**_STAMP, "vx": _SPEED, "vy": _SPEED, "wz": Column(limits.MAX_YAW_RATE, "rad/s")},
     DETECTIONS_FILE: {
         **_STAMP,
         **{"x": _RANGE, "y": _RANGE, "label": Column()},
         **dict.fromkeys(("xx", "xy", "yy"), _COVARIANCE),
     },
-    TRUTH_POSES_FILE: {**_STAMP, **_POINT, "theta": Column(MAX_ANGLE, "rad")},
+    TRUTH_POSES_FILE: {**_STAMP, **_POINT, "theta": Column(limits.MAX_ANGLE, "rad")},
     TRUTH_CONES_FILE: {**_POINT, "label": Column()},
     TRUTH_ASSOCIATIONS_FILE: {"cone": Column()},
 }
@@ -143,12 +134,7 @@ class SensorInfo:
 class Truth:
     """What a simulator or a survey knows, for evaluation only; what is not known has no rows."""
 
-    LENGTHS: ClassVar = {
-        "poses": POSE,
-        "cones": 1,
-        "sensor": (0, 1, 0, 0, 1),
-        "noise": (1, 1, 0, 0, 0, 0),
-    }
+    LENGTHS: ClassVar = {"poses": POSE, "cones": 1, "sensor": (0, 1, 0, 0, 1), "noise": (1, 1, 0, 0, 0, 0)}
 
     pose_t: FloatArray
     """Stamps of the true poses (N,) in s."""
@@ -269,10 +255,10 @@ def _read_odometry(table: Table) -> Odometry:
         raise InputError(table.file, "expected at least one row, found a header only", 2)
     t, speeds = _increasing_times(table), table.stack(("vx", "vy"))
     held = np.abs(speeds[:-1]).max(axis=1) * np.diff(t)
-    held_far = f"expected a twist that moves the vehicle by at most {MAX_HELD:g} m until the next row"
-    table.require(np.append(held <= MAX_HELD, True), held_far)
-    too_long = f"expected a drive of at most {MAX_DRIVE:g} m up to the next row"
-    table.require(np.append(np.cumsum(held) <= MAX_DRIVE, True), too_long)
+    held_far = f"expected a twist that moves the vehicle by at most {limits.MAX_HELD:g} m until the next row"
+    table.require(np.append(held <= limits.MAX_HELD, True), held_far)
+    too_long = f"expected a drive of at most {limits.MAX_DRIVE:g} m up to the next row"
+    table.require(np.append(np.cumsum(held) <= limits.MAX_DRIVE, True), too_long)
     return Odometry(t, np.column_stack([speeds, table.numbers("wz")]))
 
 
@@ -294,9 +280,9 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
     points = table.stack(("x", "y"))
     cycles = cycles_of(t, points, _covariances(table), _labels(table))
     counts = [len(cycle.labels) for cycle in cycles]
-    if max(counts) > MAX_DETECTIONS:
+    if max(counts) > limits.MAX_DETECTIONS:
         first = sum(counts[: int(np.argmax(counts))])
-        table.fail(first, f"expected at most {MAX_DETECTIONS} detections in a cycle, found more")
+        table.fail(first, f"expected at most {limits.MAX_DETECTIONS} detections in a cycle, found more")
     return cycles
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +16,6 @@ from .parsing import parse_json, read_text
 
 FORMAT: Final = "pathspace-manifest/1"
 MANIFEST_FILE: Final = "manifest.json"
-"""A folder holds its manifest in this file."""
 _MARK: Final = "pathspace"
 """A manifest holds this word more than once, so that a damaged one is not taken for another program's."""
 _DIGEST: Final = "pathspace_digest"
@@ -25,27 +23,26 @@ _DIGEST: Final = "pathspace_digest"
 
 
 def manifest_of(folder: Path) -> str:
-    """Returns the text of the manifest of all files in a folder and in its subfolders.
+    """Return the text of the manifest of all files in a folder and in its subfolders.
 
     Of a subfolder with a manifest of its own, only that is listed. Hidden files are left out.
     """
-    files = {}
-    for file in sorted(_files(folder)):
-        with file.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
-        files[file.relative_to(folder).as_posix()] = {"size": file.stat().st_size, "sha256": digest}
-    return _text(files)
+    return _text(
+        {
+            file.relative_to(folder).as_posix(): {"size": file.stat().st_size, "sha256": _digest(file)}
+            for file in sorted(_files(folder))
+        }
+    )
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    for entry in os.scandir(folder):
-        path = Path(entry.path)
-        if entry.name.startswith(".") or path == folder / MANIFEST_FILE or entry.is_symlink():
+    for path in folder.iterdir():
+        if path.name.startswith(".") or path.name == MANIFEST_FILE or path.is_symlink():
             continue
-        if entry.is_dir():
-            own = path / MANIFEST_FILE
-            yield from [own] if own.is_file() else _files(path)
-        elif entry.is_file():
+        if path.is_dir():
+            inner = path / MANIFEST_FILE
+            yield from [inner] if inner.is_file() else _files(path)
+        elif path.is_file():
             yield path
 
 
@@ -56,7 +53,7 @@ def _text(files: Any) -> str:
 
 
 def read_manifest(folder: Path) -> dict[str, dict[str, Any]] | None:
-    """Returns size and SHA-256 of each listed file by its path, or None where the folder has no manifest.
+    """Return size and SHA-256 of each listed file by its path, or None where the folder has no manifest.
 
     A file of the same name that another program wrote is none. An InputError says where one is damaged.
     """
@@ -78,18 +75,18 @@ _ACCEPT: Final = f" (removing {MANIFEST_FILE} accepts the files as they are)"
 
 
 def verify(folder: Path, names: Iterable[str]) -> None:
-    """Raises an InputError for the first of these files that is not as the folder's manifest says.
+    """Raise an InputError for the first of these files that is not as the folder's manifest says.
 
     A file that is missing or not listed, and a folder without a manifest, are accepted.
     """
-    listed = read_manifest(folder)
-    for name in names if listed else ():
-        if listed and name in listed and (folder / name).is_file():
+    listed = read_manifest(folder) or {}
+    for name in names:
+        if name in listed and (folder / name).is_file():
             _verify_file(folder / name, listed[name])
 
 
 def verify_all(folder: Path) -> int:
-    """Verifies every listed file, also by the manifests of subfolders, and returns their number.
+    """Verify every listed file, also by the manifests of subfolders, and returns their number.
 
     An InputError names the first file that is missing or differs, or the folder where it has no manifest.
     """
@@ -108,26 +105,25 @@ def verify_all(folder: Path) -> int:
 
 
 def _verify_file(file: Path, entry: Any) -> None:
-    if not _is_as_written(file, entry):
-        message = f"expected the file as it was written ({MANIFEST_FILE}), found another content"
-        raise InputError(file, message + _ACCEPT)
-
-
-def _is_as_written(file: Path, entry: Any) -> bool:
     try:
-        if entry["size"] != file.stat().st_size:
-            return False
-        with file.open("rb") as stream:
-            return bool(entry["sha256"] == hashlib.file_digest(stream, "sha256").hexdigest())
+        good = entry["size"] == file.stat().st_size and entry["sha256"] == _digest(file)
     except (LookupError, TypeError) as error:
         raise InputError(file, f"expected size and sha256 in the manifest, found {shown(entry)}") from error
     except OSError as error:
         raise InputError(file, f"expected a readable file: {error.strerror}") from error
+    if not good:
+        expected = f"expected the file as it was written ({MANIFEST_FILE})"
+        raise InputError(file, f"{expected}, found another content{_ACCEPT}")
+
+
+def _digest(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 @contextmanager
 def verified(folder: Path, *names: str) -> Iterator[None]:
-    """Verifies these files after they were read without an error.
+    """Verify these files after they were read without an error.
 
     An error of the content of a file that has changed comes first, since it names the row.
     """

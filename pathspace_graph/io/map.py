@@ -17,7 +17,7 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, POINTS
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
-from .limits import MAX_COORDINATE, MAX_DEGREE, shown
+from .limits import MAX_COORDINATE, MAX_DEGREE, MAX_INTEGER, shown
 from .manifest import verified
 from .parsing import read_json
 
@@ -37,7 +37,7 @@ _NEGATIVE_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class SplineBoundary:
-    """Holds a boundary as a B-spline."""
+    """A boundary as a B-spline."""
 
     LENGTHS: ClassVar = {"spline": 0, "covariance": 2, "confirmed_until": 1}
 
@@ -45,34 +45,32 @@ class SplineBoundary:
     """The curve is in the map frame, in the direction of travel."""
 
     covariance: Array
-    """This is the joint covariance (2m, 2m) in m^2 of the m distinct control points, in the order x0, y0, x1,
-    y1 and so on."""
+    """Joint covariance (2m, 2m) in m^2 of the m distinct control points, in the order x0, y0, x1 and so on."""
 
     confirmed_until: float = math.inf
-    """The curve is confirmed up to this parameter; beyond, it is tentative, and may be taken back. The whole
-    of a curve is confirmed where this is infinite or the end of its domain."""
+    """Parameter up to which the curve is confirmed; beyond, it is tentative, and may be taken back."""
 
     @property
     def size(self) -> int:
-        """Returns the number m of distinct control points."""
+        """Return the number m of distinct control points."""
         return self.spline.size
 
 
 @dataclass(frozen=True, eq=False)
 class PointBoundary:
-    """Holds a boundary as points: the landmarks of an estimator that does not know that they form a curve."""
+    """A boundary as points: the landmarks of an estimator that does not know that they form a curve."""
 
     LENGTHS: ClassVar = {"points": 1, "covariance": 2}
 
     points: Array
-    """Each row is a point (m, 2) in m, map frame, in no particular order."""
+    """Points (m, 2) in m, map frame, in no particular order."""
 
     covariance: Array
-    """This is the joint covariance (2m, 2m) in m^2 of the points, in the order x0, y0, x1, y1 and so on."""
+    """Joint covariance (2m, 2m) in m^2 of the points, in the order x0, y0, x1 and so on."""
 
     @property
     def size(self) -> int:
-        """Returns the number m of points."""
+        """Return the number m of points."""
         return len(self.points)
 
 
@@ -81,30 +79,29 @@ MapBoundary = SplineBoundary | PointBoundary
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """Holds what was mapped of a track."""
+    """What was mapped of a track."""
 
     LENGTHS: ClassVar = {"boundaries": 0, "joint_covariance": 2, "points": 0}
 
     closed: bool
-    """The track was found to be a loop where this is true."""
+    """Whether the track was found to be a loop."""
 
     boundaries: Mapping[int, MapBoundary]
-    """Each boundary stands under its label, LEFT or RIGHT; a boundary that could not be mapped is absent."""
+    """Boundaries by label, LEFT or RIGHT; one that could not be mapped is absent."""
 
     joint_covariance: Array | None = None
-    """This is the joint covariance (2m, 2m) in m^2 of the points of all boundaries, in the order of their
-    labels; it is None where it isn't known."""
+    """Joint covariance (2m, 2m) in m^2 of the points of all boundaries, in the order of their labels."""
 
     points: Mapping[int, PointBoundary] = field(default_factory=dict)
     """Cones of no boundary by their label, ORANGE or BIG_ORANGE, each label with one covariance."""
 
     @property
     def size(self) -> int:
-        """Returns the number of control points or landmarks on both boundaries together."""
+        """Return the number of control points or landmarks on both boundaries together."""
         return sum(boundary.size for boundary in self.boundaries.values())
 
     def centre_line(self, step: float = 1.0) -> CentreLine:
-        """Returns the centre line with widths, heading, curvature and arc length, and their sigmas.
+        """Return the centre line with widths, heading, curvature and arc length, and their sigmas.
 
         Its points are `step` (m) apart. Where the joint covariance isn't known, the boundaries are taken as
         independent. A tentative stretch takes part as well. Both boundaries must be splines; otherwise, or
@@ -116,7 +113,7 @@ class Map:
         )
 
     def curve(self, label: int, purpose: str) -> SplineBoundary:
-        """Returns a boundary that is a curve; a SettingsError says for which purpose one was expected."""
+        """Return a boundary that is a curve; a SettingsError says for which purpose one was expected."""
         boundary = self.boundaries.get(label)
         if isinstance(boundary, SplineBoundary):
             return boundary
@@ -124,7 +121,7 @@ class Map:
         raise SettingsError(f"{purpose}: expected a curve as {NAMES[label]} boundary, found {found}")
 
     def covariance_of(self, left: SplineBoundary, right: SplineBoundary) -> Array | None:
-        """Returns the covariance of both boundaries' control points; None where it wasn't asked for."""
+        """Return the covariance of both boundaries' control points; None where it wasn't asked for."""
         if self.joint_covariance is not None:
             return self.joint_covariance
         if any(boundary.covariance.shape[0] != 2 * boundary.size for boundary in (left, right)):
@@ -132,7 +129,7 @@ class Map:
         return np.asarray(block_diag(left.covariance, right.covariance))
 
     def _is_loop(self, left: SplineBoundary, right: SplineBoundary) -> bool:
-        """Returns whether the centre line is closed: both curves are."""
+        """Return whether the centre line is closed: both curves are."""
         if left.spline.periodic != right.spline.periodic:
             raise SettingsError(
                 "a centre line: expected both boundaries closed or both open, found one of each"
@@ -141,7 +138,7 @@ class Map:
 
 
 def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Array:
-    """Returns a joint covariance (2m, 2m) with each boundary's own covariance as its diagonal block.
+    """Return a joint covariance (2m, 2m) with each boundary's own covariance as its diagonal block.
 
     A boundary's covariance may hold what the others don't share, such as the scatter of its cones.
     """
@@ -156,7 +153,7 @@ def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Arr
 
 
 def map_to_json(track: Map) -> dict[str, Any]:
-    """Returns the content of `map.json` in plain Python types, every number to full precision."""
+    """Return the content of `map.json` in plain Python types, every number to full precision."""
     boundaries = {
         NAMES[label]: _boundary_to_json(track.boundaries[label]) for label in sorted(track.boundaries)
     }
@@ -185,144 +182,129 @@ def _boundary_to_json(boundary: MapBoundary) -> dict[str, Any]:
 
 
 def map_from_json(content: Any, file: Path | str = MAP_FILE) -> Map:
-    """Returns the map of a `map.json`'s content; an InputError names `file` and what breaks FORMATS."""
-    reader = _Reader(Path(file))
-    top = reader.object(content, "the file")
-    if top.get("format") != FORMAT:
-        raise reader.error(f'expected format = "{FORMAT}", found {shown(top.get("format"))}')
-    boundaries = reader.object(reader.get(top, "boundaries", ""), "boundaries")
-    unknown = sorted(set(boundaries) - {NAMES[label] for label in BOUNDARIES})
+    """Return the map of a `map.json`'s content; an InputError names `file` and what breaks FORMATS."""
+    top = _Object(Path(file), "", content)
+    if top.entries.get("format") != FORMAT:
+        raise InputError(top.file, f'expected format = "{FORMAT}", found {shown(top.entries.get("format"))}')
+    boundaries, names = top.object("boundaries"), {NAMES[label]: label for label in BOUNDARIES}
+    unknown = sorted(boundaries.entries.keys() - names)
     if unknown:
-        raise reader.error(f"boundaries: expected left and right, found {shown(unknown[0])}")
-    closed = reader.boolean(reader.get(top, "closed", ""), "closed")
-    mapped = {
-        label: reader.boundary(boundaries[NAMES[label]], f"boundaries.{NAMES[label]}")
-        for label in BOUNDARIES
-        if NAMES[label] in boundaries
-    }
-    return Map(closed, mapped, reader.joint_covariance(top, mapped), reader.points(top))
+        raise boundaries.error("", f"expected left and right, found {shown(unknown[0])}")
+    closed = top.boolean("closed")
+    mapped = {names[name]: _boundary(boundaries.object(name)) for name in names if name in boundaries.entries}
+    joint = _joint_covariance(top, mapped) if "cross_covariance" in top.entries else None
+    return Map(closed, mapped, joint, _points(top) if "points" in top.entries else {})
 
 
-@dataclass(frozen=True)
-class _Reader:
-    """Takes values out of parsed JSON and checks them; `where` is the dotted path that an error names."""
+def _boundary(entry: _Object) -> MapBoundary:
+    if "points" in entry.entries:
+        points = entry.array("points", columns=2)
+        return PointBoundary(points, _covariance(entry, len(points)))
+    degree, periodic = entry.integer("degree", 1, MAX_DEGREE), entry.boolean("periodic")
+    try:
+        spline = BSpline(entry.array("knots"), entry.array("control_points", columns=2), degree, periodic)
+    except SettingsError as error:
+        raise entry.error("", str(error)) from None
+    covariance, (low, high) = _covariance(entry, spline.size), spline.domain
+    until = entry.number("confirmed_until") if "confirmed_until" in entry.entries else high
+    if not low <= until <= high:
+        raise entry.error("confirmed_until", f"expected a number from {low:g} to {high:g}, found {until:g}")
+    return SplineBoundary(spline, covariance, until)
 
-    file: Path
 
-    def error(self, message: str) -> InputError:
-        return InputError(self.file, message)
+def _points(top: _Object) -> dict[int, PointBoundary]:
+    """Return the cones of no boundary by label."""
+    names, found, listed = {NAMES[label]: label for label in POINTS}, {}, top.object("points")
+    for name in listed.entries:
+        cones = _boundary(listed.object(name))
+        if name not in names or not isinstance(cones, PointBoundary):
+            raise listed.error("", f"expected points of {', '.join(names)}, found {shown(name)}")
+        found[names[name]] = cones
+    return found
 
-    def object(self, value: Any, where: str) -> dict[str, Any]:
+
+def _covariance(entry: _Object, size: int) -> Array:
+    stated = entry.integer("size", 0)
+    if stated != size:
+        raise entry.error("size", f"expected {size} (what is listed), found {stated}")
+    covariance = entry.array("covariance", 2 * size, 2 * size, MAX_COORDINATE**2)
+    if not _is_covariance(covariance):
+        raise entry.error("covariance", "expected a symmetric, positive semidefinite matrix")
+    return covariance
+
+
+def _joint_covariance(top: _Object, boundaries: Mapping[int, MapBoundary]) -> Array:
+    if len(boundaries) != len(BOUNDARIES):
+        raise top.error("cross_covariance", f"expected both boundaries, found {len(boundaries)}")
+    left, right = (boundaries[label].covariance for label in BOUNDARIES)
+    cross = top.array("cross_covariance", len(right), len(left), MAX_COORDINATE**2)
+    joint = np.block([[left, cross], [cross.T, right]])
+    if not _is_covariance(joint):
+        raise top.error("cross_covariance", "expected a joint covariance that is positive semidefinite")
+    return joint
+
+
+class _Object:
+    """A JSON object at a dotted path; an entry that is not as expected is an InputError that names it."""
+
+    def __init__(self, file: Path, path: str, value: Any) -> None:
+        self.file, self._path = file, path
         if not isinstance(value, dict):
-            raise self.error(f"{where}: expected an object, found {type(value).__name__}")
-        return value
+            raise InputError(file, f"{path or 'the file'}: expected an object, found {type(value).__name__}")
+        self.entries: dict[str, Any] = value
 
-    def get(self, parent: dict[str, Any], key: str, where: str) -> Any:
-        if key not in parent:
-            raise self.error(f"{where + '.' if where else ''}{key}: expected, but missing")
-        return parent[key]
+    def error(self, name: str, message: str) -> InputError:
+        return InputError(self.file, f"{self._inner(name)}: {message}")
 
-    def boolean(self, value: Any, where: str) -> bool:
+    def _inner(self, name: str) -> str:
+        return ".".join(part for part in (self._path, name) if part)
+
+    def _get(self, name: str) -> Any:
+        if name not in self.entries:
+            raise self.error(name, "expected, but missing")
+        return self.entries[name]
+
+    def object(self, name: str) -> _Object:
+        return _Object(self.file, self._inner(name), self._get(name))
+
+    def boolean(self, name: str) -> bool:
+        value = self._get(name)
         if not isinstance(value, bool):
-            raise self.error(f"{where}: expected true or false, found {shown(value)}")
+            raise self.error(name, f"expected true or false, found {shown(value)}")
         return value
 
-    def integer(self, value: Any, where: str, least: int) -> int:
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise self.error(f"{where}: expected a whole number of at least {least}, found {shown(value)}")
+    def integer(self, name: str, least: int, most: int = MAX_INTEGER) -> int:
+        value = self._get(name)
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+            expected = f"expected a whole number from {least} to {most}"
+            raise self.error(name, f"{expected}, found {shown(value)}")
         return value
+
+    def number(self, name: str) -> float:
+        return _Object(self.file, self._path, {name: [self._get(name)]}).array(name).item()
 
     def array(
-        self, value: Any, where: str, columns: int | None = None, largest: float = MAX_COORDINATE
+        self, name: str, columns: int | None = None, rows: int | None = None, largest: float = MAX_COORDINATE
     ) -> Array:
-        """Returns finite numbers: a list where `columns` is None, or rows of `columns` values.
-
-        Each is at most `largest` in size.
-        """
+        """Return finite numbers, at most `largest` in size: a list, or rows of `columns` values."""
+        value = self._get(name)
         expected = "a list of finite numbers" if columns is None else f"rows of {columns} finite numbers"
         try:
             array = np.asarray(value)
         except (TypeError, ValueError):
-            raise self.error(f"{where}: expected {expected}") from None
-        if array.dtype.kind not in "iuf":  # texts and null would be turned into numbers
-            raise self.error(f"{where}: expected {expected}")
-        array = array.astype(float)
+            array = np.empty(0, dtype=object)
+        good = isinstance(value, list) and array.dtype.kind in "iuf"  # texts and null would become numbers
+        array = array.astype(float) if good else np.full(1, np.nan)
         if columns is not None and array.size == 0:
             array = array.reshape(0, columns)
-        shaped = array.ndim == 1 if columns is None else array.ndim == 2 and array.shape[1] == columns
-        if not isinstance(value, list) or not shaped or not np.isfinite(array).all():
-            raise self.error(f"{where}: expected {expected}")
+        shape = (len(array),) if columns is None else (len(array), columns)
+        if array.shape != shape or not np.isfinite(array).all():
+            raise self.error(name, f"expected {expected}")
+        if rows is not None and len(array) != rows:
+            raise self.error(name, f"expected {rows} rows, found {len(array)}")
         if array.size and np.abs(array).max() > largest:
-            raise self.error(f"{where}: expected numbers of at most {largest:g} in size, found larger ones")
+            raise self.error(name, f"expected numbers of at most {largest:g} in size, found larger ones")
         return array
-
-    def boundary(self, value: Any, where: str) -> MapBoundary:
-        fields = self.object(value, where)
-        if "points" in fields:
-            points = self.array(fields["points"], f"{where}.points", columns=2)
-            return PointBoundary(points, self.covariance(fields, len(points), where))
-        spline = self.spline(fields, where)
-        covariance = self.covariance(fields, spline.size, where)
-        return SplineBoundary(spline, covariance, self.confirmed_until(fields, spline, where))
-
-    def confirmed_until(self, fields: dict[str, Any], spline: BSpline, where: str) -> float:
-        """Returns the parameter up to which a curve is confirmed: all of it where that isn't said."""
-        low, high = spline.domain
-        until = self.array([fields.get("confirmed_until", high)], f"{where}.confirmed_until").item()
-        if not low <= until <= high:
-            message = f"expected a parameter from {low:g} to {high:g}, found {until:g}"
-            raise self.error(f"{where}.confirmed_until: {message}")
-        return until
-
-    def points(self, top: dict[str, Any]) -> dict[int, PointBoundary]:
-        """Returns the cones of no boundary by label; a file need not have any."""
-        names, found = {NAMES[label]: label for label in POINTS}, {}
-        for name, value in self.object(top.get("points", {}), "points").items():
-            own = self.boundary(value, f"points.{name}")
-            if name not in names or not isinstance(own, PointBoundary):
-                raise self.error(f"points: expected points of {', '.join(names)}, found {shown(name)}")
-            found[names[name]] = own
-        return found
-
-    def spline(self, fields: dict[str, Any], where: str) -> BSpline:
-        degree = self.integer(self.get(fields, "degree", where), f"{where}.degree", least=1)
-        if degree > MAX_DEGREE:
-            raise self.error(f"{where}.degree: expected at most {MAX_DEGREE}, found {degree}")
-        periodic = self.boolean(self.get(fields, "periodic", where), f"{where}.periodic")
-        knots = self.array(self.get(fields, "knots", where), f"{where}.knots")
-        points = self.array(self.get(fields, "control_points", where), f"{where}.control_points", columns=2)
-        try:
-            return BSpline(knots, points, degree, periodic)
-        except SettingsError as error:
-            raise self.error(f"{where}: {error}") from None
-
-    def covariance(self, fields: dict[str, Any], size: int, where: str) -> Array:
-        stated = self.integer(self.get(fields, "size", where), f"{where}.size", least=0)
-        if stated != size:
-            raise self.error(f"{where}.size: expected {size} (what is listed), found {stated}")
-        listed = self.get(fields, "covariance", where)
-        covariance = self.array(listed, f"{where}.covariance", 2 * size, MAX_COORDINATE**2)
-        if len(covariance) != 2 * size:
-            raise self.error(f"{where}.covariance: expected {2 * size} rows, found {len(covariance)}")
-        if not _is_covariance(covariance):
-            raise self.error(f"{where}.covariance: expected a symmetric, positive semidefinite matrix")
-        return covariance
-
-    def joint_covariance(self, top: dict[str, Any], boundaries: Mapping[int, MapBoundary]) -> Array | None:
-        """Returns the joint covariance of both boundaries, or None where the file doesn't have it."""
-        where = "cross_covariance"
-        if where not in top:
-            return None
-        if len(boundaries) != len(BOUNDARIES):
-            raise self.error(f"{where}: expected both boundaries, found {len(boundaries)}")
-        left, right = (boundaries[label].covariance for label in BOUNDARIES)
-        cross = self.array(top[where], where, len(right), MAX_COORDINATE**2)
-        if len(cross) != len(left):
-            raise self.error(f"{where}: expected {len(left)} rows, found {len(cross)}")
-        joint = np.block([[left, cross], [cross.T, right]])
-        if not _is_covariance(joint):
-            raise self.error(f"{where}: expected a joint covariance that is positive semidefinite")
-        return joint
 
 
 def _is_covariance(P: Array) -> bool:
@@ -338,7 +320,7 @@ def _is_covariance(P: Array) -> bool:
 
 
 def read_map(folder: Path | str) -> Map:
-    """Returns the map of a folder that follows FORMATS, as those of `write_result` do."""
+    """Return the map of a folder that follows FORMATS, as those of `write_result` do."""
     file = Path(folder) / MAP_FILE
     with verified(Path(folder), MAP_FILE):
         return map_from_json(read_json(file, "a map"), file)

@@ -31,88 +31,78 @@ NoiseSource = Literal["stated", "measured", "assumed"]
 CYCLES_FILE: Final = "cycles.csv"
 """A result folder holds its cycles in this file."""
 _CYCLE_COLUMNS: Final = (
-    "cycle",
-    "t",
-    "seconds",
-    "size_left",
-    "size_right",
-    "readings",
-    "lap",
-    "offered",
-    "health",
-    "reason",
-    "dropped",
+    *("cycle", "t", "seconds", "size_left", "size_right", "readings", "lap"),
+    *("offered", "health", "reason", "dropped"),
 )
 
 
 @dataclass(frozen=True)
 class CycleRecord:
-    """Holds one row of `cycles.csv` (FORMATS)."""
+    """One row of `cycles.csv` (FORMATS)."""
 
     LENGTHS: ClassVar = {"jump": POSE, "notice": 1, "reason": 1}
 
     cycle: int
-    """This is the number of the perception cycle, from 0."""
+    """Number of the perception cycle, from 0."""
     t: float
-    """This is the stamp of the cycle (s)."""
+    """Stamp of the cycle, s."""
     seconds: float
-    """The whole update took this wall time (s)."""
+    """Wall time of the whole update, s."""
     size_left: int
-    """The left boundary has this number of control points or landmarks."""
     size_right: int
-    """The right boundary has this number of control points or landmarks."""
+    """Number of control points or landmarks of the right boundary, as of the left one."""
     readings: int
-    """This is the number of the cycle's detections that were used."""
+    """Number of the cycle's detections that were used."""
     lap: int
-    """The estimated trajectory is in this lap, counted from 1."""
+    """Lap of the estimated trajectory, from 1."""
     stages: Mapping[str, float] = field(default_factory=dict)
-    """Each stage of the update took this time (s), by the stage's name."""
+    """Time of each stage of the update, s, by its name."""
     closed: bool = False
-    """The loop has closed by the end of this cycle where this is true."""
+    """Whether the loop has closed by the end of the cycle."""
     jump: tuple[float, float, float] | None = None
-    """The newest pose jumped by this [m, m, rad], map frame, where the map was replaced in this cycle."""
+    """Jump of the newest pose [m, m, rad], map frame, where the map was replaced in this cycle."""
     notice: str = ""
-    """This says what a user should know of the cycle; it is empty if there is nothing."""
+    """What a user should know of the cycle, if anything."""
     offered: int = 0
-    """This is the number of the cycle's detections."""
+    """Number of the cycle's detections."""
     health: str = ""
-    """The estimate is good, degraded or lost; this is empty where the estimator does not say it."""
+    """Good, degraded or lost; empty where the estimator does not say it."""
     reason: str = ""
-    """This says why the estimate is not good."""
+    """Why the estimate is not good."""
     dropped: int = 0
-    """This is the number of the cycle's detections that were dropped, since they are impossible."""
+    """Number of the cycle's detections that were dropped as impossible."""
     late: bool = False
-    """The cycle was handed over after a newer one, and was used at its own time, where this is true."""
+    """Whether the cycle came after a newer one, and was used at its own time."""
     refused: int = 0
-    """This number of cycles was refused just before this one."""
+    """Number of cycles that were refused just before this one."""
 
 
 @dataclass(frozen=True, eq=False)
 class VehicleState:
-    """Holds what an estimator believes of the vehicle: its pose, and the calibration of its odometry."""
+    """What an estimator believes of the vehicle: its pose, and the calibration of its odometry."""
 
     LENGTHS: ClassVar = {"pose": POSE, "sensor": (0, 1, 0, 0, 1)}
     COVARIANCES: ClassVar = {"covariance": (*POSE, 0, 0), "sensor_covariance": (0, 1, 0, 0, 1)}
 
     pose: Array
-    """This is the pose [x, y, theta] (3,) in m and rad, map frame; theta isn't wrapped."""
+    """Pose [x, y, theta] (3,) in m and rad, map frame; theta isn't wrapped."""
     calibration: Array
-    """This is the calibration (2,): scale error of the speeds (-), bias of the yaw rate (rad/s)."""
+    """Calibration (2,): scale error of the speeds (-), bias of the yaw rate (rad/s)."""
     covariance: Array
-    """This is the joint covariance (5, 5) of [pose | calibration]."""
+    """Joint covariance (5, 5) of [pose | calibration]."""
     sensor: Array = field(default_factory=lambda: np.zeros(0))
-    """This is the calibration of the sensor (5,), `factors.sensor:SENSOR`, or (0,) where there is none."""
+    """Calibration of the sensor (5,), `factors.sensor:SENSOR`, or (0,) where there is none."""
     sensor_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    """This is its covariance (5, 5), or (0, 0)."""
+    """Its covariance (5, 5), or (0, 0)."""
 
     @property
     def sensor_sigmas(self) -> Array:
-        """Returns the standard deviations (5,) of the sensor's calibration, or (0,)."""
+        """Return the standard deviations (5,) of the sensor's calibration, or (0,)."""
         return np.sqrt(np.diag(self.sensor_covariance))
 
     @property
     def by_name(self) -> dict[str, tuple[float, float]]:
-        """Returns each calibration with its standard deviation, by its name in `CALIBRATION` and `SENSOR`."""
+        """Return each calibration with its standard deviation, by its name in `CALIBRATION` and `SENSOR`."""
         values = [*self.calibration.tolist(), *self.sensor.tolist()]
         sigmas = [*self.sigmas[len(self.pose) :].tolist(), *self.sensor_sigmas.tolist()]
         known = zip([*CALIBRATION, *SENSOR], values, sigmas, strict=False)
@@ -120,7 +110,7 @@ class VehicleState:
 
     @classmethod
     def split(cls, pose: Array, calibrations: Array, joint: Array) -> VehicleState:
-        """Returns the state of a joint covariance of [pose | calibration of odometry | of sensor].
+        """Return the state of a joint covariance of [pose | calibration of odometry | of sensor].
 
         The calibrations (2,) or (7,) are copied.
         """
@@ -130,39 +120,37 @@ class VehicleState:
 
     @property
     def sigmas(self) -> Array:
-        """Returns the standard deviations (5,) of [pose | calibration]."""
+        """Return the standard deviations (5,) of [pose | calibration]."""
         return np.sqrt(np.diag(self.covariance))
 
 
 @dataclass(frozen=True)
 class LapBatches:
-    """Holds when those batches ended which another process solves while an online estimator goes on."""
+    """Ends of the batches that another process solves while an online estimator goes on."""
 
     ends: tuple[int, ...]
-    """In each of these cycles the result of a batch was taken, or the batch was given up."""
+    """Cycles in which the result of a batch was taken, or the batch was given up."""
     late: int
-    """By its wall time, the slowest batch is this number of cycles late in a vehicle, 0 where none is."""
+    """Cycles by which the slowest batch is late in a vehicle, by its wall time."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunNoise:
-    """Holds which noise a run has used, and what it has measured."""
+    """Noise that a run has used, and what it has measured."""
 
     LENGTHS: ClassVar = {"measured": 0}
 
     odometry: NoiseSource
-    """The noise of the odometry comes from here."""
     detections: NoiseSource
-    """The covariances of the detections come from here."""
     measured: MeasuredNoise | None = None
-    """This was measured in the drive, where anything was."""
+    """What was measured in the drive, where anything was."""
     size: Literal["odometry", "ranges"] | None = None
     """Ranges and speeds disagree, and the size of the map is that of these; None where they agree."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """Holds what a run of an estimator over a log gives."""
+    """What a run of an estimator over a log gives."""
 
     LENGTHS: ClassVar = {
         "map": 0,
@@ -177,39 +165,36 @@ class RunResult:
     }
 
     estimator: str
-    """This is the name of the estimator (FORMATS)."""
+    """Name of the estimator (FORMATS)."""
     settings: dict[str, Any]
-    """These are all settings of the estimator, as plain values."""
+    """All settings of the estimator, as plain values."""
     map: Map
-    """This is the map at the end of the log."""
+    """Map at the end of the log."""
     trajectory_t: Array
-    """These are the stamps of the perception cycles (n,) in s."""
+    """Stamps of the perception cycles (n,) in s."""
     trajectory: Array
-    """Each row is a pose [x, y, theta] (n, 3), map frame; an online estimator gives it as it stood at that
-    cycle."""
+    """Poses [x, y, theta] (n, 3), map frame; of an online estimator as they stood at that cycle."""
     cycles: tuple[CycleRecord, ...]
-    """Each perception cycle has a record."""
     laps: int
-    """The estimated trajectory has this number of complete laps, with a last one that ends just before the
-    line."""
+    """Complete laps of the estimated trajectory, with a last one that ends just before the line."""
     lap_maps: tuple[tuple[int, Map], ...] = ()
-    """Each complete lap of the estimated trajectory has its number and the map as it stood at its end."""
+    """Number of each complete lap, and the map as it stood at its end."""
     snapshots: tuple[Map, ...] = ()
-    """The map is kept as it stood at each of the times that were asked for."""
+    """Map as it stood at each of the times that were asked for."""
     vehicle: VehicleState | None = None
-    """This is the vehicle's state at the end of the log, where the estimator gives it."""
+    """State of the vehicle at the end of the log, where the estimator gives it."""
     reach: Array | None = None
-    """Each perception cycle has a row (n, 3), if an observer knew the truth: the reach ahead of the vehicle
-    (m), the sum of squared distances (m^2) of the true cones on that stretch, and their number. The reach is
-    NaN where the cycle doesn't count."""
+    """Row of each cycle (n, 3), if an observer knew the truth: the reach ahead of the vehicle, m, the sum of
+    squared distances of the true cones on that stretch, m^2, and their number. The reach is NaN where the
+    cycle doesn't count."""
     observing: float = 0.0
-    """The observers took this wall time (s), which is no part of the estimator's."""
+    """Wall time of the observers, s, which is no part of the estimator's."""
     batches: LapBatches | None = None
-    """This says when batches of the lap have ended, where the estimator has such."""
+    """When batches of the lap have ended, where the estimator has such."""
     waited: float = 0.0
-    """Between cycles, the run waited for batches for this wall time (s)."""
+    """Wall time for which the run waited for batches between cycles, s."""
     noise: RunNoise | None = None
-    """This is the noise that was used, where the estimator says it."""
+    """Noise that was used, where the estimator says it."""
     scale: float = 1.0
     """Size of the scene by that of a Formula Student track."""
 
@@ -220,16 +205,16 @@ class RunResult:
 
 @dataclass(frozen=True, eq=False)
 class BatchRun(RunResult):
-    """Holds what a batch estimator gives; its maps of the laps are all the one of the whole log."""
+    """What a batch estimator gives; its maps of the laps are all the one of the whole log."""
 
     converged: bool = True
-    """The optimization ended at an optimum where this is true."""
+    """Whether the optimization ended at an optimum."""
     cost: float = nan
-    """This is the cost at its end, half the sum of squared whitened residuals, where it is known."""
+    """Cost at its end, half the sum of squared whitened residuals, where it is known."""
 
 
 def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, Any]) -> None:
-    """Writes map.json, trajectory.tum, cycles.csv and summary.json: all of them, or on failure nothing.
+    """Write map.json, trajectory.tum, cycles.csv and summary.json: all of them, or on failure nothing.
 
     An earlier result in `folder` is kept as a numbered backup; anything else there is an OutputError.
     """
@@ -242,6 +227,6 @@ def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, An
 
 
 def read_health(file: Path) -> list[str]:
-    """Returns the health of each cycle by the file of cycles; the list is empty if it does not say it."""
+    """Return the health of each cycle by the file of cycles; the list is empty if it does not say it."""
     with verified(file.parent, file.name):
         return list(read_table(file, ("cycle",)).columns.get("health", []))

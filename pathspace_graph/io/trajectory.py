@@ -18,13 +18,11 @@ from .parsing import read_text
 Array = NDArray[np.float64]
 
 TRAJECTORY_FILE: Final = "trajectory.tum"
-"""A result folder holds its trajectory in this file."""
 _COLUMNS: Final = 8
-"""A row has this number of values."""
 
 
 def write_trajectory(file: Path, t: ArrayLike, poses: ArrayLike) -> None:
-    """Writes stamps (n,) in s and poses [x, y, theta] (n, 3), map frame; every number to full precision."""
+    """Write stamps (n,) in s and poses [x, y, theta] (n, 3), map frame; every number to full precision."""
     rows = np.column_stack([np.asarray(t, dtype=float), np.asarray(poses, dtype=float).reshape(-1, 3)])
     with file.open("w", encoding="utf-8", newline="\n") as out:
         for stamp, x, y, theta in rows.tolist():
@@ -33,7 +31,7 @@ def write_trajectory(file: Path, t: ArrayLike, poses: ArrayLike) -> None:
 
 
 def read_trajectory(file: Path) -> tuple[Array, Array]:
-    """Returns stamps (n,) in s and poses [x, y, theta] (n, 3), map frame, theta in [-2 pi, 2 pi].
+    """Return stamps (n,) in s and poses [x, y, theta] (n, 3), map frame, theta in [-2 pi, 2 pi].
 
     Empty lines and lines that begin with # are left out. An InputError names the row that is wrong.
     """

@@ -58,7 +58,7 @@ def test_a_cluster_of_few_detections_is_no_cone() -> None:
 def test_a_cone_at_which_the_row_folds_back_is_a_duplicate() -> None:
     x = np.array([0.0, 4.0, 8.0, 7.4, 12.0, 16.0])
     cones = Cones(np.column_stack([x, np.zeros(6)]), np.arange(6.0), np.full(6, 9))
-    assert (np.diff(without_folds(cones, False, SETTINGS.batch.cones).points[:, 0]) > 0.0).all()
+    assert (np.diff(without_folds(cones, False).points[:, 0]) > 0.0).all()
 
 
 def test_a_cone_that_the_curve_cuts_off_is_found_as_well() -> None:

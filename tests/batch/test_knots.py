@@ -28,7 +28,7 @@ def zigzag_ring(count: int) -> Array:
 def test_a_fit_has_at_most_its_share_of_control_points(share: float) -> None:
     """It has at least the settings' share of that number."""
     spline = fit_through(zigzag_ring(60), True, SETTINGS, share)
-    assert int(SETTINGS.batch.min_size_share * int(share * 60)) <= spline.size <= int(share * 60)
+    assert int(MIN_SIZE_SHARE * int(share * 60)) <= spline.size <= int(share * 60)
     assert spline.periodic
 
 
