@@ -27,7 +27,7 @@ TRACK_LENGTH = 2e3
 """Tracks are at most this long (m) here: one of 30 km takes the time of thousands of short ones."""
 INSTRUMENTED = [
     "tomllib",
-    *(f"pathspace_graph.{room}" for room in ("io", "sim", "spline", "eval.study", "settings")),
+    *(f"pathspace_graph.{room}" for room in ("io", "sim", "spline", "eval.experiment", "settings")),
 ]
 """Branches of these modules guide the fuzzer."""
 

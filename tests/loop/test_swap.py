@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
-from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.graph.gaussian import factorize, graph_of
 from pathspace_graph.io.log import Log
 from pathspace_graph.loop import drive_record
