@@ -24,8 +24,8 @@ from pathspace_graph.convert.recording import to_log
 from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings
 from pathspace_graph.convert.text_files import Columns, Units, read_csv
 from pathspace_graph.estimators import DEFAULT, DEFAULT_BATCH, make_batch, make_online
-from pathspace_graph.eval.metrics.curves import crossings
-from pathspace_graph.eval.metrics.gap import aligned_distance
+from pathspace_graph.eval.metrics.accuracy import crossings
+from pathspace_graph.eval.metrics.reference import aligned_distance
 from pathspace_graph.eval.metrics.summary import summarize
 from pathspace_graph.factors.measured_noise import MeasuredNoise
 from pathspace_graph.factors.se2 import compose, move_points, to_map, to_vehicle, wrap_angle

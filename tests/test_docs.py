@@ -25,7 +25,7 @@ import pytest
 from pathspace_graph import FixedLagMapper, Log
 from pathspace_graph.cli import COMMANDS, parse_command
 from pathspace_graph.errors import InputError
-from pathspace_graph.eval.study.overrides import leaves
+from pathspace_graph.eval.experiment.study import leaves
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import write_log
 from pathspace_graph.io.results import write_result

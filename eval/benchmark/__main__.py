@@ -1,5 +1,99 @@
-"""`python -m pathspace_graph.eval.benchmark` measures the online mapper's speed."""
+"""`python -m pathspace_graph.eval.benchmark` times the online mapper beside GTSAM and the landmark graph.
 
-from .benchmark import main
+With `--laps 5 --seed 0 --json FILE` everything is measured in one run, on the same cycles. With `--compare`
+it says what is worse than the committed baseline (the exit code is 1 then), and `--write-baseline` writes
+that baseline.
+"""
 
-main()
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from pathspace_graph.errors import PathspaceError
+from pathspace_graph.io.files import atomic_file, check_file_target, write_json
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
+
+from .measurement import Measurement, measure, metrics
+from .ratios import BASELINE, baseline_table, compare, metrics_table, read_baseline, write_baseline
+
+WORSE: Final = 1
+"""Exit code where a figure is worse than the baseline."""
+BAD_INPUT: Final = 2
+"""Exit code where a file can't be read or written."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Benchmark:
+    """Times the online mapper on a generated track of 200 cones, and GTSAM's own solver on its windows."""
+
+    laps: int = 5
+    """The track is driven for this many laps."""
+    seed: int = 0
+    """The track, the drive and its noise have this seed."""
+    json: Path | None = None
+    """The figures are written to this file."""
+    compare: bool = False
+    """The table says what is worse than the baseline by more than its tolerance; the exit code is 1 then."""
+    write_baseline: bool = False
+    """The ratios of this run become the baseline."""
+    baseline: Path = BASELINE
+    """The baseline is in this file; by default it is the one that comes with the package."""
+
+    def check(self) -> None:
+        """Raise OutputError or InputError, before anything runs, where a file can't be written or read."""
+        for file in (self.json, self.baseline if self.write_baseline else None):
+            if file is not None:
+                check_file_target(file)
+        if self.compare:
+            read_baseline(self.baseline)
+
+    def measure(self) -> Measurement:
+        """Simulate the drive and measure a run on it."""
+        track = generate_track(np.random.default_rng(self.seed))
+        log = simulate(track, SimulationSettings(laps=self.laps), self.seed)
+        return measure(log, MapperSettings())
+
+
+def main() -> None:
+    """Run the script; the exit code is 1 where a figure is worse than the baseline, 2 on bad files."""
+    benchmark = tyro.cli(Benchmark)
+    try:
+        worse = _run(benchmark)
+    except PathspaceError as error:
+        Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(f"benchmark: {error}")
+        raise SystemExit(BAD_INPUT) from error
+    if worse:
+        raise SystemExit(WORSE)
+
+
+def _run(benchmark: Benchmark) -> bool:
+    """Measure, write and report; return whether anything is worse than the baseline."""
+    benchmark.check()
+    measurement = benchmark.measure()
+    figures = metrics(measurement)
+    if benchmark.json is not None:
+        with atomic_file(benchmark.json) as temporary:
+            write_json(temporary, [asdict(metric) for metric in figures])
+    console = Console(highlight=False)
+    console.print(metrics_table(figures))
+    best = measurement.gtsam
+    console.print(f"GTSAM at its best over {best.samples} windows: {best.ordering}")
+    found = compare(figures, read_baseline(benchmark.baseline)) if benchmark.compare else []
+    if benchmark.compare:
+        console.print(baseline_table(found))
+    if benchmark.write_baseline:
+        write_baseline(benchmark.baseline, figures)
+        console.print(f"baseline written to {benchmark.baseline}", soft_wrap=True)
+    return any(compared.worse for compared in found)
+
+
+if __name__ == "__main__":
+    main()

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.estimators import make_online
+from pathspace_graph.eval.metrics.measures import stage_times
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -28,84 +29,79 @@ from pathspace_graph.run import ObservedCycle, run_online, split_odometry, timed
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .gtsam_window import linear_window, time_gtsam
-from .metric import Metric
+from .ratios import Metric
 
 Array = NDArray[np.float64]
 
 AHEAD: Final = 20.0
-"""The track is looked at this far ahead (m) after every cycle, as a controller does."""
+"""Distance ahead (m) at which the track is looked at after every cycle, as a controller does."""
 RIVAL: Final = "landmark-fixed-lag"
-"""This estimator gets the same cycles in turn."""
+"""Estimator that gets the same cycles in turn."""
 SAMPLE_EVERY: Final = 10
-"""GTSAM is timed after every tenth cycle."""
+"""Number of cycles from one timing of GTSAM to the next."""
 WARM_UP: Final = 50
-"""The first sample comes after this many cycles, when the window is full."""
+"""Number of cycles before the first sample, when the window is full."""
 REFERENCE_LAP: Final = 2
-"""The last lap is compared with this one, the first that is driven on a closed map."""
+"""Lap that the last one is compared with, the first on a closed map."""
 
-MEAN_RATIO: Final = 2.0
-"""A mean cycle takes at most this many times GTSAM's mean."""
-P99_MILLISECONDS: Final = 10.0
-"""The 99th percentile of a cycle is at most this; a mean cycle of 3 ms was measured when it was chosen."""
-LAP_RATIO: Final = 1.1
-"""A mean cycle of the last lap takes at most this many times that of lap 2."""
-CLOSING_MILLISECONDS: Final = 100.0
-"""The cycle that closes the loop takes at most this."""
-MEANWHILE_RATIO: Final = 1.1
-"""While the batch of the lap is being solved, a mean cycle takes at most this many times one before it."""
-SOLVE_SECONDS: Final = 1.5
-"""The batch of the lap takes at most this time (s) in its own process."""
-SWAP_MILLISECONDS: Final = 100.0
-"""The cycle that replaces the map takes at most this."""
-AHEAD_MILLISECONDS: Final = 1.0
-"""A look at the track ahead takes at most this at the median."""
-
-MEAN_TOLERANCE: Final = 0.2
-"""A ratio of two means over the whole run may be worse than its baseline by this share."""
-LAP_TOLERANCE: Final = 0.15
-"""A ratio of two laps' means may be worse than its baseline by this share."""
-TAIL_TOLERANCE: Final = 0.5
-"""A ratio of a tail or of a single cycle may be worse than its baseline by this share."""
+BOUNDS: Final = {
+    "mean_by_gtsam": 2.0,
+    "p99": 10.0,  # a mean cycle of 3 ms was measured when it was chosen
+    "last_lap_by_lap_2": 1.1,
+    "closing": 100.0,
+    "meanwhile_by_before": 1.1,
+    "solve": 1.5,
+    "swap": 100.0,
+    "ahead_open": 1.0,
+    "ahead_closed": 1.0,
+}
+"""Worst value allowed of a figure, in its unit."""
+TOLERANCES: Final = {
+    **dict.fromkeys(("mean_by_gtsam", "mean_by_landmark"), 0.2),  # two means over the whole run
+    "last_lap_by_lap_2": 0.15,
+    **dict.fromkeys(("meanwhile_by_before", "p99_by_mean", "closing_by_mean"), 0.5),  # tails, single cycles
+}
+"""Share by which a ratio may be worse than its baseline."""
 
 
 @dataclass(frozen=True)
 class Gtsam:
-    """Holds GTSAM's times in its fastest ordering."""
+    """GTSAM's times in its fastest ordering."""
 
     ordering: str
-    """This ordering was fastest on average; it is empty where nothing was sampled."""
+    """Ordering that was fastest on average; empty where nothing was sampled."""
     optimize: float
-    """This is the mean time of `optimize` (s)."""
+    """Mean time of `optimize` (s)."""
     marginal: float
-    """This is the mean time of `marginal` (s)."""
+    """Mean time of `marginal` (s)."""
     samples: int
-    """GTSAM was timed on this many windows."""
+    """Number of windows on which GTSAM was timed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Holds what one run gave."""
+    """What one run gave."""
 
     cycles: tuple[CycleRecord, ...]
-    """These are the mapper's cycles."""
+    """Cycles of the mapper."""
     laps: int
-    """The run has this many complete laps."""
+    """Number of complete laps."""
     closing: int | None
-    """This cycle closed the loop; it is None where the loop stayed open."""
+    """Cycle that closed the loop; None where the loop stayed open."""
     gtsam: Gtsam
-    """These are GTSAM's times."""
+    """Times of GTSAM."""
     rival: tuple[float, ...]
-    """Each update of the landmark graph took this time (s)."""
+    """Time of each update of the landmark graph (s)."""
     swap: int | None = None
-    """This cycle replaced the map by one that was solved as a batch; it is None where none did."""
+    """Cycle that replaced the map by one that was solved as a batch; None where none did."""
     solve: float = float("nan")
-    """That batch took this time (s) in its own process."""
+    """Time of that batch in its own process (s)."""
     ahead: tuple[float, ...] = ()
-    """Each look at the track ahead took this time (s), after each cycle."""
+    """Time of each look at the track ahead (s), after each cycle."""
 
 
 class _Sampler:
-    """Times GTSAM and the landmark graph between cycles, and notes the cycle that closes the loop."""
+    """Time GTSAM and the landmark graph between cycles, and notes the cycle that closes the loop."""
 
     def __init__(self, mapper: FixedLagMapper, log: Log, every: int, advance: Callable[[], None]) -> None:
         self._mapper, self._every, self._advance = mapper, every, advance
@@ -136,12 +132,12 @@ class _Sampler:
         self._advance()
 
     def _solves(self, cycle: ObservedCycle) -> bool:
-        """Returns whether a batch of the lap may be under way, which is always shorter than the lag."""
+        """Return whether a batch of the lap may be under way, which is always shorter than the lag."""
         since = np.inf if self.closing is None else cycle.result.t - self.closing.result.t
         return self.swap is None and since < self._mapper.settings.lag
 
     def fastest(self) -> Gtsam:
-        """Returns GTSAM's times in the ordering with the least mean."""
+        """Return GTSAM's times in the ordering with the least mean."""
         if not self._timings:
             return Gtsam("", float("nan"), float("nan"), 0)
         best = min(self._timings, key=lambda name: float(np.mean(np.sum(self._timings[name], axis=1))))
@@ -150,7 +146,7 @@ class _Sampler:
 
 
 def measure(log: Log, settings: MapperSettings, every: int = SAMPLE_EVERY) -> Measurement:
-    """Maps a log online, and times GTSAM on the window after every `every`-th cycle."""
+    """Map a log online, and time GTSAM on the window after every `every`-th cycle."""
     mapper = FixedLagMapper(settings, log.odometry_sigma)
     with progress("benchmark", len(log.cycles)) as advance:
         sampler = _Sampler(mapper, log, every, advance)
@@ -169,71 +165,72 @@ def measure(log: Log, settings: MapperSettings, every: int = SAMPLE_EVERY) -> Me
 
 
 def metrics(measurement: Measurement) -> tuple[Metric, ...]:
-    """Returns every figure; those with a bound come first."""
+    """Return every figure; those with a bound come first."""
+    return tuple(
+        Metric(key, value, unit, bound=BOUNDS.get(key), tolerance=TOLERANCES.get(key))
+        for key, value, unit in _figures(measurement)
+    )
+
+
+def _figures(measurement: Measurement) -> Iterator[tuple[str, float, str]]:
+    """Yield the key, the value and the unit of each figure."""
     cycles, best = measurement.cycles, measurement.gtsam
     times = np.array([record.seconds for record in cycles])
     mean, p99 = _mean(times[WARM_UP:]), float(np.quantile(times, 0.99))
     gtsam, rival = best.optimize + best.marginal, _mean(measurement.rival[WARM_UP:])
     laps = _lap_means(cycles, measurement.laps)
-    slowdown = laps[-1] / laps[REFERENCE_LAP - 1] if len(laps) > REFERENCE_LAP else float("nan")
     closing = float(times[measurement.closing]) if measurement.closing is not None else float("nan")
-    return (
-        Metric("mean_by_gtsam", mean / gtsam, "", bound=MEAN_RATIO, tolerance=MEAN_TOLERANCE),
-        Metric("mean_by_landmark", mean / rival, "", tolerance=MEAN_TOLERANCE),
-        Metric("p99", 1e3 * p99, "ms", bound=P99_MILLISECONDS),
-        Metric("last_lap_by_lap_2", slowdown, "", bound=LAP_RATIO, tolerance=LAP_TOLERANCE),
-        Metric("closing", 1e3 * closing, "ms", bound=CLOSING_MILLISECONDS),
-        *_swap_metrics(measurement, times),
-        *_ahead_metrics(measurement),
-        Metric("p99_by_mean", p99 / mean, "", tolerance=TAIL_TOLERANCE),
-        Metric("closing_by_mean", closing / mean, "", tolerance=TAIL_TOLERANCE),
-        Metric("mean", 1e3 * _mean(times), "ms"),
-        Metric("median", 1e3 * float(np.median(times)), "ms"),
-        Metric("slowest", 1e3 * float(times.max()), "ms"),
-        Metric("landmark", 1e3 * rival, "ms"),
-        Metric("gtsam", 1e3 * gtsam, "ms"),
-        Metric("gtsam_optimize", 1e3 * best.optimize, "ms"),
-        Metric("gtsam_marginal", 1e3 * best.marginal, "ms"),
-        *(Metric(f"mean_lap_{lap}", 1e3 * value, "ms") for lap, value in enumerate(laps, start=1)),
-        *(Metric(f"mean_{stage}", 1e3 * value, "ms") for stage, value in _stage_means(cycles).items()),
-    )
+    yield "mean_by_gtsam", mean / gtsam, ""
+    yield "mean_by_landmark", mean / rival, ""
+    yield "p99", 1e3 * p99, "ms"
+    yield "last_lap_by_lap_2", laps[-1] / laps[REFERENCE_LAP - 1] if len(laps) > REFERENCE_LAP else np.nan, ""
+    yield "closing", 1e3 * closing, "ms"
+    yield from _swap_figures(measurement, times)
+    yield from _ahead_figures(measurement)
+    yield "p99_by_mean", p99 / mean, ""
+    yield "closing_by_mean", closing / mean, ""
+    milliseconds = {
+        "mean": _mean(times),
+        "median": float(np.median(times)),
+        "slowest": float(times.max()),
+        "landmark": rival,
+        "gtsam": gtsam,
+        "gtsam_optimize": best.optimize,
+        "gtsam_marginal": best.marginal,
+        **{f"mean_lap_{lap}": value for lap, value in enumerate(laps, start=1)},
+        **{f"mean_{stage.stage}": stage.mean for stage in stage_times(cycles)[1:]},
+    }
+    yield from ((key, 1e3 * seconds, "ms") for key, seconds in milliseconds.items())
 
 
-def _swap_metrics(measurement: Measurement, times: Array) -> Iterator[Metric]:
-    """Yields what it takes to replace the map, where it was replaced."""
+def _swap_figures(measurement: Measurement, times: Array) -> Iterator[tuple[str, float, str]]:
+    """Yield what it takes to replace the map, where it was replaced."""
     closing, swap = measurement.closing, measurement.swap
     if closing is None or swap is None:
         return
     meanwhile = times[closing + 1 : swap]
     before = times[max(closing - len(meanwhile), 0) : closing]
-    ratio = _mean(meanwhile) / _mean(before)
-    yield Metric("meanwhile_by_before", ratio, "", bound=MEANWHILE_RATIO, tolerance=TAIL_TOLERANCE)
-    yield Metric("solve", measurement.solve, "s", bound=SOLVE_SECONDS)
-    yield Metric("swap", 1e3 * float(times[swap]), "ms", bound=SWAP_MILLISECONDS)
-    yield Metric("meanwhile_by_after", _mean(meanwhile) / _mean(times[swap + 1 :][: len(meanwhile)]), "")
+    yield "meanwhile_by_before", _mean(meanwhile) / _mean(before), ""
+    yield "solve", measurement.solve, "s"
+    yield "swap", 1e3 * float(times[swap]), "ms"
+    yield "meanwhile_by_after", _mean(meanwhile) / _mean(times[swap + 1 :][: len(meanwhile)]), ""
 
 
-def _ahead_metrics(measurement: Measurement) -> Iterator[Metric]:
-    """Yields the median time of a look ahead, on the open map and on the closed one."""
+def _ahead_figures(measurement: Measurement) -> Iterator[tuple[str, float, str]]:
+    """Yield the median time of a look ahead, on the open map and on the closed one."""
     closed = np.array([record.closed for record in measurement.cycles[: len(measurement.ahead)]], bool)
     times = 1e3 * np.array(measurement.ahead)
     for name, own in (("ahead_open", times[~closed][WARM_UP:]), ("ahead_closed", times[closed])):
         if len(own):
-            yield Metric(name, float(np.median(own)), "ms", bound=AHEAD_MILLISECONDS)
+            yield name, float(np.median(own)), "ms"
 
 
 def _lap_means(cycles: Sequence[CycleRecord], laps: int) -> list[float]:
-    """Returns the mean time (s) of a cycle in each complete lap."""
+    """Return the mean time (s) of a cycle in each complete lap."""
     return [_mean([c.seconds for c in cycles if c.lap == lap]) for lap in range(1, laps + 1)]
 
 
-def _stage_means(cycles: Sequence[CycleRecord]) -> dict[str, float]:
-    """Returns the mean time (s) of each stage of the update."""
-    names = dict.fromkeys(name for record in cycles for name in record.stages)
-    return {name: _mean([record.stages.get(name, 0.0) for record in cycles]) for name in names}
-
-
 def _mean(values: Iterable[float]) -> float:
-    """Returns the mean, or NaN where there are no values."""
+    """Return the mean, or NaN where there are no values."""
     array = np.asarray(list(values))
     return float(array.mean()) if len(array) else float("nan")

@@ -12,11 +12,9 @@ from matplotlib.figure import Figure
 
 from pathspace_graph.io.files import atomic_folder
 
-from .expansion import expansion, plot_expansion
-from .files import save_figures
-from .fit import fit, plot_fit
-from .simplification import plot_simplification, simplification
-from .uncertainty import plot_uncertainty, uncertainty
+from .curves import plot_simplification, plot_uncertainty, simplification, uncertainty
+from .style import save_figures
+from .updates import expansion, fit, plot_expansion, plot_fit
 
 MARKER: Final = "captions.md"
 """A folder of these figures is known by this file."""

@@ -19,16 +19,25 @@ from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, RIGHT
 
-from .marks import (
+from .style import (
+    BLUE,
+    DARK,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    RED,
     SIGMAS,
+    WIDTH,
     draw_band,
     draw_control_points,
     draw_curve,
     draw_ellipses,
     draw_points,
+    figure_context,
+    grouped_legend,
     point_blocks,
+    set_frame,
 )
-from .style import BLUE, DARK, GREEN, ORANGE, PURPLE, RED, WIDTH, figure_context, grouped_legend, set_frame
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,8 @@
-"""Whether a covariance is honest: NEES of the whole map, and the errors of the curves at the true cones."""
+"""Whether a covariance is honest: NEES of the map, errors at the true cones, and the turn about the start."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -15,12 +16,12 @@ from scipy.stats import chi2
 
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.factors.gauge import greville
-from pathspace_graph.factors.se2 import left_of
+from pathspace_graph.factors.se2 import left_of, rotation
 from pathspace_graph.io.log import Truth
-from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
+from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
+from pathspace_graph.labels import BOUNDARIES
 
-from .curves import true_curve
-from .table1 import MISSED_DISTANCE, closest_points
+from .accuracy import MISSED_DISTANCE, closest_points, true_curve
 
 Array = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ LEVEL: Final = 0.95
 
 @dataclass(frozen=True, slots=True)
 class NormalizedError:
-    """Holds a normalized error squared `e' P^-1 e`, where P is the covariance that an estimator claims.
+    """Normalized error squared `e' P^-1 e`, where P is the covariance that an estimator claims.
 
     It is chi-squared distributed with `dof` degrees of freedom where P is honest (Bar-Shalom, Li and
     Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4).
@@ -46,12 +47,12 @@ class NormalizedError:
 
     @property
     def ratio(self) -> float:
-        """Returns the value per degree of freedom: 1 is honest, more overconfident, less too cautious."""
+        """Return the value per degree of freedom: 1 is honest, more overconfident, less too cautious."""
         return self.value / self.dof if self.dof else float("nan")
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Returns the two-sided 95 % interval of `ratio` for an honest covariance."""
+        """Return the two-sided 95 % interval of `ratio` for an honest covariance."""
         if not self.dof:
             return float("nan"), float("nan")
         low, high = chi2.interval(LEVEL, self.dof)
@@ -59,13 +60,13 @@ class NormalizedError:
 
     @property
     def honest(self) -> bool:
-        """Returns whether `ratio` lies in its interval."""
+        """Return whether `ratio` lies in its interval."""
         low, high = self.interval
         return low <= self.ratio <= high
 
 
 def _squared(error: Array, covariance: Array) -> float:
-    """Returns e' P^-1 e, or NaN where P isn't positive definite."""
+    """Return e' P^-1 e, or NaN where P isn't positive definite."""
     if len(error) == 0:
         return 0.0
     try:
@@ -78,7 +79,7 @@ def _squared(error: Array, covariance: Array) -> float:
 
 
 def map_nees(track: Map, truth: Truth) -> NormalizedError:
-    """Returns the normalized estimation error squared (NEES) of a map, by the covariance that it holds.
+    """Return the normalized estimation error squared (NEES) of a map, by the covariance that it holds.
 
     The error of a curve is its signed distance to the true curve, at as many places as the curve has degrees
     of freedom across itself. The error of landmarks is their offset in the plane. The state of the estimator
@@ -99,7 +100,7 @@ def map_nees(track: Map, truth: Truth) -> NormalizedError:
 
 
 def curve_errors(boundary: SplineBoundary, curve_true: Array) -> tuple[Array, Array]:
-    """Returns e_j = n_j . (q_j - S(u_j)), (k,) in m, and its covariance N B Sigma B' N', (k, k) in m^2.
+    """Return e_j = n_j . (q_j - S(u_j)), (k,) in m, and its covariance N B Sigma B' N', (k, k) in m^2.
 
     There is one row for each control point, at its Greville abscissa u_j. So there are as many rows as the
     curve has degrees of freedom across itself, and the covariance is regular. Abscissae beyond the ends of an
@@ -120,7 +121,7 @@ def curve_errors(boundary: SplineBoundary, curve_true: Array) -> tuple[Array, Ar
 
 
 def landmark_errors(boundary: PointBoundary, cones: Array) -> tuple[Array, Array]:
-    """Returns cone - landmark, (2 k,) in m over x0, y0, x1, ..., and its covariance (2 k, 2 k) in m^2.
+    """Return cone - landmark, (2 k,) in m over x0, y0, x1, ..., and its covariance (2 k, 2 k) in m^2.
 
     Landmarks and cones (n, 2) are paired one to one with the smallest total distance. A pair more than 3 m
     apart is left out: it is a missed cone and a ghost, not an error.
@@ -139,7 +140,7 @@ def landmark_errors(boundary: PointBoundary, cones: Array) -> tuple[Array, Array
 
 @dataclass(frozen=True, eq=False)
 class NormalErrors:
-    """Holds the errors of a map's curves at the true cones, and the standard deviations that they claim."""
+    """Errors of a map's curves at the true cones, and the standard deviations that they claim."""
 
     errors: Array
     """Each entry (k,) is the signed distance (m) of a true cone along the normal at its foot point, left
@@ -149,13 +150,13 @@ class NormalErrors:
     """Each entry (k,) is the standard deviation (m) of the curve along that normal."""
 
     def share_inside(self, factor: float = 2.0) -> float:
-        """Returns the share of the cones with |error| <= factor * sigma; NaN without cones."""
+        """Return the share of the cones with |error| <= factor * sigma; NaN without cones."""
         if len(self.errors) == 0:
             return float("nan")
         return float(np.mean(np.abs(self.errors) <= factor * self.sigmas))
 
     def mean_squared(self) -> float:
-        """Returns mean (error / sigma)^2, which is 1 where the band is honest; NaN without cones.
+        """Return mean (error / sigma)^2, which is 1 where the band is honest; NaN without cones.
 
         Every cone is judged alone. In contrast to NEES, correlations between the cones don't count.
         """
@@ -165,7 +166,7 @@ class NormalErrors:
 
 
 def normal_errors(track: Map, truth: Truth) -> NormalErrors:
-    """Returns e = n . (cone - S(u)), sigma^2 = n' B Sigma B' n at the foot point u of each true cone.
+    """Return e = n . (cone - S(u)), sigma^2 = n' B Sigma B' n at the foot point u of each true cone.
 
     Only boundaries that are splines count. Missed cones count, too, as the large errors that they are.
     """
@@ -180,7 +181,7 @@ def normal_errors(track: Map, truth: Truth) -> NormalErrors:
 
 
 def joint_cone_error(result: BatchResult, truth: Truth) -> NormalizedError:
-    """Returns e' (B Sigma B' + diag(s^2))^-1 e, the errors of both curves at all true cones at once.
+    """Return e' (B Sigma B' + diag(s^2))^-1 e, the errors of both curves at all true cones at once.
 
     In contrast to the NEES of the map, Sigma is the joint covariance of both boundaries from the detections,
     and s is the scatter of the cones about a smooth curve, at each cone, larger where a cone was never
@@ -204,7 +205,7 @@ def joint_cone_error(result: BatchResult, truth: Truth) -> NormalizedError:
 
 
 def with_marginals(track: Map) -> Map:
-    """Returns the splines of a map with their control points' own covariances and no cross terms.
+    """Return the splines of a map with their control points' own covariances and no cross terms.
 
     It is the squared basis of the paper: `B blockdiag(Sigma) B' = sum_j beta_j(u)^2 Sigma_jj` (section State
     Uncertainty).
@@ -218,3 +219,100 @@ def with_marginals(track: Map) -> Map:
         if isinstance(boundary, SplineBoundary)
     }
     return Map(track.closed, boundaries)
+
+
+MOST_ROUNDS: Final = 50
+"""The points are paired with the map at most this often."""
+TOLERANCE: Final = 1e-9
+"""The turn is found where a round changes it by less than this (rad)."""
+
+
+@dataclass(frozen=True)
+class Turn:
+    """How far a map is turned about the start."""
+
+    angle: float
+    """The map is turned to the left by this angle (rad); it is NaN where nothing of it can be compared."""
+    sigma: float
+    """The map's joint covariance claims this standard deviation (rad) of it; it is NaN where the map has
+    none."""
+
+    @property
+    def nees(self) -> float:
+        """Return the squared angle by its claimed variance; its mean is 1 where the covariance is honest."""
+        return (self.angle / self.sigma) ** 2 if self.sigma > 0.0 else float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Offsets of points from a map along the map's normals, and what they depend on."""
+
+    error: Array
+    """Offsets n . (p - S) (r,) in m."""
+    lever: Array
+    """Derivatives n . J p (r,) in m/rad of the offsets by the angle of the points."""
+    gradient: Array
+    """Derivative (2m,) of `sum lever n . S` by the points of the map's boundaries."""
+
+
+def turn_from_truth(track: Map, truth: Truth) -> Turn:
+    """Return the turn of a map from the true cones."""
+    return turn(track, {label: truth.cones[truth.cone_labels == label] for label in BOUNDARIES})
+
+
+def turn(track: Map, points: Mapping[int, Array]) -> Turn:
+    """Return the angle a that minimizes `sum (n . (R(a) p - S))^2` over points (k, 2) by their label.
+
+    S is the foot point of R(a) p on the map's own boundary, found anew in every round, and n is the normal
+    there; a landmark has both axes for normals. Points farther than 3 m from the map, and those beyond the
+    ends of an open curve, don't count. The angle is linear in the map's points near the solution, so their
+    joint covariance gives its variance.
+    """
+    angle, rows = 0.0, _rows(track, points, 0.0)
+    for _ in range(MOST_ROUNDS):
+        moment = float(rows.lever @ rows.lever)
+        if moment == 0.0:
+            return Turn(float("nan"), float("nan"))
+        change = -float(rows.lever @ rows.error) / moment
+        angle += change
+        rows = _rows(track, points, angle)
+        if abs(change) < TOLERANCE:
+            break
+    return Turn(angle, _sigma(rows, track.joint_covariance))
+
+
+def _sigma(rows: _Rows, joint_covariance: Array | None) -> float:
+    """Return the standard deviation of `sum lever n . S / sum lever^2`."""
+    if joint_covariance is None:
+        return float("nan")
+    variance = float(rows.gradient @ joint_covariance @ rows.gradient)
+    return float(np.sqrt(variance)) / float(rows.lever @ rows.lever)
+
+
+def _rows(track: Map, points: Mapping[int, Array], angle: float) -> _Rows:
+    """Return the rows of all boundaries, with the points turned by an angle (rad)."""
+    error, lever, gradient = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
+    for label, boundary in sorted(track.boundaries.items()):
+        turned = points.get(label, np.zeros((0, 2))) @ rotation(angle).T
+        if len(turned) == 0 or boundary.size == 0:
+            gradient.append(np.zeros(2 * boundary.size))
+            continue
+        point, normal, position, basis = near_pairs(boundary, turned)
+        error.append(np.einsum("rd,rd->r", normal, point - position))
+        lever.append(normal[:, 1] * point[:, 0] - normal[:, 0] * point[:, 1])
+        gradient.append((basis.T @ (lever[-1][:, None] * normal)).ravel())
+    return _Rows(*(np.concatenate(parts) for parts in (error, lever, gradient)))
+
+
+def near_pairs(boundary: MapBoundary, points: Array) -> tuple[Array, Array, Array, Array]:
+    """Return points (r, 2) near a boundary, and there its normal, its position (r, 2) and basis (r, m)."""
+    if isinstance(boundary, SplineBoundary):
+        feet = boundary.spline.foot_points(points)
+        near = feet.interior & (np.abs(feet.distance) <= MISSED_DISTANCE)
+        basis = boundary.spline.basis_matrix(feet.u[near])
+        return points[near], feet.normal_unit[near], feet.position[near], basis
+    distance, nearest = KDTree(boundary.points).query(points)
+    paired = np.flatnonzero(distance <= MISSED_DISTANCE)
+    both = np.repeat(np.asarray(nearest, np.intp)[paired], 2)
+    axes = np.tile(np.eye(2), (len(paired), 1))
+    return np.repeat(points[paired], 2, axis=0), axes, boundary.points[both], np.eye(boundary.size)[both]

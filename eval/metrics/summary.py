@@ -25,8 +25,8 @@ from pathspace_graph.plausibility.diagnosis import diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.scale.scene import scale_of
 
+from .accuracy import LapMetrics, lap_metrics, root_mean_square
 from .consistency import normal_errors
-from .table1 import LapMetrics, lap_metrics, root_mean_square
 from .trajectory import ate, trajectory_errors
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ LIBRARIES: Final = ("pathspace-graph", "gtsam", "numpy", "scipy")
 
 
 def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
-    """Returns the estimator, settings, versions, laps and timing, and with truth the paper's metrics.
+    """Return the estimator, settings, versions, laps and timing, and with truth the paper's metrics.
 
     What was said of the log before it was mapped is in it, too, where anything was.
     """
@@ -81,12 +81,12 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
 
 
 def vehicle_of(result: RunResult) -> VehicleState | None:
-    """Returns the vehicle's state at the end of the log, where the estimator gives it."""
+    """Return the vehicle's state at the end of the log, where the estimator gives it."""
     return result.vehicle_state if isinstance(result, BatchResult) else result.vehicle
 
 
 def _vehicle(state: VehicleState) -> dict[str, Any]:
-    """Returns the calibrations with their standard deviations, and that of the last heading (rad).
+    """Return the calibrations with their standard deviations, and that of the last heading (rad).
 
     Those of the odometry are in (-, rad/s), those of the sensor in the units of `factors.sensor:SENSOR`.
     """
@@ -97,7 +97,7 @@ def _vehicle(state: VehicleState) -> dict[str, Any]:
 
 
 def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
-    """Returns where the noise comes from, what the log states of it, and what was measured."""
+    """Return where the noise comes from, what the log states of it, and what was measured."""
     stated: dict[str, Any] = {}
     if log.odometry_stated:
         stated["odometry"] = log.odometry_sigma.tolist()
@@ -132,7 +132,7 @@ def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
 
 
 def _events(result: RunResult) -> list[dict[str, Any]]:
-    """Returns the cycles in which the map was replaced, with the jump of the pose, or that have a notice."""
+    """Return the cycles in which the map was replaced, with the jump of the pose, or that have a notice."""
     return [
         {"cycle": record.cycle, "t": record.t, "jump": record.jump, "notice": record.notice}
         for record in result.cycles
@@ -141,35 +141,35 @@ def _events(result: RunResult) -> list[dict[str, Any]]:
 
 
 def _health(result: RunResult) -> dict[str, Any]:
-    """Returns the number of cycles of each condition, and the stretches (s) that were not good."""
+    """Return the number of cycles of each condition, and the stretches (s) that were not good."""
     not_good = [asdict(stretch) for stretch in stretches_of(result)]
     return {**counts([health_of(record) for record in result.cycles]), "stretches": not_good}
 
 
 def stretches_of(result: RunResult) -> list[Stretch]:
-    """Returns the stretches of a run that were not good."""
+    """Return the stretches of a run that were not good."""
     return stretches([r.t for r in result.cycles], [health_of(r) for r in result.cycles])
 
 
 def health_of(record: CycleRecord) -> Health:
-    """Returns the health that a cycle's record holds."""
+    """Return the health that a cycle's record holds."""
     return Health(record.health, record.reason)
 
 
 def versions() -> dict[str, str]:
-    """Returns the versions of Python and the libraries that a result depends on."""
+    """Return the versions of Python and the libraries that a result depends on."""
     return {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}}
 
 
 def lap_times(log: Log) -> Array:
-    """Returns the stamps (s) at which true laps end; without a true path there are none."""
+    """Return the stamps (s) at which true laps end; without a true path there are none."""
     if log.truth is None or len(log.truth.poses) == 0:
         return np.zeros(0)
     return log.truth.pose_t[lap_end_indices(scaled(log.truth, 1.0 / scale_of(log)).poses)]
 
 
 def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
-    """Returns the paper's table: a row at the end of each true lap, or that of the end where there is none.
+    """Return the paper's table: a row at the end of each true lap, or that of the end where there is none.
 
     Without a true path the laps are the estimated ones, without true cones there is no row. The snapshots of
     `result` are those at `lap_times`. A batch has one map for all laps, and so one row.
@@ -184,13 +184,13 @@ def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
 
 
 def _metrics(track: Map, truth: Truth, lap: int, scale: float) -> LapMetrics:
-    """Returns the metrics of a map where a cone more than 3 m times the scale away is missed."""
+    """Return the metrics of a map where a cone more than 3 m times the scale away is missed."""
     found = lap_metrics(scaled(track, 1.0 / scale), scaled(truth, 1.0 / scale), lap)
     return replace(found, rmse=found.rmse * scale)
 
 
 def not_mapped(track: Map, log: Log) -> list[str]:
-    """Returns a line for each boundary that the map lacks, with the reason."""
+    """Return a line for each boundary that the map lacks, with the reason."""
     labels = np.concatenate([np.zeros(0, dtype=int), *(cycle.labels for cycle in log.cycles)])
     lines = []
     for label in BOUNDARIES:
@@ -202,7 +202,7 @@ def not_mapped(track: Map, log: Log) -> list[str]:
 
 
 def has_cones(truth: Truth) -> bool:
-    """Returns whether any true cone belongs to a boundary."""
+    """Return whether any true cone belongs to a boundary."""
     return bool(np.isin(truth.cone_labels, BOUNDARIES).any())
 
 
@@ -218,7 +218,7 @@ def _timing(result: RunResult) -> dict[str, float] | None:
 
 
 def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:
-    """Returns `laps`, and as `final` the same of the map at the end of the log."""
+    """Return `laps`, and as `final` the same of the map at the end of the log."""
     if not has_cones(truth):
         return {}
     final = asdict(_metrics(result.map, truth, result.laps, result.scale))
@@ -233,7 +233,7 @@ def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:
 
 
 def _trajectory_errors(result: RunResult, truth: Truth) -> dict[str, float]:
-    """Returns `ate`, and the root mean square error along (m), across (m) and in heading (rad)."""
+    """Return `ate`, and the root mean square error along (m), across (m) and in heading (rad)."""
     if len(truth.poses) == 0 or len(result.trajectory) == 0:
         return {}
     errors = trajectory_errors(result.trajectory_t, result.trajectory, truth)

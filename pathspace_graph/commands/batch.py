@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT_BATCH, MapKind, check_batch, for_map, make_batch
-from pathspace_graph.eval.metrics.gap import gap
+from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.eval.metrics.summary import summarize
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import Log

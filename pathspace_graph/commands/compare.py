@@ -9,11 +9,17 @@ from typing import Annotated, Final
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from pathspace_graph.eval.compare.comparison import Comparison, choose, choose_reference, compare, read_logs
-from pathspace_graph.eval.compare.differences import with_gaps
-from pathspace_graph.eval.compare.output import MARKER, tables, write_comparison
-from pathspace_graph.eval.harness.workers import check_jobs
-from pathspace_graph.eval.metrics.ghosts import GhostSettings
+from pathspace_graph.eval.experiment.compare import (
+    Comparison,
+    choose,
+    choose_reference,
+    compare,
+    read_logs,
+    tables,
+)
+from pathspace_graph.eval.experiment.output import MARKER, write_comparison
+from pathspace_graph.eval.experiment.workers import check_jobs
+from pathspace_graph.eval.metrics.accuracy import GhostSettings
 from pathspace_graph.io.files import check_target
 from pathspace_graph.progress import progress
 from pathspace_graph.settings.mapper import MapperSettings
@@ -72,7 +78,6 @@ class Compare:
                 on_run=advance,
             )
         with progress("writing"):
-            comparison = with_gaps(comparison)
             write_comparison(self.out, comparison, self.settings, self.jobs)
         self._report(comparison)
 
@@ -86,10 +91,9 @@ class Compare:
                 console.print(part.rich())
         console.print(f"written to {self.out}", highlight=False, soft_wrap=True, markup=False)
         say = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
-        for outcome in comparison.outcomes:
-            if outcome.unsettled:
-                say.print(f"{outcome.estimator} on {outcome.log}: not converged")
-        for outcome in comparison.failures:
-            say.print(f"{outcome.estimator} on {outcome.log}: failed, {outcome.failure}")
+        told = [(outcome.names, "not converged") for outcome in comparison.unsettled]
+        told += [(outcome.names, f"failed, {outcome.failure}") for outcome in comparison.failures]
+        for names, what in told:
+            say.print(f"{names['estimator']} on {names['log']}: {what}")
         if comparison.failures:
             raise SystemExit(FAILED)

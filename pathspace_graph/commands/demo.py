@@ -11,10 +11,10 @@ from joblib import Parallel, delayed, parallel_config
 from rich.console import Console
 
 from pathspace_graph.estimators import DEFAULT, make_online
-from pathspace_graph.eval.compare.table import side_by_side
-from pathspace_graph.eval.figures.files import save_plot
+from pathspace_graph.eval.experiment.cells import run_estimator
+from pathspace_graph.eval.experiment.compare import side_by_side
 from pathspace_graph.eval.figures.map_plot import plot_map
-from pathspace_graph.eval.harness.attempts import run_estimator
+from pathspace_graph.eval.figures.style import save_plot
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.io.files import atomic_folder, check_target
 from pathspace_graph.io.log import Log, write_log

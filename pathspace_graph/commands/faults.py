@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from pathspace_graph.estimators import DEFAULT
-from pathspace_graph.eval.faults.output import write_suite
-from pathspace_graph.eval.faults.suite import only, strongest, suite
+from pathspace_graph.eval.experiment.faults import only, strongest, suite
+from pathspace_graph.eval.experiment.output import write_suite
 
 from .studies import StudyCommand
 

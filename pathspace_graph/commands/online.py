@@ -14,6 +14,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT, MapKind, check_online, for_map, make_online
+from pathspace_graph.eval.metrics.accuracy import LapMetrics
 from pathspace_graph.eval.metrics.summary import (
     health_of,
     lap_times,
@@ -23,7 +24,6 @@ from pathspace_graph.eval.metrics.summary import (
     summarize,
     vehicle_of,
 )
-from pathspace_graph.eval.metrics.table1 import LapMetrics
 from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import Log

@@ -9,8 +9,8 @@ import numpy as np
 from tyro.conf import Positional
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.figures.files import check_plot_file, save_plot
 from pathspace_graph.eval.figures.map_plot import plot_map
+from pathspace_graph.eval.figures.style import check_plot_file, save_plot
 from pathspace_graph.io.files import check_file_target
 from pathspace_graph.io.log import read_log
 from pathspace_graph.io.map import read_map

@@ -11,10 +11,9 @@ from tyro.conf import arg
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import ONLINE, check_online
-from pathspace_graph.eval.scaling.output import MARKER, scaling_table, stops, write_scaling
-from pathspace_graph.eval.scaling.roads import make_drives
-from pathspace_graph.eval.scaling.scaling import measure_scaling
-from pathspace_graph.eval.scaling.settings import QUICK, ScalingSettings
+from pathspace_graph.eval.benchmark.roads import QUICK, ScalingSettings, make_drives
+from pathspace_graph.eval.benchmark.scaling import measure_scaling
+from pathspace_graph.eval.benchmark.scaling_output import MARKER, scaling_table, stops, write_scaling
 from pathspace_graph.io.files import check_target
 from pathspace_graph.progress import progress
 from pathspace_graph.settings.mapper import MapperSettings

@@ -11,9 +11,9 @@ import pandas as pd
 from rich.console import Console
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.harness.workers import check_jobs
-from pathspace_graph.eval.study.run import make_plan, run_plan
-from pathspace_graph.eval.study.study import Study
+from pathspace_graph.eval.experiment.run import make_plan, run_plan
+from pathspace_graph.eval.experiment.study import Study
+from pathspace_graph.eval.experiment.workers import check_jobs
 from pathspace_graph.io.files import write_manifest
 from pathspace_graph.progress import progress
 

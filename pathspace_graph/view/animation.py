@@ -25,10 +25,19 @@ from pathspace_graph.eval.figures.map_plot import (
     draw_trajectory,
     draw_unhealthy,
 )
-from pathspace_graph.eval.figures.marks import SIGMAS, draw_points
-from pathspace_graph.eval.figures.style import DARK, GREY, LIGHT, PALETTE, RED, figure_context, set_frame
+from pathspace_graph.eval.figures.style import (
+    DARK,
+    GREY,
+    LIGHT,
+    PALETTE,
+    RED,
+    SIGMAS,
+    draw_points,
+    figure_context,
+    set_frame,
+)
+from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.eval.metrics.summary import has_cones, lap_times
-from pathspace_graph.eval.metrics.table1 import lap_metrics
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, PointBoundary

@@ -9,8 +9,18 @@ from matplotlib.colors import to_hex, to_rgb
 from numpy.typing import NDArray
 
 from pathspace_graph.eval.figures.map_plot import BOUNDARY_COLORS, HEALTH_COLORS, TRAJECTORY_COLOR
-from pathspace_graph.eval.figures.marks import curve_parameters, ellipse_outlines, uncertainty_band
-from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, LIGHT, ORANGE, RED
+from pathspace_graph.eval.figures.style import (
+    BLUE,
+    DARK,
+    GREEN,
+    GREY,
+    LIGHT,
+    ORANGE,
+    RED,
+    curve_parameters,
+    ellipse_outlines,
+    uncertainty_band,
+)
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import CONDITIONS, LOST, Health
 from pathspace_graph.io.log import Truth

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import replace
 from functools import cache
 from typing import Literal
 
@@ -21,10 +20,10 @@ from pathspace_graph.batch.lap import (
     solve_lap,
 )
 from pathspace_graph.batch.mapper import BatchMapper
-from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
 from pathspace_graph.batch.optimizer import Effort
+from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
 from pathspace_graph.batch.system import BatchSystem, Evaluation
-from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.graph.elimination import eliminated_system, linear_graph
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor

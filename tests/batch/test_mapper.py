@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.cli import main
 from pathspace_graph.commands.batch import NOT_CONVERGED
-from pathspace_graph.eval.metrics.gap import gap
-from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.eval.metrics.accuracy import lap_metrics
+from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.graph.keys import CALIBRATION_KEY
 from pathspace_graph.io.log import Log, write_log
 from pathspace_graph.io.map import SplineBoundary, read_map

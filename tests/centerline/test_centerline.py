@@ -15,7 +15,7 @@ from pathspace_graph.centerline.graph import ribbon_keys, shape_factors
 from pathspace_graph.centerline.online import CenterlineMapper
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import for_map
-from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.graph.keys import pose_key
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.io.map import Map, SplineBoundary

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.ckf import expansion
-from pathspace_graph.ckf.mapper import REACH
 from pathspace_graph.ckf.expansion import Expansion, beyond_end, proximity_chain
+from pathspace_graph.ckf.mapper import REACH
 from pathspace_graph.ckf.state import CurveState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief

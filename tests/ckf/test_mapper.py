@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.ckf.mapper import CkfMapper
 from pathspace_graph.estimators import make_online
-from pathspace_graph.eval.metrics.table1 import cone_distances, lap_metrics
+from pathspace_graph.eval.metrics.accuracy import cone_distances, lap_metrics
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.ckf.update import classify, on_curve, update

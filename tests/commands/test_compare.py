@@ -32,7 +32,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures as PNG only."""
-    monkeypatch.setattr("pathspace_graph.eval.figures.files.SUFFIXES", (".png",))
+    monkeypatch.setattr("pathspace_graph.eval.figures.style.SUFFIXES", (".png",))
 
 
 def without_truth(folder: Path, out: Path) -> Path:

@@ -10,17 +10,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.cli import parse_command
-from pathspace_graph.eval.compare.comparison import Comparison, compare, read_logs
+from pathspace_graph.eval.benchmark.roads import ScalingSettings
+from pathspace_graph.eval.benchmark.scaling import CONES, LAPS, READINGS, Scaling, fit_slope
+from pathspace_graph.eval.experiment.cells import run_estimator
+from pathspace_graph.eval.experiment.compare import Comparison, compare, read_logs
+from pathspace_graph.eval.experiment.tables import TextTable
 from pathspace_graph.eval.figures.isolated import IsolatedFigure
-from pathspace_graph.eval.harness.attempts import run_estimator
-from pathspace_graph.eval.metrics.text_table import TextTable
-from pathspace_graph.eval.scaling.points import CONES, LAPS, READINGS, Point, Scaling, fit_slope
-from pathspace_graph.eval.scaling.settings import ScalingSettings
 from pathspace_graph.io.log import Log, read_log, write_log
 from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
 from pathspace_graph.io.results import RunResult, write_result
@@ -98,21 +99,21 @@ def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.Monkey
         "commands.compare.Compare._report": None,
         "commands.scale.make_drives": Roads(),
         "commands.scale.measure_scaling": scaling(),
-        "eval.compare.output.plot_maps": picture,
-        "eval.compare.output.tables": {"table": TextTable("", ("a",), (("1",),))},
-        "eval.scaling.output.plot_laps": picture,
-        "eval.scaling.output.plot_scaling": picture,
-        "eval.scaling.output._process_megabytes": 1.0,
+        "eval.experiment.output.plot_maps": picture,
+        "eval.experiment.output.tables": {"table": TextTable("", ("a",), (("1",),))},
+        "eval.benchmark.scaling_output.plot_laps": picture,
+        "eval.benchmark.scaling_output.plot_scaling": picture,
+        "eval.benchmark.scaling_output._process_megabytes": 1.0,
     }
     judged = recorded.log, []
     answers |= {f"commands.{command}.read_plausible_log": judged for command in ("online", "batch")}
     answers["commands.plot.read_log"] = recorded.log
     answers |= {f"{room}.summarize": {} for room in ("commands.demo", "commands.online", "commands.batch")}
-    answers |= {"eval.compare.output.summarize": {}, "commands.compare.with_gaps": comparison}
+    answers |= {"eval.experiment.output.summarize": {}}
     for name, answer in answers.items():
         monkeypatch.setattr(f"pathspace_graph.{name}", lambda *_, _answer=answer, **__: _answer)
     monkeypatch.setattr("pathspace_graph.eval.figures.isolated.FIGURES", figures)
-    monkeypatch.setattr("pathspace_graph.eval.figures.files.SUFFIXES", (".png",))
+    monkeypatch.setattr("pathspace_graph.eval.figures.style.SUFFIXES", (".png",))
 
 
 @dataclass(frozen=True)
@@ -121,8 +122,9 @@ class Roads:
 
 
 def scaling() -> Scaling:
-    points = tuple(Point(CONES, "rings", at, 0.002, 9, 50.0) for at in (100.0, 200.0, 300.0))
-    slopes = tuple(fit_slope(sweep, "rings", points) for sweep in (CONES, READINGS, LAPS))
+    points = pd.DataFrame({"at": [100.0, 200.0, 300.0], "seconds": 0.002, "cycles": 9, "size": 50.0})
+    points = points.assign(sweep=CONES, estimator="rings")
+    slopes = pd.DataFrame([fit_slope(sweep, "rings", points) for sweep in (CONES, READINGS, LAPS)])
     return Scaling(ScalingSettings(), {}, points, slopes, {"rings": 1.0})
 
 
@@ -218,11 +220,11 @@ estimators = ["rings"]
 def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     name: str, recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study, rows = "pathspace_graph.eval.study", [{"lap": 1, "rmse": 0.5}]
+    study, rows = "pathspace_graph.eval.experiment", [{"lap": 1, "rmse": 0.5}]
     monkeypatch.setattr(f"{study}.run.try_drive", lambda _: recorded.log)
     monkeypatch.setattr(f"{study}.cells.lap_rows", lambda *_, **__: rows)
     monkeypatch.setattr(f"{study}.output.figures", lambda *_: {"rmse": Figure()})
-    monkeypatch.setattr("pathspace_graph.eval.faults.output.plot_faults", lambda *_: Figure())
+    monkeypatch.setattr(f"{study}.output.plot_faults", lambda *_: Figure())
     track = write_round_track(tmp_path)
     (tmp_path / "small.toml").write_text(STUDY.format(track=track))
     folder = tmp_path / "folder"

@@ -28,7 +28,7 @@ TRACK_LENGTH = 2e3
 INSTRUMENTED = [
     "tomllib",
     "pathspace_graph.snapshot",
-    *(f"pathspace_graph.{room}" for room in ("io", "sim", "spline", "eval.study", "settings")),
+    *(f"pathspace_graph.{room}" for room in ("io", "sim", "spline", "eval.experiment", "settings")),
 ]
 """Branches of these modules guide the fuzzer."""
 

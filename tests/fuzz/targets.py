@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pathspace_graph.eval.study.file import read_study
+from pathspace_graph.eval.experiment.study import read_study
 from pathspace_graph.io.log import read_log
 from pathspace_graph.io.manifest import verify_all
 from pathspace_graph.io.map import read_map

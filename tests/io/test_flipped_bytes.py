@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError, PathspaceError
-from pathspace_graph.eval.harness.drives import Drive, NamedTrack
-from pathspace_graph.eval.study.cells import Cell, failed
-from pathspace_graph.eval.study.store import Store
+from pathspace_graph.eval.experiment.cells import Cell, Store, failed
+from pathspace_graph.eval.experiment.drives import Drive, NamedTrack
 from pathspace_graph.io.log import FILES, read_log, write_log
 from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
 from pathspace_graph.io.map import read_map

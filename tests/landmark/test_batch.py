@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from pathspace_graph.eval.metrics.limit import solve_oracle_landmarks
+from pathspace_graph.eval.metrics.reference import solve_oracle_landmarks
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.labels import BOUNDARIES

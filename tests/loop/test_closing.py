@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.table1 import cone_distances
+from pathspace_graph.eval.metrics.accuracy import cone_distances
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.gaussian import keys_of, normal_equations
 from pathspace_graph.graph.keys import control_keys

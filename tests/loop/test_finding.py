@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.factors.se2 import compose, inverse, move_points, to_vehicle
 from pathspace_graph.graph.gaussian import factorize, marginalize
 from pathspace_graph.graph.keys import pose_keys

@@ -13,7 +13,7 @@ from gtsam import GaussianFactorGraph
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
-from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.factors.se2 import relative
 from pathspace_graph.graph.gaussian import normal_equations
 from pathspace_graph.graph.keys import pose_keys

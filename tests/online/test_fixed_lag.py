@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import make_online
-from pathspace_graph.eval.metrics.table1 import cone_distances, lap_metrics
+from pathspace_graph.eval.metrics.accuracy import cone_distances, lap_metrics
 from pathspace_graph.eval.metrics.trajectory import ate
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth

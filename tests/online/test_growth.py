@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from pathspace_graph.eval.metrics.curves import mapped_points, true_curve
+from pathspace_graph.eval.metrics.accuracy import mapped_points, true_curve
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.candidates import Candidates, End

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.estimators import make_online
-from pathspace_graph.eval.metrics.table1 import lap_metrics
+from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import run_online

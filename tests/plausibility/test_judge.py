@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph import hints
-from pathspace_graph.eval.hints.good import GOOD, backs_up, in_unix_time, one_boundary, stands_first
-from pathspace_graph.eval.hints.measure import causes_of
+from pathspace_graph.eval.hints import GOOD, backs_up, causes_of, in_unix_time, one_boundary, stands_first
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.sim.mistakes import MISTAKES, in_frame, late, with_points, with_twists

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathspace_graph.eval.benchmark.measurement import Gtsam, Measurement
-from pathspace_graph.eval.scaling.settings import ScalingSettings
+from pathspace_graph.eval.benchmark.roads import ScalingSettings
 from pathspace_graph.io.results import CycleRecord
 
 SMALL = ScalingSettings(

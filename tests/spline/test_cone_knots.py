@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.table1 import closest_points
+from pathspace_graph.eval.metrics.accuracy import closest_points
 from pathspace_graph.settings.knots import FitSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.cone_knots import chosen_breaks, thin

@@ -11,16 +11,16 @@ import pytest
 from rich.console import Console
 
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.eval.benchmark.baseline import (
+from pathspace_graph.eval.benchmark.measurement import metrics
+from pathspace_graph.eval.benchmark.ratios import (
     BASELINE,
+    Metric,
     baseline_table,
     compare,
     ratios,
     read_baseline,
     write_baseline,
 )
-from pathspace_graph.eval.benchmark.measurement import metrics
-from pathspace_graph.eval.benchmark.metric import Metric
 
 from ...scenes.timing import steady_run
 
@@ -42,7 +42,7 @@ def test_worse_is_beyond_the_tolerance_in_the_bad_direction() -> None:
 def test_only_ratios_are_compared() -> None:
     figures = [ratio(2.5), Metric("time", 9.0, "ms", tolerance=0.1), Metric("b", 1.0, "")]
     assert [metric.key for metric in ratios(figures)] == ["a"]
-    found = {c.key: c for c in compare([*figures, ratio(1.0, "new")], {"a": 2.0, "gone": 1.0})}
+    found = {c.metric.key: c for c in compare([*figures, ratio(1.0, "new")], {"a": 2.0, "gone": 1.0})}
     assert {key: c.worse for key, c in found.items()} == {"a": True, "new": False, "gone": True}
     console = Console(width=100, file=io.StringIO(), record=True)
     console.print(baseline_table(list(found.values())))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pathspace_graph.eval.benchmark import benchmark
+from pathspace_graph.eval.benchmark import __main__ as benchmark
 from pathspace_graph.eval.benchmark.measurement import metrics
 
 from ...scenes.timing import steady_run

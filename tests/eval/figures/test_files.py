@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.figures.files import check_plot_file, save_figures, save_plot
+from pathspace_graph.eval.figures.style import check_plot_file, save_figures, save_plot
 
 
 def line(height: float = 1.0) -> Figure:

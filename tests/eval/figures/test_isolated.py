@@ -11,11 +11,9 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.ckf.expansion import beyond_end
 from pathspace_graph.cli import main
-from pathspace_graph.eval.figures.expansion import ExpansionScene, expansion, extend
-from pathspace_graph.eval.figures.fit import FitScene, fit
+from pathspace_graph.eval.figures.curves import BLIND, simplification, uncertainty
 from pathspace_graph.eval.figures.isolated import FIGURES, MARKER
-from pathspace_graph.eval.figures.simplification import simplification
-from pathspace_graph.eval.figures.uncertainty import UncertaintyScene, uncertainty
+from pathspace_graph.eval.figures.updates import RIDGE, SIGMA_DETECTION, expansion, extend, fit
 from pathspace_graph.io.manifest import MANIFEST_FILE
 from pathspace_graph.mapping.cubature import cubature_points, square_root
 from pathspace_graph.settings.comparison import CkfSettings
@@ -33,7 +31,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def test_the_joint_covariance_is_the_spread_of_splines_and_the_marginals_are_not() -> None:
-    data = uncertainty(np.random.default_rng(2), UncertaintyScene(samples=6000))
+    data = uncertainty(np.random.default_rng(2), 6000)
     np.testing.assert_allclose(data.joint, data.sampled, rtol=0.05)
     assert np.abs(data.marginals / data.sampled - 1.0).max() > 0.15
 
@@ -42,7 +40,7 @@ def test_the_curve_is_least_certain_where_nothing_was_seen() -> None:
     data = uncertainty(np.random.default_rng(0))
     share = data.length / data.length[-1]
     inner = (share > 0.1) & (share < 0.9)
-    low, high = UncertaintyScene().blind
+    low, high = BLIND
     assert low < share[inner][np.argmax(data.joint[inner])] < high
     assert data.joint[(share > low) & (share < high)].max() > 2.0 * np.median(data.joint)
 
@@ -80,13 +78,13 @@ def test_extension_leaves_the_curve_and_its_uncertainty_as_they_were() -> None:
     # of a point on the old curve the new last control point has no share but near the seam
     np.testing.assert_allclose(after[:30], before[:30], rtol=1e-9)
     last = data.extended.covariance[-2:, -2:]
-    np.testing.assert_allclose(last, ExpansionScene().sigma_detection ** 2 * np.eye(2))
+    np.testing.assert_allclose(last, SIGMA_DETECTION**2 * np.eye(2))
 
 
 def test_the_covariance_of_an_extension_is_that_of_extended_samples() -> None:
     data, rng = expansion(), np.random.default_rng(4)
-    detection, scene = data.detections[4], ExpansionScene()
-    extended = extend(data.before, detection, scene.sigma_detection**2 * np.eye(2))
+    detection = data.detections[4]
+    extended = extend(data.before, detection, SIGMA_DETECTION**2 * np.eye(2))
     drawn = rng.multivariate_normal(data.before.spline.control_points.ravel(), data.before.covariance, 4000)
     knots = extended.spline.knots
     lengthened = []
@@ -119,10 +117,10 @@ def test_the_update_draws_the_curve_to_the_detections_and_makes_it_surer() -> No
 
 def test_each_spline_is_the_ridge_regression_of_its_sigma_point() -> None:
     """The paper's solution, (B'B + L)^-1 (B'y + L C_mu), and mean and covariance of all of them."""
-    scene = FitScene()
-    data = fit(scene)
+
+    data = fit()
     m, n = data.basis.shape
-    L = scene.ridge * np.diag(1.0 - data.basis.sum(axis=0) / m)
+    L = RIDGE * np.diag(1.0 - data.basis.sum(axis=0) / m)
     known = data.curve.control_points
     for sigma_point, fitted in zip(data.sigma_points, data.fitted_points, strict=True):
         expected = np.linalg.solve(data.basis.T @ data.basis + L, data.basis.T @ sigma_point + L @ known)

@@ -8,7 +8,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 
-from pathspace_graph.eval.figures.marks import (
+from pathspace_graph.eval.figures.style import (
     curve_parameters,
     draw_band,
     draw_control_points,

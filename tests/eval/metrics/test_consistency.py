@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.batch.simplification import Scatter
+from pathspace_graph.eval.metrics.accuracy import true_curve
 from pathspace_graph.eval.metrics.consistency import (
     NormalizedError,
     curve_errors,
@@ -19,7 +20,6 @@ from pathspace_graph.eval.metrics.consistency import (
     normal_errors,
     with_marginals,
 )
-from pathspace_graph.eval.metrics.curves import true_curve
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.metrics.cost import WHOLE, covariance_bytes, map_bytes, stage_times
+from pathspace_graph.eval.metrics.measures import WHOLE, covariance_bytes, map_bytes, stage_times
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.labels import LEFT, RIGHT

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.curves import (
+from pathspace_graph.eval.metrics.accuracy import (
     centre_line_errors,
     crossings,
     curve_distance,

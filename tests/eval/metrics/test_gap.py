@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.gap import aligned_distance, from_batch, gap
+from pathspace_graph.eval.metrics.reference import aligned_distance, from_batch, gap
 from pathspace_graph.factors.bspline import clamped_knots
 from pathspace_graph.factors.gauge import greville
 from pathspace_graph.factors.se2 import move_points

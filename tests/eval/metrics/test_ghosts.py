@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.metrics.ghosts import GhostSettings, ghosts
+from pathspace_graph.eval.metrics.accuracy import GhostSettings, ghosts
 from pathspace_graph.io.map import Map
 from pathspace_graph.labels import LEFT, RIGHT
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.limit import (
+from pathspace_graph.eval.metrics.accuracy import root_mean_square
+from pathspace_graph.eval.metrics.reference import (
     Limit,
     fit_rmse,
     landmark_rmse,
@@ -17,7 +18,6 @@ from pathspace_graph.eval.metrics.limit import (
     with_true_noise,
     without_sensor_errors,
 )
-from pathspace_graph.eval.metrics.table1 import root_mean_square
 from pathspace_graph.eval.metrics.trajectory import ate
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth

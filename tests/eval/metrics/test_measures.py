@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.metrics.measures import METRICS, PAPER, Metric, closes_falsely, measure
+from pathspace_graph.eval.metrics.measures import closes_falsely, measure
+from pathspace_graph.eval.metrics.metric import METRICS, PAPER, Metric
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState

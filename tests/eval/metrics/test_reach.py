@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.reach import MOST, ReachObserver, cycle_reach, reach_values, true_road
+from pathspace_graph.eval.metrics.trajectory import MOST, ReachObserver, cycle_reach, reach_values, true_road
 from pathspace_graph.factors.se2 import compose, to_map
 from pathspace_graph.io.log import Detections, Odometry, Truth
 from pathspace_graph.io.map import Map, SplineBoundary

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.table1 import (
+from pathspace_graph.eval.metrics.accuracy import (
     boundary_distances,
     capped_rmse,
     cone_distances,

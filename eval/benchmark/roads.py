@@ -1,0 +1,223 @@
+"""Roads and drives to measure time by: ever more cones, ever more detections, and lap after lap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.metrics.summary import lap_times
+from pathspace_graph.io.log import Detections, Log
+from pathspace_graph.settings.checked import Positive
+from pathspace_graph.sim.geometry import along_polyline, arc_lengths, left_normals, unit
+from pathspace_graph.sim.sensor import SensorSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track import Track
+from pathspace_graph.sim.vehicle import VehicleSettings
+
+
+@dataclass(frozen=True)
+class RoadSettings(Positive):
+    """Roads and the drives on them."""
+
+    gap: float = 5.0
+    """Distance of the cones of a row (m)."""
+    dense_gap: float = 1.0
+    """The cones of a row are this far apart on the dense road, where detections are counted (m)."""
+    dense_range: float = 30.0
+    """The sensor has this range on the dense road (m)."""
+    width: float = 4.0
+    """The rows are this far apart (m)."""
+    swing: float = 0.9
+    """An open road turns by at most this angle from its general direction (rad)."""
+    wavelength: float = 300.0
+    """The swings of an open road are this far apart along it (m)."""
+    dent: float = 0.12
+    """A closed road leaves its circle by this share of the radius."""
+    dents: int = 3
+    """A closed road has this many dents."""
+    speed: float = 20.0
+    """The vehicle drives at this speed (m/s)."""
+    acceleration_lateral: float = 9.0
+    """The lateral acceleration in corners is at most this (m/s^2)."""
+
+
+@dataclass(frozen=True)
+class ScalingSettings(Positive):
+    """Describes what is measured of how time scales."""
+
+    cones_min: float = 50.0
+    """A point of the sweep over cones has at least this many cones seen."""
+    cones_max: float = 2000.0
+    """The sweep over cones ends when this many cones have been seen."""
+    bins: int = 16
+    """The sweep over cones has this many points, evenly spaced on a logarithmic axis."""
+    fit_from: float = 200.0
+    """The slope against cones is fitted from this number of cones on."""
+    readings: tuple[int, ...] = (2, 4, 8, 14, 20, 28, 40)
+    """Updates with each of these numbers of detections are timed."""
+    readings_cones: int = 300
+    """The dense road, where these updates are timed, has this many cones."""
+    warm_up: int = 30
+    """This many cycles at the beginning of the dense road are not counted."""
+    laps: int = 20
+    """The closed road is driven for this many laps."""
+    laps_cones: int = 100
+    """The closed road has this many cones."""
+    budget: float = 0.5
+    """An estimator is stopped where a mean update takes longer than this (s)."""
+    seed: int = 1
+    """The drives and the choice of detections have this seed."""
+    road: RoadSettings = field(default_factory=RoadSettings)
+    """These settings describe the roads and the drives on them."""
+
+    def __post_init__(self) -> None:
+        """Raise SettingsError as well where a range is empty."""
+        super().__post_init__()
+        if self.cones_min >= self.cones_max:
+            raise SettingsError(f"cones_min: expected less than cones_max, found {self.cones_min:g}")
+        if not self.readings or min(self.readings) < 1:
+            raise SettingsError(f"readings: expected numbers of at least 1, found {self.readings}")
+
+
+QUICK: Final = ScalingSettings(
+    cones_max=200.0,
+    bins=8,
+    fit_from=50.0,
+    readings=(2, 8, 20),
+    readings_cones=160,
+    warm_up=20,
+    laps=4,
+    laps_cones=60,
+    budget=0.1,
+)
+"""This preset takes less than a minute and shows that everything works; its slopes mean little."""
+
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int_]
+
+STEP: Final = 0.25
+"""Distance of the samples of a road's middle (m)."""
+SPARE: Final = 1.1
+"""Factor by which an open road has more cones than are to be seen, since some are never detected."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drives:
+    """Logs of the three sweeps."""
+
+    cones: Log
+    """A long road, up to the cycle in which the last cone asked for is seen."""
+    seen: Array
+    """Number of cones seen by the end of each cycle of that log (n,)."""
+    readings: dict[int, Log]
+    """A short dense road, by the number of detections in a cycle."""
+    laps: Log
+    """Laps of a closed road."""
+    lap_ends: Array
+    """Stamps at which the laps end (m,), s."""
+
+    @property
+    def cycles(self) -> int:
+        """Return the number of cycles of all three sweeps together."""
+        dense = max(len(log.cycles) for log in self.readings.values())
+        return len(self.cones.cycles) + dense + len(self.laps.cycles)
+
+
+def make_drives(settings: ScalingSettings) -> Drives:
+    """Simulate the drives that the estimators are to be timed on."""
+    road, seed = settings.road, settings.seed
+    long = drive_log(open_road(int(settings.cones_max), road.gap, road), road, seed)
+    seen = cones_seen(long)
+    count = int(np.searchsorted(seen, settings.cones_max)) + 1
+    dense = drive_log(open_road(settings.readings_cones, road.dense_gap, road), road, seed, dense=True)
+    rng = np.random.default_rng(seed)
+    laps = drive_log(closed_road(settings.laps_cones, road), road, seed, settings.laps)
+    return Drives(
+        cones=first_cycles(long, count),
+        seen=seen[:count].astype(float),
+        readings={k: thinned(dense, k, rng) for k in settings.readings},
+        laps=laps,
+        lap_ends=lap_times(laps),
+    )
+
+
+# --- roads -----------------------------------------------------------------------------------------------
+
+
+def open_road(cones: int, gap: float, settings: RoadSettings) -> Track:
+    """Return a winding road that never comes near itself, on which at least `cones` cones can be seen.
+
+    Its heading is `swing * sin(2 pi s / wavelength)` at the length s along it; cones are `gap` (m) apart.
+    """
+    length = SPARE * cones / 2 * gap
+    s = np.arange(0.0, length, STEP)
+    heading = settings.swing * np.sin(2 * np.pi * s / settings.wavelength)
+    middle = STEP * np.cumsum(np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+    return _with_rows(middle, gap, settings, closed=False)
+
+
+def closed_road(cones: int, settings: RoadSettings) -> Track:
+    """Return a dented circle with about `cones` cones: `r = 1 + dent cos(dents phi)`, scaled."""
+    phi = np.linspace(0.0, 2 * np.pi, max(int(cones * settings.gap / STEP), 100))
+    r = 1.0 + settings.dent * np.cos(settings.dents * phi)
+    unscaled = r[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])
+    middle = unscaled * (cones / 2 * settings.gap / arc_lengths(unscaled)[-1])
+    return _with_rows(middle, settings.gap, settings, closed=True)
+
+
+def _with_rows(middle: Array, gap: float, settings: RoadSettings, closed: bool) -> Track:
+    """Return the road with cones on both sides of its middle (n, 2), `gap` (m) apart."""
+    tangents = unit(np.gradient(middle, axis=0))
+    rows = []
+    for side in (0.5, -0.5):
+        row = middle + side * settings.width * left_normals(tangents)
+        s = arc_lengths(row)
+        at = np.linspace(0.0, s[-1], max(round(s[-1] / gap), 2), endpoint=not closed)
+        rows.append(along_polyline(at, s, row))
+    start = np.append(middle[0], np.arctan2(tangents[0, 1], tangents[0, 0]))
+    return Track(rows[0], rows[1], np.zeros((0, 2)), closed, start, "road")
+
+
+# --- logs ------------------------------------------------------------------------------------------------
+
+
+def drive_log(track: Track, settings: RoadSettings, seed: int, laps: int = 1, dense: bool = False) -> Log:
+    """Simulate a drive along a road at full speed from the start on."""
+    vehicle = VehicleSettings(
+        speed_max=settings.speed,
+        speed_start=settings.speed,
+        acceleration_lateral=settings.acceleration_lateral,
+    )
+    sensor = SensorSettings(range_max=settings.dense_range) if dense else SensorSettings()
+    return simulate(track, SimulationSettings(laps=laps, vehicle=vehicle, sensor=sensor), seed)
+
+
+def cones_seen(log: Log) -> IntArray:
+    """Return the number of true cones that had been detected by the end of each cycle (n,)."""
+    assert log.truth is not None
+    assert log.truth.associations is not None
+    ends = np.cumsum([len(cycle.labels) for cycle in log.cycles])
+    seen, first = np.unique(log.truth.associations, return_index=True)
+    return np.searchsorted(np.sort(first[seen >= 0]), ends, side="left")
+
+
+def first_cycles(log: Log, count: int) -> Log:
+    """Return the first `count` cycles of a log, without truth."""
+    return replace(log, cycles=log.cycles[:count], truth=None)
+
+
+def thinned(log: Log, count: int, rng: Generator) -> Log:
+    """Return the drive with `count` detections a cycle, chosen at random, or all where there are fewer."""
+    return replace(log, cycles=tuple(_chosen(cycle, count, rng) for cycle in log.cycles), truth=None)
+
+
+def _chosen(cycle: Detections, count: int, rng: Generator) -> Detections:
+    size = len(cycle.labels)
+    kept = np.sort(rng.choice(size, min(count, size), replace=False))
+    return Detections(cycle.t, cycle.points_vehicle[kept], cycle.covariances[kept], cycle.labels[kept])

@@ -1,0 +1,253 @@
+"""Time of an update against the size of the map, its detections and the laps: points, power laws, memory.
+
+All estimators run in one process: every cycle goes to each in turn, so that whatever slows the machine down
+slows all alike.
+"""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Final, Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.stats import linregress
+from threadpoolctl import threadpool_limits
+
+from pathspace_graph.estimators import make_online
+from pathspace_graph.io.log import Log
+from pathspace_graph.run import split_odometry, timed_update, timed_wait
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .roads import Drives, ScalingSettings, first_cycles
+
+Array = NDArray[np.float64]
+
+Sweep = Literal["cones", "readings", "laps"]
+"""What is varied: the cones seen, the detections of an update (readings), or the lap."""
+CONES: Final[Sweep] = "cones"
+READINGS: Final[Sweep] = "readings"
+LAPS: Final[Sweep] = "laps"
+LEAST_POINTS: Final = 3
+"""Least number of points of a slope: two would leave nothing to estimate its error from."""
+JUDGED: Final = 10
+"""Number of updates whose mean is compared with the budget."""
+
+
+# --- lanes -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Lane:
+    """An estimator that is to map a log."""
+
+    estimator: str
+    """Name of the estimator."""
+    log: Log
+    """Log to map."""
+    readings: int = 0
+    """Number of detections in each cycle of the log, where they are varied."""
+
+
+@dataclass(eq=False)
+class LaneTimes:
+    """What was measured in a lane, an entry for each cycle until it ended or was stopped."""
+
+    lane: Lane
+    """The lane."""
+    seconds: list[float] = field(default_factory=list)
+    """Wall time of each update, s."""
+    sizes: list[int] = field(default_factory=list)
+    """Number of control points or landmarks after each update."""
+    stopped: str = ""
+    """Why the lane did not reach the log's end; empty where it did."""
+
+    def updates(self, settings: MapperSettings, budget: float) -> Iterator[None]:
+        """Do an update at each step, until the log ends or the lane is stopped."""
+        estimator = make_online(self.lane.estimator, settings, self.lane.log)
+        for cycle in split_odometry(self.lane.log):
+            try:
+                timed_wait(estimator)
+                estimate, seconds = timed_update(estimator, *cycle)
+            except Exception as error:  # the table reports any failure
+                self.stopped = " ".join(f"{type(error).__name__}: {error}".split())
+                return
+            self.seconds.append(seconds)
+            self.sizes.append(sum(estimate.sizes))
+            if len(self.seconds) >= JUDGED and np.mean(self.seconds[-JUDGED:]) > budget:
+                self.stopped = f"over {budget:g} s an update"
+                return
+            yield
+
+
+def run_lanes(
+    lanes: Sequence[Lane],
+    settings: MapperSettings,
+    budget: float,
+    on_cycle: Callable[[], None] = lambda: None,
+) -> list[LaneTimes]:
+    """Give cycle k to every lane in turn; the lane that is first moves on by one with k.
+
+    So none always follows the same other. A lane is stopped where its last updates took more than `budget`
+    (s) each on average. BLAS has one thread.
+    """
+    times = [LaneTimes(lane) for lane in lanes]
+    runners = [own.updates(settings, budget) for own in times]
+    with threadpool_limits(limits=1):
+        for cycle in range(max(len(lane.log.cycles) for lane in lanes)):
+            first = cycle % len(runners)
+            for runner in (*runners[first:], *runners[:first]):
+                next(runner, None)
+            on_cycle()
+    return times
+
+
+def peak_memory(lane: Lane, settings: MapperSettings) -> float:
+    """Return the most memory (MB) that Python and numpy held at a time while the lane ran.
+
+    This is what tracemalloc sees; it sees nothing of what GTSAM and LAPACK allocate. Don't time a lane
+    meanwhile: tracing slows everything down.
+    """
+    tracemalloc.start()
+    try:
+        before, _ = tracemalloc.get_traced_memory()
+        tracemalloc.reset_peak()
+        run_lanes([lane], settings, float("inf"))
+        return (tracemalloc.get_traced_memory()[1] - before) / 1e6
+    finally:
+        tracemalloc.stop()
+
+
+# --- points and slopes -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Scaling:
+    """Everything that was measured."""
+
+    settings: ScalingSettings
+    """What was asked for."""
+    mapper: dict[str, Any]
+    """Settings of the estimators, in full."""
+    points: pd.DataFrame
+    """Row for each mean of some updates: `sweep`, `estimator`, `at` (mean number of cones, number of
+    detections, or lap), `seconds` of an update, number of `cycles`, mean `size` of the map."""
+    slopes: pd.DataFrame
+    """Row for each sweep and estimator, as `fit_slope` returns it."""
+    memory: dict[str, float]
+    """Most memory (MB) that Python and numpy held while each estimator mapped the first lap."""
+
+    def of(self, sweep: Sweep, estimator: str) -> pd.DataFrame:
+        """Return the points of a sweep of an estimator."""
+        return self.points[(self.points["sweep"] == sweep) & (self.points["estimator"] == estimator)]
+
+    def slope(self, sweep: Sweep, estimator: str) -> pd.Series:
+        """Return the slope of a sweep of an estimator."""
+        own = (self.slopes["sweep"] == sweep) & (self.slopes["estimator"] == estimator)
+        return self.slopes[own].iloc[0]
+
+    @property
+    def estimators(self) -> tuple[str, ...]:
+        """Names of the estimators, in order."""
+        return tuple(self.memory)
+
+    def seconds_at(self, cones: float, estimator: str) -> float:
+        """Return the mean update (s) at a number of cones, between the points; NaN beyond them."""
+        points = self.of(CONES, estimator)
+        if not len(points):
+            return float("nan")
+        at, seconds = np.log(points["at"]), np.log(points["seconds"])
+        return float(np.exp(np.interp(np.log(cones), at, seconds, left=np.nan, right=np.nan)))
+
+
+def binned(sweep: Sweep, times: LaneTimes, at: Array, edges: Array) -> pd.DataFrame:
+    """Return a point for each interval between two `edges` that holds cycles; `at` (n,): their abscissas."""
+    at = at[: len(times.seconds)]
+    seconds, sizes = np.array(times.seconds), np.array(times.sizes, dtype=float)
+    bins = np.searchsorted(edges, at, side="right") - 1
+    chosen = [bins == number for number in range(len(edges) - 1) if np.any(bins == number)]
+    means = [
+        [np.mean(at[of]), np.mean(seconds[of]), of.sum(), np.mean(sizes[of])] for of in chosen if of.any()
+    ]
+    rows = [[sweep, times.lane.estimator, *values] for values in means]
+    return pd.DataFrame(rows, columns=["sweep", "estimator", "at", "seconds", "cycles", "size"])
+
+
+def fit_slope(
+    sweep: Sweep, estimator: str, points: pd.DataFrame, fit_from: float = 0.0, stopped: str = ""
+) -> dict[str, Any]:
+    """Return the power law `seconds ~ at^slope`, a line fitted to the logarithms from `fit_from` on.
+
+    The standard `error` is that of the exponent; both are NaN where there are too few `points`, which lie
+    from `low` to `high`.
+    """
+    kept = points[points["at"] >= fit_from]
+    at, seconds = (kept[name].to_numpy(float) for name in ("at", "seconds"))
+    line = linregress(np.log(at), np.log(seconds)) if len(at) >= LEAST_POINTS else None
+    return {
+        "sweep": sweep,
+        "estimator": estimator,
+        "slope": float("nan") if line is None else float(line.slope),
+        "error": float("nan") if line is None else float(line.stderr),
+        "points": len(at),
+        "low": float(min(at, default=np.nan)),
+        "high": float(max(at, default=np.nan)),
+        "stopped": stopped,
+    }
+
+
+# --- the measurement -------------------------------------------------------------------------------------
+
+
+def measure_scaling(
+    estimators: Sequence[str],
+    drives: Drives,
+    settings: ScalingSettings,
+    mapper: MapperSettings | None = None,
+    on_cycle: Callable[[], None] = lambda: None,
+) -> Scaling:
+    """Measure all three sweeps, and the memory; `on_cycle` is called after each cycle of a sweep."""
+    mapper = mapper or MapperSettings()
+
+    def run(lanes: Sequence[Lane]) -> list[LaneTimes]:
+        return run_lanes(lanes, mapper, settings.budget, on_cycle)
+
+    ends, laps = drives.lap_ends, drives.laps
+    edges = np.exp(
+        np.linspace(np.log(settings.cones_min), np.log(settings.cones_max + 1.0), settings.bins + 1)
+    )
+    lap = 1.0 + np.searchsorted(ends, [cycle.t for cycle in laps.cycles]).astype(np.float64)
+    points: list[pd.DataFrame] = []
+    slopes: list[dict[str, Any]] = []
+    for times in run([Lane(name, drives.cones) for name in estimators]):
+        points.append(binned(CONES, times, drives.seen, edges))
+        slopes.append(fit_slope(CONES, times.lane.estimator, points[-1], settings.fit_from, times.stopped))
+    dense = run([Lane(name, log, k) for name in estimators for k, log in drives.readings.items()])
+    for name in estimators:
+        own = [times for times in dense if times.lane.estimator == name]
+        points.append(_joined([_at_readings(times, settings.warm_up) for times in own]))
+        stopped = "; ".join(f"{t.lane.readings} readings: {t.stopped}" for t in own if t.stopped)
+        slopes.append(fit_slope(READINGS, name, points[-1], stopped=stopped))
+    for times in run([Lane(name, laps) for name in estimators]):
+        points.append(binned(LAPS, times, lap, np.arange(1.0, len(ends) + 2.0)))
+        slopes.append(fit_slope(LAPS, times.lane.estimator, points[-1], 2.0, times.stopped))
+    first_lap = first_cycles(laps, int(np.searchsorted([cycle.t for cycle in laps.cycles], ends[0])))
+    memory = {name: peak_memory(Lane(name, first_lap), mapper) for name in estimators}
+    return Scaling(settings, asdict(mapper), _joined(points), pd.DataFrame(slopes), memory)
+
+
+def _joined(points: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Return the points of all frames that have some."""
+    return pd.concat([of for of in points if len(of)] or points[:1], ignore_index=True)
+
+
+def _at_readings(times: LaneTimes, warm_up: int) -> pd.DataFrame:
+    """Return the mean of the cycles after the warm-up that had as many detections as were asked for."""
+    wanted = float(times.lane.readings)
+    cycles = times.lane.log.cycles[: len(times.seconds)]
+    detections = np.array([len(cycle.labels) for cycle in cycles], dtype=float)
+    detections[:warm_up] = np.nan
+    return binned(READINGS, times, detections, np.array([wanted, np.nextafter(wanted, np.inf)]))

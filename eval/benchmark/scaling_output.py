@@ -1,0 +1,210 @@
+"""The results of a scaling measurement: a table to print, and points, slopes and figures on disk."""
+
+from __future__ import annotations
+
+import math
+import platform
+import resource
+from dataclasses import asdict
+from itertools import cycle
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullFormatter, ScalarFormatter
+
+from pathspace_graph.eval.experiment.tables import TextTable
+from pathspace_graph.eval.figures.style import (
+    MARKERS,
+    PALETTE,
+    WIDTH,
+    figure_context,
+    label_logarithms,
+    save_figures,
+    shared_legend,
+)
+from pathspace_graph.eval.metrics.summary import versions
+from pathspace_graph.io.files import atomic_folder, write_json
+
+from .scaling import CONES, LAPS, READINGS, Scaling, Sweep
+
+FORMAT: Final = "pathspace-scaling/1"
+MARKER: Final = "scaling.json"
+"""File by which a folder of results is known."""
+COMPARED_AT: Final = 200.0
+"""Number of cones at which estimators are compared, that of an ordinary track."""
+
+_HEIGHT: Final = 3.1
+"""Height of a figure (in)."""
+_MARKER_SIZE: Final = 3.6
+"""Size of the estimators' points (pt)."""
+_CONES_TICKS: Final = (50, 100, 200, 500, 1000, 2000)
+"""Labels of the axis of cones, as far as it reaches."""
+_TITLES: Final[dict[Sweep, tuple[str, str]]] = {
+    CONES: ("cones seen", "(a) map size"),
+    READINGS: ("detections per update", "(b) detections"),
+    LAPS: ("lap", "time per lap on a closed road"),
+}
+"""Axis title and title of each panel."""
+
+
+# --- table and files -------------------------------------------------------------------------------------
+
+
+def scaling_table(scaling: Scaling) -> TextTable:
+    """Return a row for each estimator: slopes, times, the ratio to the first, laps and memory."""
+    settings = scaling.settings
+    header = (
+        "estimator",
+        f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})",
+        "slope, readings",
+        f"ms at {COMPARED_AT:g} cones",
+        f"{scaling.estimators[0]} / this",
+        "most cones",
+        f"ms, lap 2 and {settings.laps}",
+        "peak MB",
+    )
+    rows = tuple(_row(scaling, name) for name in scaling.estimators)
+    return TextTable("Time per update: slopes of the logarithms, +- standard error", header, rows)
+
+
+def _row(scaling: Scaling, name: str) -> tuple[str, ...]:
+    here, first = (scaling.seconds_at(COMPARED_AT, one) for one in (name, scaling.estimators[0]))
+    cones, laps = scaling.of(CONES, name)["at"], scaling.of(LAPS, name).set_index("at")["seconds"]
+    ends = (laps.get(float(lap), math.nan) for lap in (2, scaling.settings.laps))
+    return (
+        name,
+        *(_slope(scaling, sweep, name) for sweep in (CONES, READINGS)),
+        _number(1e3 * here, ".1f"),
+        _number(first / here, ".2f"),
+        f"{cones.iloc[-1]:.0f}" if len(cones) else "none",
+        ", ".join(_number(1e3 * seconds, ".1f") for seconds in ends),
+        f"{scaling.memory[name]:.1f}",
+    )
+
+
+def _slope(scaling: Scaling, sweep: Sweep, name: str) -> str:
+    fitted = scaling.slope(sweep, name)
+    if not math.isfinite(fitted["slope"]):
+        return f"too few points ({fitted['points']})"
+    return f"{fitted['slope']:.2f} +- {fitted['error']:.2f}"
+
+
+def _number(value: float, form: str) -> str:
+    return format(value, form) if math.isfinite(value) else "-"
+
+
+def stops(scaling: Scaling) -> list[str]:
+    """Return a line for each estimator and sweep that did not reach the end."""
+    return [
+        f"{s['estimator']}, {s['sweep']}: stopped, {s['stopped']}"
+        + (f" (slope to {s['high']:.0f})" if s["points"] else "")
+        for s in scaling.slopes.to_dict("records")
+        if s["stopped"]
+    ]
+
+
+def write_scaling(out: Path, scaling: Scaling) -> None:
+    """Write `points.csv`, `scaling.json` (with slopes and settings), `table.md` and two figures."""
+    with atomic_folder(out, MARKER) as folder:
+        scaling.points.to_csv(folder / "points.csv", index=False, lineterminator="\n")
+        (folder / "table.md").write_text(scaling_table(scaling).markdown(), encoding="utf-8")
+        write_json(folder / MARKER, _content(scaling))
+        save_figures(folder, {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)})
+
+
+def _content(scaling: Scaling) -> dict[str, Any]:
+    at = {name: scaling.seconds_at(COMPARED_AT, name) for name in scaling.estimators}
+    return {
+        "format": FORMAT,
+        "slopes": scaling.slopes.to_dict("records"),
+        "compared_at_cones": COMPARED_AT,
+        "seconds_compared": at,
+        "ratio_of_first": {name: at[scaling.estimators[0]] / seconds for name, seconds in at.items()},
+        "peak_megabytes_tracemalloc_first_lap": scaling.memory,
+        "peak_megabytes_of_the_process": _process_megabytes(),
+        "settings": asdict(scaling.settings),
+        "estimator_settings": scaling.mapper,
+        "versions": versions(),
+    }
+
+
+def _process_megabytes() -> float:
+    """Return the most memory (MB) that the process had, with all estimators loaded at once."""
+    unit = 1e-6 if platform.system() == "Darwin" else 1.024e-3
+    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+# --- figures ---------------------------------------------------------------------------------------------
+
+
+def plot_scaling(scaling: Scaling) -> Figure:
+    """Draw two sweeps on logarithmic axes, with fitted lines, and a cross where an estimator was stopped."""
+    with figure_context():
+        figure = Figure(figsize=(WIDTH, _HEIGHT), layout="constrained")
+        cones, detections = figure.subplots(1, 2, sharey=True)
+        for axes, sweep in ((cones, CONES), (detections, READINGS)):
+            for name, color in _draw_sweep(axes, scaling, sweep).items():
+                _draw_power_law(axes, scaling, sweep, name, color)
+                if sweep == CONES and scaling.slope(sweep, name)["stopped"]:
+                    last = scaling.of(sweep, name).iloc[-1]
+                    size = 3 * _MARKER_SIZE
+                    axes.plot(last["at"], 1e3 * last["seconds"], "x", color=color, markersize=size)
+            axes.set_xscale("log")
+        cones.set_ylabel("mean update (ms)")
+        _label_ticks(cones, tuple(t for t in _CONES_TICKS if t <= scaling.settings.cones_max))
+        _label_ticks(detections, scaling.settings.readings)
+        shared_legend(figure, columns=min(len(scaling.estimators), 4))
+    return figure
+
+
+def plot_laps(scaling: Scaling) -> Figure:
+    """Draw the time per update of each lap, from the first on."""
+    with figure_context():
+        figure = Figure(figsize=(WIDTH / 2, _HEIGHT), layout="constrained")
+        axes = figure.subplots()
+        _draw_sweep(axes, scaling, LAPS, linestyle="-")
+        axes.set_ylabel("mean update (ms)")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        shared_legend(figure, columns=2)
+    return figure
+
+
+def _draw_sweep(axes: Axes, scaling: Scaling, sweep: Sweep, linestyle: str = "none") -> dict[str, str]:
+    """Draw the points of every estimator that has some, and return the colours by name."""
+    drawn: dict[str, str] = {}
+    for name, color, marker in zip(scaling.estimators, cycle(PALETTE), cycle(MARKERS), strict=False):
+        points = scaling.of(sweep, name)
+        if len(points):
+            look: dict[str, Any] = {"linewidth": 0.7, "marker": marker, "markersize": _MARKER_SIZE}
+            milliseconds = 1e3 * points["seconds"]
+            axes.plot(points["at"], milliseconds, linestyle=linestyle, color=color, label=name, **look)
+            drawn[name] = color
+    axes.set_yscale("log")
+    label_logarithms(axes)
+    abscissa, title = _TITLES[sweep]
+    axes.set_xlabel(abscissa)
+    axes.set_title(title)
+    axes.grid(which="both")
+    return drawn
+
+
+def _draw_power_law(axes: Axes, scaling: Scaling, sweep: Sweep, name: str, color: str) -> None:
+    """Draw the fitted power law through the mean of its points' logarithms, over their range."""
+    slope = scaling.slope(sweep, name)
+    if not np.isfinite(slope["slope"]):
+        return
+    points = scaling.of(sweep, name)
+    fitted = points.loc[points["at"].between(slope["low"], slope["high"]), ["at", "seconds"]]
+    at, seconds = np.exp(np.log(fitted).mean())
+    ends = np.array([slope["low"], slope["high"]])
+    milliseconds = 1e3 * seconds * (ends / at) ** slope["slope"]
+    axes.plot(ends, milliseconds, color=color, linewidth=0.9, alpha=0.8)
+
+
+def _label_ticks(axes: Axes, ticks: tuple[int, ...]) -> None:
+    axes.xaxis.set_major_locator(FixedLocator(ticks))
+    axes.xaxis.set_major_formatter(ScalarFormatter())
+    axes.xaxis.set_minor_formatter(NullFormatter())

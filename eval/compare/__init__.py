@@ -1,1 +1,0 @@
-"""Every estimator on the same logs, side by side."""

@@ -1,0 +1,1 @@
+"""Experiments: estimators and settings on many logs, in parallel, as one frame that every table shows."""

@@ -1,0 +1,264 @@
+"""Cells, each one estimator with one set of settings on one log: how they are run, measured and kept."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final, Generic, TypeVar
+
+from threadpoolctl import threadpool_limits
+
+from pathspace_graph import estimators as registry
+from pathspace_graph.errors import InputError
+from pathspace_graph.eval.metrics.measures import Row, StageTime, measure, online_cycles, stage_times
+from pathspace_graph.eval.metrics.metric import METRICS
+from pathspace_graph.eval.metrics.summary import has_cones, lap_times, vehicle_of, versions
+from pathspace_graph.eval.metrics.trajectory import ReachObserver
+from pathspace_graph.io.files import replacing, to_plain, write_json
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.parsing import read_json
+from pathspace_graph.io.results import RunResult
+from pathspace_graph.plausibility.diagnosis import diagnose
+from pathspace_graph.plausibility.hint import Hint
+from pathspace_graph.run import run_online
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .drives import Drive, identity, read_log_file, write_log_file
+
+FORMAT: Final = "pathspace-cell/3"
+DIGEST: Final = "digest"
+"""Key of a record's digest in its file."""
+_KEYS: Final = {"format", "id", "cell", "versions", "failure", "traceback", "said", "laps"}
+
+Record = dict[str, Any]
+"""What is kept of a cell, in the types of JSON only."""
+
+
+@dataclass(frozen=True, eq=False)
+class NamedLog:
+    """A log with its name."""
+
+    name: str
+    """Name of the log's folder."""
+    log: Log
+    """The log."""
+    hints: tuple[Hint, ...] = ()
+    """Mistakes that are likely in it."""
+
+    @property
+    def names(self) -> dict[str, Any]:
+        """Name that distinguishes the log from others in the results."""
+        return {"log": self.name}
+
+    @cached_property
+    def id(self) -> str:
+        """Identity among the logs of one experiment."""
+        return identity(log=self.name)
+
+
+D = TypeVar("D", Drive, NamedLog)
+
+
+@dataclass(frozen=True, eq=False)
+class Cell(Generic[D]):
+    """One run of an experiment."""
+
+    drive: D
+    """Drive or log that is mapped."""
+    estimator: str
+    """Name of the estimator."""
+    settings: MapperSettings
+    """Settings of the estimator."""
+    variant: str | None = None
+    """Name of the settings, where there are several."""
+    measured: Mapping[str, Any] = field(default_factory=dict)
+    """Keyword arguments of `measure`."""
+
+    @cached_property
+    def id(self) -> str:
+        """Identity of everything that the result depends on, except the code."""
+        yardsticks = self.measured.get("yardsticks", False)
+        settings = asdict(self.settings)
+        return identity(
+            drive=self.drive.id, estimator=self.estimator, settings=settings, yardsticks=yardsticks
+        )
+
+    @property
+    def names(self) -> dict[str, Any]:
+        """Names that distinguish the cell from the others of its experiment."""
+        names = self.drive.names | {"estimator": self.estimator}
+        return names if self.variant is None else names | {"variant": self.variant}
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What came of a cell; a failure is a result as well."""
+
+    names: Mapping[str, Any]
+    """Names of the cell."""
+    rows: Sequence[Row] = ()
+    """Metrics of each lap and, as the last row, of the whole run; none where the cell failed."""
+    times: Sequence[StageTime] = ()
+    """Times of the cycles and of their stages; a batch has none."""
+    result: RunResult | None = None
+    """Result of the run; None where the cell failed."""
+    failure: str = ""
+    """Line that names the error, if there was one."""
+    trace: str = ""
+    """Traceback of the error."""
+
+    @property
+    def laps(self) -> int:
+        """Number of laps that the estimator counted."""
+        return 0 if self.result is None else self.result.laps
+
+    @classmethod
+    def failed(cls, cell: Cell[Any], error: BaseException) -> Outcome:
+        """Make the outcome of a cell that ended with an error."""
+        failure = " ".join(f"{type(error).__name__}: {error}".split())
+        return cls(cell.names, failure=failure, trace="".join(traceback.format_exception(error)))
+
+
+# --- runs ------------------------------------------------------------------------------------------------
+
+
+def run_cell(cell: Cell[Any], log: Log) -> Outcome:
+    """Run and measure a cell with one thread of BLAS; never raise."""
+    try:
+        with threadpool_limits(limits=1):
+            begin = time.perf_counter()
+            result = run_estimator(cell.estimator, cell.settings, log)
+            seconds = time.perf_counter() - begin - result.observing
+            rows, cycles = measure(result, log, seconds, **cell.measured), online_cycles(result)
+            return Outcome(cell.names, rows, stage_times(cycles) if cycles else (), result)
+    except Exception as error:  # whatever ends a run belongs into the results
+        return Outcome.failed(cell, error)
+
+
+def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
+    """Run an online estimator cycle by cycle, with its map at the end of each true lap, or a batch one.
+
+    The reach of an online one is measured where there is truth.
+    """
+    if name not in registry.ONLINE:
+        return registry.make_batch(name, settings, log).solve(log)
+    estimator, times = registry.make_online(name, settings, log), lap_times(log)
+    if log.truth is None or not has_cones(log.truth) or len(log.truth.poses) == 0:
+        return run_online(log, estimator, name=name, snapshot_times=times)
+    observer = ReachObserver(log.truth)
+    result = run_online(log, estimator, name=name, snapshot_times=times, observers=[observer])
+    return replace(result, reach=observer.rows)
+
+
+# --- records ---------------------------------------------------------------------------------------------
+
+
+def record_cell(cell: Cell[Drive], log: Log) -> Record:
+    """Run a cell and return its record."""
+    return record_of(cell, run_cell(cell, log))
+
+
+def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
+    """Return the record of a cell's outcome."""
+    return {
+        "format": FORMAT,
+        "id": cell.id,
+        "cell": cell.names,
+        "versions": versions(),
+        "failure": outcome.failure,
+        "traceback": outcome.trace,
+        "said": said(outcome.result),
+        "laps": lap_rows(outcome.rows),
+    }
+
+
+def said(run: RunResult | None) -> str:
+    """Return the notices of a run's cycles and its diagnosis, each once, or an empty text."""
+    if run is None:
+        return ""
+    state = vehicle_of(run)
+    lines = [record.notice for record in run.cycles if record.notice]
+    lines += [] if state is None else diagnose(state, run.settings)
+    return "; ".join(dict.fromkeys(lines))
+
+
+def lap_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return a row for each lap, with the metrics of the whole run beside its own.
+
+    A run that completed no lap has one row, that of the whole run as lap 1.
+    """
+    if not rows:
+        return []
+    *laps, whole = rows
+    shared = {key: value for key, value in whole.values.items() if METRICS[key].scope == "run"}
+    return [{"lap": row.lap, **row.values, **shared} for row in laps] or [{"lap": 1, **whole.values}]
+
+
+@dataclass(frozen=True)
+class Store:
+    """Records of a study in a file each, and its logs while cells are missing.
+
+    All of them are data. A folder that comes from elsewhere can be resumed without running anything in it.
+    """
+
+    folder: Path
+    """Folder of the study."""
+
+    def read(self, cell: Cell[Drive]) -> Record | None:
+        """Return the cell's record, or None if there is none that is as it was written."""
+        try:
+            record = read_json(self._file(cell), "a cell")
+        except InputError:
+            return None
+        return record if _is_record(record) and record["id"] == cell.id else None
+
+    def write(self, cell: Cell[Drive], record: Record) -> None:
+        """Write the record as a file of its own, whole or not at all."""
+        write_json(self._file(cell), {**record, DIGEST: _digest(record)}, indent=1)
+
+    def has_log(self, drive: Drive) -> bool:
+        """Return whether the drive has been simulated."""
+        return self._log(drive).is_file()
+
+    def read_log(self, drive: Drive) -> Log:
+        """Return the log of a drive, simulated again where it can't be read."""
+        try:
+            return read_log_file(self._log(drive))
+        except InputError:
+            return drive.simulate()
+
+    def write_log(self, drive: Drive, log: Log) -> None:
+        """Write a simulated log, whole or not at all."""
+        with replacing(self._log(drive)) as temporary:
+            write_log_file(temporary, log)
+
+    def drop_logs(self) -> None:
+        """Remove the logs, since they can be simulated again."""
+        logs = self.folder / "logs"
+        for file in (*logs.glob("*.log"), *logs.glob("*.pickle")):  # pickles of older versions
+            file.unlink()
+        with suppress(OSError):  # there is none, or it holds something else
+            logs.rmdir()
+
+    def _file(self, cell: Cell[Drive]) -> Path:
+        return self.folder / "cells" / f"{cell.id}.json"
+
+    def _log(self, drive: Drive) -> Path:
+        return self.folder / "logs" / f"{drive.id}.log"
+
+
+def _is_record(record: Any) -> bool:
+    """Return whether this is a whole record with the right digest; older ones have none."""
+    if not isinstance(record, dict) or record.get("format") != FORMAT:
+        return False
+    digest = record.pop(DIGEST, None)
+    return record.keys() == _KEYS and digest in (None, _digest(record))
+
+
+def _digest(record: Record) -> str:
+    return identity(record=to_plain(record))

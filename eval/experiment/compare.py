@@ -1,0 +1,333 @@
+"""Every estimator on the same logs: their frame, the paper's Table 1, all metrics, and paired differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+
+from pathspace_graph import estimators as registry
+from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.eval.metrics.accuracy import GhostSettings, LapMetrics
+from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
+from pathspace_graph.eval.metrics.reference import gap
+from pathspace_graph.eval.metrics.summary import has_cones
+from pathspace_graph.io.log import LOG_FILE
+from pathspace_graph.io.map import SplineBoundary
+from pathspace_graph.io.results import BatchRun, RunResult
+from pathspace_graph.io.disk import is_temporary
+from pathspace_graph.plausibility.reading import read_plausible_log
+from pathspace_graph.settings.limits import LimitSettings
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .cells import Cell, NamedLog, Outcome, run_cell
+from .frame import add_batch, difference
+from .study import known_estimators
+from .tables import TextTable
+from .workers import check_jobs, outcomes, workers
+
+RUN: Final = ("log", "estimator")
+"""Columns that identify a run."""
+NO_TRUTH: Final = "the log has no true cones, which rmse, missed and most other metrics need"
+"""Part of a title where the columns of the paper are missing."""
+FAILED: Final = "failed"
+"""Text in place of a lap for an estimator that failed on every log."""
+AT_END: Final = "end"
+"""Text in place of a lap for an estimator that completed no lap."""
+_SPACE: Final = "   "
+"""Space between figures that share a column."""
+_PRINTED: Final = (
+    *("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m"),
+    *("two_way", "ghost_share", "size", "ate", "ms_mean"),
+)
+"""Metrics whose differences are in the table; the file has those of all."""
+_NOT_PAIRED: Final = ("nees_low", "nees_high")
+"""Metrics whose differences mean nothing."""
+
+
+# --- runs ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """All outcomes, log by log, in the order of the estimators."""
+
+    logs: tuple[NamedLog, ...]
+    """Logs that were mapped."""
+    estimators: tuple[str, ...]
+    """Estimators that mapped them."""
+    reference: str
+    """Estimator that the others are compared with."""
+    outcomes: tuple[Outcome, ...] = ()
+    """Outcome of each estimator on each log."""
+
+    @cached_property
+    def frame(self) -> pd.DataFrame:
+        """Tidy row per run and lap, and one per run for the whole log, with the gaps to the batch."""
+        rows = [row for outcome in self.outcomes for row in self._rows(outcome)]
+        add_batch(rows, ("log",))
+        return pd.DataFrame(rows, columns=None if rows else [*RUN, "scope", "lap"])
+
+    def _rows(self, outcome: Outcome) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = [
+            {
+                **outcome.names,
+                "scope": "lap" if row.lap else "log",
+                "lap": row.lap or outcome.laps,
+                **row.values,
+            }
+            for row in outcome.rows
+        ]
+        batch = self.result(outcome.names["log"], registry.DEFAULT_BATCH)
+        if outcome.result is not None and batch is not None and outcome.result is not batch:
+            rows[-1] |= gap_columns(outcome.result, batch)
+        return rows
+
+    def times(self) -> pd.DataFrame:
+        """Return a tidy row per run and stage, in s."""
+        names = ["stage", "mean", "median", "p99", "share"]
+        found = [
+            [*o.names.values(), *(getattr(stage, name) for name in names)]
+            for o in self.outcomes
+            for stage in o.times
+        ]
+        return pd.DataFrame(found, columns=[*RUN, *names])
+
+    def of(self, log: str) -> list[Outcome]:
+        """Return the outcomes on one log."""
+        return [outcome for outcome in self.outcomes if outcome.names["log"] == log]
+
+    def result(self, log: str, estimator: str) -> RunResult | None:
+        """Return the result of an estimator on a log, if it ran there and did not fail."""
+        return next((o.result for o in self.of(log) if o.names["estimator"] == estimator), None)
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether any log has true cones."""
+        return any(n.log.truth is not None and has_cones(n.log.truth) for n in self.logs)
+
+    @property
+    def paired(self) -> bool:
+        """Whether there are differences to show: several estimators on several logs."""
+        return len(self.logs) > 1 and len(self.estimators) > 1
+
+    @property
+    def failures(self) -> list[Outcome]:
+        """Outcomes that failed."""
+        return [outcome for outcome in self.outcomes if outcome.failure]
+
+    @property
+    def unsettled(self) -> list[Outcome]:
+        """Outcomes of batches that did not converge."""
+        runs = ((outcome, outcome.result) for outcome in self.outcomes)
+        return [outcome for outcome, run in runs if isinstance(run, BatchRun) and not run.converged]
+
+
+def gap_columns(result: RunResult, batch: RunResult) -> dict[str, float]:
+    """Return the mean two-way distance of the curves (m) and the rms distance of the poses (m).
+
+    Landmarks are no curves, so a landmark map has the distance of the poses only.
+    """
+    found = gap(result, batch)
+    row = {"gap_trajectory": float(np.hypot(found.along, found.across))}
+    if found.curves and all(isinstance(b, SplineBoundary) for b in result.map.boundaries.values()):
+        row["gap_curves"] = float(np.mean(list(found.curves.values())))
+    return row
+
+
+def read_logs(folder: Path, limits: LimitSettings | None = None) -> tuple[NamedLog, ...]:
+    """Return the log of a log folder, or those of a folder of log folders by name; InputError if there
+    are none, or if a cycle of one cannot be used."""
+    folders = {folder.resolve().name: folder}
+    if folder.is_dir() and not (folder / LOG_FILE).exists():
+        entries = (entry for entry in folder.iterdir() if not is_temporary(entry.name))
+        folders = {entry.name: entry for entry in sorted(entries) if (entry / LOG_FILE).is_file()}
+    if not folders:
+        raise InputError(folder, f"expected a log ({LOG_FILE}) or folders that are logs, found neither")
+    read = {name: read_plausible_log(own, limits or LimitSettings()) for name, own in folders.items()}
+    return tuple(NamedLog(name, log, tuple(hints)) for name, (log, hints) in read.items())
+
+
+def choose(names: Sequence[str]) -> tuple[str, ...]:
+    """Return estimators by name, or all that are known if none is named; SettingsError if one is unknown."""
+    known = known_estimators()
+    for name in names:
+        if name not in known:
+            raise SettingsError(f"--estimators: expected known ones ({', '.join(known)}), found '{name}'")
+    return tuple(dict.fromkeys(names or known))
+
+
+def choose_reference(name: str | None, estimators: Sequence[str]) -> str:
+    """Return the named one, or the default estimator if it is compared, or else the first."""
+    if name is None:
+        return registry.DEFAULT if registry.DEFAULT in estimators else estimators[0]
+    if name not in estimators:
+        raise SettingsError(
+            f"--reference: expected one that is compared ({', '.join(estimators)}), found '{name}'"
+        )
+    return name
+
+
+def compare(
+    logs: Sequence[NamedLog],
+    estimators: Sequence[str],
+    settings: MapperSettings | None = None,
+    *,
+    reference: str | None = None,
+    ghosts: GhostSettings | None = None,
+    jobs: int = 1,
+    on_run: Callable[[], None] | None = None,
+) -> Comparison:
+    """Run every estimator on every log, `jobs` at a time on one BLAS thread each; call `on_run` after each.
+
+    A failure of one does not stop the others.
+    """
+    check_jobs(jobs)
+    settings, measured = settings or MapperSettings(), {"ghost_settings": ghosts}
+    cells = [Cell(log, name, settings, measured=measured) for log in logs for name in estimators]
+    done: dict[Cell[NamedLog], Outcome] = {}
+    with workers(jobs, None):
+        for cell, found in outcomes(run_cell, cells, lambda cell: (cell.drive.log,)):
+            done[cell] = found if isinstance(found, Outcome) else Outcome.failed(cell, found)
+            if on_run is not None:
+                on_run()
+    chosen = choose_reference(reference, estimators)
+    return Comparison(tuple(logs), tuple(estimators), chosen, tuple(done[cell] for cell in cells))
+
+
+# --- tables ----------------------------------------------------------------------------------------------
+
+
+def tables(comparison: Comparison) -> dict[str, TextTable]:
+    """Return the printed tables by the name of their files, differences only where runs can be paired."""
+    printed = {"table": paper_table(comparison), "metrics": final_table(comparison)}
+    return printed | ({"paired": paired_table(comparison)} if comparison.paired else {})
+
+
+def paper_frame(comparison: Comparison) -> pd.DataFrame:
+    """Return rmse (m), missed (share) and size of each estimator and lap, means over `logs` logs.
+
+    An estimator that completed no lap on any log has a row without a lap, of its maps at the end of the logs.
+    """
+    keys = [metric.key for metric in PAPER]
+    frame = comparison.frame.reindex(columns=[*RUN, "scope", "lap", *keys])
+    rows = []
+    for estimator in comparison.estimators:
+        own = frame[frame["estimator"] == estimator]
+        laps = own[own["scope"] == "lap"]
+        for lap, over_logs in laps.groupby("lap") if len(laps) else [(np.nan, own)]:
+            means = {key: over_logs[key].astype(float).mean() for key in keys}
+            rows.append({"estimator": estimator, "lap": lap, "logs": len(over_logs)} | means)
+    return pd.DataFrame(rows).astype({"lap": "Int64"})
+
+
+def paper_table(comparison: Comparison) -> TextTable:
+    """Return the paper's Table 1, lap by lap; without truth it has the sizes only."""
+    frame = paper_frame(comparison)
+    shown = PAPER if comparison.has_truth else (METRICS["size"],)
+    logs = ["logs"] if len(comparison.logs) > 1 else []
+    rows = [
+        (row["estimator"], _lap(row), *(str(row[key]) for key in logs), *(_cell(m, row) for m in shown))
+        for row in frame.to_dict("records")
+    ]
+    groups = tuple(i for i in range(1, len(rows)) if rows[i][0] != rows[i - 1][0])
+    header = ("estimator", "lap", *logs, *(metric.heading for metric in shown))
+    return TextTable(_title(comparison, "at the end of each lap"), header, tuple(rows), groups)
+
+
+def final_table(comparison: Comparison) -> TextTable:
+    """Return the means over the logs of every metric of whole logs, with a column for each estimator."""
+    frame, names = comparison.frame, comparison.estimators
+    final = frame[frame["scope"] == "log"]
+    known = [m for m in METRICS.values() if m.key in frame and not final[m.key].astype(float).isna().all()]
+    rows = tuple(
+        (m.heading, *(m.text(m.over(final.loc[final["estimator"] == name, m.key])) for name in names))
+        for m in known
+    )
+    return TextTable(_title(comparison, "at the end of the log"), ("metric", *names), rows)
+
+
+def paired_frame(comparison: Comparison) -> pd.DataFrame:
+    """Return a tidy row for each estimator and metric of whole logs: its difference from the reference."""
+    frame, reference = comparison.frame, comparison.reference
+    final = frame[frame["scope"] == "log"].set_index([*RUN])
+    keys = [key for key in METRICS if key in frame and key not in _NOT_PAIRED]
+    rows = []
+    for estimator in comparison.estimators:
+        for key in keys if estimator != reference else ():
+            own, others = (
+                final[key].astype(float).reindex([(named.name, name) for named in comparison.logs]).to_numpy()
+                for name in (estimator, reference)
+            )
+            d = difference(own, others)
+            rows.append([estimator, reference, key, d.mean, d.low, d.high, d.count])
+    return pd.DataFrame(rows, columns=["estimator", "reference", "metric", "mean", "low", "high", "pairs"])
+
+
+def paired_table(comparison: Comparison) -> TextTable:
+    """Return the differences with their intervals: a row for each metric, a column for each estimator."""
+    paired = paired_frame(comparison)
+    others = [name for name in comparison.estimators if name != comparison.reference]
+    rows = []
+    for metric in (METRICS[key] for key in _PRINTED):
+        by_estimator = paired[paired["metric"] == metric.key].set_index("estimator")
+        if len(by_estimator) and by_estimator["mean"].notna().any():
+            rows.append((metric.heading, *(_interval(metric, by_estimator.loc[name]) for name in others)))
+    title = (
+        f"Difference from {comparison.reference}, mean [95 % interval] over {len(comparison.logs)} logs, "
+        "paired; * where 0 is outside of it. Positive: the reference has less."
+    )
+    return TextTable(title, ("metric", *others), tuple(rows))
+
+
+def _interval(metric: Metric, row: Any) -> str:
+    """Return `mean [low, high]` in the metric's unit, with * where it excludes 0."""
+    mean, low, high = (metric.factor * float(row[name]) for name in ("mean", "low", "high"))
+    if np.isnan(mean):
+        return UNKNOWN
+    digits = max(metric.digits, MEAN_DIGITS)
+    mark = "*" if low > 0.0 or high < 0.0 else ""
+    return f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]{mark}"
+
+
+def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
+    """Return the paper's Table 1 in the paper's form: a row per lap, the estimators beside each other.
+
+    The rmse, missed and size of an estimator share a column, so that its name stands above all three.
+    """
+    titles = _SPACE.join(metric.heading for metric in PAPER)
+    header = ("lap", *(f"{name}\n{titles}" for name in laps))
+    count = max((len(rows) for rows in laps.values()), default=0)
+    rows = (
+        (str(lap + 1), *(_three(own[lap] if lap < len(own) else None) for own in laps.values()))
+        for lap in range(count)
+    )
+    return TextTable("", header, tuple(rows), names=0)
+
+
+def _three(row: LapMetrics | None) -> str:
+    """Return the paper's three figures of a lap, each as wide as its title."""
+    values = {} if row is None else {metric.key: getattr(row, metric.key) for metric in PAPER}
+    return _SPACE.join(_cell(metric, values).rjust(len(metric.heading)) for metric in PAPER)
+
+
+def _title(comparison: Comparison, when: str) -> str:
+    count = len(comparison.logs)
+    logs = comparison.logs[0].name if count == 1 else f"mean over {count} logs"
+    missing = "" if comparison.has_truth else f" ({NO_TRUTH})"
+    return f"{logs}, {when}{missing}"
+
+
+def _lap(row: dict[Any, Any]) -> str:
+    if not pd.isna(row["lap"]):
+        return str(int(row["lap"]))
+    return AT_END if row["logs"] else FAILED
+
+
+def _cell(metric: Metric, row: dict[Any, Any]) -> str:
+    return metric.text(float(row.get(metric.key, np.nan)))

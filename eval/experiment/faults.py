@@ -1,0 +1,244 @@
+"""The suite of faults: a study whose noises are single faults, `fault: strength`, each beside a clean run."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+
+from pathspace_graph.errors import SettingsError, check_name
+from pathspace_graph.eval.metrics.metric import METRICS, UNKNOWN
+from pathspace_graph.plausibility.diagnosis import LIMIT
+
+from .frame import RUN, last_laps
+from .study import Study, find_study, read_study
+from .tables import TextTable
+
+SUITE: Final = Path("faults")
+"""Name of the shipped study that is the suite."""
+CLEAN: Final = "clean"
+"""Name of the noise without a fault, which every other one is compared with."""
+BY_PRIOR: Final = "_by_prior"
+"""Suffix of metrics that are estimates of a calibration by the sigma of its prior."""
+TITLE_BY_PRIOR: Final = " by its prior's sigma"
+"""End of the titles of these metrics."""
+HEADER: Final = (
+    "fault",
+    "strength",
+    "rmse by clean",
+    "range",
+    "size by clean",
+    "missed [%]",
+    "closed",
+    "lost at the end",
+    "largest error [m]",
+    "over 1 m off after closing [s, m]",
+    "calibration by its prior's sigma",
+    "called degraded, lost [% of cycles]",
+    "said",
+)
+NOTHING: Final = "nothing"
+"""Text where no run said anything."""
+_SAID_LENGTH: Final = 60
+"""Number of characters that a notice is shortened to; the JSON file has the whole of it."""
+_MEASURED: Final = [
+    *("rmse", "size", "missed", "closed_at_end", "lost_at_end", "error_max", "error_end"),
+    *("astray_time", "astray_way", "told_degraded", "told_lost"),
+]
+_NAME: Final = re.compile(r"(?P<kind>.+): (?P<strength>(?P<value>[-+.\d]+)(?: (?P<unit>\S+))?)")
+
+
+# --- the suite -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of a kind and a strength."""
+
+    kind: str
+    """Kind of the fault in plain words; `clean` where there is no fault."""
+    strength: str
+    """Strength as it is written."""
+    value: float
+    """Number of the strength."""
+    unit: str
+    """Unit of the number; empty for counts."""
+
+
+def fault_of(noise: str) -> Fault:
+    """Return the fault of a noise such as `latency: 20 ms`; SettingsError for any other name."""
+    if noise == CLEAN:
+        return Fault(CLEAN, "", 0.0, "")
+    found = _NAME.fullmatch(noise)
+    try:
+        assert found is not None
+        return Fault(found["kind"], found["strength"], float(found["value"]), found["unit"] or "")
+    except (AssertionError, ValueError) as error:
+        raise SettingsError(f"noise: expected a name such as 'latency: 20 ms', found '{noise}'") from error
+
+
+def suite() -> Study:
+    """Return the suite that ships with the package."""
+    return read_study(find_study(SUITE))
+
+
+def kinds(study: Study) -> list[str]:
+    """Return the kinds of faults of a suite, in its order."""
+    found = (fault_of(noise).kind for noise in study.noise)
+    return [kind for kind in dict.fromkeys(found) if kind != CLEAN]
+
+
+def only(study: Study, wanted: Sequence[str]) -> Study:
+    """Return the suite with the clean run and the faults of these kinds; all of them where none is named."""
+    for kind in wanted:
+        check_name(kind, kinds(study), "--only: expected a known fault")
+    keep = {CLEAN, *(wanted or kinds(study))}
+    return _with(study, [noise for noise in study.noise if fault_of(noise).kind in keep])
+
+
+def strongest(study: Study) -> Study:
+    """Return the suite with the clean run and each fault at the last of its strengths."""
+    return _with(study, list({fault_of(noise).kind: noise for noise in study.noise}.values()))
+
+
+def _with(study: Study, noises: Sequence[str]) -> Study:
+    return replace(study, noise={noise: study.noise[noise] for noise in noises})
+
+
+# --- outcomes --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class FaultOutcome:
+    """What came of one fault of one strength."""
+
+    fault: Fault
+    """The fault."""
+    runs: pd.DataFrame
+    """Runs that finished, with the `ratio` of the rmse and the `size_ratio` to those of the clean run, NaN
+    where either has no map, and whether anything was `told`."""
+    failed: int
+    """Number of runs that ended with an error."""
+
+    def values(self) -> dict[str, Any]:
+        """Return the outcome as a row of plain values; what is not known is NaN."""
+        runs, ratios = self.runs, known(self.runs["ratio"])
+        return {
+            "fault": self.fault.kind,
+            "strength": self.fault.value,
+            "unit": self.fault.unit,
+            "runs": len(runs),
+            "failed": self.failed,
+            "with_map": len(ratios),
+            "ratio_mean": mean(ratios),
+            "ratio_min": float(ratios.min()) if len(ratios) else np.nan,
+            "ratio_max": float(ratios.max()) if len(ratios) else np.nan,
+            "size_ratio": mean(known(runs["size_ratio"])),
+            "missed": mean(known(runs["missed"])),
+            "closed": int((runs["closed_at_end"] == 1.0).sum()),
+            "lost": int((runs["lost_at_end"] == 1.0).sum()),
+            "error_max": max(runs["error_max"].tolist(), default=np.nan),
+            "error_end": max(runs["error_end"].tolist(), default=np.nan),
+            "astray_time": float(max(known(runs["astray_time"]), default=np.nan)),
+            "astray_way": float(max(known(runs["astray_way"]), default=np.nan)),
+            "told": int(runs["told"].sum()),
+            "told_degraded": mean(known(runs["told_degraded"])),
+            "told_lost": mean(known(runs["told_lost"])),
+            "calibration": self._calibration(),
+            "said": dict(Counter(text for text in runs["said"] if text).most_common()),
+        }
+
+    def _calibration(self) -> dict[str, float]:
+        """Return the mean of each estimate by its prior's sigma, where it is conspicuous."""
+        keys = [name for name in self.runs if name.endswith(BY_PRIOR)]
+        means = {
+            METRICS[key].title.removesuffix(TITLE_BY_PRIOR): mean(known(self.runs[key].astype(float)))
+            for key in keys
+        }
+        return {name: value for name, value in means.items() if abs(value) > LIMIT}
+
+
+def known(values: pd.Series) -> np.ndarray:
+    """Return the values that are known."""
+    return np.asarray(values.dropna())
+
+
+def mean(values: np.ndarray) -> float:
+    """Return the mean of the values, and NaN if there are none."""
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def outcomes(study: Study, frame: pd.DataFrame) -> list[FaultOutcome]:
+    """Return the outcome of every noise of a suite, in its order, each at the end of the last lap."""
+    runs = beside_clean(frame)
+    failures = frame[frame["failure"] != ""].groupby("noise").size()
+    return [
+        FaultOutcome(fault_of(noise), runs[runs["noise"] == noise], int(failures.get(noise, 0)))
+        for noise in study.noise
+    ]
+
+
+def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the last laps of the runs that finished, beside the clean run of the same track and seed."""
+    last = last_laps(frame)
+    last = last.reindex(columns=[*dict.fromkeys([*last, *_MEASURED])]).astype(dict.fromkeys(_MEASURED, float))
+    clean = last[last["noise"] == CLEAN].set_index([*RUN])
+    own = pd.MultiIndex.from_frame(last[[*RUN]])
+    for name, ratio in (("rmse", "ratio"), ("size", "size_ratio")):
+        reference = clean[name].where(clean[name] > 0.0).reindex(own)
+        last[ratio] = last[name] / reference.to_numpy()
+    return last.assign(told=(last["said"] != "") | (last["told_lost"] > 0.0))
+
+
+# --- table -----------------------------------------------------------------------------------------------
+
+
+def fault_table(study: Study, found: Sequence[FaultOutcome]) -> TextTable:
+    """Return a row for each fault and strength, without columns that no run knows anything of."""
+    rows = [_row(outcome) for outcome in found]
+    kept = [k for k in range(len(HEADER)) if any(row[k] not in ("", UNKNOWN) for row in rows)]
+    title = (
+        f"{study.name}: {study.question} {len(study.tracks)} tracks, {len(study.seeds)} seeds, "
+        f"{study.laps} laps, {', '.join(study.estimators)}. The rmse is the map's at the end by that "
+        "of the clean run on the same track and with the same seed, as its mean and its range. "
+        "Lost means more than 5 m off in the last second."
+    )
+    groups = tuple(k for k in range(1, len(rows)) if rows[k][0] != rows[k - 1][0])
+    shown = tuple(tuple(row[k] for k in kept) for row in rows)
+    return TextTable(title, tuple(HEADER[k] for k in kept), shown, groups, names=2)
+
+
+def _row(outcome: FaultOutcome) -> tuple[str, ...]:
+    values, runs = outcome.values(), len(outcome.runs)
+    ratio, with_map = values["ratio_mean"], values["with_map"]
+    partly = "" if with_map == runs else f" ({with_map} of {runs})"
+    failed = f", {outcome.failed} failed" if outcome.failed else ""
+    return (
+        outcome.fault.kind,
+        outcome.fault.strength,
+        "no map" if np.isnan(ratio) else f"{ratio:.2f}{partly}",
+        _text("{:.1f} to {:.1f}", values["ratio_min"], values["ratio_max"]),
+        _text("{:.2f}", values["size_ratio"]),
+        _text("{:.1f}", 100.0 * values["missed"]),
+        f"{values['closed']} of {runs}{failed}",
+        f"{values['lost']} of {runs}",
+        _text("{:.1f}", values["error_max"]),
+        _text("{:.1f}, {:.1f}", values["astray_time"], values["astray_way"]),
+        ", ".join(f"{name} {value:+.1f}" for name, value in values["calibration"].items()),
+        _text("{:.1f}, {:.1f}", 100.0 * values["told_degraded"], 100.0 * values["told_lost"]),
+        "; ".join(f"{n} of {runs}: {_short(text)}" for text, n in values["said"].items()) or NOTHING,
+    )
+
+
+def _text(form: str, *values: float) -> str:
+    return UNKNOWN if np.isnan(values[0]) else form.format(*values)
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _SAID_LENGTH else f"{text[:_SAID_LENGTH].rstrip()} …"

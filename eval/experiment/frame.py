@@ -1,0 +1,222 @@
+"""The one frame: results with a row for each run and lap, its views, and paired statistics of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+from pathspace_graph.estimators import DEFAULT_BATCH
+from pathspace_graph.eval.metrics.metric import METRICS
+from pathspace_graph.eval.metrics.reference import from_batch
+from pathspace_graph.eval.metrics.summary import versions
+
+from .cells import Cell, Record
+from .drives import Drive
+from .study import Study, leaves
+
+Array = NDArray[np.float64]
+
+COMBINATION: Final = ("noise", "estimator", "variant")
+"""Columns that name a combination, which is compared with others."""
+RUN: Final = ("track", "seed")
+"""Columns that name a drive; combinations are paired on the same drive and noise."""
+SIMULATION: Final = "simulation."
+"""Prefix of columns with settings of the simulation."""
+SETTING: Final = "settings."
+"""Prefix of columns with settings of the estimator where another column has their name."""
+TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
+"""Columns of wall times, all that differs when a study is run again."""
+LEVEL: Final = 0.95
+"""Confidence level of intervals; a difference is significant where its p is below 1 - LEVEL."""
+CORRECTION: Final = "Holm"
+"""Method by which multiple comparisons are corrected."""
+
+
+# --- frame -----------------------------------------------------------------------------------------------
+
+
+def frame_of(study: Study, cells: Sequence[tuple[Cell[Drive], Record | None]]) -> pd.DataFrame:
+    """Return a row for each run and lap, and one without metrics for a run that failed.
+
+    Every varied setting is a column.
+    """
+    rows = []
+    for cell, record in cells:
+        assert record is not None, "every cell has been run by now"
+        shared = {"study": study.name} | cell.names | _settings_row(study, cell)
+        about = {"failure": record["failure"], "said": record["said"], **record["versions"]}
+        rows += [shared | lap | about for lap in record["laps"]] or [shared | {"lap": None} | about]
+    add_batch(rows, (*RUN, "noise", "variant"))
+    settings = _settings_row(study, cells[0][0])
+    order = ["study", *RUN, *COMBINATION, *settings, "lap", *METRICS, "failure", "said", *versions()]
+    known = dict.fromkeys([*order, *(name for row in rows for name in row)])
+    frame = pd.DataFrame(rows, columns=[name for name in known if any(name in row for row in rows)])
+    return frame.astype({"lap": "Int64"})
+
+
+def add_batch(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
+    """Add how each run compares with the last row of the batch of the same `names`, if it ran."""
+    batches = {tuple(row[name] for name in names): row for row in rows if row["estimator"] == DEFAULT_BATCH}
+    for row in rows:
+        batch = batches.get(tuple(row[name] for name in names))
+        if batch is not None and row["estimator"] != DEFAULT_BATCH:
+            row.update(from_batch(row, batch))
+
+
+def _settings_row(study: Study, cell: Cell[Drive]) -> dict[str, Any]:
+    settings, simulation = leaves(cell.settings), leaves(cell.drive.simulation)
+    row = {f"{SIMULATION}{name}": _cell(simulation[name]) for name in study.varied_noise}
+    own = {"study", *RUN, *COMBINATION}
+    return row | {f"{SETTING}{name}" if name in own else name: _cell(settings[name]) for name in study.varied}
+
+
+def _cell(value: Any) -> Any:
+    return " ".join(str(part) for part in value) if isinstance(value, tuple) else value
+
+
+def without_times(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the columns that are the same whenever the study is run."""
+    return frame.drop(columns=[name for name in TIMES if name in frame])
+
+
+def times_of(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the wall times, in the same rows."""
+    return frame[["study", *RUN, *COMBINATION, "lap", *(name for name in TIMES if name in frame)]]
+
+
+def last_laps(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the last row of each run that finished."""
+    finished = frame[frame["failure"] == ""]
+    return finished.groupby([*RUN, *COMBINATION], sort=False).tail(1)
+
+
+# --- statistics ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Mean and its 95 % interval by Student's t over runs."""
+
+    mean: float
+    """Mean; NaN without runs."""
+    half: float
+    """Half the width of the interval; NaN for fewer than two runs."""
+    count: int
+    """Number of runs, or of pairs of runs."""
+
+    @property
+    def low(self) -> float:
+        """Lower end of the interval."""
+        return self.mean - self.half
+
+    @property
+    def high(self) -> float:
+        """Upper end of the interval."""
+        return self.mean + self.half
+
+
+def estimate(values: Array) -> Estimate:
+    """Return the mean of the values (n,) and its interval, mean -+ t(0.975, n - 1) s / sqrt(n)."""
+    n = len(values)
+    if n < 2:
+        return Estimate(float(values[0]) if n else float("nan"), float("nan"), n)
+    half = float(stats.t.ppf(0.5 + LEVEL / 2, n - 1) * stats.sem(values))
+    return Estimate(float(np.mean(values)), half, n)
+
+
+def difference(values: ArrayLike, reference: ArrayLike) -> Estimate:
+    """Return the estimate of values - reference (n,) over the pairs of which both are finite."""
+    own, others = np.asarray(values, dtype=float), np.asarray(reference, dtype=float)
+    finite = np.isfinite(own) & np.isfinite(others)
+    return estimate(own[finite] - others[finite])
+
+
+def paired_p(differences: Array) -> float:
+    """Return the two-sided p of the paired t-test that the mean of the differences (n,) is 0.
+
+    It is NaN for fewer than two pairs. Without any spread it is 1 where all differences are 0, else 0.
+    """
+    if len(differences) < 2:
+        return float("nan")
+    if np.ptp(differences) == 0.0:
+        return float(differences[0] == 0.0)
+    return float(stats.ttest_1samp(differences, 0.0).pvalue)
+
+
+def holm(p: Array) -> Array:
+    """Return p (m,) corrected by Holm's method.
+
+    The i-th smallest becomes `max over j <= i of (m - j) p_(j)`, j from 0, at most 1. NaN isn't counted and
+    stays NaN. scipy.stats corrects the false discovery rate only, so this is written by hand.
+    """
+    corrected = np.full(len(p), np.nan)
+    known = np.flatnonzero(~np.isnan(p))
+    order = known[np.argsort(p[known], kind="stable")]
+    factors = len(order) - np.arange(len(order))
+    corrected[order] = np.minimum(np.maximum.accumulate(factors * p[order]), 1.0)
+    return corrected
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """One metric of one combination, and its difference from the baseline, run by run."""
+
+    noise: str
+    """Name of the noise."""
+    estimator: str
+    """Name of the estimator."""
+    variant: str
+    """Name of the settings."""
+    metric: str
+    """Key of the metric."""
+    value: Estimate
+    """Mean over all runs, each at the end of its last lap."""
+    difference: Estimate | None
+    """Mean over the pairs; None for the baseline itself."""
+    differences: tuple[float, ...] = ()
+    """Difference of each pair of runs."""
+    p: float = float("nan")
+    """P of the paired t-test, corrected for all comparisons of the metric."""
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance alone rarely makes such a difference anywhere in the study."""
+        return bool(self.p < 1.0 - LEVEL)
+
+
+def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
+    """Return every combination against the baseline of its noise, in the study's order.
+
+    p is corrected by Holm's method over all comparisons of the metric in the study.
+    """
+    last = last_laps(frame)
+    known = last.assign(**{metric: last[metric].astype(float)}).dropna(subset=[metric])
+    runs = {key: of.set_index([*RUN])[metric] for key, of in known.groupby([*COMBINATION], sort=False)}
+    found = []
+    for noise in study.noise:
+        for estimator in study.estimators:
+            base = (noise, study.baseline.estimator or estimator, study.baseline_variant)
+            for variant in study.points:
+                key = (noise, estimator, variant)
+                found.append(_contrast(key, metric, runs, None if key == base else base))
+    corrected = holm(np.array([contrast.p for contrast in found]))
+    return [replace(contrast, p=float(p)) for contrast, p in zip(found, corrected, strict=True)]
+
+
+def _contrast(
+    key: tuple[str, str, str], metric: str, runs: dict[Any, pd.Series], base: tuple[str, str, str] | None
+) -> Contrast:
+    own = runs.get(key, pd.Series(dtype=float))
+    value = estimate(own.to_numpy())
+    if base is None:
+        return Contrast(*key, metric, value, None)
+    against = runs.get(base, pd.Series(dtype=float))
+    shared = own.index[own.index.isin(against.index)]
+    pairs = own[shared].to_numpy() - against[shared].to_numpy()
+    return Contrast(*key, metric, value, estimate(pairs), tuple(pairs.tolist()), paired_p(pairs))

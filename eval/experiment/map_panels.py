@@ -1,0 +1,222 @@
+"""Maps side by side over the truth, and the stretch where landmarks miss cones that a spline passes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from pathspace_graph.eval.figures.map_plot import (
+    MARGIN,
+    WHOLE_TRACK,
+    MapStyle,
+    draw_boundary,
+    draw_start,
+    draw_truth,
+)
+from pathspace_graph.eval.figures.style import (
+    RED,
+    WIDTH,
+    draw_points,
+    figure_context,
+    fit_height,
+    grouped_legend,
+    set_frame,
+)
+from pathspace_graph.eval.metrics.accuracy import MISSED_DISTANCE, cone_distances, mapped_points
+from pathspace_graph.eval.metrics.metric import PAPER
+from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.io.map import Map
+from pathspace_graph.labels import BOUNDARIES
+
+from .cells import Outcome
+
+Array = NDArray[np.float64]
+
+DISTANCES: Final = (MISSED_DISTANCE, 2.0, 1.0)
+"""Distances (m) within which nothing is mapped at a missed cone, in the order in which they are tried."""
+_MIN_CONES: Final = 2
+"""Least number of cones missed on a stretch that is a good example."""
+_MAX_WEIGHT: Final = 10.0
+"""Cones farther than this (m) from any landmark all have the same weight."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlindSpot:
+    """Stretch of the track, and the true cones in it that maps miss."""
+
+    centre: Array
+    """Centre (2,) of the stretch in m, map frame."""
+    half_size: tuple[float, float]
+    """Half width and half height of the stretch (m)."""
+    distance: float
+    """Distance (m) within which nothing is mapped at a missed cone."""
+    cones: int
+    """Number of true cones in the stretch."""
+    missed: tuple[Array, ...]
+    """Positions (k, 2) of the cones that each map misses in the stretch."""
+
+
+def find_blind_spot(
+    truth: Truth, spline_map: Map, landmark_map: Map, half_size: tuple[float, float] = (17.0, 13.0)
+) -> BlindSpot | None:
+    """Return the stretch where the landmark map misses the most cones that the spline map doesn't.
+
+    The cones are missed at the largest of `DISTANCES` at which a stretch misses several cones, else at the
+    largest at which any cone is missed. It is None where none is missed at any. Among equal stretches the one
+    is chosen whose cones have the largest total distance from their nearest landmarks.
+    """
+    cones = truth.cones[np.isin(truth.cone_labels, BOUNDARIES)]
+    distances = [cone_distances(track, truth) for track in (spline_map, landmark_map)]
+    best: BlindSpot | None = None
+    for distance in DISTANCES:
+        bridged = (distances[0] <= distance) & (distances[1] > distance)
+        if bridged.any():
+            centre = _densest(cones[bridged], np.minimum(distances[1][bridged], _MAX_WEIGHT), half_size)
+            spot = _spot(cones, distances, centre, half_size, distance)
+            if len(spot.missed[1]) >= _MIN_CONES:
+                return spot
+            best = best or spot
+    return best
+
+
+def _densest(points: Array, weights: Array, half_size: tuple[float, float]) -> Array:
+    """Return the centre (2,) of the points (k, 2) around the one with most neighbours, then most weight."""
+    scaled = points / np.array(half_size)
+    neighbours = KDTree(scaled).query_ball_point(scaled, 1.0, p=np.inf)
+    best = max(neighbours, key=lambda members: (len(members), float(weights[members].sum())))
+    chosen: Array = points[best]
+    return np.asarray(0.5 * (chosen.min(axis=0) + chosen.max(axis=0)))
+
+
+def _spot(
+    cones: Array, distances: list[Array], centre: Array, half_size: tuple[float, float], distance: float
+) -> BlindSpot:
+    inside = (np.abs(cones - centre) <= half_size).all(axis=1)
+    missed = tuple(cones[inside & (d > distance)] for d in distances)
+    return BlindSpot(centre, half_size, distance, int(inside.sum()), missed)
+
+
+COLUMNS: Final = (2, 3, 4)
+"""Numbers of panels side by side; the first with which the figure fits a page is taken."""
+MAX_HEIGHT: Final = 10.0
+"""Height of a page (in)."""
+CLOSE_UP: Final = MapStyle(curve_width=1.1, marker_size=4.2, landmark_size=3.0, path_width=0.8)
+"""Style of a panel that shows a short stretch of a track."""
+
+_TITLE_HEIGHT: Final = 0.6
+"""Height of a panel's title and its free space (in)."""
+_TICK_LABELS: Final = 0.48
+"""Width and height of the outer tick labels and axis titles (in)."""
+_LEGEND_HEIGHT: Final = 2.0
+"""More than enough height for the legend (in); what it doesn't take is cut off."""
+_GAP: Final = 0.12
+"""Space between panels (in)."""
+_RING_SIZE: Final = 8.0
+"""Size of the ring around a missed cone (pt)."""
+
+
+def plot_maps(outcomes: Sequence[Outcome], log: Log) -> Figure:
+    """Draw a panel for each map over the truth, all of the same area; failures have no panel."""
+    drawn = [(outcome, outcome.result.map) for outcome in outcomes if outcome.result is not None]
+    low, high = _extent([track for _, track in drawn], log.truth)
+    with figure_context():
+        figure, panels, columns = _panels(len(drawn), (high - low) / 2.0)
+        for axes, (outcome, track) in zip(panels, drawn, strict=False):
+            _draw_map(axes, track, log.truth, WHOLE_TRACK)
+            draw_start(axes, WHOLE_TRACK)
+            axes.set_title(_caption(outcome))
+            set_frame(axes, low, high)
+        _finish(figure, panels, len(drawn), columns)
+    return figure
+
+
+def plot_blind_spot(spot: BlindSpot, maps: Sequence[tuple[str, Map]], truth: Truth) -> Figure:
+    """Draw the same area of several maps side by side, with rings around the cones that a map misses."""
+    half_size = np.array(spot.half_size)
+    shows_start = bool((np.abs(spot.centre) < half_size).all())
+    with figure_context():
+        figure, panels, columns = _panels(len(maps), half_size)
+        for axes, (name, track), missed in zip(panels, maps, spot.missed, strict=False):
+            _draw_map(axes, track, truth, CLOSE_UP)
+            if shows_start:
+                draw_start(axes, CLOSE_UP)
+            _draw_missed(axes, missed, spot.distance)
+            axes.set_title(f"{name}\n{len(missed)} of {spot.cones} true cones missed here")
+            set_frame(axes, spot.centre - half_size, spot.centre + half_size)
+        _finish(figure, panels, len(maps), columns)
+    return figure
+
+
+def _panels(count: int, half_size: Array) -> tuple[Figure, list[Axes], int]:
+    """Return a figure, its panels and columns: `count` panels of that shape, as large as a page allows."""
+    half_width, half_height = half_size
+    for columns in COLUMNS:
+        rows = -(-max(count, 1) // columns)
+        width = (WIDTH - _TICK_LABELS) / columns - _GAP
+        height = rows * (width * half_height / half_width + _TITLE_HEIGHT) + _TICK_LABELS
+        if height <= MAX_HEIGHT:
+            break
+    figure = Figure((WIDTH, float(height) + _LEGEND_HEIGHT), layout="compressed")
+    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    return figure, list(panels.flat), columns
+
+
+def _finish(figure: Figure, panels: list[Axes], used: int, columns: int) -> None:
+    """Add axis titles to the outer panels and a legend, hides unused panels, and cuts the figure."""
+    for number, axes in enumerate(panels):
+        axes.set_visible(number < used)
+        if number % columns == 0:
+            axes.set_ylabel("y [m]")
+        if number + columns >= used:
+            axes.set_xlabel("x [m]")
+            axes.tick_params(labelbottom=True)
+    grouped_legend(figure)
+    fit_height(figure)
+
+
+def _draw_missed(axes: Axes, missed: Array, distance: float) -> None:
+    """Draw rings around the cones (k, 2) that a map misses."""
+    ring: dict[str, Any] = {
+        "markersize": _RING_SIZE,
+        "markerfacecolor": "none",
+        "markeredgewidth": 1.0,
+        "zorder": 8,
+    }
+    draw_points(axes, missed, "o", RED, f"missed: nothing within {distance:g} m", **ring)
+
+
+def _draw_map(axes: Axes, track: Map, truth: Truth | None, style: MapStyle) -> None:
+    for label, boundary in sorted(track.boundaries.items()):
+        draw_boundary(axes, boundary, label, style)
+    if truth is not None:
+        draw_truth(axes, truth, style)
+
+
+def _caption(outcome: Outcome) -> str:
+    """Return the estimator's name and the paper's metrics, where they are known."""
+    row = outcome.rows[-1].values
+    words = {
+        metric.key: f"{metric.title} {metric.text(float(row[metric.key]))} {metric.unit}".strip()
+        for metric in PAPER
+        if metric.key in row
+    }
+    size = words.pop("size")
+    return "\n".join([outcome.names["estimator"], ", ".join(words.values()), size])
+
+
+def _extent(maps: Sequence[Map], truth: Truth | None) -> tuple[Array, Array]:
+    """Return two corners (2,) around the true cones and a margin, or around all maps without true cones."""
+    points = [np.zeros((1, 2))]
+    if truth is not None and len(truth.cones):
+        points.append(truth.cones)
+    else:
+        points += [mapped_points(boundary) for track in maps for boundary in track.boundaries.values()]
+    together = np.concatenate(points)
+    return together.min(axis=0) - MARGIN, together.max(axis=0) + MARGIN

@@ -1,0 +1,170 @@
+"""The files of studies, of the suite of faults and of comparisons: tables, tidy results, figures and maps."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from pathspace_graph.eval.figures.style import save_figures
+from pathspace_graph.eval.metrics.summary import summarize, versions
+from pathspace_graph.io.files import atomic_folder, replacing, write_json, write_text
+from pathspace_graph.io.map import PointBoundary
+from pathspace_graph.io.results import write_result
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .cells import NamedLog, Outcome
+from .compare import Comparison, paired_frame, paper_frame, tables
+from .faults import fault_table, outcomes
+from .frame import times_of, without_times
+from .map_panels import find_blind_spot, plot_blind_spot, plot_maps
+from .plots import figures, plot_faults
+from .study import Study
+from .tables import as_latex, as_markdown, as_text, caption, summary_tables, track_tables
+
+FAULTS_FORMAT: Final = "pathspace-faults/1"
+COMPARISON_FORMAT: Final = "pathspace-comparison/1"
+MARKER: Final = "comparison.json"
+"""File by which a comparison's folder is recognized."""
+
+
+def write_csv(file: Path, frame: pd.DataFrame) -> None:
+    """Write a frame without its index, whole or not at all."""
+    with replacing(file) as temporary:
+        frame.to_csv(temporary, index=False, lineterminator="\n")
+
+
+# --- studies ---------------------------------------------------------------------------------------------
+
+
+def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
+    """Write the tables and the figures of a study, and return the text of its summary."""
+    summary = write_tables(study, frame, out)
+    save_figures(out / "figures", figures(study, frame))
+    return summary
+
+
+def write_tables(study: Study, frame: pd.DataFrame, out: Path) -> str:
+    """Write `results.csv`, `times.csv` and the summary in three forms, and return its text."""
+    write_results(frame, out)
+    found, note = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
+    text = as_text(found, note)
+    write_text(out / "summary.txt", text)
+    write_text(out / "summary.md", as_markdown(found, note))
+    write_text(out / "summary.tex", as_latex(found, note))
+    return text
+
+
+def write_results(frame: pd.DataFrame, out: Path) -> None:
+    """Write `results.csv` and `times.csv`."""
+    write_csv(out / "results.csv", without_times(frame))
+    write_csv(out / "times.csv", times_of(frame))
+
+
+def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
+    """Write the results of every run, and the table, the values and the figure; return the table's text.
+
+    `faults.csv` has calibration and notices as JSON texts.
+    """
+    found = outcomes(study, frame)
+    table = fault_table(study, found)
+    text = f"{table.title}\n\n{table.text()}\n"
+    write_results(frame, out)
+    write_text(out / "faults.txt", text)
+    write_text(out / "faults.md", table.markdown())
+    write_text(out / "faults.tex", table.latex())
+    rows = [{name: _known(value) for name, value in outcome.values().items()} for outcome in found]
+    about = {"estimator": study.estimators, "seeds": study.seeds, "laps": study.laps}
+    write_json(out / "faults.json", {"format": FAULTS_FORMAT, **about, "faults": rows}, indent=1)
+    flat = [{name: _flat(value) for name, value in row.items()} for row in rows]
+    write_csv(out / "faults.csv", pd.DataFrame(flat))
+    save_figures(out, {"faults": plot_faults(found)})
+    return text
+
+
+def _known(value: Any) -> Any:
+    return None if isinstance(value, float) and np.isnan(value) else value
+
+
+def _flat(value: Any) -> Any:
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, dict) else value
+
+
+# --- comparisons -----------------------------------------------------------------------------------------
+
+
+def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings, jobs: int) -> None:
+    """Write all files of a comparison, or on failure none.
+
+    `table.*` is the paper's Table 1. `metrics.*` has every metric; its CSV has a tidy row for each run and
+    lap. `times.csv` has the stages of the cycles, `paired.*` the differences. Each log has `maps.*`,
+    `blind_spot.*` and a map folder for each estimator, in a folder of its own where there are several logs.
+    An earlier comparison in `out` is kept as a numbered backup.
+    """
+    frames = {"table": paper_frame(comparison), "metrics": comparison.frame, "times": comparison.times()}
+    if comparison.paired:
+        frames["paired"] = paired_frame(comparison)
+    with atomic_folder(out, MARKER) as folder:
+        for name, table in tables(comparison).items():
+            (folder / f"{name}.md").write_text(table.markdown(), encoding="utf-8")
+            (folder / f"{name}.tex").write_text(table.latex(), encoding="utf-8")
+        for name, frame in frames.items():
+            frame.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
+        for named in comparison.logs:
+            own = folder if len(comparison.logs) == 1 else folder / named.name
+            own.mkdir(exist_ok=True)
+            _write_log(own, named, comparison)
+        write_json(folder / MARKER, _content(comparison, settings, jobs))
+
+
+def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
+    """Write the maps and figures of one log."""
+    found = comparison.of(named.name)
+    for outcome in found:
+        if outcome.result is not None:
+            summary = summarize(outcome.result, named.log, named.hints)
+            write_result(folder / outcome.names["estimator"], outcome.result, summary)
+    if any(outcome.result is not None for outcome in found):
+        save_figures(folder, {"maps": plot_maps(found, named.log)})
+    figure = blind_spot_figure(found, named, comparison.reference)
+    if figure is not None:
+        save_figures(folder, {"blind_spot": figure})
+
+
+def blind_spot_figure(found: list[Outcome], named: NamedLog, reference: str) -> Figure | None:
+    """Return the reference beside the first landmark map that misses cones, or None.
+
+    It is None without truth, or where no landmark map misses cones that the reference passes.
+    """
+    maps = {o.names["estimator"]: o.result.map for o in found if o.result is not None}
+    truth = named.log.truth
+    points = [
+        name
+        for name, track in maps.items()
+        if any(isinstance(boundary, PointBoundary) for boundary in track.boundaries.values())
+    ]
+    if truth is None or reference not in maps or reference in points:
+        return None
+    for name in points:
+        spot = find_blind_spot(truth, maps[reference], maps[name])
+        if spot is not None:
+            return plot_blind_spot(spot, [(reference, maps[reference]), (name, maps[name])], truth)
+    return None
+
+
+def _content(comparison: Comparison, settings: MapperSettings, jobs: int) -> dict[str, Any]:
+    return {
+        "format": COMPARISON_FORMAT,
+        "logs": [named.name for named in comparison.logs],
+        "estimators": comparison.estimators,
+        "reference": comparison.reference,
+        "failures": [{**o.names, "error": o.failure} for o in comparison.failures],
+        "jobs": jobs,
+        "settings": asdict(settings),
+        "versions": versions(),
+    }

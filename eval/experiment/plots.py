@@ -1,0 +1,260 @@
+"""Figures of a study, differences from the baseline and accuracy against size and time, and of the faults."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from pathspace_graph.eval.figures.style import (
+    BLUE,
+    DARK,
+    GREEN,
+    GREY,
+    MARKERS,
+    ORANGE,
+    PALETTE,
+    WIDTH,
+    figure_context,
+    label_logarithms,
+    shared_legend,
+)
+from pathspace_graph.eval.metrics.metric import METRICS
+
+from .faults import CLEAN, FaultOutcome, known
+from .frame import Contrast, contrasts
+from .study import Study
+
+ACCURACY: Final = "rmse"
+SIZE: Final = "size"
+TIME: Final = "ms_mean"
+
+_MAX_PANELS: Final = 3
+"""Most metrics side by side in the figure of differences."""
+_ROW_HEIGHT: Final = 0.24
+"""Height of a combination in the figure of differences (in)."""
+_LABELS_HEIGHT: Final = 1.1
+"""Height of titles and tick labels there (in)."""
+_SCATTER_HEIGHT: Final = 3.6
+"""Height of each noise in the figures of accuracy (in)."""
+_MEAN_SIZE: Final = 4.5
+"""Size of the marker of a mean (pt)."""
+_PAIR_SIZE: Final = 3.5
+"""Size of the marker of a single pair (pt)."""
+_JITTER: Final = 0.22
+"""Share of a row by which single pairs are scattered vertically, so that they can be told apart."""
+_JITTER_SEED: Final = 0
+
+_FAULT_COLUMNS: Final = 4
+"""Number of panels side by side in the figure of faults."""
+_PANEL_HEIGHT: Final = 1.45
+"""Height of a panel there (in)."""
+_LEGEND_HEIGHT: Final = 0.5
+"""Height of the legend and the title of the axis there (in)."""
+_LEGEND_COLUMNS: Final = 6
+"""Every look of a mark, and the mean, stand in one row of that legend."""
+_SPREAD: Final = 0.15
+"""Spread of the runs of one strength to both sides, so that they can be told apart."""
+_MARKER_SIZE: Final = 4.0
+"""Size of the marker of a faulty run (pt)."""
+_ROOM: Final = 1.15
+"""Factor by which the axis reaches beyond the smallest and the largest ratio."""
+_TITLE_LENGTH: Final = 30
+"""Number of characters at which the title of a panel is broken."""
+
+
+def figures(study: Study, frame: pd.DataFrame) -> dict[str, Figure]:
+    """Draw every figure that the study has runs for, by the name of its file."""
+    with figure_context():
+        drawn = {
+            "differences": plot_differences(study, frame),
+            "accuracy_size": plot_against(study, frame, SIZE),
+            "accuracy_time": plot_against(study, frame, TIME),
+        }
+    return {name: figure for name, figure in drawn.items() if figure is not None}
+
+
+# --- differences -----------------------------------------------------------------------------------------
+
+
+def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
+    """Draw every pair, their mean and its interval: a row for each combination, a panel for each metric.
+
+    Only the first metrics of the study have a panel, and there is none where no run differs.
+    """
+    panels = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
+    panels = [panel for panel in panels if _differs(panel)][:_MAX_PANELS]
+    if not panels:
+        return None
+    rows = [i for i in range(len(panels[0])) if any(_is_known(panel[i]) for panel in panels)]
+    figure = Figure(figsize=(WIDTH, _LABELS_HEIGHT + _ROW_HEIGHT * len(rows)), layout="constrained")
+    all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, panel in zip(all_axes, panels, strict=True):
+        _draw_differences(axes, [panel[i] for i in rows])
+    all_axes[0].set_yticks(range(len(rows)), [_row_name(study, panels[0][i]) for i in rows])
+    all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
+    caption = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
+    figure.supxlabel(caption)
+    return figure
+
+
+def _is_known(contrast: Contrast) -> bool:
+    """Return whether a combination isn't the baseline itself and has pairs."""
+    return contrast.difference is not None and contrast.difference.count > 0
+
+
+def _differs(panel: Sequence[Contrast]) -> bool:
+    """Return whether any run differs from the baseline."""
+    return any(d != 0.0 for contrast in panel for d in contrast.differences)
+
+
+def _draw_differences(axes: Axes, rows: Sequence[Contrast]) -> None:
+    metric = METRICS[rows[0].metric]
+    rng = np.random.default_rng(_JITTER_SEED)
+    axes.axvline(0.0, color=DARK, linewidth=0.6, zorder=1)
+    for row, contrast in enumerate(rows):
+        if contrast.difference is None or not contrast.difference.count:
+            continue
+        color = BLUE if contrast.significant else GREY
+        pairs = metric.factor * np.array(contrast.differences)
+        scattered = row + rng.uniform(-_JITTER, _JITTER, len(pairs))
+        axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=_PAIR_SIZE, zorder=2)
+        mean, half = metric.factor * contrast.difference.mean, metric.factor * contrast.difference.half
+        look: dict[str, Any] = {"color": color, "markersize": _MEAN_SIZE, "elinewidth": 1.0}
+        axes.errorbar(mean, row, xerr=_bar(half), fmt="o", zorder=3, **look)
+    axes.set_title(metric.heading)
+    axes.grid(axis="x")
+
+
+def _bar(half: float) -> float | None:
+    """Return the half width of an error bar, or None where it isn't known."""
+    return None if np.isnan(half) else half
+
+
+def _row_name(study: Study, contrast: Contrast) -> str:
+    several = [name for name in ("noise", "estimator", "variant") if len(_of(study, name)) > 1]
+    return _brief(study, ", ".join(getattr(contrast, name) for name in several))
+
+
+def _brief(study: Study, name: str) -> str:
+    """Return `sigma_spacing=1` for `gauge.sigma_spacing=1`, unless two groups have a setting of one name."""
+    last = {field: field.rpartition(".")[2] for field in study.varied}
+    if len(set(last.values())) == len(last):
+        for field, short in last.items():
+            name = name.replace(f"{field}=", f"{short}=")
+    return name
+
+
+def _of(study: Study, name: str) -> Sequence[str]:
+    return {"noise": list(study.noise), "estimator": study.estimators, "variant": list(study.points)}[name]
+
+
+# --- accuracy against ------------------------------------------------------------------------------------
+
+
+def plot_against(study: Study, frame: pd.DataFrame, metric: str) -> Figure | None:
+    """Draw the mean accuracy of each combination against the mean of another metric, with both intervals."""
+    if metric not in frame or ACCURACY not in frame:
+        return None
+    across, up = contrasts(study, frame, metric), contrasts(study, frame, ACCURACY)
+    figure = Figure(figsize=(WIDTH, _SCATTER_HEIGHT * len(study.noise)), layout="constrained")
+    all_axes = figure.subplots(len(study.noise), 1, squeeze=False)[:, 0]
+    for axes, noise in zip(all_axes, study.noise, strict=True):
+        pairs = [(a, b) for a, b in zip(across, up, strict=True) if a.noise == noise and a.value.count]
+        for index, (a, b) in enumerate(pairs):
+            _draw_point(axes, a, b, index, _label(study, a))
+        axes.set_xlabel(METRICS[metric].heading)
+        axes.set_ylabel(METRICS[ACCURACY].heading)
+        axes.set_title(noise if len(study.noise) > 1 else "")
+        axes.grid()
+    shared_legend(figure, loc="outside right upper")
+    return figure
+
+
+def _draw_point(axes: Axes, across: Contrast, up: Contrast, index: int, label: str) -> None:
+    x, y = METRICS[across.metric], METRICS[up.metric]
+    axes.errorbar(
+        x.factor * across.value.mean,
+        y.factor * up.value.mean,
+        xerr=_bar(x.factor * across.value.half),
+        yerr=_bar(y.factor * up.value.half),
+        fmt=MARKERS[index % len(MARKERS)],
+        color=DARK if across.difference is None else PALETTE[index % len(PALETTE)],
+        markersize=_MEAN_SIZE,
+        elinewidth=0.6,
+        label=label,
+    )
+
+
+def _label(study: Study, contrast: Contrast) -> str:
+    several = [name for name in ("estimator", "variant") if len(_of(study, name)) > 1]
+    return _brief(
+        study,
+        ", ".join(getattr(contrast, name) for name in several) or f"{contrast.estimator}: {contrast.variant}",
+    )
+
+
+# --- faults ----------------------------------------------------------------------------------------------
+
+
+def plot_faults(outcomes: Sequence[FaultOutcome]) -> Figure:
+    """Draw a panel for each kind of fault: the mean, and every run, filled where anything was said."""
+    panels = [(kind, list(of)) for kind, of in groupby(outcomes, key=lambda o: o.fault.kind) if kind != CLEAN]
+    rows = max(1, -(-len(panels) // _FAULT_COLUMNS))
+    with figure_context():
+        figure = Figure(figsize=(WIDTH, _LEGEND_HEIGHT + _PANEL_HEIGHT * rows), layout="constrained")
+        every = figure.subplots(rows, _FAULT_COLUMNS, sharey=True, squeeze=False).ravel()
+        for axes, (kind, of) in zip(every, panels, strict=False):
+            _draw_fault(axes, kind, of)
+        for axes in every[len(panels) :]:
+            axes.set_visible(False)
+        ratios = np.concatenate([np.ones(1), *(known(o.runs["ratio"]) for o in outcomes)])
+        every[0].set_yscale("log")
+        every[0].set_ylim(ratios.min() / _ROOM, ratios.max() * _ROOM)
+        label_logarithms(every[0])
+        figure.supylabel("rmse by that of the clean run")
+        shared_legend(figure, columns=_LEGEND_COLUMNS)
+    return figure
+
+
+def _draw_fault(axes: Axes, kind: str, outcomes: Sequence[FaultOutcome]) -> None:
+    axes.axhline(1.0, color=DARK, linewidth=0.6)
+    for at, outcome in enumerate(outcomes):
+        runs = outcome.runs
+        spread = _SPREAD if len(runs) > 1 else 0.0
+        places = at + np.linspace(-spread, spread, len(runs))
+        for place, *run in zip(places, runs["ratio"], runs["lost_at_end"] == 1.0, runs["told"], strict=True):
+            _draw_faulty_run(axes, float(place), *run)
+    means = [(at, o.values()["ratio_mean"]) for at, o in enumerate(outcomes) if len(known(o.runs["ratio"]))]
+    if means:
+        axes.plot(*np.array(means).T, color=BLUE, linewidth=0.9, label="mean", zorder=1)
+    axes.set_xticks(range(len(outcomes)), [f"{outcome.fault.value:g}" for outcome in outcomes])
+    axes.set_xlim(-0.5, len(outcomes) - 0.5)
+    unit = outcomes[0].fault.unit
+    axes.set_title(_broken(f"{kind} [{unit}]" if unit else kind))
+    axes.grid(axis="y")
+
+
+def _draw_faulty_run(axes: Axes, at: float, ratio: float, lost: bool, told: bool) -> None:
+    """Draw a triangle where the vehicle is lost at the end, a cross at the top where there is no map."""
+    if np.isnan(ratio):
+        edge = axes.get_xaxis_transform()
+        axes.plot(at, 0.95, "x", color=ORANGE, markersize=_MARKER_SIZE, transform=edge, label="no map")
+        return
+    color = ORANGE if lost else GREEN
+    label = f"{'lost at the end' if lost else 'not lost'}{', said so' if told else ''}"
+    look: dict[str, Any] = {"markerfacecolor": color if told else "none", "markersize": _MARKER_SIZE}
+    axes.plot(at, ratio, "^" if lost else "o", color=color, markeredgewidth=0.8, label=label, **look)
+
+
+def _broken(title: str) -> str:
+    """Return the title in two lines where it is long."""
+    if len(title) <= _TITLE_LENGTH:
+        return title
+    cut = title.rfind(" ", 0, _TITLE_LENGTH)
+    return f"{title[:cut]}\n{title[cut + 1 :]}" if cut > 0 else title

@@ -1,0 +1,323 @@
+"""Studies: the tracks, seeds, noise, estimators and settings to compare, as a TOML file or in Python."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from itertools import product
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from pathspace_graph import estimators as registry
+from pathspace_graph.errors import InputError, PathspaceError, SettingsError, check_name
+from pathspace_graph.eval.metrics.metric import METRICS, column_of
+from pathspace_graph.io.limits import MAX_HEADER_BYTES, MAX_VARIANTS, shown
+from pathspace_graph.io.parsing import parse_toml, read_text
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.presets import PLAIN, PRESETS, preset
+from pathspace_graph.sim.simulate import SimulationSettings
+
+T = TypeVar("T")
+Overrides = Mapping[str, Any]
+"""New values by dotted field, such as `spline.degree`."""
+
+SHIPPED: Final = Path(__file__).parents[1] / "studies"
+"""Folder of the studies that ship with the package."""
+DEFAULT: Final = "default"
+"""Variant that overrides nothing, part of every study."""
+PRESET: Final = "preset"
+"""Entry by which a noise names the preset of a group, as in `sensor.preset = "camera"`."""
+ALL: Final = "all"
+"""Name that stands for all known estimators."""
+_LISTS: Final = ("tracks", "seeds", "estimators", "metrics", "columns")
+
+
+def known_estimators() -> list[str]:
+    """Return the name of every estimator, online ones first."""
+    return [*registry.ONLINE, *registry.BATCH]
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """Combination that every other one is compared with, on the same track, seed and noise."""
+
+    variant: str = DEFAULT
+    """Variant of the baseline."""
+    estimator: str | None = None
+    """Estimator of the baseline; without one, each estimator is compared with itself."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """Grid of tracks x seeds x noise x estimators x settings, checked when it is made."""
+
+    tracks: tuple[Path | int, ...]
+    """Track files, and seeds of generated tracks."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of the drives and their noise."""
+    laps: int = 5
+    """Number of laps of each drive."""
+    name: str = "study"
+    """Name of the study."""
+    question: str = ""
+    """Question that the study answers."""
+    estimators: tuple[str, ...] = (registry.DEFAULT,)
+    """Estimators to run, online and batch ones; `all` stands for every one."""
+    noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
+    """Overrides of the simulation by the name of a noise."""
+    variants: Mapping[str, Overrides] = field(default_factory=dict)
+    """Overrides of the settings by the name of a variant; `default` is always there."""
+    grids: tuple[Mapping[str, Sequence[Any]], ...] = ()
+    """Values by dotted field; every combination is a variant with a name such as `lag=1, steps=2`."""
+    baseline: Baseline = field(default_factory=Baseline)
+    """Combination that the others are compared with."""
+    metrics: tuple[str, ...] = ("rmse", "missed", "size", "ms_mean")
+    """Metrics that the summary compares with the baseline."""
+    columns: tuple[str, ...] = ()
+    """Columns of the table by track: `rmse` is the last lap's, `rmse@1` that of lap 1, and
+    `slope(bias, bias_true)` says how much of the truth an estimate has found."""
+    yardsticks: bool = False
+    """Whether to compute the limit of every run, which takes a landmark batch with oracle associations."""
+
+    def __post_init__(self) -> None:
+        """Raise SettingsError if anything is unknown, empty, named twice or out of its range."""
+        for name in (*_LISTS, "grids"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
+        tracks = tuple(Path(track) if isinstance(track, str) else track for track in self.tracks)
+        object.__setattr__(self, "tracks", tracks)
+        if self.estimators == (ALL,):
+            object.__setattr__(self, "estimators", tuple(known_estimators()))
+        self._check_lists()
+        self._check_settings()
+        check_name(self.baseline.variant, self._named(), "baseline.variant: expected a variant")
+        if self.baseline.estimator is not None:
+            expected = "baseline.estimator: expected one of the study's estimators"
+            check_name(self.baseline.estimator, self.estimators, expected)
+
+    def _check_lists(self) -> None:
+        for name in ("tracks", "seeds", "estimators", "noise", "metrics"):
+            values = getattr(self, name)
+            if len(values) == 0 or len({repr(value) for value in values}) != len(values):
+                expected = "expected at least one, and none twice"
+                raise SettingsError(f"{name}: {expected}, found {shown(list(values))}")
+        _check_integers("seeds", self.seeds)
+        _check_integers("tracks", [track for track in self.tracks if not isinstance(track, Path)])
+        for name in self.estimators:
+            check_name(name, known_estimators(), "estimators: expected a known estimator")
+        for name in self.metrics:
+            check_name(name, METRICS, "metrics: expected a known metric")
+        for column in self.columns:
+            column_of(column)
+
+    def _check_settings(self) -> None:
+        if not isinstance(self.yardsticks, bool):
+            raise SettingsError(f"yardsticks: expected true or false, found {shown(self.yardsticks)}")
+        if isinstance(self.laps, bool) or not isinstance(self.laps, int):
+            raise SettingsError(f"laps: expected a whole number, found {shown(self.laps)}")
+        if DEFAULT in self.variants:
+            raise SettingsError(f"variants.{DEFAULT}: that name is kept for the settings as they are")
+        for name in self.noise:
+            self.simulation(name)
+        if len(self._named()) != 1 + len(self.variants) + sum(len(_grid(grid)) for grid in self.grids):
+            raise SettingsError("variants: expected every name once, found one of a grid among them")
+
+    def simulation(self, noise: str) -> SimulationSettings:
+        """Return the settings of the drives under a named noise."""
+        overrides = dict(self.noise[noise])
+        if "laps" in overrides:
+            raise SettingsError(f"noise.{noise}.laps: expected laps as a key of the study itself")
+        chosen = {group: overrides.pop(f"{group}.{PRESET}", PLAIN) for group in PRESETS}
+        return replace(override(preset(chosen), overrides, f"noise.{noise}"), laps=self.laps)
+
+    @property
+    def points(self) -> dict[str, MapperSettings]:
+        """Settings to run by name; of variants with equal settings the first."""
+        distinct: dict[str, MapperSettings] = {}
+        for name, settings in self._named().items():
+            if settings not in distinct.values():
+                distinct[name] = settings
+        return distinct
+
+    @property
+    def baseline_variant(self) -> str:
+        """Name of the baseline among `points`."""
+        wanted = self._named()[self.baseline.variant]
+        return next(name for name, settings in self.points.items() if settings == wanted)
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """Dotted settings that any variant overrides."""
+        return tuple(
+            dict.fromkeys(name for group in (*self.variants.values(), *self.grids) for name in group)
+        )
+
+    @property
+    def varied_noise(self) -> tuple[str, ...]:
+        """Dotted settings of the simulation that any noise overrides, without presets."""
+        names = dict.fromkeys(name for overrides in self.noise.values() for name in overrides)
+        return tuple(name for name in names if not name.endswith(f".{PRESET}"))
+
+    def _named(self) -> dict[str, MapperSettings]:
+        """Return the settings of every variant, also of those that come to the same."""
+        points = {DEFAULT: MapperSettings()}
+        for name, overrides in self.variants.items():
+            points[name] = override(MapperSettings(), overrides, f"variants.{name}")
+        for grid in self.grids:
+            for name, overrides in _grid(grid).items():
+                points[name] = override(MapperSettings(), overrides, "grid")
+        return points
+
+
+def _grid(grid: Mapping[str, Sequence[Any]]) -> dict[str, Overrides]:
+    """Return every combination of the values by its name."""
+    for name, values in grid.items():
+        if not isinstance(values, list | tuple) or not values:
+            raise SettingsError(f"grid.{name}: expected a list of values, found {shown(values)}")
+    combinations = math.prod(map(len, grid.values()))
+    if combinations > MAX_VARIANTS:
+        raise SettingsError(f"grid: expected at most {MAX_VARIANTS} combinations, found {combinations}")
+    points = [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
+    return {", ".join(f"{name}={_short(value)}" for name, value in point.items()): point for point in points}
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, int | float) and float(f"{value:g}") == value and not isinstance(value, bool):
+        return f"{value:g}"
+    return str(value)
+
+
+def _check_integers(name: str, values: Sequence[Any]) -> None:
+    for value in values:
+        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+            raise SettingsError(f"{name}: expected whole numbers from 0 on, found {shown(value)}")
+
+
+# --- files -----------------------------------------------------------------------------------------------
+
+
+def shipped_studies() -> list[str]:
+    """Return the names of the studies that ship with the package."""
+    return sorted(file.stem for file in SHIPPED.glob("*.toml"))
+
+
+def find_study(name: Path) -> Path:
+    """Return the file itself, or that of the shipped study of this name."""
+    if name.is_file():
+        return name
+    if name.suffix == "" and name.stem in shipped_studies():
+        return SHIPPED / f"{name.stem}.toml"
+    check_name(str(name), shipped_studies(), "expected a study's file, or one that is known by name")
+    raise InputError(name, "expected a study's file")
+
+
+def read_study(file: Path | str) -> Study:
+    """Return the study of a TOML file, with track files relative to it; InputError says what is wrong."""
+    file = Path(file)
+    content = parse_toml(read_text(file, "a study", MAX_HEADER_BYTES), file)
+    try:
+        return study_from(content, file.parent, file.stem)
+    except PathspaceError as error:
+        raise InputError(file, str(error)) from error
+
+
+def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "study") -> Study:
+    """Return the study with the content of a TOML file."""
+    known = ["grid" if entry.name == "grids" else entry.name for entry in fields(Study)]
+    for key in content:
+        check_name(key, known, "expected a known key")
+    values: dict[str, Any] = {"name": name} | dict(content)
+    if "tracks" not in values:
+        raise SettingsError("tracks: expected track files, or seeds of generated tracks, found none")
+    for key in (key for key in _LISTS if key in values):
+        values[key] = (ALL,) if values[key] == ALL else tuple(_typed(key, values[key], list))
+    for key in ("name", "question"):
+        _typed(key, values.get(key, ""), str)
+    values["tracks"] = tuple(folder / t if isinstance(t, str) else t for t in values["tracks"])
+    for key in (key for key in ("noise", "variants") if key in values):
+        tables = _typed(key, values[key], Mapping).items()
+        values[key] = {k: flatten(_typed(f"{key}.{k}", v, Mapping)) for k, v in tables}
+    if "grid" in values:
+        grids = values.pop("grid")
+        grids = grids if isinstance(grids, list) else [grids]
+        values["grids"] = tuple(flatten(_typed("grid", grid, Mapping)) for grid in grids)
+    if "baseline" in values:
+        for key, value in _typed("baseline", values["baseline"], Mapping).items():
+            check_name(key, ("variant", "estimator"), "baseline: expected a known key")
+            _typed(f"baseline.{key}", value, str)
+        values["baseline"] = Baseline(**values["baseline"])
+    return Study(**values)
+
+
+def _typed(key: str, value: Any, kind: type) -> Any:
+    """Return a value of TOML that has to be of a kind."""
+    if not isinstance(value, kind):
+        expected = "a list" if kind is list else "text" if kind is str else "a table"
+        raise SettingsError(f"{key}: expected {expected}, found {shown(value)}")
+    return value
+
+
+# --- dotted fields ---------------------------------------------------------------------------------------
+
+
+def leaves(settings: Any, prefix: str = "") -> dict[str, Any]:
+    """Return the value of every dotted field of a settings dataclass, in order."""
+    found: dict[str, Any] = {}
+    for entry in fields(settings):
+        value = getattr(settings, entry.name)
+        name = f"{prefix}{entry.name}"
+        found |= leaves(value, f"{name}.") if is_dataclass(value) else {name: value}
+    return found
+
+
+def flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested tables with dotted names, which mean the same as TOML's dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        name = f"{prefix}{key}"
+        flat |= flatten(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return flat
+
+
+def override(settings: T, overrides: Overrides, where: str) -> T:
+    """Return the settings with some dotted fields overridden; SettingsError if a field or a value is
+    wrong."""
+    known = leaves(settings)
+    for name, value in overrides.items():
+        check_name(name, known, f"{where}: expected a known setting")
+        settings = _set(settings, name.split("."), value, f"{where}.{name}")
+    return settings
+
+
+def _set(settings: Any, path: list[str], value: Any, where: str) -> Any:
+    name, *rest = path
+    if rest:
+        new = _set(getattr(settings, name), rest, value, where)
+    else:
+        new = as_type(value, get_type_hints(type(settings))[name], where)
+    try:
+        return replace(settings, **{name: new})
+    except SettingsError as error:
+        raise SettingsError(f"{where}: {error}") from error
+
+
+def as_type(value: Any, hint: Any, where: str) -> Any:
+    """Return a value of TOML in the type of a field: a list as a tuple, a whole number as a float."""
+    arguments = get_args(hint)
+    if get_origin(hint) is Literal and value in arguments:
+        return value
+    if get_origin(hint) in (Union, UnionType):
+        (hint,) = (entry for entry in arguments if entry is not NoneType)
+        return as_type(value, hint, where)
+    if get_origin(hint) is tuple and isinstance(value, list | tuple):
+        each = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
+        if len(each) == len(value):
+            return tuple(as_type(v, h, where) for v, h in zip(value, each, strict=True))
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(hint, type) and type(value) is hint:
+        return value
+    name = hint.__name__ if isinstance(hint, type) else str(hint)
+    raise SettingsError(f"{where}: expected a value of type {name}, found {shown(value)}")

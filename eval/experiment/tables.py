@@ -1,0 +1,213 @@
+"""Tables as text, Markdown and LaTeX, and a study's own: differences from the baseline, columns by track."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import pandas as pd
+from rich.table import Table
+from rich.text import Text
+from tabulate import LATEX_ESCAPE_RULES, SEPARATING_LINE, tabulate
+
+from pathspace_graph.eval.metrics.metric import LATER_LAPS, MEAN_DIGITS, METRICS, Column, column_of
+
+from .frame import COMBINATION, CORRECTION, LEVEL, RUN, Contrast, Estimate, contrasts, last_laps
+from .study import Study
+
+_BORDER: Final = 3
+"""Number of characters between two columns of a terminal's table."""
+_UNICODE: Final = str.maketrans(
+    {"–": "--", "σ": r"$\sigma$", "−": "$-$", "±": r"$\pm$", "²": r"$^2$", "×": r"$\times$"}
+)
+"""LaTeX commands in place of characters that not every font has."""
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """Rows of text under a header: first names, left-aligned, then numbers, right-aligned."""
+
+    title: str
+    """Sentence above the table, which may be empty."""
+    header: tuple[str, ...]
+    """Title of every column."""
+    rows: tuple[tuple[str, ...], ...]
+    """Rows, each as long as the header."""
+    groups: tuple[int, ...] = ()
+    """Row numbers at which a new group of rows begins."""
+    names: int = 1
+    """Number of first columns that are names."""
+
+    def parts(self, width: int) -> list[TextTable]:
+        """Return tables of at most `width` characters, each with the names and some of the other columns."""
+        needed = [max(map(len, column)) + _BORDER for column in zip(self.header, *self.rows, strict=True)]
+        shared = sum(needed[: self.names]) + 1
+        parts: list[list[int]] = [[]]
+        for number in range(self.names, len(self.header)):
+            if parts[-1] and shared + sum(needed[k] for k in (*parts[-1], number)) > width:
+                parts.append([])
+            parts[-1].append(number)
+        return [self._only([*range(self.names), *part]) for part in parts]
+
+    def _only(self, columns: Sequence[int]) -> TextTable:
+        rows = tuple(tuple(row[k] for k in columns) for row in self.rows)
+        return replace(self, header=tuple(self.header[k] for k in columns), rows=rows)
+
+    def rich(self) -> Table:
+        """Return the table for a terminal, without its title; units in brackets aren't taken for markup."""
+        table = Table()
+        for number, name in enumerate(self.header):
+            table.add_column(Text(name), justify="left" if number < self.names else "right")
+        for number, row in enumerate(self.rows):
+            table.add_row(*map(Text, row), end_section=number + 1 in self.groups)
+        return table
+
+    def text(self) -> str:
+        """Return the table for a text file, without its title: columns aligned by blanks."""
+        return self._formatted("simple", self.rows)
+
+    def markdown(self) -> str:
+        """Return the title and the table in Markdown."""
+        rows = [[cell.replace("|", r"\|") for cell in row] for row in self.rows]
+        title = f"{self.title}\n\n" if self.title else ""
+        return f"{title}{self._formatted('pipe', rows)}\n"
+
+    def latex(self) -> str:
+        """Return a `table` environment in LaTeX, with the title as its caption; it needs booktabs."""
+        rows: list[Sequence[str] | str] = []
+        for number, row in enumerate(self.rows):
+            rows += [SEPARATING_LINE, row] if number in self.groups else [row]
+        caption = "".join(LATEX_ESCAPE_RULES.get(character, character) for character in self.title)
+        lines = [
+            r"% \usepackage{booktabs}",
+            r"\begin{table}",
+            r"\centering",
+            rf"\caption{{{caption}}}",
+            self._formatted("latex_booktabs", rows),
+            r"\end{table}",
+            "",
+        ]
+        return "\n".join(lines).translate(_UNICODE)
+
+    def _formatted(self, style: str, rows: Sequence[Sequence[str] | str]) -> str:
+        sides = ["left"] * self.names + ["right"] * (len(self.header) - self.names)
+        return str(tabulate(rows, self.header, tablefmt=style, colalign=sides, disable_numparse=True))
+
+
+# --- a study ---------------------------------------------------------------------------------------------
+
+SMALLEST_P: Final = 0.001
+"""A p below this is shown as smaller than it."""
+FIGURES: Final = ("runs", "mean", "95 %", "difference", "95 %", "p", "")
+"""Columns of every table after those that name the combination."""
+_EXTREMES: Final = {"all, median": "median", "all, largest": "max"}
+"""Rows below the average over all runs, each made by a function of pandas."""
+
+
+def summary_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
+    """Return a table for each metric of the study that its runs have."""
+    return [_table(study, frame, metric) for metric in study.metrics if metric in frame]
+
+
+def caption(study: Study, frame: pd.DataFrame) -> str:
+    """Return what the tables show, and how it was tested."""
+    base = study.baseline
+    against = f"{base.estimator}: {study.baseline_variant}" if base.estimator else study.baseline_variant
+    runs = frame.groupby([*RUN, *COMBINATION], sort=False)["failure"].first()
+    return (
+        f"{study.name}: {study.question} "
+        f"{len(runs)} runs ({int((runs != '').sum())} failed) of {study.laps} laps, at the end of the last. "
+        f"Mean and {100 * LEVEL:g} % interval (Student's t) over track x seed; difference from {against} "
+        f"paired over track and seed; p of the paired t-test, corrected by {CORRECTION}'s method over all "
+        f"comparisons of the metric; * where p < {1 - LEVEL:.2f}."
+    )
+
+
+def _table(study: Study, frame: pd.DataFrame, key: str) -> TextTable:
+    several = [name for name in COMBINATION if frame[name].nunique() > 1] or ["variant"]
+    header = (*several, *FIGURES)
+    metric = METRICS[key]
+    digits = max(metric.digits, MEAN_DIGITS)
+
+    def row(contrast: Contrast) -> tuple[str, ...]:
+        names = tuple(getattr(contrast, name) for name in several)
+        value, difference = contrast.value, contrast.difference
+        figures = (str(value.count), *_figures(value, metric.factor, digits, ""))
+        if difference is None:
+            return (*names, *figures, "baseline", "", "", "")
+        by = _figures(difference, metric.factor, digits, "+")
+        return (*names, *figures, *by, _p(contrast.p), "*" if contrast.significant else "")
+
+    rows = tuple(row(contrast) for contrast in contrasts(study, frame, key))
+    return TextTable(metric.heading, header, rows, names=len(several))
+
+
+def _p(p: float) -> str:
+    if np.isnan(p):
+        return ""
+    return f"{p:.3f}" if p >= SMALLEST_P else f"<{SMALLEST_P:g}"
+
+
+def _figures(estimated: Estimate, factor: float, digits: int, sign: str) -> tuple[str, str]:
+    if not estimated.count:
+        return "", ""
+    mean = f"{factor * estimated.mean:{sign}.{digits}f}"
+    half = "" if np.isnan(estimated.half) else f"± {factor * estimated.half:.{digits}f}"
+    return mean, half
+
+
+def as_text(tables: Sequence[TextTable], caption: str) -> str:
+    """Return the caption and the tables for a text file."""
+    return "\n\n".join([caption, *(f"{table.title}\n{table.text()}" for table in tables)]) + "\n"
+
+
+def as_markdown(tables: Sequence[TextTable], caption: str) -> str:
+    """Return the caption and the tables in Markdown."""
+    bold = (replace(table, title=f"**{table.title}**") for table in tables)
+    return "\n".join([caption.replace("*", r"\*") + "\n", *(table.markdown() for table in bold)])
+
+
+def as_latex(tables: Sequence[TextTable], caption: str) -> str:
+    """Return a `table` environment for each metric, each with the whole caption."""
+    return "\n".join(replace(table, title=f"{table.title}. {caption}").latex() for table in tables)
+
+
+def track_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
+    """Return a table for each combination of noise, estimator and settings, if the study wants columns."""
+    columns = [column_of(text) for text in study.columns]
+    if not columns:
+        return []
+    several = [name for name in COMBINATION if frame[name].nunique() > 1] or ["estimator"]
+    header = ("track", "runs", *(column.title for column in columns))
+    return [
+        TextTable(", ".join(str(runs[name].iloc[0]) for name in several), header, tuple(_rows(columns, runs)))
+        for _, runs in frame.groupby([*COMBINATION], sort=False)
+    ]
+
+
+def _rows(columns: Sequence[Column], frame: pd.DataFrame) -> Iterator[tuple[str, ...]]:
+    """Yield a row of texts for each track, and those over all runs."""
+    finished = frame.groupby([*RUN], sort=False)["failure"].first() == ""
+    values = [_values(column, frame).reindex(finished.index) for column in columns]
+    whole = (f"{int(finished.sum())} of {len(finished)}",)
+    for track, done in finished.groupby(level=0, sort=False):
+        texts = (c.average(v.loc[done.index]) for c, v in zip(columns, values, strict=True))
+        yield (str(track), f"{int(done.sum())} of {len(done)}", *texts)
+    yield ("all, mean", *whole, *(c.average(v) for c, v in zip(columns, values, strict=True)))
+    for name, over in _EXTREMES.items():
+        yield (name, *whole, *(c.extreme(v, over) for c, v in zip(columns, values, strict=True)))
+
+
+def _values(column: Column, frame: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each run that finished, by track and seed: the values of the metrics by key."""
+    laps = column.laps
+    done = frame[frame["failure"] == ""] if laps else last_laps(frame)
+    if laps == LATER_LAPS:
+        done = done[done["lap"] > 1]
+    elif laps.isdecimal():
+        done = done[done["lap"] == int(laps)]
+    done = done.reindex(columns=[*RUN, *(metric.key for metric in column.metrics)])
+    by_run = done.groupby([*RUN], sort=False)
+    return pd.DataFrame({m.key: by_run[m.key].agg(m.over) for m in column.metrics})

@@ -1,0 +1,124 @@
+"""Work is spread over processes or a cluster, and goes on when a worker dies."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from threading import Thread
+from typing import Any, Final, TypeVar
+
+from joblib import Parallel, delayed, parallel_config
+
+from pathspace_graph.errors import SettingsError
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+CONNECT_SECONDS: Final = 20.0
+"""Time (s) within which a cluster has to answer."""
+
+WATCH_SECONDS: Final = 1.0
+"""Interval (s) at which a worker checks whether the process that started it is still there."""
+
+
+class WorkerDiedError(RuntimeError):
+    """The process that did the work was killed, ran out of memory or crashed."""
+
+
+@contextmanager
+def workers(jobs: int, cluster: str | None) -> Iterator[None]:
+    """Start processes on this machine with one BLAS thread each, or connect to a Dask cluster's workers."""
+    if cluster is None:
+        leave = {"initializer": _end_with, "initargs": (os.getpid(),)}
+        with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1, **leave):
+            yield
+        return
+    try:
+        from distributed import Client  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise SettingsError("--cluster: expected the extra pathspace-graph[cluster], found none") from error
+    try:
+        client = Client(cluster, timeout=CONNECT_SECONDS)
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"--cluster: expected a Dask scheduler, found none at {cluster}") from error
+    with client, parallel_config(backend="dask", wait_for_workers_timeout=CONNECT_SECONDS):
+        yield
+
+
+def _end_with(parent: int) -> None:
+    """End this process soon after its parent, since a parent that is killed can't end its workers."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(WATCH_SECONDS)
+        os._exit(1)
+
+    if os.getpid() != parent:
+        Thread(target=watch, daemon=True).start()
+
+
+def check_jobs(jobs: int) -> None:
+    """Raise SettingsError unless the number of processes is at least 1, or -1."""
+    if jobs < 1 and jobs != -1:
+        raise SettingsError(f"jobs: expected at least 1, or -1 for every core, found {jobs}")
+
+
+def outcomes(
+    work: Callable[..., R], items: Sequence[T], load: Callable[[T], tuple[Any, ...]]
+) -> Iterator[tuple[T, R | WorkerDiedError]]:
+    """Yield (item, `work(item, *load(item))`) in the order in which they finish; `work` must not raise.
+
+    When a worker dies, nobody knows which item it had, so each item under way is tried again alone.
+    """
+    remaining = dict(enumerate(items))
+    while remaining:
+        sent: list[int] = []
+        try:
+            for index, result in _run(work, _tasks(remaining, load, sent)):
+                yield remaining.pop(index), result
+        except _deaths():
+            for index in sent:
+                if index in remaining:
+                    item = remaining.pop(index)
+                    yield item, _alone(work, item, load(item))
+
+
+def _tasks(
+    remaining: dict[int, T], load: Callable[[T], tuple[Any, ...]], sent: list[int]
+) -> Iterator[tuple[int, tuple[Any, ...]]]:
+    """Yield the remaining work a little ahead of the workers, and notes its indices in `sent`."""
+    for index, item in list(remaining.items()):
+        sent.append(index)
+        yield index, (item, *load(item))
+
+
+def _run(
+    work: Callable[..., R], tasks: Iterator[tuple[int, tuple[Any, ...]]], **options: Any
+) -> Iterator[tuple[int, R]]:
+    parallel = Parallel(return_as="generator_unordered", batch_size=1, **options)
+    yield from parallel(delayed(_numbered)(work, index, arguments) for index, arguments in tasks)
+
+
+def _numbered(work: Callable[..., R], index: int, arguments: tuple[Any, ...]) -> tuple[int, R]:
+    return index, work(*arguments)
+
+
+def _alone(work: Callable[..., R], item: T, loaded: tuple[Any, ...]) -> R | WorkerDiedError:
+    try:
+        # one job would be done by this very process
+        ((_, result),) = _run(work, iter([(0, (item, *loaded))]), n_jobs=2)
+    except _deaths() as error:
+        return WorkerDiedError(f"the process that ran it died ({type(error).__name__})")
+    return result
+
+
+def _deaths() -> tuple[type[Exception], ...]:
+    """Return the exceptions that mean that a worker died."""
+    try:
+        from distributed import KilledWorker  # noqa: PLC0415 - an extra
+    except ImportError:
+        return (BrokenProcessPool,)
+    return (BrokenProcessPool, KilledWorker)

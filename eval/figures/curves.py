@@ -1,0 +1,284 @@
+"""The uncertainty along a spline, with what its formula leaves out, and the simplification of a curve."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from pathspace_graph.eval.metrics.accuracy import closest_points, root_mean_square
+from pathspace_graph.factors.gauge import greville, smoothness_matrix
+from pathspace_graph.io.map import SplineBoundary
+from pathspace_graph.settings.knots import BreakSettings
+from pathspace_graph.sim.geometry import ring
+from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
+from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.knots import curvature_weighted_breaks, fit_spline, refit
+
+from .style import (
+    BLUE,
+    DARK,
+    LIGHT,
+    ORANGE,
+    PURPLE,
+    THIN_WIDTH,
+    WIDTH,
+    draw_control_points,
+    draw_curve,
+    draw_ellipses,
+    draw_points,
+    figure_context,
+    normals,
+    point_blocks,
+    set_frame,
+    uncertainty_band,
+)
+
+Array = NDArray[np.float64]
+
+# a curve swings to either side, and cones along it were seen but between two shares of its length (m)
+_CONTROL_POINTS, _SPACING, _SWING = 13, 5.5, 6.0
+_CONES, BLIND = 18, (0.52, 0.74)
+_SIGMA_DETECTION = 0.3  # of a seen cone across the curve
+_SIGMA_BEND, _SIGMA_ANCHOR = 1.0, 2.0  # weak priors of second differences and of control points
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """Curve with its standard deviation across itself, computed in three ways."""
+
+    boundary: SplineBoundary
+    """Curve with the joint covariance of its control points."""
+    cones: Array
+    """Each row holds the position (x, y) of a seen cone (m)."""
+    u: Array
+    """Parameters (n,) that everything below is computed at."""
+    length: Array
+    """Lengths (n,) along the curve at the parameters (m)."""
+    joint: Array
+    """The joint covariance, B Sigma B', gives these standard deviations (n,), m."""
+    marginals: Array
+    """The paper's formula, the sum of beta_j^2 Sigma_j, gives these standard deviations (n,), m."""
+    sampled: Array
+    """The splines drawn at random have these standard deviations (n,), m."""
+    curves: Array
+    """Points (s, n, 2) of the splines drawn at random (m)."""
+
+
+def uncertainty(rng: np.random.Generator, samples: int = 2000) -> Uncertainty:
+    """Compute the posterior of a curve that cones hold across itself, and draw splines from it."""
+    x = _SPACING * np.arange(_CONTROL_POINTS)
+    points = np.stack([x, _SWING * np.sin(2.0 * np.pi * x / x[-1])], axis=1)
+    spline = BSpline.open_uniform(points, interval=_SPACING).clamp()
+    share = (np.arange(_CONES) + 0.5) / _CONES
+    seen = spline.parameters_at(spline.length() * share[(share < BLIND[0]) | (share > BLIND[1])])
+    covariance = posterior(spline, seen, _SIGMA_DETECTION, _SIGMA_BEND, _SIGMA_ANCHOR)
+    u = np.linspace(*spline.domain, 301)
+    drawn = rng.multivariate_normal(spline.control_points.ravel(), covariance, samples)
+    curves = np.einsum("nm,smd->snd", spline.basis_matrix(u), drawn.reshape(samples, -1, 2))
+    across = np.einsum("snd,nd->sn", curves - spline.evaluate(u), normals(spline, u))
+    return Uncertainty(
+        boundary=SplineBoundary(spline, covariance),
+        cones=spline.evaluate(seen),
+        u=u,
+        length=spline.arc_length(u),
+        joint=spline.normal_sigma(u, covariance),
+        marginals=marginal_sigma(spline, u, covariance),
+        sampled=across.std(axis=0),
+        curves=curves,
+    )
+
+
+def marginal_sigma(spline: BSpline, u: Array, covariance: Array) -> Array:
+    """Return sqrt(n' (sum_j beta_j(u)^2 Sigma_j) n) (k,), m: the paper's formula, without cross terms."""
+    own = covariance * np.kron(np.eye(spline.size), np.ones((2, 2)))
+    return spline.normal_sigma(u, own)
+
+
+def posterior(
+    spline: BSpline, seen: Array, sigma_detection: float, sigma_bend: float, sigma_anchor: float
+) -> Array:
+    """Return `(R'R / sigma_detection^2 + D'D / sigma_bend^2 + I / sigma_anchor^2)^-1` (2m, 2m), m^2.
+
+    R maps control points to the displacement across the curve at the parameters `seen` (k,), and D to second
+    differences. The sigmas are in m.
+    """
+    rows = (spline.basis_matrix(seen)[:, :, None] * normals(spline, seen)[:, None, :]).reshape(len(seen), -1)
+    bend = np.kron(smoothness_matrix(greville(spline.knots, spline.degree), None), np.eye(2))
+    information = rows.T @ rows / sigma_detection**2 + bend.T @ bend / sigma_bend**2
+    return np.asarray(np.linalg.inv(information + np.eye(len(information)) / sigma_anchor**2))
+
+
+# --- figure ----------------------------------------------------------------------------------------------
+
+_SHOWN: Final = 40
+"""This many of the splines drawn at random are shown."""
+_EVERY: Final = 6
+"""The spread of the samples is marked at every sixth parameter."""
+
+
+def plot_uncertainty(data: Uncertainty) -> Figure:
+    """Draw (a) the uncertainty of control points and curve, (b) its sigma across itself in three ways."""
+    with figure_context():
+        figure = Figure((WIDTH, 4.6), layout="constrained")
+        above, below = figure.subplots(2, 1, height_ratios=(1.55, 1.0))
+        _draw_curves(above, data)
+        _draw_sigmas(below, data)
+        above.set_title("(a) uncertainty of the control points, and of the curve that they make")
+        below.set_title("(b) standard deviation across the curve")
+    return figure
+
+
+def _draw_curves(axes: Axes, data: Uncertainty) -> None:
+    boundary, spline = data.boundary, data.boundary.spline
+    for number, curve in enumerate(data.curves[:_SHOWN]):
+        label = None if number else "sampled splines"
+        axes.plot(*curve.T, color=LIGHT, linewidth=THIN_WIDTH, zorder=1.5, label=label)
+    for number, edge in enumerate(uncertainty_band(boundary, data.u)):
+        label = None if number else "2σ band"
+        axes.plot(*edge.T, color=BLUE, linewidth=0.8, zorder=3, label=label)
+    draw_curve(axes, spline, BLUE, "spline")
+    draw_control_points(axes, spline.control_points, ORANGE, "control points, 2σ")
+    draw_ellipses(axes, spline.control_points, point_blocks(boundary.covariance), ORANGE)
+    draw_points(axes, data.cones, "x", DARK, "cones seen", zorder=5)
+    set_frame(axes, spline.control_points.min(axis=0) - 3.0, spline.control_points.max(axis=0) + 3.0)
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.legend(loc="upper right")
+
+
+def _draw_sigmas(axes: Axes, data: Uncertainty) -> None:
+    axes.plot(data.length, data.joint, color=BLUE, label="joint covariance, $BΣB^⊤$")
+    marginals = r"marginals only, $\Sigma_j\, β_j^2 Σ_{C_j}$"
+    axes.plot(data.length, data.marginals, color=ORANGE, linestyle="--", label=marginals)
+    spread = np.stack([data.length, data.sampled], axis=1)[::_EVERY]
+    draw_points(axes, spread, ".", "black", f"spread of {len(data.curves)} sampled splines", zorder=2)
+    axes.set_xlim(0.0, data.length[-1])
+    axes.set_ylim(0.0, 1.25 * float(data.joint.max()))
+    axes.set_xlabel("length along the curve [m]")
+    axes.set_ylabel("σ [m]")
+    axes.legend(loc="upper left", ncols=3)
+
+
+# the left boundary of a generated track of some length (m) gets fewer control points
+_TRACK_SEED, _LAP_LENGTH = 3, (200.0, 260.0)
+_BEFORE, _AFTER, _SAMPLES = 100, 32, 1500
+
+
+@dataclass(frozen=True, eq=False)
+class Simplified:
+    """Curve on fewer knots and its distance from the old one."""
+
+    curve: BSpline
+    """New curve."""
+    errors: Array
+    """Distances (n,) of points of the old curve, at equal lengths, from the new one (m)."""
+
+    @property
+    def rms(self) -> float:
+        """Return the root mean square of the distances (m)."""
+        return root_mean_square(self.errors)
+
+
+@dataclass(frozen=True, eq=False)
+class Simplification:
+    """The paper's simplification beside one that ignores curvature."""
+
+    old: BSpline
+    """Curve of many control points."""
+    length: Array
+    """The errors are taken at these lengths (n,) along the old curve (m)."""
+    curvature: Array
+    """Old curve's curvature (n,) there (1/m)."""
+    weighted: Simplified
+    """This curve has curvature-weighted knots."""
+    uniform: Simplified
+    """This curve has as many knots at equal lengths."""
+
+
+def simplification() -> Simplification:
+    """Fit a spline of many control points to a generated boundary, and simplify it in two ways."""
+    settings = TrackGeneratorSettings(lap_length=_LAP_LENGTH)
+    track = generate_track(np.random.default_rng(_TRACK_SEED), settings)
+    old = fit_spline(np.asarray(track.left), _BEFORE, periodic=True)
+    length = old.length() * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    u = old.parameters_at(length)
+    points = old.evaluate(u)
+
+    def simplified(settings: BreakSettings) -> Simplified:
+        curve = simplify_curve(old, _AFTER, settings)
+        return Simplified(curve, np.linalg.norm(points - closest_points(curve, points).position, axis=1))
+
+    uniform = BreakSettings(baseline=1.0)
+    return Simplification(old, length, old.curvature(u), simplified(BreakSettings()), simplified(uniform))
+
+
+def simplify_curve(old: BSpline, size: int, settings: BreakSettings) -> BSpline:
+    """Return the least-squares curve of `size` control points on curvature-weighted knots."""
+    breaks = curvature_weighted_breaks(old, size, settings)
+    empty = BSpline.periodic_from(breaks, np.zeros((size, 2)), old.degree)
+    return empty.with_points(refit(old, empty).new_from_old @ old.distinct_control_points)
+
+
+# --- figure ----------------------------------------------------------------------------------------------
+
+
+def plot_simplification(data: Simplification) -> Figure:
+    """Draw (a) before, (b) after, (c) the distance between the two along the curve, (d) its curvature."""
+    with figure_context():
+        points = data.old.evaluate(np.linspace(*data.old.domain, 400))
+        low, high = points.min(axis=0) - 6.0, points.max(axis=0) + 6.0
+        width, height = high - low
+        panel_height = 0.5 * WIDTH * height / width
+        figure = Figure((WIDTH, panel_height + 3.0), layout="constrained")
+        grid = figure.add_gridspec(3, 2, height_ratios=(panel_height, 1.1, 0.7))
+        before, after = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
+        _draw_closed(before, data.old, "(a) before", BLUE)
+        _draw_closed(after, data.weighted.curve, "(b) after", PURPLE)
+        draw_curve(after, data.old, DARK, width=0.8, linestyle="--", zorder=3.5)
+        for axes in (before, after):
+            set_frame(axes, low, high)
+            axes.set_xlabel("x [m]")
+        before.set_ylabel("y [m]")
+        after.tick_params(labelleft=False)
+        errors = figure.add_subplot(grid[1, :])
+        _draw_errors(errors, data)
+        _draw_curvature(figure.add_subplot(grid[2, :], sharex=errors), data)
+    return figure
+
+
+def _draw_closed(axes: Axes, spline: BSpline, title: str, color: str) -> None:
+    draw_curve(axes, spline, color)
+    draw_control_points(axes, ring(spline.distinct_control_points), color)
+    axes.set_title(f"{title}: {spline.size} control points")
+
+
+def _draw_errors(axes: Axes, data: Simplification) -> None:
+    for simplified, color, line, name in (
+        (data.uniform, ORANGE, "--", "uniform knots"),
+        (data.weighted, PURPLE, "-", "curvature-weighted knots"),
+    ):
+        errors_cm = 100.0 * simplified.errors
+        label = f"{name}: rms {100 * simplified.rms:.1f} cm, largest {errors_cm.max():.1f} cm"
+        axes.plot(data.length, errors_cm, color=color, linestyle=line, linewidth=0.9, label=label)
+    axes.set_xlim(0.0, data.old.length())
+    axes.set_ylim(0.0, 170.0 * float(data.uniform.errors.max()))
+    axes.set_ylabel("distance [cm]")
+    axes.tick_params(labelbottom=False)
+    axes.set_title("(c) distance between before and after")
+    axes.legend(loc="upper right")
+
+
+def _draw_curvature(axes: Axes, data: Simplification) -> None:
+    axes.fill_between(data.length, np.abs(data.curvature), color=LIGHT, linewidth=0.0)
+    knots = data.old.arc_length(data.weighted.curve.breaks)
+    on_axis = np.stack([knots, np.zeros(len(knots))], axis=1)
+    draw_points(axes, on_axis, "|", PURPLE, markersize=9.0, clip_on=False)
+    axes.set_ylim(0.0)
+    axes.set_xlabel("length along the curve [m]")
+    axes.set_ylabel("curvature\n[1/m]")
+    axes.set_title("(d) curvature, and the knots that follow it")

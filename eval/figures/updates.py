@@ -1,0 +1,329 @@
+"""The paper's expansion of a curve in three steps, and its fit of detections, as figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from pathspace_graph.ckf.expansion import beyond_end, proximity_chain
+from pathspace_graph.ckf.fit import SplineMeasurement, fit_detections
+from pathspace_graph.factors.bspline import end_change_matrix
+from pathspace_graph.io.map import SplineBoundary
+from pathspace_graph.mapping.cubature import cubature_points, square_root
+from pathspace_graph.settings.comparison import CkfSettings
+from pathspace_graph.sim.geometry import left_normals, unit
+from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.knots import fit_spline
+
+from .curves import posterior
+from .style import (
+    BLUE,
+    DARK,
+    GREEN,
+    LIGHT,
+    MARKER_SIZE,
+    ORANGE,
+    PURPLE,
+    RED,
+    THIN_WIDTH,
+    WIDTH,
+    draw_band,
+    draw_control_points,
+    draw_curve,
+    draw_ellipses,
+    draw_points,
+    figure_context,
+    fit_height,
+    normals,
+    point_blocks,
+    set_frame,
+    shared_legend,
+)
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+# a curve ends at the origin, on a left bend that it leaves to the outside by a share of its length (m)
+_RADIUS, _DRIFT = 30.0, 0.03
+_POINTS, _SPACING = 6, 3.0
+_SIGMA_KNOWN, _SIGMA_BEND, _SIGMA_ANCHOR = 0.3, 0.5, 1.0  # what the curve was made of, and weak priors
+# detections lie on it and beyond its end, at these lengths along the bend and to the inside of it (m)
+_ALONG, _INSIDE = (-5.5, -2.6, 2.2, 4.6, 7.0), (0.1, 0.25, 0.3, 0.05, 0.2)
+SIGMA_DETECTION = 0.2
+_SETTINGS = CkfSettings(threshold=2.0, separation=2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """The three steps."""
+
+    detections: Array
+    """Each row holds the position (x, y) of a detection (m)."""
+    sigma: float
+    """Each detection has this standard deviation (m)."""
+    expands: Bools
+    """In step (a) these detections (m,) mark an expansion of the curve."""
+    order: NDArray[np.intp]
+    """Proximity chain of those detections; the curve is extended to the last one."""
+    before: SplineBoundary
+    """Curve of step (a), with the joint covariance of its control points."""
+    extended: SplineBoundary
+    """Curve of step (b)."""
+    updated: SplineBoundary
+    """Curve of step (c)."""
+
+
+def expansion() -> Expansion:
+    """Classify the detections, extend the curve to the last of their chain, update it with the others."""
+    before = _known_curve()
+    detections = _on_bend(np.array(_ALONG), np.array(_INSIDE))
+    covariances = np.tile(SIGMA_DETECTION**2 * np.eye(2), (len(detections), 1, 1))
+    spline, high = before.spline, before.spline.domain[1]
+    foot_u = spline.foot_points(detections).u
+    expands = beyond_end(detections, foot_u, high, spline.control_points, _SETTINGS)
+    beyond = np.flatnonzero(expands)
+    order = beyond[proximity_chain(detections[beyond], spline.control_points[-1])]
+    extended = extend(before, detections[order[-1]], covariances[order[-1]])
+    others = np.arange(len(detections)) != order[-1]
+    updated = update(extended, detections[others], covariances[others])
+    return Expansion(detections, SIGMA_DETECTION, expands, order, before, extended, updated)
+
+
+def extend(boundary: SplineBoundary, detection: Array, covariance: Array) -> SplineBoundary:
+    """Unclamp the curve, append the detection (2,), (2, 2) as last control point, and clamp it there."""
+    spline = boundary.spline
+    longer = spline.extend_to(detection)
+    change = np.kron(end_change_matrix(spline.knots, spline.degree, longer.knots), np.eye(2))
+    return SplineBoundary(longer, block_diag(change @ boundary.covariance @ change.T, covariance))
+
+
+def update(boundary: SplineBoundary, detections: Array, covariances: Array) -> SplineBoundary:
+    """Do one Kalman update of the control points with S_z of detections (m, 2), (m, 2, 2), map frame."""
+    spline, n = boundary.spline, boundary.size
+    basis = spline.basis_matrix(spline.foot_points(detections).u)
+    measurement = fit_detections(basis, detections, covariances, spline.control_points, CkfSettings())
+    combine = np.kron(measurement.range_basis(), np.eye(2)).T
+    H = combine @ np.kron(measurement.taken, np.eye(2))
+    R = combine @ measurement.covariance @ combine.T
+    P = boundary.covariance
+    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    innovation = combine @ (measurement.points - spline.control_points).ravel()
+    points = spline.control_points + (gain @ innovation).reshape(n, 2)
+    keep = np.eye(2 * n) - gain @ H
+    return SplineBoundary(spline.with_points(points), keep @ P @ keep.T + gain @ R @ gain.T)
+
+
+def _known_curve() -> SplineBoundary:
+    """Return a clamped curve along the bend that drifts to its outside and ends beside the origin."""
+    count = _POINTS
+    along = np.linspace(-_SPACING * count, 0.0, 2 * count + 1)
+    row = _on_bend(along, -_DRIFT * (along - along[0]))
+    spline = fit_spline(row, count, periodic=False)
+    seen = np.linspace(*spline.domain, 2 * count)
+    covariance = posterior(spline, seen, _SIGMA_KNOWN, _SIGMA_BEND, _SIGMA_ANCHOR)
+    return SplineBoundary(spline, covariance)
+
+
+def _on_bend(along: Array, inside: Array) -> Array:
+    """Return points (m, 2) of a left bend that passes the origin eastward, m."""
+    angle = along / _RADIUS
+    r = _RADIUS - inside
+    return np.stack([r * np.sin(angle), _RADIUS - r * np.cos(angle)], axis=1)
+
+
+# --- figure ----------------------------------------------------------------------------------------------
+
+
+def plot_expansion(data: Expansion) -> Figure:
+    """Draw (a) classified detections, (b) the curve extended to the last of their chain, (c) the update."""
+    interpolated = np.arange(len(data.detections)) == data.order[-1]
+    with figure_context():
+        figure = Figure((WIDTH, 7.4), layout="compressed")
+        panels = figure.subplots(3, 1, sharex=True)
+        _draw_step(panels[0], data, data.before, data.expands)
+        _draw_step(panels[1], data, data.extended, interpolated)
+        _draw_step(panels[2], data, data.updated, interpolated)
+        _draw_chain(panels[0], data)
+        for axes, before in ((panels[1], data.before), (panels[2], data.extended)):
+            draw_curve(axes, before.spline, DARK, "spline before the step", 0.9, linestyle="--", zorder=3.5)
+        panels[0].set_title("(a) detections beyond the end expand the curve, the others update it")
+        panels[1].set_title("(b) the curve is extended to the last of their chain; the others update it too")
+        panels[2].set_title("(c) the curve after the update")
+        panels[2].set_xlabel("x [m]")
+        for axes in panels:
+            axes.set_ylabel("y [m]")
+        shared_legend(figure, 4)
+        fit_height(figure)
+    return figure
+
+
+def _draw_step(axes: Axes, data: Expansion, boundary: SplineBoundary, expands: Bools) -> None:
+    color, name = (PURPLE, "updated spline") if boundary is data.updated else (BLUE, "spline")
+    draw_band(axes, boundary, color, f"{name}, 2σ", zorder=1)
+    draw_curve(axes, boundary.spline, color, name)
+    draw_control_points(axes, boundary.spline.control_points, color, f"{name}, control points")
+    for chosen, of, text in (
+        (~expands, GREEN, "detections that update, 2σ"),
+        (expands, RED, "detections that expand, 2σ"),
+    ):
+        points = data.detections[chosen]
+        draw_ellipses(axes, points, np.tile(data.sigma**2 * np.eye(2), (len(points), 1, 1)), of)
+        draw_points(axes, points, "o", of, text)
+    shown = np.concatenate([data.detections, data.updated.spline.control_points])
+    set_frame(axes, shown.min(axis=0) - 1.0, shown.max(axis=0) + 0.8)
+
+
+def _draw_chain(axes: Axes, data: Expansion) -> None:
+    """Draw the proximity chain, from the end of the curve on."""
+    chain = np.concatenate([data.before.spline.control_points[-1:], data.detections[data.order]])
+    axes.plot(*chain.T, color=RED, linewidth=0.8, linestyle=":", zorder=2, label="proximity chain")
+
+
+# a curve swings to either side; detections lie to its left, at shares of its length (m)
+_SHAPE = (9, 3.5, 3.0)  # number of control points, their distance, swing
+_SHARES, _OFFSETS = (0.36, 0.47, 0.58, 0.68), (0.5, 1.2, 1.3, 0.6)
+_SIGMAS, _VEHICLE = (0.45, 0.15), (2.0, 5.5)  # along the ray from the vehicle and across it
+RIDGE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The four steps."""
+
+    curve: BSpline
+    """S_mu, the state's curve."""
+    detections: Array
+    """Each row holds the position (x, y) of a detection z (m)."""
+    covariances: Array
+    """Detections' covariances (m, 2, 2), m^2."""
+    foot_u: Array
+    """Parameters (m,) of the closest points."""
+    basis: Array
+    """This is B (m, n), the basis functions at the closest points."""
+    sigma_points: Array
+    """Sigma points X (4 m, m, 2) of the detections (m)."""
+    fitted_points: Array
+    """Control points Z (4 m, n, 2) fitted to each sigma point (m)."""
+    measurement: SplineMeasurement
+    """S_z."""
+
+    @property
+    def fitted(self) -> BSpline:
+        """Return S_z as a curve."""
+        return self.curve.with_points(self.measurement.points)
+
+
+def fit() -> Fit:
+    """Compute C = C_mu + (B' B + L)^-1 B' (y - B C_mu) of the detections and of their sigma points."""
+    count, spacing, swing = _SHAPE
+    x = spacing * np.arange(count)
+    points = np.stack([x, -swing * np.cos(2.0 * np.pi * x / x[-1])], axis=1)
+    curve = BSpline.open_uniform(points, interval=spacing).clamp()
+    beside = curve.parameters_at(np.array(_SHARES) * curve.length())
+    detections = curve.evaluate(beside) + np.array(_OFFSETS)[:, None] * normals(curve, beside)
+    covariances = _ray_covariances(detections - np.array(_VEHICLE), _SIGMAS)
+    foot_u = curve.foot_points(detections).u
+    basis = curve.basis_matrix(foot_u)
+    settings = CkfSettings(ridge=RIDGE, penalty="solution")
+    measurement = fit_detections(basis, detections, covariances, curve.control_points, settings)
+    sigma_points = _sigma_points(detections, covariances)
+    innovations = sigma_points - basis @ curve.control_points
+    fitted_points = curve.control_points + np.einsum("nm,kmd->knd", measurement.gain, innovations)
+    return Fit(curve, detections, covariances, foot_u, basis, sigma_points, fitted_points, measurement)
+
+
+def _ray_covariances(rays: Array, sigmas: tuple[float, float]) -> Array:
+    """Return covariances (m, 2, 2), m^2, of standard deviations (m) along each ray (m, 2) and across it."""
+    along = unit(rays)
+    parts = zip(sigmas, (along, left_normals(along)), strict=True)
+    return np.asarray(sum(s**2 * v[:, :, None] * v[:, None, :] for s, v in parts))
+
+
+def _sigma_points(detections: Array, covariances: Array) -> Array:
+    """Return the cubature points (4 m, m, 2) of all detections (m, 2), (m, 2, 2) together."""
+    root = square_root(block_diag(*covariances))
+    return cubature_points(detections.ravel(), root).reshape(-1, *detections.shape)
+
+
+# --- figure ----------------------------------------------------------------------------------------------
+
+_INVISIBLE: Final = 1e-3
+"""A basis function below this can't be seen."""
+_DETECTIONS: Final = "detections $z$ (a: 2σ)"
+_DIAMOND: Final = 0.8 * MARKER_SIZE
+
+
+def plot_fit(data: Fit) -> Figure:
+    """Draw (a) closest points, (b) sigma points and their fits, (c) S_z, (d) the basis functions there."""
+    with figure_context():
+        figure = Figure((WIDTH, 4.0), layout="compressed")
+        closest, sigma, fitted, basis = figure.subplots(2, 2).flat
+        for axes in (closest, sigma, fitted):
+            draw_curve(axes, data.curve, BLUE, r"$S_\mu$")
+        _draw_closest(closest, data)
+        _draw_sigma_points(sigma, data)
+        _draw_fitted(fitted, data)
+        _draw_basis(basis, data)
+        shown = np.concatenate([data.curve.control_points, data.detections])
+        low = shown.min(axis=0) - np.array([1.0, 1.6])
+        high = shown.max(axis=0) + np.array([1.0, 1.9])
+        for axes in (closest, sigma, fitted):
+            draw_points(axes, data.detections, "o", GREEN, _DETECTIONS)
+            set_frame(axes, low, high)
+            axes.set_xlabel("x [m]")
+            axes.set_ylabel("y [m]")
+        width, height = high - low
+        basis.set_box_aspect(height / width)
+        shared_legend(figure, 5)
+        fit_height(figure)
+    return figure
+
+
+def _draw_closest(axes: Axes, data: Fit) -> None:
+    draw_control_points(axes, data.curve.control_points, BLUE, r"$C_\mu$")
+    nearest = data.curve.evaluate(data.foot_u)
+    for ends in np.stack([data.detections, nearest], axis=1):
+        axes.plot(*ends.T, color=DARK, linewidth=0.7, zorder=4)
+    draw_ellipses(axes, data.detections, data.covariances, GREEN)
+    draw_points(axes, nearest, "D", ORANGE, "closest points", markersize=_DIAMOND)
+    axes.set_title("(a) closest points on the state's curve")
+
+
+def _draw_sigma_points(axes: Axes, data: Fit) -> None:
+    for number, points in enumerate(data.fitted_points):
+        label = None if number else "splines $Z$"
+        draw_curve(axes, data.curve.with_points(points), LIGHT, label, THIN_WIDTH, zorder=2)
+    draw_points(axes, data.sigma_points.reshape(-1, 2), ".", RED, "sigma points $X$", zorder=5)
+    axes.set_title("(b) sigma points, and a fit to each")
+
+
+def _draw_fitted(axes: Axes, data: Fit) -> None:
+    points = data.measurement.points
+    draw_curve(axes, data.fitted, PURPLE, "$S_z$", zorder=3.5)
+    draw_control_points(axes, points, PURPLE, "$C_z$, 2σ")
+    draw_ellipses(axes, points, point_blocks(data.measurement.covariance), PURPLE)
+    axes.set_title("(c) $S_z$: their mean and covariance")
+
+
+def _draw_basis(axes: Axes, data: Fit) -> None:
+    """Draw the basis functions over the parameter, and marks their values at the detections."""
+    u = np.linspace(*data.curve.domain, 400)
+    for j, values in enumerate(data.curve.basis_matrix(u).T):
+        color = PURPLE if data.basis[:, j].sum() > _INVISIBLE else LIGHT
+        axes.plot(np.where(values > _INVISIBLE, u, np.nan), values, color=color, linewidth=0.9, zorder=2)
+    rows, columns = np.nonzero(data.basis > _INVISIBLE)
+    values = np.stack([data.foot_u[rows], data.basis[rows, columns]], axis=1)
+    draw_points(axes, values, "D", ORANGE, "basis at the closest points", markersize=_DIAMOND, zorder=3)
+    for foot in data.foot_u:
+        axes.axvline(foot, color=ORANGE, linewidth=0.7, linestyle=":", zorder=1)
+    axes.set_xlim(*data.curve.domain)
+    axes.set_ylim(0.0, 1.0)
+    axes.set_xlabel("parameter $u$ [m]")
+    axes.set_ylabel("basis $β_j(u)$")
+    axes.set_title("(d) basis: how freely each control point moves")

@@ -1,0 +1,367 @@
+"""`python -m pathspace_graph.eval.hints` measures how many spoiled logs are told and good ones accused.
+
+Good logs of all kinds are judged: what is unusual about them is no mistake, and none of them may be accused.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, Final
+
+import numpy as np
+import pandas as pd
+import tyro
+from rich.console import Console
+from scipy.stats import binomtest
+from threadpoolctl import threadpool_limits
+from tyro.conf import arg
+
+from pathspace_graph.errors import PathspaceError, check_name
+from pathspace_graph.estimators import DEFAULT, make_online
+from pathspace_graph.eval.experiment.drives import NamedTrack, load_tracks
+from pathspace_graph.eval.experiment.tables import TextTable
+from pathspace_graph.eval.metrics.accuracy import lap_metrics
+from pathspace_graph.io.files import atomic_folder, check_target
+from pathspace_graph.io.log import Detections, Log, Odometry, write_log
+from pathspace_graph.labels import LEFT
+from pathspace_graph.plausibility.judge import hints
+from pathspace_graph.plausibility.reading import read_plausible_log
+from pathspace_graph.progress import progress
+from pathspace_graph.run import run_online
+from pathspace_graph.settings.limits import LimitSettings
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.faults import Faults, OdometryFaults, SensorFaults, VehicleFaults
+from pathspace_graph.sim.mistakes import MISTAKES
+from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+
+Row = dict[str, Any]
+
+BAD_INPUT: Final = 2
+"""Exit code where a track can't be read or the output can't be written."""
+MARKER: Final = "hints.csv"
+"""File of the results, by which their folder is recognized."""
+AS_SIMULATED: Final = "as simulated"
+"""Kind of good logs with nothing unusual."""
+CONFIDENCE: Final = 0.95
+"""Confidence of the intervals."""
+MISSED: Final = 0.05
+"""A map that misses a larger share of the cones is bad."""
+WORSE: Final = 2.0
+"""A map is bad if its rmse is larger by this factor than that of the good log."""
+NOISE: Final = 3.0
+"""Factor of the noise in the noisy logs."""
+STANDING: Final = 10.0
+"""Time (s) for which a vehicle stands before it drives."""
+CAUSES: Final = {
+    "positions": ("positions",),
+    "speeds": ("speeds",),
+    "all lengths": ("positions", "speeds"),
+    "yaw rate": ("yaw rate",),
+    "bearings": ("unexplained",),
+    "y to the right": ("y to the right",),
+    "stamps": ("stamps",),
+    "sensor frame": ("sensor frame", "mounting"),
+    "odometry": ("odometry",),
+    "speeds in the map frame": ("odometry",),
+    "detections in the map frame": ("map frame",),
+    "detections 1 s late": ("clocks",),
+    "covariances": ("covariances",),
+    "all labels": ("labels",),
+}
+"""A mistake whose name begins so is told if one of these causes is named; the longest beginning counts."""
+
+
+# --- good logs -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Good:
+    """A kind of good log."""
+
+    simulation: SimulationSettings = field(default_factory=SimulationSettings)
+    """Settings of the drive, but for its laps."""
+    edit: Callable[[Log], Log] | None = None
+    """Change of the log afterwards."""
+    open_road: bool = False
+    """Whether the track is open: its second half is not there."""
+
+    def log(self, track: NamedTrack, seed: int, laps: int) -> Log:
+        """Return a log of this kind."""
+        cones = track.track
+        if self.open_road:
+            left, right = cones.left[: len(cones.left) // 2], cones.right[: len(cones.right) // 2]
+            cones = replace(cones, left=left, right=right, closed=False)
+        log = simulate(cones, replace(self.simulation, laps=laps), seed)
+        return log if self.edit is None else self.edit(log)
+
+
+def _sensor(**values: float) -> Good:
+    return Good(SimulationSettings(sensor=SensorSettings(**values)))  # type: ignore[arg-type]
+
+
+def _faulty(*faults: OdometryFaults | SensorFaults | VehicleFaults) -> Good:
+    names = {OdometryFaults: "odometry", SensorFaults: "sensor", VehicleFaults: "vehicle"}
+    return Good(SimulationSettings(faults=Faults(**{names[type(fault)]: fault for fault in faults})))  # type: ignore[arg-type]
+
+
+def _noisy() -> Good:
+    sensor, odometry = SensorSettings(), OdometryNoise()
+    louder = {
+        name: NOISE * getattr(sensor, name) for name in ("range_sigma", "range_sigma_growth", "bearing_sigma")
+    }
+    vx, vy, wz = (NOISE * sigma for sigma in odometry.white)
+    drift = OdometryNoise((vx, vy, wz), scale=NOISE * odometry.scale, gyro_bias=NOISE * odometry.gyro_bias)
+    return Good(SimulationSettings(sensor=replace(sensor, **louder), odometry=drift))
+
+
+def one_boundary(log: Log) -> Log:
+    """Return the log with the detections of the left boundary only."""
+    return _kept(log, lambda cycle: cycle.labels == LEFT)
+
+
+def few_cones(log: Log) -> Log:
+    """Return the log with the three nearest detections of each cycle."""
+    return _kept(log, lambda cycle: np.argsort(np.argsort(np.hypot(*cycle.points_vehicle.T))) < 3)
+
+
+def _kept(log: Log, chosen: Callable[[Detections], np.ndarray]) -> Log:
+    kept = (cycle.where(chosen(cycle)) for cycle in log.cycles)
+    return replace(log, cycles=tuple(cycle for cycle in kept if len(cycle.labels)), truth=None)
+
+
+def stands_first(log: Log) -> Log:
+    """Return the log of a vehicle that stands for ten seconds first, with fresh noise in each detection."""
+    rng, odometry, first = np.random.default_rng(0), log.odometry, log.cycles[0]
+    before = np.arange(0.0, STANDING, 0.02)
+    twists = rng.normal(0.0, log.odometry_sigma, (len(before), 3))
+    roots, points = np.linalg.cholesky(first.covariances), first.points_vehicle
+    standing = [
+        replace(
+            first, t=t, points_vehicle=points + np.einsum("mij,mj->mi", roots, rng.normal(size=points.shape))
+        )
+        for t in np.arange(0.0, STANDING, 0.1).tolist()
+    ]
+    driving = [replace(cycle, t=cycle.t + STANDING) for cycle in log.cycles]
+    stamps = np.append(before, odometry.t - odometry.t[0] + STANDING)
+    whole = Odometry(stamps, np.vstack([twists, odometry.twist]))
+    return replace(log, odometry=whole, cycles=(*standing, *driving), truth=None)
+
+
+def backs_up(log: Log) -> Log:
+    """Return the log of a vehicle that goes the same way backward: time runs the other way."""
+    end = float(log.odometry.t[-1])
+    odometry = Odometry(end - log.odometry.t[::-1], -log.odometry.twist[::-1])
+    cycles = [replace(cycle, t=end - cycle.t) for cycle in log.cycles[::-1] if cycle.t <= end]
+    return replace(log, odometry=odometry, cycles=tuple(cycles), truth=None)
+
+
+def slow_odometry(log: Log) -> Log:
+    """Return the log with every fifth twist."""
+    return replace(log, odometry=Odometry(log.odometry.t[::5], log.odometry.twist[::5]))
+
+
+def in_unix_time(log: Log) -> Log:
+    """Return the log with stamps since 1970."""
+    odometry = replace(log.odometry, t=log.odometry.t + 1.7e9)
+    cycles = tuple(replace(cycle, t=cycle.t + 1.7e9) for cycle in log.cycles)
+    return replace(log, odometry=odometry, cycles=cycles, truth=None)
+
+
+GOOD: Final[dict[str, Good]] = {
+    AS_SIMULATED: Good(),
+    "field of view of 180 degrees": _sensor(fov=np.pi),
+    "field of view of 360 degrees": _sensor(fov=2.0 * np.pi),
+    "range of 5 m": _sensor(range_max=5.0),
+    "range of 8 m": _sensor(range_max=8.0),
+    "range of 20 m": _sensor(range_max=20.0),
+    "noise times 3": _noisy(),
+    "2 cycles per second": _sensor(rate=2.0),
+    "5 cycles per second": _sensor(rate=5.0),
+    "20 cycles per second": _sensor(rate=20.0),
+    "30 % of the cones missed": _sensor(detection_probability=0.7, blind_fraction=0.15),
+    "5 false positives in a cycle": _sensor(false_positives=5.0),
+    "30 % wrong colours": _sensor(wrong_colour=0.3),
+    "without colours": _faulty(SensorFaults(colourless=1.0)),
+    "yaw-rate bias of 0.02 rad/s": _faulty(OdometryFaults(yaw_rate_bias=0.02)),
+    "wheel slip of 50 %": _faulty(OdometryFaults(slip=0.5)),
+    "latency of 100 ms": _faulty(SensorFaults(latency=0.1)),
+    "sensor turned by 2 degrees": _faulty(SensorFaults(yaw=0.0349)),
+    "sensor 0.2 m to the left": _faulty(SensorFaults(lateral=0.2)),
+    "ranges 4 % too long": _faulty(SensorFaults(range_scale=0.04)),
+    "odometry missing for 2 s": _faulty(OdometryFaults(gap=2.0)),
+    "no detections for 5 s": _faulty(SensorFaults(dropout=5.0)),
+    "driven the other way round": _faulty(VehicleFaults(wrong_way=True)),
+    "one boundary": Good(edit=one_boundary),
+    "three cones in a cycle": Good(edit=few_cones),
+    "stands for 10 s first": Good(edit=stands_first),
+    "backs up": Good(edit=backs_up),
+    "odometry at 10 Hz": Good(edit=slow_odometry),
+    "stamps since 1970": Good(edit=in_unix_time),
+    "open road": Good(open_road=True),
+}
+"""Kinds of good logs by name."""
+
+
+# --- the measurement -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class HintStudy:
+    """Spoils simulated logs by each mistake, and varies good ones; says how many are told and accused."""
+
+    out: Path
+    """The results are written to this folder; earlier ones there are kept as a numbered backup."""
+    tracks: Annotated[tuple[str, ...], arg(metavar="TRACK...")] = ("0", "1")
+    """The drives are on these tracks: files, folders of files, or seeds of generated tracks."""
+    seeds: tuple[int, ...] = (0, 1)
+    """Each track is driven with these seeds."""
+    laps: int = 1
+    """Each drive has this number of laps."""
+    good: bool = True
+    """Good logs of all kinds are judged as well."""
+    mistakes: tuple[str, ...] = tuple(MISTAKES)
+    """Logs are spoiled by these mistakes."""
+    kinds: tuple[str, ...] = (AS_SIMULATED,)
+    """Good logs of these kinds are spoiled."""
+    maps: bool = False
+    """What becomes of the map of each spoiled log is measured, too, which takes long."""
+
+    def run(self) -> TextTable:
+        """Judge every log, write the results and return the table."""
+        for name in self.mistakes:
+            check_name(name, MISTAKES, "--mistakes: expected a known mistake")
+        for name in self.kinds:
+            check_name(name, GOOD, "--kinds: expected a known kind of good log")
+        check_target(self.out, MARKER)
+        tracks = load_tracks([int(one) if one.isdigit() else Path(one) for one in self.tracks])
+        rows: list[Row] = []
+        with progress("judging", len(tracks) * len(self.seeds)) as advance:
+            for track in tracks:
+                for seed in self.seeds:
+                    drive = {"track": track.name, "seed": seed}
+                    rows += [drive | row for row in self._judge(track, seed)]
+                    advance()
+        frame = pd.DataFrame(rows)
+        table = summary(frame)
+        with atomic_folder(self.out, MARKER) as folder:
+            frame.to_csv(folder / MARKER, index=False, lineterminator="\n")
+            (folder / "hints.md").write_text(table.markdown(), encoding="utf-8")
+        return table
+
+    def _judge(self, track: NamedTrack, seed: int) -> Iterator[Row]:
+        """Yield a row for each log of a drive: the good ones, and each of those that are spoiled."""
+        for of, kind in GOOD.items():
+            if not self.good and of not in self.kinds:
+                continue
+            log = kind.log(track, seed, self.laps)
+            if self.good:
+                yield {"kind": "good", "name": of, "of": of, **judged(log)}
+            clean = mapped(log) if self.maps and of in self.kinds else {}
+            for name in self.mistakes if of in self.kinds else ():
+                spoiled = MISTAKES[name](log)
+                row = {"of": of, "kind": "spoiled", "name": name, **judged(spoiled, causes_of(name))}
+                yield row | (outcome(mapped(spoiled), clean) if self.maps else {})
+
+
+def causes_of(mistake: str) -> tuple[str, ...]:
+    """Return the causes of which one must be named."""
+    return CAUSES[max((begin for begin in CAUSES if mistake.startswith(begin)), key=len)]
+
+
+def judged(log: Log, causes: Sequence[str] = ()) -> Row:
+    """Return what is said of a log, and whether one of the causes is named."""
+    begin = time.perf_counter()
+    with threadpool_limits(limits=1):
+        found = hints(log)
+    seconds = time.perf_counter() - begin
+    named = [hint.cause for hint in found]
+    return {
+        "said": bool(found),
+        "told": any(cause in named for cause in causes),
+        "causes": "; ".join(named),
+        "seconds": seconds,
+        "text": " | ".join(hint.line for hint in found),
+    }
+
+
+def mapped(log: Log) -> Row:
+    """Return what the default estimator makes of a log in files: a refusal, or the errors of its map."""
+    with TemporaryDirectory() as folder, threadpool_limits(limits=1):
+        write_log(log, Path(folder) / "log")
+        try:
+            usable, _ = read_plausible_log(Path(folder) / "log", LimitSettings())
+            result = run_online(usable, make_online(DEFAULT, MapperSettings(), usable))
+        except PathspaceError as error:
+            return {"refusal": str(error).replace(str(folder), "")}
+    if log.truth is None or not result.map.boundaries:
+        return {"boundaries": len(result.map.boundaries)}
+    errors = lap_metrics(result.map, log.truth, result.laps)
+    return {"boundaries": len(result.map.boundaries), "rmse": errors.rmse, "missed": errors.missed}
+
+
+def outcome(found: Row, clean: Row) -> Row:
+    """Return what became of the map: it is refused, empty, bad or good."""
+    if "refusal" in found:
+        return {**found, "map": "refused"}
+    if found["boundaries"] == 0:
+        return {**found, "map": "empty"}
+    worse = found["missed"] > MISSED + clean["missed"] or not found["rmse"] <= WORSE * clean["rmse"]
+    return {**found, "map": "bad" if worse or found["boundaries"] < clean["boundaries"] else "good"}
+
+
+def summary(rows: pd.DataFrame) -> TextTable:
+    """Return the table: for each kind of log how many were told or accused, with exact intervals."""
+    lines: list[tuple[str, ...]] = []
+    groups = []
+    for kind, title, column in (("spoiled", "told", "told"), ("good", "accused", "said")):
+        of_kind = rows[rows["kind"] == kind]
+        if len(of_kind):
+            groups.append(len(lines))
+            lines += [
+                _line(f"{title}: {name}", of, column) for name, of in of_kind.groupby("name", sort=False)
+            ]
+            lines.append(_line(f"{title}: all", of_kind, column))
+    title = (
+        "Spoiled logs that are told by their cause, and good logs that are accused of anything, with the "
+        f"{100.0 * CONFIDENCE:.0f} % interval of Clopper and Pearson."
+    )
+    header = ("logs", "number", "of", "share [%]", "interval [%]", "maps", "seconds")
+    return TextTable(title, header, tuple(lines), groups=tuple(groups[1:]))
+
+
+def _line(name: str, logs: pd.DataFrame, column: str) -> tuple[str, ...]:
+    count, total = int(logs[column].sum()), len(logs)
+    interval = binomtest(count, total).proportion_ci(CONFIDENCE)
+    maps = logs["map"].value_counts().to_dict() if "map" in logs and column == "told" else {}
+    return (
+        name,
+        str(count),
+        str(total),
+        f"{100.0 * count / total:.1f}",
+        f"{100.0 * interval.low:.1f} to {100.0 * interval.high:.1f}",
+        ", ".join(f"{number} {what}" for what, number in maps.items()),
+        f"{np.median(logs['seconds']):.2f}",
+    )
+
+
+def main() -> None:
+    """Run the script; the exit code is 2 on bad input."""
+    study = tyro.cli(HintStudy)
+    try:
+        table = study.run()
+    except PathspaceError as error:
+        Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(f"hints: {error}")
+        raise SystemExit(BAD_INPUT) from error
+    console = Console(highlight=False, soft_wrap=True, markup=False)
+    console.print(table.title)
+    console.print(table.text())
+    console.print(f"written to {study.out}")
+
+
+if __name__ == "__main__":
+    main()

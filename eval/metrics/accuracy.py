@@ -1,0 +1,404 @@
+"""How far a map is from the truth: the paper's Table 1, true boundaries as curves, crossings, ghosts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import Akima1DInterpolator
+from scipy.spatial import KDTree
+
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.footpoint import FootPoints, foot_points
+from pathspace_graph.io.log import Truth
+from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.laps import lap_end_indices
+from pathspace_graph.settings.checked import Positive
+from pathspace_graph.spline.bspline import BSpline
+
+Array = NDArray[np.float64]
+
+MISSED_DISTANCE = 3.0
+"""A true cone farther than this (m) from its mapped boundary is missed (paper, Table 1)."""
+
+GRID_PER_SPAN = 64
+"""Closest points are searched from this many grid points on each span, about every 0.1 m of a track."""
+
+
+@dataclass(frozen=True, slots=True)
+class LapMetrics:
+    """One row of the paper's Table 1."""
+
+    lap: int
+    """Laps count from 1; the map is taken as it stood at the end of this lap."""
+
+    rmse: float
+    """Rmse (m) over the cones that aren't missed; it is NaN where all are missed."""
+
+    missed: float
+    """This share (0 to 1) of all true cones is missed; it is NaN without true cones."""
+
+    size: int
+    """Both boundaries together have this many control points or landmarks."""
+
+
+def lap_metrics(track: Map, truth: Truth, lap: int) -> LapMetrics:
+    """Return rmse = sqrt(mean d^2) over true cones with d <= 3 m, and the share of those with d > 3 m."""
+    distances = cone_distances(track, truth)
+    return LapMetrics(
+        lap=lap,
+        rmse=root_mean_square(distances[distances <= MISSED_DISTANCE]),
+        missed=missed_share(distances),
+        size=track.size,
+    )
+
+
+def missed_share(distances: Array, threshold: float = MISSED_DISTANCE) -> float:
+    """Return the share of the distances (K,) with d > threshold (m); NaN without any."""
+    return float(np.mean(distances > threshold)) if len(distances) else float("nan")
+
+
+def capped_rmse(distances: Array, cap: float = MISSED_DISTANCE) -> float:
+    """Return sqrt(mean min(d, cap)^2) in m: a missed cone counts as `cap`, so that missing it never pays."""
+    return root_mean_square(np.minimum(distances, cap))
+
+
+def cone_distances(track: Map, truth: Truth) -> Array:
+    """Return the distance (K,) in m of each true cone from its own mapped boundary, in the truth's order.
+
+    It is infinite where that boundary isn't mapped. Cones labelled `unknown` belong to no boundary and are
+    left out.
+    """
+    distances = np.full(len(truth.cones), np.inf)
+    for label in BOUNDARIES:
+        if label in track.boundaries:
+            own = truth.cone_labels == label
+            distances[own] = boundary_distances(track.boundaries[label], truth.cones[own])
+    return distances[np.isin(truth.cone_labels, BOUNDARIES)]
+
+
+def boundary_distances(boundary: MapBoundary, points_map: Array) -> Array:
+    """Return the distance (k,) in m of each point (k, 2) from the spline, or from the nearest landmark."""
+    if isinstance(boundary, SplineBoundary):
+        feet = closest_points(boundary.spline, points_map)
+        return np.asarray(np.linalg.norm(points_map - feet.position, axis=1))
+    if boundary.size == 0:
+        return np.full(len(points_map), np.inf)
+    return np.asarray(KDTree(boundary.points).query(points_map)[0])
+
+
+def closest_points(spline: BSpline, points_map: Array) -> FootPoints:
+    """Return the closest point of the whole curve to each point (k, 2).
+
+    The search is so fine that the result is exact, except where two stretches are equally near to about the
+    sagitta of the grid: then either may be found.
+    """
+    low, high = spline.domain
+    step = (high - low) / (GRID_PER_SPAN * (len(spline.breaks) - 1))
+    lows, highs = np.full(len(points_map), low), np.full(len(points_map), high)
+    return foot_points(spline.tables, spline.control_points, points_map, lows, highs, step)
+
+
+def root_mean_square(values: Array) -> float:
+    """Return sqrt(mean v^2); NaN without values."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+
+
+PATH_STEP: Final = 0.1
+"""The cones are ordered along points of the true path that are at most this far (m) apart."""
+TRUE_STEP: Final = 0.02
+"""Points of a true curve are at most this far (m) apart: a distance of 0.1 m is at most 0.5 mm too long."""
+MAPPED_STEP: Final = 0.1
+"""Distances are measured from points of a curve that are at most this far (m) apart."""
+CENTRE_STEP: Final = 1.0
+"""The centre line is compared with the true one at points that are this far (m) apart."""
+CHORD: Final = 0.25
+"""Crossings are those of chords of this length (m)."""
+FARTHEST: Final = 3.0
+"""A true boundary farther than this (m) from the mapped one is missed, as cones are in the paper's table."""
+ROUND_OFF: Final = 1e-9
+"""A length that exceeds whole steps by less than this share of a step gets no further step."""
+_OVERLAP: Final = 3
+"""Akima's tangents of a closed curve need this many cones beyond the seam."""
+_CACHED: Final = 16
+"""This many true curves are cached, since every map of a log is compared with the same ones several times."""
+_MIN_CONES: Final = 2
+"""A curve needs at least this many cones."""
+
+
+# --- points on curves ------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=_CACHED)
+def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
+    """Return points (k, 2) in m, at most `step` apart, on the curve through the true cones of a boundary.
+
+    The curve is Akima's cubic over chord lengths, in driving order. It passes through every cone and, unlike
+    a natural spline, it doesn't overshoot where the spacing of the cones changes. It is closed where the true
+    path completes a lap. One cone gives one point, no cone none. Callers must not write to the array, because
+    it is cached.
+    """
+    cones = driving_order(truth, label)
+    if len(cones) < _MIN_CONES:
+        return cones
+    closed = len(cones) > _OVERLAP and len(truth.poses) > 0 and len(lap_end_indices(truth.poses)) > 0
+    nodes = np.concatenate([cones[-_OVERLAP:], cones, cones[: _OVERLAP + 1]]) if closed else cones
+    nodes = nodes[np.append(True, np.linalg.norm(np.diff(nodes, axis=0), axis=1) > 0.0)]
+    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1)))
+    low, high = (length[_OVERLAP], length[-_OVERLAP - 1]) if closed else (length[0], length[-1])
+    samples = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
+    return np.asarray(Akima1DInterpolator(length, nodes)(samples), dtype=float)
+
+
+def driving_order(truth: Truth, label: int) -> Array:
+    """Return the true cones (k, 2) of one boundary in driving order.
+
+    They are sorted by the nearest point of the true path's first lap. The order of the file is kept where it
+    gives the shorter polygon (on the inside of a hairpin several cones have the same nearest point), or where
+    there is no true path.
+    """
+    cones: Array = truth.cones[truth.cone_labels == label]
+    if len(truth.poses) < 2 or len(cones) == 0:
+        return cones
+    nearest: NDArray[np.intp] = np.asarray(KDTree(_first_lap(truth)).query(cones)[1])
+    by_path: Array = cones[np.argsort(nearest, kind="stable")]
+    return by_path if _perimeter(by_path) < _perimeter(cones) else cones
+
+
+def _first_lap(truth: Truth) -> Array:
+    """Return points (n, 2) of the true path up to the end of lap 1, at most PATH_STEP apart."""
+    ends = lap_end_indices(truth.poses)
+    path = truth.poses[: ends[0] + 1 if len(ends) else None, :2]
+    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
+    samples = np.linspace(0.0, length[-1], int(np.ceil(length[-1] / PATH_STEP)) + 1)
+    return np.stack([np.interp(samples, length, coordinate) for coordinate in path.T], axis=1)
+
+
+def _perimeter(points: Array) -> float:
+    """Return the length (m) of the closed polygon through the points."""
+    return float(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
+
+
+def mapped_points(boundary: MapBoundary, step: float = MAPPED_STEP) -> Array:
+    """Return points (k, 2) in m on a curve, equal lengths of at most `step` apart, or the landmarks."""
+    if not isinstance(boundary, SplineBoundary):
+        return boundary.points
+    spline = boundary.spline
+    length = spline.length()
+    count = max(int(np.ceil(length / step - ROUND_OFF)), 1)
+    return spline.evaluate(spline.parameters_at((np.arange(count) + 0.5) * length / count))
+
+
+# --- distances -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CurveDistance:
+    """Mean distances (m) between the mapped and the true boundaries, both boundaries together."""
+
+    mapped_to_truth: float
+    """This distance, from the mapped curve to the true one, is large where something false is mapped."""
+    truth_to_mapped: float
+    """This distance, from the true curve to the mapped one, is large where something true isn't mapped."""
+
+    @property
+    def two_way(self) -> float:
+        """Return the mean of both."""
+        return 0.5 * (self.mapped_to_truth + self.truth_to_mapped)
+
+
+def curve_distance(track: Map, truth: Truth) -> CurveDistance:
+    """Return mean_p min_q |p - q| over mapped points p, and mean_q min_p |q - p| over true ones q.
+
+    Points of the true curve and of a mapped spline are equal lengths apart. Landmarks are points with nothing
+    in between, so the second distance charges them for the gaps, in contrast to the error at the cones. It is
+    infinite where a boundary isn't mapped. Either is NaN where there is nothing to measure from.
+    """
+    forth, back = [np.zeros(0)], [np.zeros(0)]
+    for label in BOUNDARIES:
+        curve_true = true_curve(truth, label)
+        if len(curve_true) == 0:
+            continue
+        if label not in track.boundaries:
+            back.append(np.full(1, np.inf))
+            continue
+        boundary = track.boundaries[label]
+        forth.append(np.asarray(KDTree(curve_true).query(mapped_points(boundary))[0]))
+        back.append(boundary_distances(boundary, true_curve(truth, label, MAPPED_STEP)))
+    return CurveDistance(_mean(np.concatenate(forth)), _mean(np.concatenate(back)))
+
+
+def two_way_distance(first: MapBoundary, second: MapBoundary) -> float:
+    """Return the same two-way distance (m) between two mapped boundaries."""
+    forth = boundary_distances(second, mapped_points(first))
+    back = boundary_distances(first, mapped_points(second))
+    return 0.5 * (_mean(forth) + _mean(back))
+
+
+# --- crossings -------------------------------------------------------------------------------------------
+
+
+def crossings(track: Map) -> tuple[int, int]:
+    """Return how often the curves of a map cross each other, and how often they cross themselves.
+
+    No boundary crosses the other one. Where the same cones bound two stretches of a track, a boundary lies on
+    itself.
+    """
+    chords, owner = [np.zeros((0, 2, 2))], [np.zeros(0)]
+    for label, boundary in track.boundaries.items():
+        if isinstance(boundary, SplineBoundary):
+            points = mapped_points(boundary, CHORD)
+            ends = np.roll(points, -1, axis=0) if boundary.spline.periodic else points[1:]
+            chords.append(np.stack([points[: len(ends)], ends], axis=1))
+            owner.append(np.full(len(ends), label))
+    begin, end = np.concatenate(chords).transpose(1, 0, 2)
+    of = np.concatenate(owner)
+    other = own = 0
+    for k, (a, b) in enumerate(zip(begin, end, strict=True)):
+        crossed = _apart(a, b, begin[k:], end[k:]) & _apart(begin[k:], end[k:], a, b)
+        other += int((crossed & (of[k:] != of[k])).sum())
+        own += int((crossed & (of[k:] == of[k])).sum())
+    return other, own
+
+
+def _apart(begin: Array, end: Array, a: Array, b: Array) -> NDArray[np.bool_]:
+    """Return whether points a and b lie on different sides of the lines through begin and end."""
+    way, first, second = end - begin, a - begin, b - begin
+    sides = way[..., 0] * first[..., 1] - way[..., 1] * first[..., 0]
+    others = way[..., 0] * second[..., 1] - way[..., 1] * second[..., 0]
+    return np.asarray(sides * others < 0.0)
+
+
+# --- the centre line -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CentreLineErrors:
+    """Errors of a mapped centre line at its n points, along their normals, and their sigmas (m).
+
+    A value is NaN where a true boundary does not cross the normal near the mapped one.
+    """
+
+    across: Array
+    """(n,) The true centre is this far to the left of the mapped one."""
+    across_sigma: Array
+    """(n,) The map claims this standard deviation of it."""
+    width: Array
+    """(n,) The true track is this much wider to each side than the mapped one."""
+    width_sigma: Array
+    """(n,) The map claims this standard deviation of it: the mean of both sides."""
+
+
+def centre_line_errors(track: Map, truth: Truth, step: float = CENTRE_STEP) -> CentreLineErrors | None:
+    """Return the errors of the centre line at points `step` (m) apart; None where the map has no such line.
+
+    The normal of a point crosses the true boundaries at the offsets o_l and o_r. The true centre is at their
+    mean, and half the width is half their difference.
+    """
+    try:
+        line = track.centre_line(step)
+    except SettingsError:
+        return None
+    normals = np.column_stack([-np.sin(line.heading), np.cos(line.heading)])
+    left, right = (
+        _crossings(line.points, normals, offsets, true_curve(truth, label, MAPPED_STEP))
+        for label, offsets in zip(BOUNDARIES, (line.width_left, -line.width_right), strict=True)
+    )
+    return CentreLineErrors(
+        across=0.5 * (left + right),
+        across_sigma=line.points_sigma,
+        width=0.5 * (left - right - line.width_left - line.width_right),
+        width_sigma=0.5 * (line.width_left_sigma + line.width_right_sigma),
+    )
+
+
+def _crossings(points: Array, normals: Array, expected: Array, curve: Array) -> Array:
+    """Return the offsets (n,) at which normals through points (n, 2) cross a curve (k, 2), by its chords.
+
+    Of several crossings it is the one nearest to the expected offset; none as far off as `FARTHEST` counts.
+    """
+    tangents = np.column_stack([normals[:, 1], -normals[:, 0]])
+    offsets = np.full(len(points), np.nan)
+    for i, (point, tangent, normal) in enumerate(zip(points, tangents, normals, strict=True)):
+        relative = curve - point
+        ahead = relative @ tangent
+        at = np.flatnonzero(ahead[:-1] * ahead[1:] <= 0.0)
+        if len(at):
+            run = ahead[at] - ahead[at + 1]
+            share = np.divide(ahead[at], run, out=np.zeros(len(at)), where=run != 0.0)
+            across = (relative[at] + share[:, None] * (relative[at + 1] - relative[at])) @ normal
+            nearest = across[np.abs(across - expected[i]).argmin()]
+            if abs(nearest - expected[i]) < FARTHEST:
+                offsets[i] = nearest
+    return offsets
+
+
+def _mean(distances: Array) -> float:
+    return float(np.mean(distances)) if len(distances) else float("nan")
+
+
+@dataclass(frozen=True)
+class GhostSettings(Positive):
+    """What counts as a ghost."""
+
+    distance: float = 2.0
+    """A mapped point farther than this (m) from the true boundary of its own colour is a ghost. The default
+    exceeds the drift of a map whose loop is closed, but not the width of the narrowest lane (3 m)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ghosts:
+    """What is mapped but doesn't exist, on both boundaries together."""
+
+    landmarks: int
+    """This many landmarks have no true boundary near."""
+    metres: float
+    """Mapped curves have no true boundary near over this length (m)."""
+    share: float
+    """Ghosts are this share of all landmarks and points of curves; it is NaN where nothing is mapped."""
+    duplicates: int
+    """This many landmarks are nearest to a true cone that already has one."""
+
+
+def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> Ghosts:
+    """Return the landmarks p and the length of curve with min_q |p - q| > distance, q on the true curve.
+
+    The true curve is that of the same boundary. A boundary without any true cone is a ghost as a whole.
+    """
+    settings = settings or GhostSettings()
+    landmarks = duplicates = 0
+    metres, all_ghosts = 0.0, []
+    for label, boundary in track.boundaries.items():
+        is_ghost = _is_ghost(mapped_points(boundary), true_curve(truth, label), settings.distance)
+        all_ghosts.append(is_ghost)
+        if isinstance(boundary, SplineBoundary):
+            metres += float(np.mean(is_ghost)) * boundary.spline.length()
+        else:
+            landmarks += int(is_ghost.sum())
+            duplicates += _duplicates(boundary, truth.cones[truth.cone_labels == label], settings.distance)
+    return Ghosts(landmarks, metres, _share(all_ghosts), duplicates)
+
+
+def _is_ghost(points: Array, curve_true: Array, distance: float) -> NDArray[np.bool_]:
+    """Return which points (k, 2) are ghosts."""
+    if len(curve_true) == 0 or len(points) == 0:
+        return np.ones(len(points), dtype=bool)
+    return np.asarray(KDTree(curve_true).query(points)[0] > distance)
+
+
+def _share(all_ghosts: list[NDArray[np.bool_]]) -> float:
+    pooled = np.concatenate([np.zeros(0, dtype=bool), *all_ghosts])
+    return float(np.mean(pooled)) if len(pooled) else float("nan")
+
+
+def _duplicates(boundary: PointBoundary, cones: Array, distance: float) -> int:
+    """Return how many landmarks within `distance` of their nearest cone share it with an earlier one."""
+    if len(cones) == 0 or boundary.size == 0:
+        return 0
+    distances, nearest = KDTree(cones).query(boundary.points)
+    matched = np.asarray(nearest)[np.asarray(distances) <= distance]
+    return int(len(matched) - len(np.unique(matched)))

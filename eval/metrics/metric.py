@@ -1,0 +1,257 @@
+"""The metrics: their names, units and averages, and columns of tables of several runs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from pathspace_graph.errors import SettingsError, check_name
+
+from .accuracy import root_mean_square
+
+FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3, "°": float(np.rad2deg(1.0)), "mrad/s": 1e3}
+"""Factors from the shares, bytes and radians of the columns to the units of the tables."""
+MEAN_DIGITS: Final = 2
+"""Least number of digits after the decimal point of a mean with its interval."""
+UNKNOWN: Final = "–"
+"""Text of a value that isn't known."""
+EVERY_LAP: Final = "all"
+"""A column `rmse@all` is the average over all laps."""
+LATER_LAPS: Final = "later"
+"""A column `rmse@later` is the average over the laps from the second on."""
+_SLOPE: Final = re.compile(r"slope\((\w+), (\w+)\)")
+_SLOPE_DIGITS: Final = 2
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One number that is measured of every lap or of every run."""
+
+    key: str
+    """Name of its column in every file."""
+    title: str
+    """Name in tables."""
+    unit: str = ""
+    """Unit in tables; empty for pure numbers and counts."""
+    digits: int = 3
+    """Number of digits after the decimal point in tables."""
+    scope: Literal["lap", "run"] = "lap"
+    """`lap`: measured of every lap and of the whole run; `run`: of the whole run only."""
+    time: bool = False
+    """Whether it is a wall time, all that differs when the same run is repeated."""
+    average: Literal["mean", "rms"] = "mean"
+    """Average over several runs: a root mean square for errors with a sign."""
+
+    @property
+    def heading(self) -> str:
+        """Title with the unit in brackets."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+    @property
+    def factor(self) -> float:
+        """Factor from the column's unit to that of the tables."""
+        return FACTORS.get(self.unit, 1.0)
+
+    def over(self, values: ArrayLike) -> float:
+        """Return the average of values of several runs, without those that aren't known."""
+        known = np.asarray(values, float)
+        known = known[~np.isnan(known)]
+        if len(known) == 0:
+            return float("nan")
+        return root_mean_square(known) if self.average == "rms" else float(np.mean(known))
+
+    def text(self, value: float) -> str:
+        """Return a value as tables show it."""
+        return UNKNOWN if np.isnan(value) else f"{self.factor * value:.{self.digits}f}"
+
+
+PAPER: Final = (
+    Metric("rmse", "rmse", "m"),
+    Metric("missed", "missed", "%", 1),
+    Metric("size", "size", digits=0),
+)
+"""Metrics of the paper's Table 1."""
+_ALL: Final = (
+    *PAPER,
+    Metric("cones", "true cones", digits=0),
+    Metric("size_share", "size by true cones", "%", 1),
+    Metric("missed_2m", "missed at 2 m", "%", 1),
+    Metric("missed_1m", "missed at 1 m", "%", 1),
+    Metric("rmse_capped", "rmse, a missed cone as 3 m", "m"),
+    Metric("mapped_to_truth", "curve distance, mapped to truth", "m"),
+    Metric("truth_to_mapped", "curve distance, truth to mapped", "m"),
+    Metric("two_way", "curve distance, two-way", "m"),
+    Metric("centre", "error of the centre line, across", "m"),
+    Metric("centre_nees", "NEES of the centre line, across", digits=2),
+    Metric("half_width", "error of the width to each side", "m"),
+    Metric("half_width_nees", "NEES of the width to each side", digits=2),
+    Metric("ghost_landmarks", "ghost landmarks", digits=1),
+    Metric("ghost_metres", "ghost curve", "m", 1),
+    Metric("ghost_share", "ghosts, share of the map", "%", 2),
+    Metric("duplicates", "landmarks of a cone mapped before", digits=1),
+    Metric("ate", "trajectory error (ATE)", "m"),
+    Metric("along", "trajectory error along", "m"),
+    Metric("across", "trajectory error across", "m"),
+    Metric("reach_median", "reach, median", "m", 1),
+    Metric("reach_p10", "reach, 10th percentile", "m", 1),
+    Metric("reach_short", "reach under 4 m, share of cycles", "%", 1),
+    Metric("reach_error", "error of the cones in reach", "m"),
+    Metric("turn", "turn about the start", "°", 2, average="rms"),
+    Metric("turn_sigma", "turn about the start, claimed sigma", "°", 2, average="rms"),
+    Metric("turn_nees", "NEES of the turn", digits=2),
+    Metric("turn_from_batch", "turn from the batch", "°", 2, average="rms"),
+    Metric("rmse_by_batch", "rmse by that of the batch", digits=2),
+    Metric("gap_curves", "gap to batch, curves", "m", scope="run"),
+    Metric("gap_trajectory", "gap to batch, trajectory", "m", scope="run"),
+    Metric("l", "limit, landmarks", "m", scope="run"),
+    Metric("f", "limit, fit", "m", scope="run"),
+    Metric("limit", "limit", "m", scope="run"),
+    Metric("nees", "NEES per degree of freedom", digits=2),
+    Metric("nees_low", "NEES, 95 % interval from", digits=2),
+    Metric("nees_high", "NEES, 95 % interval to", digits=2),
+    Metric("nees_inside", "NEES within its 95 % interval", "%", 1),
+    Metric("nees_marginals", "NEES per degree of freedom, of the marginals", digits=2),
+    Metric("inside", "cones within 2σ of the curve", "%", 1),
+    Metric("inside_marginals", "cones within 2σ of the marginals", "%", 1),
+    Metric("normalized_error", "mean squared error by variance at the cones", digits=2),
+    Metric(
+        "normalized_error_marginals",
+        "mean squared error by marginal variance at the cones",
+        digits=2,
+    ),
+    Metric(
+        "normalized_error_joint",
+        "squared error by the joint covariance of the batch at the cones",
+        digits=2,
+        scope="run",
+    ),
+    Metric(
+        "normalized_error_joint_inside",
+        "joint squared error within its 95 % interval",
+        "%",
+        1,
+        scope="run",
+    ),
+    Metric("closed", "loop closed", "%", 0),
+    Metric("closed_at_end", "loop closed at the end of the log", "%", 0, scope="run"),
+    Metric("false_closing", "loop closed falsely", "%", 1, scope="run"),
+    Metric("jump", "jump of the pose where the map is replaced", "m", 2, scope="run"),
+    Metric("error_max", "largest trajectory error", "m", 2, scope="run"),
+    Metric("error_end", "trajectory error in the last second", "m", 2, scope="run"),
+    Metric("lost_at_end", "vehicle lost at the end", "%", 0, scope="run"),
+    Metric("astray_time", "longest time with an error of over 1 m, after closing", "s", 1, scope="run"),
+    Metric("astray_way", "longest way with an error of over 1 m, after closing", "m", 0, scope="run"),
+    Metric("told_degraded", "cycles that the estimator calls degraded", "%", 1, scope="run"),
+    Metric("told_lost", "cycles that the estimator calls lost", "%", 1, scope="run"),
+    Metric("scale", "scale error of the speeds", "%", 2, scope="run"),
+    Metric("scale_true", "scale error of the speeds, true", "%", 2, scope="run"),
+    Metric("scale_sigma", "scale error of the speeds, claimed sigma", "%", 2, scope="run", average="rms"),
+    Metric("scale_error", "error of the scale", "%", 2, scope="run", average="rms"),
+    Metric("scale_by_sigma", "error of the scale by claimed sigma", digits=2, scope="run", average="rms"),
+    Metric("scale_by_prior", "scale error of the speeds by its prior's sigma", digits=1, scope="run"),
+    Metric("bias", "bias of the yaw rate", "mrad/s", 2, scope="run"),
+    Metric("bias_true", "bias of the yaw rate, true", "mrad/s", 2, scope="run"),
+    Metric("bias_sigma", "bias of the yaw rate, claimed sigma", "mrad/s", 2, scope="run", average="rms"),
+    Metric("bias_error", "error of the bias", "mrad/s", 2, scope="run", average="rms"),
+    Metric("bias_by_sigma", "error of the bias by claimed sigma", digits=2, scope="run", average="rms"),
+    Metric("bias_by_prior", "bias of the yaw rate by its prior's sigma", digits=1, scope="run"),
+    Metric("yaw_by_prior", "yaw of the sensor by its prior's sigma", digits=1, scope="run"),
+    Metric("lateral_by_prior", "lateral offset of the sensor by its prior's sigma", digits=1, scope="run"),
+    Metric("latency_by_prior", "latency of detections by its prior's sigma", digits=1, scope="run"),
+    Metric("range_scale_by_prior", "scale error of ranges by its prior's sigma", digits=1, scope="run"),
+    Metric("range_bias_by_prior", "bias of ranges by its prior's sigma", digits=1, scope="run"),
+    Metric("heading_sigma", "last heading, claimed sigma", "°", 2, scope="run", average="rms"),
+    Metric("heading_error", "error of the last heading", "°", 2, scope="run", average="rms"),
+    Metric(
+        "heading_by_sigma", "error of the last heading by claimed sigma", digits=2, scope="run", average="rms"
+    ),
+    Metric("converged", "batch converged", "%", 0, scope="run"),
+    Metric("cost", "cost of the batch", digits=1, scope="run"),
+    Metric("bytes", "map", "kB", 2),
+    Metric("bytes_covariance", "covariance of the map", "kB", 1),
+    Metric("ms_mean", "update, mean", "ms", 2, time=True),
+    Metric("ms_median", "update, median", "ms", 2, time=True),
+    Metric("ms_p99", "update, 99th percentile", "ms", 2, time=True),
+    Metric("seconds", "whole run", "s", 1, scope="run", time=True),
+)
+METRICS: Final[Mapping[str, Metric]] = {metric.key: metric for metric in _ALL}
+"""All metrics by key, in the order of the tables."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A figure of several runs: a metric of one lap or several, or a slope of one metric on another."""
+
+    metric: Metric
+    """Metric of the figure."""
+    laps: str = ""
+    """Number of a lap, `later` or `all`; empty for the last lap."""
+    given: Metric | None = None
+    """Metric on which the slope is taken, if it is a slope."""
+
+    @property
+    def title(self) -> str:
+        """Text above the column."""
+        if self.given is not None:
+            return f"slope of {self.metric.title} on {self.given.title}"
+        if self.laps.isdecimal():
+            return f"{self.metric.heading}, lap {self.laps}"
+        return f"{self.metric.heading}, {self.laps} laps" if self.laps else self.metric.heading
+
+    @property
+    def metrics(self) -> list[Metric]:
+        """Every metric that the column needs."""
+        return [self.metric] if self.given is None else [self.metric, self.given]
+
+    def average(self, values: pd.DataFrame) -> str:
+        """Return the text of the average over runs, whose metrics are columns by key, or of the slope."""
+        of = values[self.metric.key].astype(float)
+        if self.given is None:
+            return self.metric.text(self.metric.over(of))
+        slope = slope_of(of.to_numpy(), values[self.given.key].astype(float).to_numpy())
+        return UNKNOWN if np.isnan(slope) else f"{slope:.{_SLOPE_DIGITS}f}"
+
+    def extreme(self, values: pd.DataFrame, name: str) -> str:
+        """Return the text of the `median` or the `max` over runs, of magnitudes where there are signs."""
+        if self.given is not None:
+            return UNKNOWN
+        of = values[self.metric.key].astype(float)
+        return self.metric.text(float((of.abs() if self.metric.average == "rms" else of).agg(name)))
+
+
+def column_of(text: str) -> Column:
+    """Return a column such as `rmse`, `rmse@1`, `rmse@later`, `rmse@all` or `slope(bias, bias_true)`.
+
+    SettingsError where a metric or the laps are unknown.
+    """
+    slope = _SLOPE.fullmatch(text)
+    if slope is not None:
+        return Column(_metric(slope[1]), given=_metric(slope[2]))
+    key, _, laps = text.partition("@")
+    metric = _metric(key)
+    if laps and laps not in (EVERY_LAP, LATER_LAPS) and not laps.isdecimal():
+        raise SettingsError(
+            f"columns: expected a lap's number, '{LATER_LAPS}' or '{EVERY_LAP}' after @, found '{text}'"
+        )
+    return Column(metric, laps)
+
+
+def slope_of(estimates: np.ndarray, truths: np.ndarray) -> float:
+    """Return `sum e t / sum t^2` over the runs (n,) whose estimate and truth are known; NaN without any.
+
+    The line leads through the origin, since estimator and simulator both expect zero.
+    """
+    known = ~(np.isnan(estimates) | np.isnan(truths))
+    moment = float(truths[known] @ truths[known])
+    return float(estimates[known] @ truths[known]) / moment if moment > 0.0 else float("nan")
+
+
+def _metric(key: str) -> Metric:
+    check_name(key, METRICS, "columns: expected a known metric")
+    return METRICS[key]

@@ -1,0 +1,260 @@
+"""What a run is held against: the least error to be expected of its log, and another run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.factors.se2 import inverse, left_of, to_map
+from pathspace_graph.io.log import Detections, Log, Truth
+from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
+from pathspace_graph.io.results import RunResult
+from pathspace_graph.labels import BOUNDARIES, NAMES
+from pathspace_graph.landmark.oracle import LandmarkSolution, solve_landmarks
+from pathspace_graph.settings.calibration import CalibrationSettings
+from pathspace_graph.settings.knots import FitSettings
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.knots import fit_spline
+
+from .accuracy import (
+    boundary_distances,
+    closest_points,
+    driving_order,
+    mapped_points,
+    root_mean_square,
+    two_way_distance,
+)
+from .consistency import near_pairs
+from .trajectory import pose_errors
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """Least error that a run can be expected to reach."""
+
+    l: float  # noqa: E741 - the issue's and the paper's tables call it so
+    """Rmse (m) in the plane of the landmark batch with oracle association."""
+
+    f: float
+    """Rmse (m) of the true cones to splines of the mapped size that are fitted to them."""
+
+    @property
+    def total(self) -> float:
+        """Return sqrt(l^2 + f^2) in m."""
+        return float(np.hypot(self.l, self.f))
+
+
+def limit(log: Log, track: Map) -> Limit:
+    """Return the limit of a simulated log and a map of it; ValueError without truth or associations."""
+    truth = _truth(log)
+    return Limit(l=landmark_rmse(solve_oracle_landmarks(log), truth), f=fit_rmse(track, truth))
+
+
+def solve_oracle_landmarks(log: Log, *, with_covariance: bool = False) -> LandmarkSolution:
+    """Return the landmark batch with oracle association: each detection knows its true cone.
+
+    It is also told the sensor's constant errors and the true noise, where the log has them. Landmark ids are
+    indices of true cones.
+    """
+    truth = _truth(log)
+    if truth.associations is None:
+        raise ValueError("expected a simulated log, whose associations are known, found one without")
+    if truth.sensor is None and truth.noise is None:
+        return solve_landmarks(log, truth.associations, with_covariance=with_covariance)
+    settings = MapperSettings(calibration=CalibrationSettings(sensor=truth.sensor is None))
+    told, associations = without_sensor_errors(log, truth.associations)
+    told = with_true_noise(told, associations)
+    return solve_landmarks(told, associations, with_covariance=with_covariance, settings=settings)
+
+
+def without_sensor_errors(log: Log, associations: Ints) -> tuple[Log, Ints]:
+    """Return a log without its sensor's true constant errors, and the associations (R,) that are left.
+
+    Cycles get the stamps at which they were seen; those before the first odometry are left out. A range r
+    that reads `(1 + scale) r + bias`, and a covariance beside it, are inverted to first order in the noise.
+    """
+    truth = _truth(log)
+    if truth.sensor is None:
+        return log, associations
+    yaw, lateral, latency, scale, bias = truth.sensor.tolist()
+    c, s = np.cos(yaw), np.sin(yaw)
+    to_vehicle = np.array([[c, -s], [s, c]])
+    parts = np.split(associations, np.cumsum([len(cycle.labels) for cycle in log.cycles])[:-1])
+    cycles, left = [], []
+    for cycle, part in zip(log.cycles, parts, strict=True):
+        if cycle.t - latency < log.odometry.t[0]:
+            continue
+        measured = cycle.points_vehicle
+        distance = np.maximum(np.linalg.norm(measured, axis=1), np.finfo(float).tiny)
+        unit = measured / distance[:, None]
+        radial = unit[:, :, None] * unit[:, None, :]
+        across = (distance - bias) / (1.0 + scale) / distance
+        change = radial / (1.0 + scale) + across[:, None, None] * (np.eye(2) - radial)
+        change = to_vehicle @ change
+        points = measured * across[:, None] @ to_vehicle.T + [0.0, lateral]
+        covariances = change @ cycle.covariances @ change.transpose(0, 2, 1)
+        cycles.append(Detections(cycle.t - latency, points, covariances, cycle.labels))
+        left.append(part)
+    return replace(log, cycles=tuple(cycles)), np.concatenate([np.zeros(0, dtype=int), *left])
+
+
+def with_true_noise(log: Log, associations: Ints) -> Log:
+    """Return a log that states white noise as harmful as its true noise.
+
+    The variance of the mean of n errors of a cone, of which a share stays with it for a time, is that of
+    independent ones times `1 + share (sum_ij exp(-|t_i - t_j| / time) / n - 1)`. The covariances are
+    multiplied by it, along the ray and across.
+    """
+    noise = _truth(log).noise
+    if noise is None:
+        return log
+    stamps = np.repeat([cycle.t for cycle in log.cycles], [len(cycle.labels) for cycle in log.cycles])
+    factors = np.ones((len(stamps), 2))
+    for cone in np.unique(associations[associations >= 0]):
+        rows = np.flatnonzero(associations == cone)
+        correlations = np.exp(-np.abs(stamps[rows, None] - stamps[rows]) / noise[5])
+        factors[rows] = 1.0 + noise[3:5] * (correlations.sum() / len(rows) - 1.0)
+    cycles, row = [], 0
+    for cycle in log.cycles:
+        size = len(cycle.labels)
+        distance = np.maximum(np.linalg.norm(cycle.points_vehicle, axis=1), np.finfo(float).tiny)
+        unit = cycle.points_vehicle / distance[:, None]
+        radial = unit[:, :, None] * unit[:, None, :]
+        along, across = np.sqrt(factors[row : row + size]).T[:, :, None, None]
+        change = along * radial + across * (np.eye(2) - radial)
+        cycles.append(replace(cycle, covariances=change @ cycle.covariances @ change))
+        row += size
+    return replace(log, cycles=tuple(cycles), odometry_sigma=noise[:3])
+
+
+def landmark_rmse(solution: LandmarkSolution, truth: Truth) -> float:
+    """Return sqrt(mean |l_j - cone_j|^2) in m over the cones of a boundary that were ever detected."""
+    counted = np.isin(truth.cone_labels[solution.landmark_ids], BOUNDARIES)
+    errors = solution.landmarks - truth.cones[solution.landmark_ids]
+    return root_mean_square(np.linalg.norm(errors[counted], axis=1))
+
+
+def fit_rmse(track: Map, truth: Truth) -> float:
+    """Return sqrt(mean d^2) in m, d from true cones to splines of the mapped size that are fitted to them.
+
+    A boundary of points, or with a control point for every cone, can be exact: its distances are 0.
+    Boundaries that aren't mapped don't count.
+    """
+    distances = [np.zeros(0)]
+    for label, boundary in track.boundaries.items():
+        cones = driving_order(truth, label)
+        if isinstance(boundary, SplineBoundary) and boundary.size < len(cones):
+            distances.append(fit_distances(cones, boundary.size, boundary.spline))
+        else:
+            distances.append(np.zeros(len(cones)))
+    return root_mean_square(np.concatenate(distances))
+
+
+def fit_distances(cones: Array, size: int, like: BSpline) -> Array:
+    """Return the distances (k,) in m of cones (k, 2), in driving order, from a spline fitted to them.
+
+    The spline has `size` control points, and the degree and periodicity of `like`. Its knots follow the
+    curvature (paper, section Simplification).
+    """
+    fitted = fit_spline(cones, size, like.periodic, FitSettings(degree=like.degree))
+    return np.asarray(np.linalg.norm(cones - closest_points(fitted, cones).position, axis=1))
+
+
+def _truth(log: Log) -> Truth:
+    if log.truth is None:
+        raise ValueError("expected a log with truth, found one without")
+    return log.truth
+
+
+STEP: Final = 0.5
+"""Maps are aligned by points of their curves that are this far apart (m)."""
+STARTS: Final = (0.0, -4.0, -2.0, 2.0, 4.0)
+"""The vehicle started this much farther ahead (m) in one of two maps, or less."""
+ROUNDS: Final = 30
+"""Their points are paired this often."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """How far one run is from another."""
+
+    curves: dict[str, float]
+    """Each boundary that both runs have mapped has the two-way distance (m) of its two curves."""
+    along: float
+    """Root mean square distance (m) of the poses along the reference's heading."""
+    across: float
+    """Root mean square distance (m) of the poses across it."""
+    heading: float
+    """Root mean square difference (rad) of the headings."""
+
+
+def from_batch(values: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the turn (rad) of a map from that of the batch over the same log, and the rmse by the batch's.
+
+    Both are given by their metrics. Small turns about one point add up, so the turn from the batch is the
+    difference of the turns from the truth. Where either map has no such metric, the result has none.
+    """
+    found: dict[str, Any] = {}
+    if {"turn", "rmse"} <= set(values) & set(batch):
+        found["turn_from_batch"] = float(values["turn"] - batch["turn"])
+        found["rmse_by_batch"] = float(values["rmse"] / batch["rmse"])
+    return found
+
+
+def gap(run: RunResult, reference: RunResult) -> Gap:
+    """Return the gap of a run from a reference over the same log."""
+    shared = sorted(set(run.map.boundaries) & set(reference.map.boundaries))
+    curves = {
+        NAMES[label]: two_way_distance(run.map.boundaries[label], reference.map.boundaries[label])
+        for label in shared
+    }
+    errors = pose_errors(run.trajectory_t, run.trajectory, reference.trajectory_t, reference.trajectory)
+    return Gap(curves, *(root_mean_square(column) for column in errors.T))
+
+
+def aligned_distance(track: Map, reference: Map) -> float:
+    """Return the mean two-way distance (m) of a map from another one of the same cones, rigidly aligned.
+
+    Each drive has its own map frame. Of the motions that closest points lead to from several starts, the one
+    with the least distance counts. It is infinite where the maps share no boundary.
+    """
+    shared = sorted(set(track.boundaries) & set(reference.boundaries))
+    own = [mapped_points(track.boundaries[label], STEP) for label in shared]
+    other = [mapped_points(reference.boundaries[label], STEP) for label in shared]
+    best = np.inf
+    for start in STARTS:
+        motion = _aligning(own, [reference.boundaries[label] for label in shared], start)
+        back = inverse(motion)
+        forth = [
+            boundary_distances(reference.boundaries[label], to_map(points, motion[None]))
+            for label, points in zip(shared, own, strict=True)
+        ]
+        forth += [
+            boundary_distances(track.boundaries[label], to_map(points, back[None]))
+            for label, points in zip(shared, other, strict=True)
+        ]
+        best = min([best, *([float(np.mean(np.concatenate(forth)))] if forth else [])])
+    return float(best)
+
+
+def _aligning(points: list[Array], boundaries: list[MapBoundary], start: float) -> Array:
+    """Return the motion (3,) that lays points (k, 2) of curves on the boundaries of another map."""
+    motion = np.array([start, 0.0, 0.0])
+    for _ in range(ROUNDS):
+        rows, errors = [np.zeros((0, 3))], [np.zeros(0)]
+        for own, boundary in zip(points, boundaries, strict=True):
+            point, normal, position, _ = near_pairs(boundary, to_map(own, motion[None]))
+            lever = np.einsum("kd,kd->k", normal, left_of(point - motion[:2]))
+            rows.append(np.column_stack([normal, lever]))
+            errors.append(np.einsum("kd,kd->k", normal, position - point))
+        change = np.linalg.lstsq(np.concatenate(rows), np.concatenate(errors), rcond=None)[0]
+        motion = motion + change
+    return motion

@@ -1,1 +1,0 @@
-"""Studies: tracks, seeds, estimators and settings, run in parallel and compared in pairs."""

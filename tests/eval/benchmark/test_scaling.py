@@ -1,0 +1,48 @@
+"""A small measurement of scaling from end to end, and requests that are refused; never how fast."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from pathspace_graph import cli
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.benchmark.roads import ScalingSettings, make_drives
+from pathspace_graph.eval.benchmark.scaling import CONES, LAPS, READINGS, measure_scaling
+from pathspace_graph.eval.benchmark.scaling_output import MARKER, scaling_table, stops, write_scaling
+
+from ...scenes.timing import SMALL
+
+
+@pytest.mark.slow
+def test_a_small_measurement_end_to_end(tmp_path: Path) -> None:
+    drives = make_drives(SMALL)
+    told: list[int] = []
+    scaling = measure_scaling(["fixed-lag"], drives, SMALL, on_cycle=lambda: told.append(1))
+    assert len(told) == drives.cycles
+    assert scaling.of(LAPS, "fixed-lag")["at"].tolist() == [1.0, 2.0]
+    assert scaling.of(READINGS, "fixed-lag")["at"].tolist() == [2.0, 6.0, 12.0]
+    assert len(scaling.of(CONES, "fixed-lag")) == 4
+    assert scaling.memory["fixed-lag"] > 0.01
+    assert not stops(scaling)
+    write_scaling(tmp_path / "out", scaling)
+    content = json.loads((tmp_path / "out" / MARKER).read_text())
+    assert content["seconds_compared"] == {"fixed-lag": None}  # 200 cones weren't reached
+    assert {s["sweep"] for s in content["slopes"]} == {CONES, READINGS, LAPS}
+    assert len(pd.read_csv(tmp_path / "out" / "points.csv")) == len(scaling.points)
+    names = {"scaling.png", "scaling.pdf", "laps.png", "laps.pdf", "table.md"}
+    assert names <= {file.name for file in (tmp_path / "out").iterdir()}
+    assert scaling_table(scaling).rows[0][0] == "fixed-lag"
+
+
+def test_bad_requests_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--out", str(tmp_path / "new")]
+    assert cli.main(["scale", *out, "--estimators", "nobody"]) == cli.BAD_INPUT
+    assert "nobody" in capsys.readouterr().err
+    assert cli.main(["scale", *out, "--quick", "--scaling.laps", "3"]) == cli.BAD_INPUT
+    assert not (tmp_path / "new").exists()
+    with pytest.raises(SettingsError, match="cones_min"):
+        ScalingSettings(cones_min=300.0, cones_max=200.0)

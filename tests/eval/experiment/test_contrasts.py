@@ -1,0 +1,176 @@
+"""What a study says of differences, held against results made by hand and against scipy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pathspace_graph.eval.experiment.frame import contrasts, last_laps
+from pathspace_graph.eval.experiment.plots import figures
+from pathspace_graph.eval.experiment.study import Baseline, Study
+from pathspace_graph.eval.experiment.tables import as_latex, as_markdown, as_text, caption, summary_tables
+
+STUDY = Study(
+    tracks=(0, 1, 2, 3),
+    seeds=(0, 1),
+    laps=2,
+    question="Which, at 100 %?",
+    noise={"nominal": {}, "loud_one": {"sensor.bearing_sigma": 1.0}},
+    grids=({"lag": [1.0, 2.0]},),
+    metrics=("rmse", "missed", "size"),
+)
+
+
+def rows(
+    shift: dict[str, float], noise: str = "nominal", failed: tuple[int, int] | None = None
+) -> pd.DataFrame:
+    """Runs whose rmse is their track's and seed's own, plus a shift of the variant's and a little noise."""
+    rng, made = np.random.default_rng(0), []
+    for track in STUDY.tracks:
+        for seed in STUDY.seeds:
+            for variant, by in shift.items():
+                names = {"track": f"generated {track}", "seed": seed, "noise": noise}
+                shared = names | {"estimator": "fixed-lag", "variant": variant}
+                if variant != "default" and (track, seed) == failed:
+                    made.append(shared | {"lap": None, "failure": "ValueError: lost"})
+                    continue
+                for lap in (1, 2):
+                    rmse = (
+                        5.0 * int(str(track))
+                        + seed
+                        + by
+                        + 0.01 * rng.standard_normal()
+                        + (9.0 if lap == 1 else 0.0)
+                    )
+                    figures = {"rmse": rmse, "missed": 0.0, "size": 80, "ms_mean": 3.0 + by}
+                    made.append(shared | {"lap": lap, "failure": ""} | figures)
+    return pd.DataFrame(made)
+
+
+def test_the_last_lap_of_each_run_that_finished() -> None:
+    last = last_laps(rows({"default": 0.0, "lag=1": 0.0}, failed=(0, 0)))
+    assert len(last) == 15
+    assert set(last["lap"]) == {2}
+
+
+def test_differences_are_paired() -> None:
+    """Tracks differ by metres, variants by a tenth: only pairs can tell."""
+    frame = rows({"default": 0.0, "lag=1": 0.1, "lag=2": 0.0})
+    nominal = [c for c in contrasts(STUDY, frame, "rmse") if c.noise == "nominal"]
+    base, worse, same = nominal
+    assert base.difference is None
+    assert worse.difference is not None and same.difference is not None
+    assert worse.difference.mean == pytest.approx(0.1, abs=0.02)
+    assert worse.value.half > 1.0
+    assert worse.difference.half < 0.05
+    assert worse.significant
+    assert not same.significant
+
+
+def test_a_failed_run_is_left_out_with_its_pair() -> None:
+    frame = rows({"default": 0.0, "lag=1": 0.1, "lag=2": 0.0}, failed=(3, 1))
+    _, worse, _ = (c for c in contrasts(STUDY, frame, "rmse") if c.noise == "nominal")
+    assert worse.value.count == 7
+    assert worse.difference is not None
+    assert worse.difference.count == 7
+    assert worse.difference.mean == pytest.approx(0.1, abs=0.02)
+    assert "(2 failed)" in caption(STUDY, frame)
+
+
+def test_each_noise_has_its_own_baseline() -> None:
+    loud = rows({"default": 3.0, "lag=1": 3.5, "lag=2": 3.0}, noise="loud_one")
+    frame = pd.concat([rows({"default": 0.0, "lag=1": 0.1, "lag=2": 0.0}), loud])
+    by = {(c.noise, c.variant): c.difference for c in contrasts(STUDY, frame, "rmse") if c.difference}
+    assert by["nominal", "lag=1"].mean == pytest.approx(0.1, abs=0.02)
+    assert by["loud_one", "lag=1"].mean == pytest.approx(0.5, abs=0.02)
+
+
+def test_one_estimator_can_be_the_baseline_of_all() -> None:
+    names = ("fixed-lag", "landmark-fixed-lag")
+    made = Study(tracks=(0,), seeds=(0, 1), estimators=names, baseline=Baseline(estimator="fixed-lag"))
+    frame = pd.DataFrame(
+        {"track": "generated 0", "seed": seed, "noise": "nominal", "estimator": name, "variant": "default"}
+        | {"lap": 1, "failure": "", "rmse": value + seed}
+        for seed in (0, 1)
+        for name, value in zip(names, (1.0, 3.0), strict=True)
+    )
+    first, second = contrasts(made, frame, "rmse")
+    assert first.difference is None
+    assert second.differences == (2.0, 2.0)
+
+
+# --- text and figures ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def frame() -> pd.DataFrame:
+    loud = rows({"default": 3.0, "lag=1": 3.5, "lag=2": 3.0}, noise="loud_one")
+    return pd.concat([rows({"default": 0.0, "lag=1": 0.1, "lag=2": 0.0}), loud])
+
+
+def test_tables_tell_the_same_in_every_form(frame: pd.DataFrame) -> None:
+    tables, told = summary_tables(STUDY, frame), caption(STUDY, frame)
+    assert [table.title for table in tables] == ["rmse [m]", "missed [%]", "size"]
+    assert all(len(row) == len(table.header) for table in tables for row in table.rows)
+    assert len(tables[0].rows) == 6
+    assert "Holm" in told
+    assert "paired" in told
+    text, markdown, latex = as_text(tables, told), as_markdown(tables, told), as_latex(tables, told)
+    worse = contrasts(STUDY, frame, "rmse")[1].difference
+    assert worse is not None
+    for written in (text, markdown, latex):
+        assert "lag=1" in written
+        assert f"{worse.mean:+.3f}" in written
+    significant = [line for line in text.splitlines() if line.endswith("*")]
+    assert len(significant) == 2
+    assert all("lag=1" in line for line in significant)
+
+
+def test_latex_is_escaped(frame: pd.DataFrame) -> None:
+    latex = as_latex(summary_tables(STUDY, frame), caption(STUDY, frame))
+    assert r"100 \%" in latex
+    assert r"loud\_one" in latex
+    assert r"$\pm$" in latex
+    assert latex.isascii()
+    assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == 3
+    assert {line.count(" & ") for line in latex.splitlines() if line.endswith(r"\\")} == {8}
+
+
+def test_figures_of_what_differs(frame: pd.DataFrame) -> None:
+    drawn = figures(STUDY, frame)
+    assert set(drawn) == {"differences", "accuracy_size", "accuracy_time"}
+    (panel,) = drawn["differences"].axes
+    assert panel.get_title("left") == "rmse [m]"
+    assert [label.get_text() for label in panel.get_yticklabels()] == [
+        "nominal, lag=1",
+        "nominal, lag=2",
+        "loud_one, lag=1",
+        "loud_one, lag=2",
+    ]
+    assert len(drawn["accuracy_time"].axes) == 2
+    assert "differences" not in figures(STUDY, rows({"default": 0.0}))
+
+
+def test_rows_of_all_panels_are_the_same_where_one_metric_lacks_some() -> None:
+    frame = rows({"default": 0.0, "lag=1": 0.1, "lag=2": 0.0})
+    frame.loc[frame["variant"] == "lag=1", "missed"] = np.nan
+    frame.loc[frame["variant"] == "lag=2", "missed"] = 0.5
+    first, second = figures(STUDY, frame)["differences"].axes
+    assert [label.get_text() for label in first.get_yticklabels()] == ["nominal, lag=1", "nominal, lag=2"]
+    means = [container.lines[0].get_ydata().tolist() for container in second.containers]
+    assert means == [[1]]
+
+
+def test_a_figure_names_settings_without_their_group_where_that_is_enough() -> None:
+    shift = {"default": 0.0, "spline.degree=2, lag=1": 0.1}
+    named = rows(shift)
+
+    def label(study: Study) -> str:
+        (panel,) = figures(study, named)["differences"].axes
+        return str(panel.get_yticklabels()[0].get_text())
+
+    study = replace(STUDY, noise={"nominal": {}}, grids=({"spline.degree": [2], "lag": [1.0]},))
+    assert label(study) == "degree=2, lag=1"

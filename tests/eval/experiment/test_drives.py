@@ -1,0 +1,56 @@
+"""Drives: names of tracks, folders of tracks, and what two drives must share to have one log."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pathspace_graph.errors import InputError
+from pathspace_graph.eval.experiment.drives import Drive, NamedTrack, load_tracks
+from pathspace_graph.sim.simulate import SimulationSettings
+
+from ...scenes.pretenders import write_round_track
+
+
+def folder_of_two(folder: Path) -> Path:
+    """A folder with two track files, and a file that is none."""
+    folder.mkdir()
+    track = write_round_track(folder)
+    track.rename(folder / f"another{track.suffix}")
+    write_round_track(folder)
+    (folder / "README.md").write_text("no track")
+    return folder
+
+
+def test_a_folder_stands_for_its_track_files_in_order(tmp_path: Path) -> None:
+    folder = folder_of_two(tmp_path / "tracks")
+    names = sorted(file.stem for file in folder.iterdir() if file.suffix != ".md")
+    assert [track.name for track in load_tracks([folder, 3])] == [*names, "generated 3"]
+
+
+def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    files = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        files.append(write_round_track(tmp_path / name))
+    assert [track.name for track in load_tracks(files)] == [f"{n}/{files[0].stem}" for n in ("a", "b")]
+
+
+def test_a_folder_without_tracks_and_a_missing_file_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected track files"):
+        load_tracks([tmp_path])
+    track = write_round_track(tmp_path)
+    wrong = track.with_name(f"x{track.name}")
+    with pytest.raises(InputError, match=f"the nearest is '{track.name}'"):
+        load_tracks([wrong])
+
+
+def test_a_drive_is_the_same_by_geometry_seed_and_simulation_whatever_its_names() -> None:
+    (track,) = load_tracks([0])
+    drive = Drive(track, 0, "nominal", SimulationSettings(laps=2))
+    renamed = NamedTrack("another name", track.track)
+    assert replace(drive, track=renamed, noise="quiet").id == drive.id
+    assert replace(drive, seed=1).id != drive.id
+    assert replace(drive, simulation=SimulationSettings(laps=3)).id != drive.id

@@ -1,0 +1,160 @@
+"""Outcomes of faults, and their table and figure, from a frame that is known by hand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pathspace_graph.eval.experiment.faults import (
+    HEADER,
+    FaultOutcome,
+    beside_clean,
+    fault_of,
+    fault_table,
+    outcomes,
+)
+from pathspace_graph.eval.experiment.output import write_suite
+from pathspace_graph.eval.experiment.plots import plot_faults
+from pathspace_graph.eval.experiment.study import Study
+
+NOISE = {
+    "clean": {},
+    "latency: 20 ms": {"faults.sensor.latency": 0.02},
+    "latency: 50 ms": {"faults.sensor.latency": 0.05},
+}
+STUDY = Study(name="faults", tracks=(0,), seeds=(0, 1), laps=2, noise=NOISE)
+
+
+def row(noise: str, seed: int, lap: int, **values: Any) -> dict[str, Any]:
+    usual = {
+        "track": "round",
+        "estimator": "fixed-lag",
+        "variant": "default",
+        "rmse": 0.2,
+        "size": 40,
+        "missed": 0.0,
+        "closed_at_end": True,
+        "lost_at_end": False,
+        "error_max": 0.5,
+        "scale_by_prior": 0.1,
+        "failure": "",
+        "said": "",
+    }
+    return {"study": "faults", "noise": noise, "seed": seed, "lap": lap} | usual | values
+
+
+@pytest.fixture
+def frame() -> pd.DataFrame:
+    """At 20 ms both maps are worse, at 50 ms one has none and one run failed."""
+    return pd.DataFrame(
+        [
+            row("clean", 0, 1, rmse=9.0),
+            row("clean", 0, 2, rmse=0.2),
+            row("clean", 1, 2, rmse=0.1),
+            row("latency: 20 ms", 0, 2, rmse=0.3, size=60, scale_by_prior=-5.0, said="a notice"),
+            row("latency: 20 ms", 1, 2, rmse=0.35, missed=0.1, lost_at_end=True, scale_by_prior=-3.0),
+            row("latency: 50 ms", 0, 2, rmse=np.nan, missed=1.0, closed_at_end=False, error_max=80.0),
+            row("latency: 50 ms", 1, 2, failure="ValueError: lost", rmse=np.nan),
+        ]
+    )
+
+
+def test_a_run_is_compared_with_the_clean_one_of_its_track_and_seed(frame: pd.DataFrame) -> None:
+    clean, mild, strong = outcomes(STUDY, frame)
+    np.testing.assert_allclose(clean.runs["ratio"], [1.0, 1.0])
+    np.testing.assert_allclose(mild.runs["ratio"], [1.5, 3.5])
+    values = mild.values()
+    assert values["ratio_mean"] == pytest.approx(2.5)
+    assert (values["ratio_min"], values["ratio_max"]) == pytest.approx((1.5, 3.5))
+    assert values["size_ratio"] == pytest.approx(1.25)
+    assert (values["missed"], values["closed"], values["lost"]) == (pytest.approx(0.05), 2, 1)
+    assert (values["said"], values["told"]) == ({"a notice": 1}, 1)
+    assert values["calibration"] == {"scale error of the speeds": pytest.approx(-4.0)}
+    assert np.isnan(values["told_lost"])
+    values = strong.values()
+    assert (values["runs"], values["failed"], values["with_map"]) == (1, 1, 0)
+    assert np.isnan(values["ratio_mean"])
+    assert (values["closed"], values["error_max"], values["calibration"]) == (0, 80.0, {})
+
+
+def test_what_a_run_calls_itself_is_told_where_it_judges_its_health(frame: pd.DataFrame) -> None:
+    frame["told_degraded"], frame["told_lost"] = 0.1, np.where(frame["noise"] == "clean", 0.0, 0.2)
+    clean, mild, _ = outcomes(STUDY, frame)
+    assert mild.values()["told_lost"] == pytest.approx(0.2)
+    assert (clean.values()["told"], mild.values()["told"]) == (0, 2)
+    table = fault_table(STUDY, [clean, mild])
+    assert table.rows[1][table.header.index("called degraded, lost [% of cycles]")] == "10.0, 20.0"
+
+
+def test_the_longest_way_astray_is_that_of_the_worst_run(frame: pd.DataFrame) -> None:
+    frame["astray_time"], frame["astray_way"] = np.arange(7.0), 10.0 * np.arange(7.0)
+    clean, mild, _ = outcomes(STUDY, frame)
+    table = fault_table(STUDY, [clean, mild])
+    column = table.header.index("over 1 m off after closing [s, m]")
+    assert [row[column] for row in table.rows] == ["2.0, 20.0", "4.0, 40.0"]
+
+
+def test_the_table_has_the_columns_that_something_is_known_of(frame: pd.DataFrame) -> None:
+    table = fault_table(STUDY, outcomes(STUDY, frame))
+    unknown = "called", "over 1 m off"
+    assert table.header == tuple(name for name in HEADER if not name.startswith(unknown))
+    assert table.rows[0][:7] == ("clean", "", "1.00", "1.0 to 1.0", "1.00", "0.0", "2 of 2")
+    assert table.rows[1][2:8] == ("2.50", "1.5 to 3.5", "1.25", "5.0", "2 of 2", "1 of 2")
+    assert table.rows[1][-1] == "1 of 2: a notice"
+    assert table.rows[0][-1] == "nothing"
+    assert table.rows[2][2:7] == ("no map", "–", "1.00", "100.0", "0 of 1, 1 failed")
+    assert table.groups == (1,)
+
+
+def test_the_figure_has_a_panel_for_each_fault_and_a_look_for_each_fate(frame: pd.DataFrame) -> None:
+    figure = plot_faults(outcomes(STUDY, frame))
+    visible = [axes for axes in figure.axes if axes.get_visible()]
+    assert [axes.get_title(loc="left") for axes in visible] == ["latency [ms]"]
+    labels = {str(line.get_label()) for line in visible[0].lines}
+    assert {"no map", "lost at the end", "not lost, said so", "mean"} <= labels
+    assert [text.get_text() for text in visible[0].get_xticklabels()] == ["20", "50"]
+
+
+def test_runs_without_a_map_are_crosses_on_the_upper_edge(frame: pd.DataFrame) -> None:
+    frame["rmse"] = np.nan
+    figure = plot_faults(outcomes(STUDY, frame))
+    figure.draw_without_rendering()
+    (axes,) = [axes for axes in figure.axes if axes.get_visible()]
+    crosses = [line for line in axes.lines if line.get_label() == "no map"]
+    places = np.concatenate([line.get_xydata() for line in crosses])
+    np.testing.assert_allclose(places, [[-0.15, 0.95], [0.15, 0.95], [1.0, 0.95]])
+    assert all(line.get_transform() == axes.get_xaxis_transform() for line in crosses)
+    assert {line.get_label() for line in axes.lines}.isdisjoint({"mean", "not lost", "lost at the end"})
+
+
+def test_the_files_hold_every_value(frame: pd.DataFrame, tmp_path: Path) -> None:
+    frame["ms_mean"] = 1.0
+    text = write_suite(STUDY, frame, tmp_path)
+    assert "latency" in text
+    found = json.loads((tmp_path / "faults.json").read_text())
+    assert found["format"] == "pathspace-faults/1"
+    assert [entry["strength"] for entry in found["faults"]] == [0.0, 20.0, 50.0]
+    assert found["faults"][2]["ratio_mean"] is None
+    flat = pd.read_csv(tmp_path / "faults.csv")
+    expected = [outcome.values() for outcome in outcomes(STUDY, frame)]
+    assert list(flat) == list(expected[0])
+    for entry, row in zip(found["faults"], expected, strict=True):
+        known = {name: value for name, value in row.items() if not pd.isna(value)}
+        assert entry == dict.fromkeys(row) | known
+    for name in flat.select_dtypes("number"):
+        np.testing.assert_allclose(flat[name], [row[name] for row in expected], err_msg=name)
+    assert json.loads(flat["said"][1]) == {"a notice": 1}
+    written = {file.name for file in tmp_path.iterdir()}
+    forms = {f"faults.{suffix}" for suffix in ("txt", "md", "tex", "csv", "json", "png", "pdf")}
+    assert written == forms | {"results.csv", "times.csv"}
+
+
+def test_an_outcome_without_runs_has_no_figures(frame: pd.DataFrame) -> None:
+    values = FaultOutcome(fault_of("latency: 20 ms"), beside_clean(frame)[:0], 2).values()
+    assert (values["runs"], values["failed"], values["lost"]) == (0, 2, 0)
+    assert np.isnan(values["missed"]) and np.isnan(values["error_max"])

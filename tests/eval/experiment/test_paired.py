@@ -1,0 +1,71 @@
+"""Means and paired differences: by hand, held against scipy, their coverage, and what is left out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from pathspace_graph.eval.experiment.frame import difference, estimate, holm, paired_p
+
+
+def test_the_interval_is_student_s_by_hand() -> None:
+    """d = 1, 2, 3: mean 2, s = 1, t(0.975, 2) = 4.3027, half = 4.3027 / sqrt(3)."""
+    found = difference([11.0, 7.0, 9.0], [10.0, 5.0, 6.0])
+    assert (found.mean, found.count) == (pytest.approx(2.0), 3)
+    assert found.low == pytest.approx(2.0 - 4.3027 / np.sqrt(3), abs=1e-3)
+    assert found.high == pytest.approx(2.0 + 4.3027 / np.sqrt(3), abs=1e-3)
+    assert found.low < 0.0 < found.high
+
+
+def test_what_pairs_share_cancels() -> None:
+    rng = np.random.default_rng(0)
+    hard = 10.0 * rng.random(20)  # some logs are harder than others, for everyone
+    found = difference(hard + 0.3 + 0.01 * rng.normal(size=20), hard)
+    assert found.low == pytest.approx(0.3, abs=0.02)
+
+
+def test_the_interval_holds_the_mean_95_times_of_100() -> None:
+    rng = np.random.default_rng(5)
+    found = [difference(rng.normal(1.0, 2.0, 6), np.zeros(6)) for _ in range(600)]
+    assert np.mean([d.low <= 1.0 <= d.high for d in found]) == pytest.approx(0.95, abs=0.03)
+
+
+def test_pairs_that_lack_a_value_are_left_out_and_few_have_no_interval() -> None:
+    found = difference([1.0, np.nan, 3.0, np.inf], [0.0, 1.0, 1.0, 1.0])
+    assert (found.mean, found.count) == (1.5, 2)
+    one = difference([1.0], [3.0])
+    assert (one.mean, one.count) == (-2.0, 1) and np.isnan(one.low)
+    assert np.isnan(difference([], []).mean)
+    same = difference([2.0, 3.0], [1.0, 2.0])
+    assert (same.low, same.mean, same.high) == (1.0, 1.0, 1.0)
+
+
+def test_the_interval_and_p_are_those_of_scipy() -> None:
+    values = np.random.default_rng(1).normal(0.3, 1.0, 12)
+    made = estimate(values)
+    low, high = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    assert made.mean - made.half == pytest.approx(low)
+    assert made.mean + made.half == pytest.approx(high)
+    assert paired_p(values) == pytest.approx(stats.ttest_1samp(values, 0.0).pvalue)
+
+
+@pytest.mark.parametrize(("values", "p"), [([], None), ([1.0], None), ([0.0, 0.0], 1.0), ([2.0, 2.0], 0.0)])
+def test_p_where_there_is_no_spread(values: list[float], p: float | None) -> None:
+    found = paired_p(np.array(values))
+    assert np.isnan(found) if p is None else found == p
+
+
+def test_holm_by_hand() -> None:
+    """Sorted 0.01, 0.02, 0.03, 0.4 times 4, 3, 2, 1, never falling; what isn't known isn't counted."""
+    corrected = holm(np.array([0.03, 0.01, np.nan, 0.4, 0.02]))
+    np.testing.assert_allclose(corrected, [0.06, 0.04, np.nan, 0.4, 0.06])
+    np.testing.assert_allclose(holm(np.array([0.9, 0.8])), [1.0, 1.0])
+
+
+@pytest.mark.slow
+def test_holm_keeps_false_alarms_of_a_whole_study_rare() -> None:
+    rng, alarms = np.random.default_rng(2), 0
+    for _ in range(400):
+        alarms += bool((holm(np.array([paired_p(rng.standard_normal(6)) for _ in range(10)])) < 0.05).any())
+    assert alarms / 400 < 0.08

@@ -1,0 +1,198 @@
+"""Studies as they run: resumed and broken, and what is kept of them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pathspace_graph.errors import OutputError, SettingsError
+from pathspace_graph.eval.experiment import run as study_run
+from pathspace_graph.eval.experiment.frame import TIMES, without_times
+from pathspace_graph.eval.experiment.output import write_study, write_tables
+from pathspace_graph.eval.experiment.run import make_plan, run_study
+from pathspace_graph.eval.experiment.study import Study
+
+from ...scenes.pretenders import Fragile, Pretender, contents, register, write_round_track
+
+
+@pytest.fixture(scope="module")
+def track(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_round_track(tmp_path_factory.mktemp("tracks"))
+
+
+@pytest.fixture(autouse=True)
+def pretenders(monkeypatch: pytest.MonkeyPatch) -> None:
+    register(monkeypatch)
+
+
+@pytest.fixture
+def study(track: Path) -> Study:
+    return Study(
+        name="small",
+        tracks=(track,),
+        seeds=(0, 1),
+        laps=1,
+        estimators=("pretender", "fragile"),
+        grids=({"lag": [1.0, 2.0]},),
+    )
+
+
+# --- results ---------------------------------------------------------------------------------------------
+
+
+def test_a_row_for_every_run_and_lap(study: Study) -> None:
+    frame = run_study(replace(study, laps=2, noise={"nominal": {}, "loud": {"sensor.bearing_sigma": 0.1}}))
+    done, failed = frame[frame["failure"] == ""], frame[frame["failure"] != ""]
+    assert len(done) == 2 * 2 * (3 + 2) * 2
+    assert len(failed) == 2 * 2
+    assert set(failed["variant"]) == {"lag=1"}
+    assert set(failed["failure"]) == {"ValueError: lost"}
+    assert failed["lap"].isna().all() and failed["rmse"].isna().all()
+    keys = ["track", "seed", "noise", "estimator", "variant", "lap"]
+    assert not frame.duplicated(keys).any()
+    assert dict(zip(frame["variant"], frame["lag"], strict=True)) == {
+        "default": 3.0,
+        "lag=1": 1.0,
+        "lag=2": 2.0,
+    }
+    assert set(frame["simulation.sensor.bearing_sigma"]) == {0.1, np.deg2rad(0.9)}
+    assert set(frame["track"]) == {"round"}
+    assert set(frame["cones"].dropna()) == {40}
+    assert {"python", "gtsam", "numpy", "pathspace-graph", *TIMES} <= set(frame)
+
+
+def test_results_load_into_pandas(study: Study, tmp_path: Path) -> None:
+    frame = run_study(study, tmp_path)
+    write_tables(study, frame, tmp_path)
+    loaded = pd.read_csv(tmp_path / "results.csv", keep_default_na=True)
+    assert list(loaded) == list(without_times(frame))
+    np.testing.assert_array_equal(loaded["rmse"], frame["rmse"].astype(float))
+    times = pd.read_csv(tmp_path / "times.csv")
+    merged = loaded.merge(times, on=["study", "track", "seed", "noise", "estimator", "variant", "lap"])
+    assert len(merged) == len(frame)
+
+
+def test_a_log_is_simulated_once(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulated = []
+    real = study_run.try_drive
+    monkeypatch.setattr(study_run, "try_drive", lambda drive: simulated.append(drive.id) or real(drive))
+    run_study(study)
+    assert len(simulated) == len(set(simulated)) == 2
+
+
+def test_a_study_all_of_whose_cells_fail_has_rows_and_a_summary(study: Study, tmp_path: Path) -> None:
+    hopeless = replace(study, estimators=("fragile",), variants={"only": {"lag": 1.0}}, grids=())
+    frame = run_study(hopeless)
+    frame = frame[frame["variant"] == "only"]
+    assert (frame["failure"] != "").all()
+    assert "2 runs (2 failed)" in write_study(hopeless, frame, tmp_path)
+
+
+# --- resuming --------------------------------------------------------------------------------------------
+
+
+def interrupt_after(cells: int) -> Any:
+    def told(done: int, total: int) -> None:
+        if done == cells:
+            raise KeyboardInterrupt
+
+    return told
+
+
+def test_a_killed_study_goes_on_where_it_was_with_the_same_results(study: Study, tmp_path: Path) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    write_tables(study, run_study(study, whole), whole)
+    calls = Pretender.calls
+    for cells in (3, 2):
+        with pytest.raises(KeyboardInterrupt):
+            run_study(study, killed, on_cell=interrupt_after(cells))
+    assert len(list((killed / "cells").iterdir())) == 5
+    assert list((killed / "logs").iterdir())
+    # what a kill in the middle of writing leaves
+    cell = next((killed / "cells").iterdir())
+    cell.with_name(".half.tmp.json").write_text("{")
+    write_tables(study, run_study(study, killed), killed)
+    assert Pretender.calls == 2 * calls
+    first, second = contents(whole), contents(killed)
+    for name in ("results.csv", "study.json"):
+        assert first[name] == second[name]
+    assert not (killed / "logs").exists()
+
+
+def test_a_damaged_cell_or_log_is_made_again(study: Study, tmp_path: Path) -> None:
+    first = run_study(study, tmp_path)
+    cells = sorted((tmp_path / "cells").iterdir())
+    cells[0].write_text("{")
+    calls = Pretender.calls + Fragile.calls
+    drive = make_plan(study).cells[0].drive
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / f"{drive.id}.log").write_bytes(b"not a log")
+    again = run_study(study, tmp_path)
+    assert Pretender.calls + Fragile.calls == calls + 1
+    pd.testing.assert_frame_equal(without_times(first), without_times(again))
+
+
+def test_a_finished_study_runs_nothing(study: Study, tmp_path: Path) -> None:
+    run_study(study, tmp_path)
+    calls = Pretender.calls
+    run_study(study, tmp_path)
+    assert Pretender.calls == calls
+
+
+def test_failed_cells_are_kept_until_they_are_to_be_retried(
+    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_study(study, tmp_path)
+    records = [json.loads(file.read_text()) for file in (tmp_path / "cells").iterdir()]
+    (failure, *_) = [record for record in records if record["failure"]]
+    assert "in update" in failure["traceback"]
+    monkeypatch.setattr(Fragile, "broken", False)
+    assert (run_study(study, tmp_path)["failure"] != "").sum() == 2
+    calls = Fragile.calls
+    assert (run_study(study, tmp_path, retry_failed=True)["failure"] == "").all()
+    assert Fragile.calls == calls + 2
+
+
+def test_a_log_that_cannot_be_simulated_fails_its_cells_only(
+    study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = study_run.try_drive
+    stuck = ValueError("stuck")
+    monkeypatch.setattr(study_run, "try_drive", lambda drive: stuck if drive.seed == 1 else real(drive))
+    frame = run_study(replace(study, estimators=("pretender",)))
+    assert set(frame[frame["seed"] == 1]["failure"]) == {"ValueError: stuck"}
+    assert set(frame[frame["seed"] == 0]["failure"]) == {""}
+
+
+def test_a_folder_of_another_study_is_refused(study: Study, tmp_path: Path) -> None:
+    run_study(study, tmp_path / "mine")
+    before = contents(tmp_path / "mine")
+    with pytest.raises(OutputError, match=r"laps = 2, found another, with 1"):
+        run_study(replace(study, laps=2), tmp_path / "mine")
+    with pytest.raises(OutputError, match="varied"):
+        run_study(replace(study, grids=()), tmp_path / "mine")
+    assert contents(tmp_path / "mine") == before
+    run_study(replace(study, question="Why?", metrics=("size",)), tmp_path / "mine")
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "thesis.tex").write_text("mine")
+    with pytest.raises(OutputError, match=r"study\.json"):
+        run_study(study, tmp_path / "thesis")
+    assert [file.name for file in (tmp_path / "thesis").iterdir()] == ["thesis.tex"]
+
+
+def test_a_study_that_cannot_be_planned_leaves_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> NoReturn:
+        raise SettingsError("no")
+
+    monkeypatch.setattr(study_run, "load_tracks", fail)
+    with pytest.raises(SettingsError):
+        run_study(Study(tracks=(0,)), tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,304 @@
+"""Studies as they are written: what they resolve to, and what is refused before anything runs."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.eval.experiment.drives import load_tracks
+from pathspace_graph.eval.experiment.run import make_plan
+from pathspace_graph.eval.experiment.study import (
+    SHIPPED,
+    Baseline,
+    Study,
+    as_type,
+    find_study,
+    known_estimators,
+    leaves,
+    override,
+    read_study,
+    shipped_studies,
+    study_from,
+)
+from pathspace_graph.eval.metrics.summary import lap_times
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.presets import CAMERA, CAMERA_FAULTS, INS, INS_RATE
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_files import read_track
+from pathspace_graph.sim.vehicle import VehicleSettings
+
+from ...scenes.paths import ROOT
+
+WHOLE = """
+question = "Why?"
+tracks = [0, "oval.csv"]
+seeds = [3, 4]
+laps = 2
+estimators = ["landmark-fixed-lag", "fixed-lag"]
+metrics = ["rmse", "size"]
+baseline = { variant = "soft", estimator = "fixed-lag" }
+
+[noise.quiet]
+odometry.white = [0.1, 0.1, 0.01]
+
+[noise.loud]
+sensor.bearing_sigma = 1
+
+[variants.soft]
+gate.huber = inf
+"gauge.sigma_spacing" = 1
+
+[[grid]]
+lag = [1.0, 3]
+spline.degree = [2, 3]
+
+[[grid]]
+steps = [2]
+"""
+
+
+def study(text: str) -> Study:
+    return study_from(tomllib.loads(text), Path("folder"))
+
+
+def test_a_whole_study_is_read() -> None:
+    read = study(WHOLE)
+    assert read.tracks == (0, Path("folder/oval.csv"))
+    assert read.estimators == ("landmark-fixed-lag", "fixed-lag")
+    assert read.baseline == Baseline("soft", "fixed-lag")
+    assert read.simulation("quiet").odometry.white == (0.1, 0.1, 0.01)
+    assert read.simulation("quiet").laps == 2
+    assert read.simulation("loud").sensor.bearing_sigma == 1.0
+    assert read.points["soft"].gate.huber == float("inf")
+    assert read.points["lag=1, spline.degree=2"].lag == 1.0
+    assert read.points["lag=1, spline.degree=2"].spline.degree == 2
+    assert read.varied == ("gate.huber", "gauge.sigma_spacing", "lag", "spline.degree", "steps")
+    assert read.varied_noise == ("odometry.white", "sensor.bearing_sigma")
+
+
+def test_variants_that_come_to_the_same_are_run_once() -> None:
+    read = study(WHOLE)
+    default = MapperSettings()
+    assert (default.lag, default.spline.degree) == (3.0, 3)
+    assert list(read.points) == [
+        "default",
+        "soft",
+        "lag=1, spline.degree=2",
+        "lag=1, spline.degree=3",
+        "lag=3, spline.degree=2",
+        "steps=2",
+    ]
+    same = study('tracks = [0]\nbaseline.variant = "lag=3"\ngrid.lag = [1.0, 3.0]')
+    assert same.baseline_variant == "default"
+
+
+def test_values_of_a_grid_that_are_nearly_the_same_are_kept_apart() -> None:
+    names = list(study("tracks = [0]\ngrid.lag = [1.0, 1.00000001]").points)
+    assert names == ["default", "lag=1", "lag=1.00000001"]
+
+
+def test_from_python_as_from_a_file() -> None:
+    made = Study(tracks=[0, "folder/oval.csv"], seeds=[3, 4], estimators="fixed-lag", grids=[{"lag": [1.0]}])
+    assert made == study(
+        'tracks = [0, "oval.csv"]\nseeds = [3, 4]\nestimators = ["fixed-lag"]\ngrid.lag = [1.0]'
+    )
+
+
+def test_all_estimators() -> None:
+    assert study('tracks = [0]\nestimators = "all"').estimators == tuple(known_estimators())
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("seeds = [0]", "tracks: expected"),
+        ("tracks = []", "tracks: expected at least one"),
+        ("tracks = [0, 0]", "none twice"),
+        ("tracks = [[0]]", "tracks: expected whole numbers"),
+        ("tracks = [-1]", "tracks: expected whole numbers"),
+        ("tracks = [0]\nseeds = 3", "seeds: expected a list"),
+        ("tracks = [0]\nseeds = [0.5]", "seeds: expected whole numbers"),
+        ("tracks = [0]\nlaps = 0", "laps: expected at least 1"),
+        ("tracks = [0]\nlaps = true", "laps: expected a whole number"),
+        ("tracks = [0]\nlap = 1", "found 'lap', the nearest is 'laps'"),
+        ("tracks = [0]\nname = 1", "name: expected text"),
+        ('tracks = [0]\nestimators = ["fixed-leg"]', "found 'fixed-leg', the nearest is 'fixed-lag'"),
+        ('tracks = [0]\nmetrics = ["rsme"]', "found 'rsme', the nearest is 'rmse'"),
+        ("tracks = [0]\ngrid.spline.degre = [1]", "found 'spline.degre', the nearest is 'spline.degree'"),
+        ("tracks = [0]\ngrid.lag = 1.0", "grid.lag: expected a list"),
+        ("tracks = [0]\ngrid.lag = []", "grid.lag: expected a list"),
+        ('tracks = [0]\ngrid.lag = ["long"]', "grid.lag: expected a value of type float, found 'long'"),
+        ("tracks = [0]\ngrid.lag = [-1.0]", "grid.lag: lag: expected a positive number, found -1.0"),
+        ("tracks = [0]\ngrid.steps = [1.5]", "grid.steps: expected a value of type int"),
+        ("tracks = [0]\ngrid.spline = [1]", "found 'spline'"),
+        ("tracks = [0]\nvariants.default.lag = 1.0", "variants.default: that name is kept"),
+        ("tracks = [0]\nvariants.fast = 1", "variants.fast: expected a table"),
+        ('tracks = [0]\ngrid.lag = [1.0]\nvariants."lag=1".steps = 2', "expected every name once"),
+        ("tracks = [0]\nnoise.loud.sensor.bearing_sgima = 1.0", "the nearest is 'sensor.bearing_sigma'"),
+        ("tracks = [0]\nnoise.loud.odometry.white = [1.0]", "noise.loud.odometry.white: expected"),
+        ("tracks = [0]\nnoise.loud.laps = 3", "noise.loud.laps: expected laps as a key"),
+        ('tracks = [0]\nbaseline.variant = "defualt"', "found 'defualt', the nearest is 'default'"),
+        ('tracks = [0]\nbaseline.estimator = "spline"', "baseline.estimator: expected one of the study's"),
+        ('tracks = [0]\nbaseline.settings = "x"', "baseline: expected a known key"),
+    ],
+)
+def test_what_is_unknown_or_wrong_is_refused(text: str, says: str) -> None:
+    with pytest.raises(SettingsError) as refused:
+        study(text)
+    assert says in str(refused.value)
+
+
+def test_a_file_that_is_wrong_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    with pytest.raises(InputError, match=r"mine\.toml"):
+        read_study(file)
+    file.write_text("tracks = [")
+    with pytest.raises(InputError, match=r"mine.toml: expected TOML"):
+        read_study(file)
+    file.write_text("tracks = [0]\nlap = 1")
+    with pytest.raises(InputError, match=r"mine.toml: expected a known key"):
+        read_study(file)
+    file.write_text("tracks = [0]")
+    assert read_study(file).name == "mine"
+
+
+def test_a_missing_track_names_the_nearest_file(tmp_path: Path) -> None:
+    (tmp_path / "oval.csv").write_text("")
+    with pytest.raises(InputError, match=r"ovel.csv.*the nearest is 'oval.csv'"):
+        load_tracks((tmp_path / "ovel.csv",))
+
+
+def test_a_study_is_found_by_name_or_refused_with_the_nearest() -> None:
+    assert find_study(Path("degree")) == SHIPPED / "degree.toml"
+    with pytest.raises(SettingsError, match="the nearest is 'degree'"):
+        find_study(Path("degre"))
+
+
+def test_a_noise_names_presets_and_overrides_them() -> None:
+    noise = {"sensor": {"preset": "camera", "range_max": 30.0}, "odometry": {"preset": "ins"}}
+    study = study_from({"tracks": [0], "noise": {"camera": noise}})
+    simulation = study.simulation("camera")
+    assert simulation.sensor == replace(CAMERA, range_max=30.0)
+    assert (simulation.odometry, simulation.vehicle.rate) == (INS, INS_RATE)
+    assert simulation.faults.sensor == CAMERA_FAULTS
+    assert study.varied_noise == ("sensor.range_max",)
+    with pytest.raises(SettingsError, match=r"sensor: expected a known preset.*'camra'"):
+        study_from({"tracks": [0], "noise": {"camera": {"sensor.preset": "camra"}}})
+
+
+def test_the_studies_listed_are_the_files_on_disk_and_are_shipped() -> None:
+    on_disk = {file.stem for file in (ROOT / "eval" / "studies").glob("*.toml")}
+    assert set(shipped_studies()) == on_disk
+    assert on_disk == {
+        "batch",
+        "camera",
+        "centerline",
+        "closing",
+        "covariance",
+        "degree",
+        "density",
+        "endurance",
+        "estimators",
+        "false_closings",
+        "sizes",
+        "faults",
+        "gauge",
+        "hard",
+        "lag",
+        "online",
+        "open",
+        "paper",
+        "places",
+        "reach",
+        "relinearize",
+        "residual",
+        "robust",
+    }
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    shipped = project["tool"]["setuptools"]["package-data"]["pathspace_graph.eval"]
+    assert {"studies/*.toml", "studies/tracks/*.csv"} <= set(shipped)
+
+
+@pytest.mark.parametrize("file", sorted((SHIPPED / "tracks").iterdir()), ids=lambda file: file.stem)
+def test_every_shipped_track_can_be_driven_whole_and_in_part(file: Path) -> None:
+    track = read_track(file)
+    whole, part = (
+        simulate(track, SimulationSettings(laps=1, vehicle=VehicleSettings(overrun=overrun)), 0)
+        for overrun in (10.0, -60.0)
+    )
+    assert (len(lap_times(whole)), len(lap_times(part))) == (1, 0)
+
+
+@pytest.mark.parametrize("name", shipped_studies())
+def test_every_shipped_study_is_sound_and_told_of_in_the_findings(name: str) -> None:
+    read = read_study(find_study(Path(name)))
+    assert len(read.tracks) * len(read.seeds) >= {"hard": 8, "faults": 4, "endurance": 4, "sizes": 4}.get(
+        name, 20
+    )
+    assert len(read.points) > 1 or len(read.estimators) > 1 or read.columns
+    assert f"`{name}`" in (ROOT / "docs" / "ablations.md").read_text()
+
+
+def test_the_examples_of_the_findings_are_sound() -> None:
+    text = (ROOT / "docs" / "ablations.md").read_text()
+    (example,) = re.findall(r"```toml\n(.*?)```", text, flags=re.DOTALL)
+    assert len(study(example).points) == 1 + 1 + 3
+    (code,) = re.findall(r"```python\n(.*?)frame = ", text, flags=re.DOTALL)
+    known: dict[str, object] = {}
+    exec(compile(code, "ablations.md", "exec"), known)
+    assert isinstance(known["study"], Study)
+    for name in re.findall(r"pathspace-graph ablate (\w+) --out \w+ --tracks", text):
+        assert name in shipped_studies()
+    for picture in re.findall(r"\]\((.*?\.png)\)", text):
+        assert (ROOT / "docs" / picture).is_file()
+
+
+# --- settings --------------------------------------------------------------------------------------------
+
+
+def test_every_leaf_of_both_trees_can_be_set_to_what_it_is() -> None:
+    for tree in (MapperSettings(), SimulationSettings()):
+        values = {name: value for name, value in leaves(tree).items() if value is not None}
+        assert override(tree, values, "here") == tree
+
+
+def test_types_of_toml_become_those_of_the_fields() -> None:
+    assert as_type([1, 2], tuple[float, ...], "x") == (1.0, 2.0)
+    assert as_type(3, int | None, "x") == 3
+    for value, hint in ((True, float), (True, int), (1, bool), ([1], tuple[float, float]), ("1", float)):
+        with pytest.raises(SettingsError, match="x: expected"):
+            as_type(value, hint, "x")
+
+
+# --- cells -----------------------------------------------------------------------------------------------
+
+
+def test_cells_share_a_drive_and_have_an_identity_each() -> None:
+    made = Study(
+        tracks=(0,),
+        seeds=(0, 1),
+        laps=1,
+        noise={"quiet": {}, "loud": {"sensor.bearing_sigma": 1.0}},
+        estimators=("fixed-lag", "landmark-fixed-lag"),
+        grids=({"lag": [1.0]},),
+    )
+    cells = make_plan(made).cells
+    assert len(cells) == 2 * 2 * 2 * 2
+    assert len({cell.id for cell in cells}) == len(cells)
+    assert len({cell.drive.id for cell in cells}) == len({id(cell.drive) for cell in cells}) == 4
+    again = make_plan(made).cells
+    assert [cell.id for cell in again] == [cell.id for cell in cells]
+
+
+def test_a_cell_is_known_by_what_it_runs_not_by_what_it_is_called() -> None:
+    grid = make_plan(Study(tracks=(0,), grids=({"lag": [1.0]},))).cells[1]
+    named = make_plan(Study(tracks=(0,), variants={"short": {"lag": 1.0}})).cells[1]
+    assert grid.variant != named.variant
+    assert grid.id == named.id
+    longer = make_plan(Study(tracks=(0,), laps=6)).cells[0]
+    assert longer.id != make_plan(Study(tracks=(0,))).cells[0].id
