@@ -22,7 +22,7 @@ from pathspace_graph.io.results import BatchRun, RunResult
 from pathspace_graph.io.temporary import is_temporary
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.plausibility.reading import read_plausible_log
-from pathspace_graph.settings.limits import LimitSettings
+from pathspace_graph.settings.front_end import LimitSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 Row = dict[str, float | int | str | bool]

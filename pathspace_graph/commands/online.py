@@ -37,7 +37,7 @@ from pathspace_graph.plausibility.reading import read_plausible_log
 from pathspace_graph.progress import progress
 from pathspace_graph.run import Observer, OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.view import FilmSettings, RecordingSettings
+from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 from pathspace_graph.view.watch import check_watchers, watchers
 
 

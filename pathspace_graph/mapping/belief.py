@@ -16,8 +16,7 @@ from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor, corrected
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.results import VehicleState
-from pathspace_graph.settings.calibration import CalibrationSettings
-from pathspace_graph.settings.mapper import OdometrySettings
+from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
 
 from .cubature import Transformed, square_root, transform
 from .motion import MeasuredMotion

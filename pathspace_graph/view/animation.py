@@ -34,7 +34,7 @@ from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES
 from pathspace_graph.run import ObservedCycle, Readings
-from pathspace_graph.settings.view import FilmSettings
+from pathspace_graph.settings.output import FilmSettings
 
 from .film import Film
 

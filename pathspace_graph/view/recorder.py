@@ -17,7 +17,7 @@ from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.run import ObservedCycle
-from pathspace_graph.settings.view import RecordingSettings
+from pathspace_graph.settings.output import RecordingSettings
 
 from . import entities
 

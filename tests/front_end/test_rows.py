@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.front_end.rows import Row, follow_rows
+from pathspace_graph.front_end.sides import Row, follow_rows
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.front_end import SidesSettings
 

@@ -12,8 +12,14 @@ from pathspace_graph.factors.se2 import relative, to_vehicle
 from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.motion import MotionCheck
-from pathspace_graph.front_end.scan_matching import RecentDetections, match
-from pathspace_graph.front_end.sensor_errors import ERRORS, Difference, SensorErrors, by_errors
+from pathspace_graph.front_end.scan_matching import (
+    ERRORS,
+    Difference,
+    RecentDetections,
+    SensorErrors,
+    by_errors,
+    match,
+)
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.calibration import CalibrationSettings

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pathspace_graph.factors.measured_noise import KnownNoise
-from pathspace_graph.front_end.cones import NearCones
 from pathspace_graph.front_end.front_end import FrontEnd, judge_log
+from pathspace_graph.front_end.sides import NearCones
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, ORANGE, RIGHT, UNKNOWN
 from pathspace_graph.run import split_odometry
