@@ -69,7 +69,7 @@ the vehicle could not change its velocity so."""
 REST: Final = 1.0
 """Time of standing from which the vehicle is at rest, s: its mean yaw rate measures the bias then."""
 REST_TWIST: Final = (0.1, 0.1, 0.05)
-"""Largest mean twist (m/s, m/s, rad/s) of a vehicle that stands, but for its noise; a yaw rate is the bias."""
+"""Largest mean twist (m/s, m/s, rad/s) of a vehicle that stands, but for noise; the yaw rate is bias."""
 REST_SIGMAS: Final = 3.0
 """Standard deviations of the mean that count as its noise."""
 SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)

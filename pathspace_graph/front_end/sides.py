@@ -1,9 +1,9 @@
 """The side of each detection: what is left of the way driven is left, and colours are evidence of it.
 
 A detector may have no colours, and a track may be driven the other way round, with its blue cones on the
-right. The coloured cones beside the path decide together what the colours mean. Where most detections have no
-colour, two rows of cones are followed from beside the vehicle ahead, each cone to the row that it fits better.
-What is in neither of them stays unknown.
+right. The coloured cones beside the path decide together what the colours mean. Where most detections have
+no colour, two rows of cones are followed from beside the vehicle ahead, each cone to the row that it fits
+better. What is in neither of them stays unknown.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MIN_LATERAL: Final = 0.5
 MAX_LATERAL: Final = 8.0
 """Distances from the path between which it tells the side of a cone, m."""
 MAJORITY: Final = 2.5
-"""Least ratio of cones on the side of the other colour to those on their own where the colours are swapped."""
+"""Least ratio of cones on the other colour's side to those on their own where the colours are swapped."""
 ENOUGH_VOTES: Final = 30
 """Number of cones that settles what the colours mean."""
 REMEMBERED: Final = 0.98

@@ -1,7 +1,7 @@
 """Settings of the constant errors of odometry and sensor, which are estimated along with the map.
 
-The priors are those of a vehicle that was calibrated. Where the drive contradicts one of them, they become wide:
-then odometry or sensor is not what it was said to be. What a drive does not show stays at its prior.
+The priors are those of a vehicle that was calibrated. Where the drive contradicts one of them, they become
+wide: then odometry or sensor is not what it was said to be. What a drive does not show stays at its prior.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Settings of the estimators: those that a user or a study changes, each a frozen dataclass.
 
-A number that nobody changes is a constant: beside its use, or as a class variable here where several rooms share it.
+A number that nobody changes is a constant: beside its use, or a class variable here where several rooms
+share it.
 """
 
 from __future__ import annotations
@@ -228,8 +229,8 @@ class MapperSettings(Positive):
     """The estimators of a centre line with a width."""
 
     sigma_step: ClassVar[float] = 0.5
-    """Standard deviation of a control point's move in a step, m: damps sliding along the curve, and leaves the
-    optimum where it is."""
+    """Standard deviation of a control point's move in a step, m: damps sliding along the curve, and leaves
+    the optimum where it is."""
 
     @property
     def calibrations(self) -> tuple[float, ...]:

@@ -100,7 +100,7 @@ def test_means_are_weighted_by_information() -> None:
 
 
 def test_a_vehicle_that_creeps_is_not_at_rest() -> None:
-    rest, rng = Rest(SIGMA, MotionSettings()), np.random.default_rng(0)
+    rest, rng = Rest(SIGMA), np.random.default_rng(0)
     told = []
     for k in range(40):
         t = 0.1 * k + 0.02 * np.arange(5)
