@@ -116,7 +116,7 @@ def test_with_noise_the_errors_are_as_large_as_the_covariance_says() -> None:
 
 
 CERTAIN = MapperSettings(
-    odometry=OdometrySettings(sigma_scale=1e-9, sigma_bias=1e-9, sigma_start=1e-6, sigma_start_heading=1e-6),
+    odometry=OdometrySettings(sigma_scale=1e-9, sigma_bias=1e-9),
     calibration=CalibrationSettings(sensor=False),
 )
 """A vehicle that stands turns by its yaw rate's bias, unless that is known."""
