@@ -10,8 +10,8 @@ from typing import Any, Final
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError, check_name
 from pathspace_graph.io.limits import MAX_HEADER_BYTES, shown
 from pathspace_graph.io.parsing import parse_toml, read_text
+from pathspace_graph.overrides import flatten
 
-from .overrides import flatten
 from .study import ALL, Baseline, Study
 
 SHIPPED: Final = Path(__file__).parents[1] / "studies"

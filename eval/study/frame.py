@@ -11,9 +11,9 @@ from pathspace_graph.estimators import DEFAULT_BATCH
 from pathspace_graph.eval.metrics.gap import from_batch
 from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.eval.metrics.summary import versions
+from pathspace_graph.overrides import leaves
 
 from .cells import Cell, Record
-from .overrides import leaves
 from .study import Study
 
 COMBINATION: Final = ("noise", "estimator", "variant")

@@ -16,10 +16,10 @@ from pathspace_graph.io.files import check_target, remove_manifest, to_plain, wr
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.manifest import verified
 from pathspace_graph.io.parsing import read_json
+from pathspace_graph.overrides import flatten
 
 from .cells import Cell, Record, failed, run_cell
 from .frame import frame_of
-from .overrides import flatten
 from .store import Store
 from .study import Study
 

@@ -14,12 +14,12 @@ from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.eval.harness.attempts import known_estimators
 from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.io.limits import MAX_VARIANTS, shown
+from pathspace_graph.overrides import Overrides, override
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.presets import PLAIN, PRESETS, preset
 from pathspace_graph.sim.simulate import SimulationSettings
 
 from .column import column_of
-from .overrides import Overrides, override
 
 DEFAULT: Final = "default"
 """This variant overrides nothing, and it is part of every study."""

@@ -13,9 +13,9 @@ from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval.harness.drives import load_tracks
 from pathspace_graph.eval.metrics.summary import lap_times
 from pathspace_graph.eval.study.file import SHIPPED, find_study, read_study, shipped_studies, study_from
-from pathspace_graph.eval.study.overrides import as_type, leaves, override
 from pathspace_graph.eval.study.run import make_plan
 from pathspace_graph.eval.study.study import Baseline, Study, known_estimators
+from pathspace_graph.overrides import as_type, leaves, override
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.presets import CAMERA, CAMERA_FAULTS, INS, INS_RATE
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
