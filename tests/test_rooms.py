@@ -23,7 +23,7 @@ BELOW_MAPPING = {
     "scale",
 }
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
-BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "plausibility"}
+BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "plausibility", "overrides"}
 
 ARROWS: dict[str, set[str]] = {
     **{leaf: set() for leaf in sorted(LEAVES)},
@@ -58,7 +58,8 @@ ARROWS: dict[str, set[str]] = {
     "commands": BELOW_EVAL
     | {"export", "convert", "view"}
     | {f"eval.{room}" for room in ("metrics", "figures", "experiment", "benchmark")},
-    "options": {"io"},
+    "overrides": {"io", "settings"},
+    "options": {"io", "settings", "overrides"},
     "frames": {"io"},
     "cli": {"options", "commands"},
     "__main__": {"cli"},

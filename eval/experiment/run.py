@@ -16,11 +16,12 @@ from pathspace_graph.io.files import check_target, remove_manifest, to_plain, wr
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.manifest import verified
 from pathspace_graph.io.parsing import read_json
+from pathspace_graph.overrides import flatten
 
 from .cells import Cell, Outcome, Record, Store, record_cell, record_of
 from .drives import Drive, NamedTrack, load_tracks, try_drive
 from .frame import frame_of
-from .study import Study, flatten
+from .study import Study
 from .workers import check_jobs, outcomes, workers
 
 FORMAT: Final = "pathspace-study/1"

@@ -28,28 +28,28 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .online import report, tell
 
 NOT_CONVERGED: Final = 3
-"""This is the exit code of a run whose result is written, but is not the optimum."""
+"""Exit code of a run whose result is written, but is not the optimum."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
-    """Optimizes a whole log at once, and writes the map, the trajectory, the cycles and a summary."""
+    """Optimize a whole log at once, and write the map, the trajectory, the cycles and a summary."""
 
     log: Positional[Path]
-    """The log is read from this folder."""
+    """Folder of the log."""
     out: Path
-    """The map is written to this folder; an earlier map there is kept as a numbered backup."""
+    """Folder for the map; an earlier map there is kept as a numbered backup."""
     estimator: str = DEFAULT_BATCH
-    """This is the name of the batch estimator."""
+    """Name of the batch estimator."""
     map: MapKind = "boundaries"
-    """The track is mapped as two boundaries, or as one centre line with a width."""
+    """Kind of map: two boundaries, or one centre line with a width."""
     start: Start | None = None
-    """The optimization begins at an online map, or at odometry alone; by default `batch.start` decides."""
+    """Where the optimization begins: an online map, or odometry alone; by default as `batch.start` says."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
-    """These settings describe the estimator."""
+    """Settings of the estimator."""
 
     def run(self) -> None:
-        """Reads, optimizes, writes and reports; the exit code is 3 if it did not converge."""
+        """Read, optimize, write and report; the exit code is 3 if it did not converge."""
         check_batch(self.estimator)
         name = for_map(self.estimator, self.map)
         if self.start == "odometry" and name != DEFAULT_BATCH:
@@ -77,7 +77,7 @@ class Batch:
 
 
 def summarize_batch(result: BatchRun, log: Log, start: Start, hints: Sequence[Hint] = ()) -> dict[str, Any]:
-    """Returns the summary of a run, how its optimization ended, and its gap from its online start."""
+    """Return the summary of a run, how its optimization ended, and its gap from its online start."""
     summary = summarize(result, log, hints) | {"start": start, "converged": result.converged}
     if not isinstance(result, BatchResult):
         return summary

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from joblib import Parallel, delayed, parallel_config
 from rich.console import Console
+from tyro.conf import arg
 
 from pathspace_graph.estimators import DEFAULT, make_online
 from pathspace_graph.eval.experiment.cells import run_estimator
@@ -27,32 +28,33 @@ from .online import map_online, outline
 from .simulate import describe, generated_track
 
 RIVAL: Final = "landmark-fixed-lag"
-"""The table of this estimator stands beside the spline graph's."""
+"""Estimator whose table stands beside the spline graph's."""
 PICTURE: Final = "track.png"
 PICTURE_DPI: Final = 150.0
-"""The picture has this resolution (dots per inch), which suits a web page."""
+"""Resolution of the picture, dots per inch, which suits a web page."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Demo:
-    """Simulates a track and maps it online: the paper's table beside the landmark graph's, and a picture."""
+    """Simulate a track and map it online: the paper's table beside the landmark graph's, and a picture."""
 
     out: Path = field(default_factory=lambda: Path("pathspace-demo"))
-    """The log, the map and the picture are written to this folder; an earlier demo there is kept as a
-    numbered backup."""
+    """Folder for log, map and picture; an earlier demo there is kept as a numbered backup."""
     seed: int = 0
-    """The track and all noise are drawn from this seed."""
+    """Seed of the track and of all noise."""
     laps: int = 5
-    """The vehicle drives this number of laps."""
+    """Laps that the vehicle drives."""
+    settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
+    """Settings of both estimators."""
 
     def run(self) -> None:
-        """Simulates, maps, draws and reports."""
+        """Simulate, map, draw and report."""
         check_target(self.out, PICTURE)
         with progress("driving"):
             log = simulate(generated_track(self.seed), SimulationSettings(laps=self.laps), self.seed)
         say = partial(Console().print, highlight=False, soft_wrap=True, markup=False)
         say(f"a generated track, {self.laps} times around: {describe(log)}")
-        result, rival = map_with_both(log)
+        result, rival = map_with_both(log, self.settings)
         write_demo(self.out, log, result)
         table = side_by_side({run.estimator: laps_of(run, log) for run in (result, rival)})
         if table.rows:
@@ -63,9 +65,8 @@ class Demo:
         say(f"log, map and {PICTURE} are in {self.out}")
 
 
-def map_with_both(log: Log) -> tuple[RunResult, RunResult]:
-    """Returns the spline graph's result and the landmark graph's, which runs in another process."""
-    settings = MapperSettings()
+def map_with_both(log: Log, settings: MapperSettings) -> tuple[RunResult, RunResult]:
+    """Return the spline graph's result and the landmark graph's, which runs in another process."""
     with parallel_config(backend="loky", inner_max_num_threads=1):
         # with one job it would be run here, and first
         rival = Parallel(n_jobs=2, return_as="generator")([delayed(run_estimator)(RIVAL, settings, log)])
@@ -76,7 +77,7 @@ def map_with_both(log: Log) -> tuple[RunResult, RunResult]:
 
 
 def write_demo(out: Path, log: Log, result: RunResult) -> None:
-    """Writes the log, the map and its picture: all of them, or on failure nothing."""
+    """Write the log, the map and its picture: all of them, or on failure nothing."""
     with progress("writing"), atomic_folder(out, PICTURE) as folder:
         write_log(log, folder / "log")
         write_result(folder / "map", result, summarize(result, log))

@@ -19,7 +19,7 @@ from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE, read_log
 from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map
 from pathspace_graph.io.trajectory import TRAJECTORY_FILE, read_trajectory, write_trajectory
-from pathspace_graph.settings.speed import SpeedSettings
+from pathspace_graph.settings.output import SpeedSettings
 from pathspace_graph.spline.planning import LEAST_STEP, MOST_POINTS
 
 Format = Literal["centerline", "tum", "geojson", "points", "lanelet2", "profile"]

@@ -37,43 +37,42 @@ from pathspace_graph.plausibility.reading import read_plausible_log
 from pathspace_graph.progress import progress
 from pathspace_graph.run import Observer, OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.view import FilmSettings, RecordingSettings
+from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 from pathspace_graph.view.watch import check_watchers, watchers
 
 
 @dataclass(frozen=True, kw_only=True)
 class Online:
-    """Maps a log online, cycle by cycle, and writes the map, the trajectory, the cycles and a summary."""
+    """Map a log online, cycle by cycle, and write the map, the trajectory, the cycles and a summary."""
 
     log: Positional[Path]
-    """The log is read from this folder."""
+    """Folder of the log."""
     out: Path
-    """The map is written to this folder; an earlier map there is kept as a numbered backup."""
+    """Folder for the map; an earlier map there is kept as a numbered backup."""
     estimator: str = DEFAULT
-    """This is the name of the online estimator."""
+    """Name of the online estimator."""
     map: MapKind = "boundaries"
-    """The track is mapped as two boundaries, or as one centre line with a width."""
+    """Kind of map: two boundaries, or one centre line with a width."""
     save: Path | None = None
-    """The mapper is saved to this file at the end, for `--resume`; only `fixed-lag` can be saved."""
+    """File to which the mapper is saved at the end, for `--resume`; only `fixed-lag` can be saved."""
     resume: Path | None = None
-    """The mapper that was saved in this file goes on with its settings, and with cycles after its newest."""
+    """File of a saved mapper, which goes on with its settings, and with cycles after its newest."""
     view: FlagCreatePairsOff[bool] = False
-    """The run is shown in the window of the live viewer rerun while it goes on."""
+    """Show the run in the window of the live viewer rerun while it goes on."""
     save_view: Path | None = None
-    """What the viewer shows is written to this file (.rrd), with or without a window; an earlier one is kept
-    as a numbered backup."""
+    """File (.rrd) for what the viewer shows; an earlier one is kept as a numbered backup."""
     animate: Path | None = None
-    """A film of the run is written to this file (.gif, or .mp4 where ffmpeg is installed); an earlier one is
-    kept as a numbered backup."""
+    """File for a film of the run (.gif, or .mp4 where ffmpeg is installed); an earlier one is kept as a
+    numbered backup."""
     recording: RecordingSettings = field(default_factory=RecordingSettings)
-    """These settings describe what the viewer shows."""
+    """What the viewer shows."""
     film: FilmSettings = field(default_factory=FilmSettings)
-    """These settings describe the film."""
+    """The film."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
-    """These settings describe the estimator."""
+    """Settings of the estimator."""
 
     def run(self) -> None:
-        """Reads, maps, writes and reports."""
+        """Read, map, write and report."""
         check_online(self.estimator)
         name = for_map(self.estimator, self.map)
         check_target(self.out, MAP_FILE)
@@ -94,7 +93,7 @@ class Online:
         Console().print(f"written to {written}", highlight=False, soft_wrap=True, markup=False)
 
     def _check_snapshots(self, estimator: str) -> None:
-        """Raises where a snapshot is asked for that cannot be, before anything is mapped."""
+        """Raise a SettingsError where a snapshot is asked for that cannot be, before anything is mapped."""
         asked = [f"--{name}" for name in ("save", "resume") if getattr(self, name) is not None]
         if asked and estimator != DEFAULT:
             raise SettingsError(f"{asked[0]}: expected --estimator {DEFAULT}, found {estimator}")
@@ -106,7 +105,7 @@ class Online:
             check_file_target(self.save)
 
     def _begin(self, log: Log, name: str) -> tuple[Log, OnlineEstimator]:
-        """Returns a new estimator and the log, or the saved mapper and the cycles that it has not seen."""
+        """Return a new estimator and the log, or the saved mapper and the cycles that it has not seen."""
         if self.resume is None:
             return log, make_online(name, self.settings, log)
         mapper = FixedLagMapper.restore(self.resume)
@@ -119,7 +118,7 @@ class Online:
 
 
 def tell(hints: Sequence[Hint], of: str = "") -> None:
-    """Prints a line for each hint as an error, with the name of the log `of` which it is where there are
+    """Print a line for each hint as an error, with the name of the log `of` which it is where there are
     several."""
     say = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
     for hint in hints:
@@ -129,7 +128,7 @@ def tell(hints: Sequence[Hint], of: str = "") -> None:
 def map_online(
     log: Log, estimator: OnlineEstimator, name: str = DEFAULT, observers: Sequence[Observer] = ()
 ) -> RunResult:
-    """Maps a log with progress; the map at the end of each true lap is kept where there is truth."""
+    """Map a log with progress; the map at the end of each true lap is kept where there is truth."""
     with progress("mapping", len(log.cycles)) as advance, solving("an update"):
         return run_online(
             log,
@@ -141,7 +140,7 @@ def map_online(
 
 
 def report(result: RunResult, log: Log) -> None:
-    """Prints the run in a line, the paper's table where there is truth, and what was not mapped as an
+    """Print the run in a line, the paper's table where there is truth, and what was not mapped as an
     error."""
     console = Console()
     laps = laps_of(result, log)
@@ -165,7 +164,7 @@ def report(result: RunResult, log: Log) -> None:
 
 
 def outline(result: RunResult) -> str:
-    """Returns the run in one line."""
+    """Return the run in one line."""
     laps = f"{result.laps} lap{'' if result.laps == 1 else 's'}"
     loop = "loop closed" if result.map.closed else "loop not closed"
     sizes = [f"{NAMES[label]} {boundary.size}" for label, boundary in sorted(result.map.boundaries.items())]
@@ -177,7 +176,7 @@ def outline(result: RunResult) -> str:
 
 
 def health_outline(result: RunResult) -> list[str]:
-    """Returns how many cycles were not good, and why the vehicle is lost at the end, if any were."""
+    """Return how many cycles were not good, and why the vehicle is lost at the end, if any were."""
     number = counts([health_of(record) for record in result.cycles])
     total = max(len(result.cycles), 1)
     reasons = Counter(record.reason for record in result.cycles if record.health == DEGRADED)
@@ -194,7 +193,7 @@ def health_outline(result: RunResult) -> list[str]:
 
 
 def laps_table(laps: list[LapMetrics]) -> Table:
-    """Returns the paper's Table 1 with a row for each lap."""
+    """Return the paper's Table 1 with a row for each lap."""
     table = Table("lap", "rmse [m]", "missed [%]", "size")
     for column in table.columns:
         column.justify = "right"

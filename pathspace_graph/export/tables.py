@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary
 from pathspace_graph.labels import NAMES
-from pathspace_graph.settings.speed import SpeedSettings
+from pathspace_graph.settings.output import SpeedSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.speed import speed_profile
 

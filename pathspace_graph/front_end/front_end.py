@@ -1,21 +1,24 @@
 """The front end of all estimators: what they are given of each cycle."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise
+from pathspace_graph.factors.odometry import odometry_residuals
+from pathspace_graph.factors.se2 import left_of, move_points, rotation, se2_exp
+from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.window import MapRows
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import POINTS, UNKNOWN
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.run import split_odometry
+from pathspace_graph.settings.front_end import MotionSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
@@ -26,68 +29,62 @@ from .noise import NoiseLearner
 from .sides import SideJudge
 from .sightings import SeenCycle, TwistRecord
 
-Array = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 SWAPPED: Final = {
     True: "the cones on the left have the colour of the right boundary: the colours are swapped, the track "
     "is driven the other way round, or y points to the right in the whole log",
     False: "the colours are as they were said to be",
 }
-"""These notices say that the colours are swapped from now on, or no longer."""
+"""Notices that the colours are swapped from now on, or no longer."""
 COLOURLESS: Final = {
     True: "most detections have no colour: the way driven tells their sides",
     False: "most detections have a colour again",
 }
-"""These notices say that most colours are unknown from now on, or no longer."""
+"""Notices that most colours are unknown from now on, or no longer."""
 NEAREST: Final = 2
-"""The vehicle drives between orange cones where this number of the nearest ones are orange."""
+"""Number of nearest cones that are orange where the vehicle drives between orange cones."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """Holds the readings of a cycle after they were judged."""
+    """The readings of a cycle after they were judged."""
 
     motion: MeasuredMotion
-    """This motion leads to the cycle."""
+    """Motion that leads to the cycle."""
     detections: Detections
-    """These are the detections of the cycle."""
+    """Detections of cones that bound the road."""
     seen_again: BoolArray
-    """(m,) The flag is set when a detection lies where the cycles just before had one."""
+    """(m,) Whether each of them lies where the cycles just before had one."""
     orange: Detections
-    """Its detections of orange cones, which bound no road."""
+    """Detections of orange cones, which bound no road."""
     sensor_doubted: bool = False
-    """The flag is set once the readings so far contradict the prior of the sensor's yaw or latency."""
+    """Whether the readings so far contradict the prior of the sensor's yaw or latency."""
     measured: MapperSettings | None = None
     """Settings with the priors of the calibrations, in a cycle in which they were measured."""
     notice: str = ""
-    """This says what the labels mean from now on, where that has changed."""
+    """What the labels mean from now on, where that has changed."""
 
 
 class FrontEnd:
     """Judges the readings of each cycle by those of the cycles before, without any map."""
 
     def __init__(self, settings: MapperSettings, noise: KnownNoise) -> None:
-        """Keeps the settings, and what is known of the noise."""
         self.noise = NoiseLearner(noise, settings.noise)
-        """It measures noise that nobody has stated."""
         self.gate = Gate(settings.limits)
-        """It refuses cycles that no estimator can use."""
         self._motion = MotionCheck(self.noise.twist_sigma, settings.motion)
         self._settings = settings
         self._begun = False
-        self._calibration = settings.calibration
         self._sensor_doubted = False
         self._sides = SideJudge(settings.sides, settings.path)
 
     def admit(self, odometry: Odometry, detections: Detections, window: Sequence[float] = ()) -> Admitted:
-        """Returns a cycle that may be used, or raises a ReadingError; nothing but a count changes.
+        """Return a cycle that may be used, or raise a ReadingError; nothing but a count changes.
 
         A late cycle is admitted between the stamps (s) of the `window`.
         """
         return self.gate.admit(odometry, detections, self._motion.newest, window)
 
     def use_late(self, detections: Detections, window: Sequence[float]) -> Detections:
-        """Returns the detections of a late cycle with the labels of their sides; unknown ones stay so.
+        """Return the detections of a late cycle with the labels of their sides; unknown ones stay so.
 
         Its stamp is not admitted again as long as it lies in the window, whose poses have these stamps (s).
         """
@@ -96,7 +93,7 @@ class FrontEnd:
         return self._sides.relabelled(detections, np.full(len(detections.labels), UNKNOWN))
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
-        """Returns the judged readings of a cycle: the twists since the last one, and its detections."""
+        """Return the judged readings of a cycle: the twists since the last one, and its detections."""
         noise, twist = self.noise, odometry.twist[-1] if len(odometry.t) else np.zeros(3)
         of_orange = is_orange(detections)
         in_lane = is_in_orange_lane(detections, of_orange)
@@ -109,31 +106,33 @@ class FrontEnd:
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
         judged = replace(noise.for_map(detections), labels=labels)
-        self._sensor_doubted = self._sensor_doubted or self._motion.errors.contradict(self._calibration)
+        # measured noise comes with measured errors of the sensor, by which `calibrated` judges its prior
+        if not (self._sensor_doubted or noise.of_detections):
+            self._sensor_doubted = self._motion.errors.contradict(self._settings.calibration)
         return Reading(
             motion,
             judged,
             self._motion.seen_again,
             noise.for_map(orange),
-            self._sensor_doubted and not noise.of_detections,
+            self._sensor_doubted,
             self._measured(odometry, replace(detections, labels=labels), motion),
             notice="; ".join(notices),
         )
 
     @property
     def noise_used(self) -> RunNoise:
-        """Returns the noise that is used now, and what was measured so far."""
+        """Noise that is used now, and what was measured so far."""
         return self.noise.used(self._settings)
 
     @property
     def pose(self) -> Array:
-        """Returns a copy of the newest pose (3,) by odometry alone."""
+        """Copy of the newest pose (3,) by odometry alone."""
         return self._motion.pose.copy()
 
     def _measured(
         self, odometry: Odometry, detections: Detections, motion: MeasuredMotion
     ) -> MapperSettings | None:
-        """Learns the noise from a cycle; returns settings with new priors where there are any."""
+        """Learn the noise from a cycle; return settings with new priors where there are any."""
         fresh = self.noise.observe(odometry, detections, motion, self._motion.pose)
         if fresh:
             self._motion.believe(self.noise.twist_sigma)
@@ -146,22 +145,22 @@ class FrontEnd:
 
 @dataclass(frozen=True, eq=False)
 class JudgedLog:
-    """Holds the readings of a whole log after they were judged cycle by cycle."""
+    """The readings of a whole log after they were judged cycle by cycle."""
 
     chain: LogOdometry
-    """This is the motion from each cycle to the next."""
+    """Motion from each cycle to the next."""
     cycles: Sequence[Detections]
-    """These are the detections of each cycle."""
+    """Detections of each cycle."""
     orange: Sequence[Detections]
     """Those of orange cones."""
     settings: MapperSettings
-    """Here the priors of the sensor are wide, if the readings contradict them."""
+    """Settings, with wide priors of the sensor where the readings contradict them."""
     noise: RunNoise
-    """This noise was used."""
+    """Noise that was used."""
 
 
 def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLog:
-    """Returns a log as the front end gives it to an estimator of whole logs.
+    """Return a log as the front end gives it to an estimator of whole logs.
 
     Noise that is not known is measured on the whole log first. A cycle that an online estimator would refuse
     is a ReadingError.
@@ -192,12 +191,12 @@ def is_orange(detections: Detections) -> BoolArray:
 
 
 def measure_log(log: Log) -> MeasuredNoise | None:
-    """Returns the noise of a whole log and the constant errors of its sensor, by its readings alone."""
+    """Return the noise of a whole log and the constant errors of its sensor, by its readings alone."""
     return measure(*seen_cycles(log), None)
 
 
 def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
-    """Returns the cycles of a log where odometry alone places them, and the twists.
+    """Return the cycles of a log where odometry alone places them, and the twists.
 
     It is not doubted, since the detections' noise and the sensor's errors are not known yet.
     """
@@ -211,3 +210,48 @@ def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
         labelled = replace(detections.where(~is_orange(detections)), labels=reading.detections.labels)
         cycles.append(SeenCycle(labelled, front_end.pose, reading.motion.odometry.twist))
     return cycles, twists
+
+
+# --- late cycles -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class LateDetections:
+    """The detections of a late cycle as they would be seen from a pose of the window."""
+
+    detections: Detections
+    """Detections in the vehicle frame of that pose."""
+    cycle: int
+    """Perception cycle of the pose."""
+    twist: Array
+    """(3,) Mean twist of the vehicle then, m/s, m/s and rad/s."""
+
+
+def at_nearest_pose(
+    smoother: FixedLagSmoother[MapRows], detections: Detections, settings: MotionSettings
+) -> LateDetections:
+    """Return late detections as they would be seen from the pose of the window that is nearest in time.
+
+    No pose is added. The vehicle is taken to move with a constant twist from the pose before the stamp to the
+    pose after it. With T the motion from the nearest pose to the late one, a detection z with covariance K
+    becomes `T z` with `R (K + G Q G') R'`, where `G = [I | J z]` and J is the quarter turn. Q is the
+    covariance of the odometry for the share of the interval up to the nearest pose, and what a changing twist
+    may add: half the acceleration times the times to both poses. This treats the errors of the detections as
+    independent, though one motion has moved them all.
+    """
+    times, poses, t = smoother.times, smoother.variables.poses, detections.t
+    after = int(np.searchsorted(times, t))
+    before, duration = after - 1, times[after] - times[after - 1]
+    (motion,), _, _ = odometry_residuals(poses[before, None], poses[after, None], np.zeros((1, 3)))
+    share = (t - times[before]) / duration
+    nearest, share = (before, share) if share < 0.5 else (after, share - 1.0)
+    moved, whitener = se2_exp(share * motion[None])[0], smoother.window.odometry.whiteners[before]
+    bend = 0.5 * (t - times[before]) * (times[after] - t) * np.array(settings.accelerations)
+    spread = abs(share) * np.linalg.inv(whitener.T @ whitener) + np.diag(bend**2)
+    z = detections.points_vehicle
+    by_motion = np.zeros((len(z), 2, 3))
+    by_motion[:, :, :2], by_motion[:, :, 2] = np.eye(2), left_of(z)
+    turn = rotation(moved[2])
+    covariances = turn @ (detections.covariances + by_motion @ spread @ by_motion.transpose(0, 2, 1)) @ turn.T
+    seen = replace(detections, points_vehicle=move_points(moved, z), covariances=covariances)
+    return LateDetections(seen, smoother.first_cycle + nearest, motion / duration)

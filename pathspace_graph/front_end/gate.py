@@ -17,55 +17,67 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError, ReadingError
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, read_log
 from pathspace_graph.labels import LEFT, NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.run import CycleResult, split_odometry
+from pathspace_graph.scale.door import in_scene
 from pathspace_graph.scale.scene import scale_of
-from pathspace_graph.settings.limits import LimitSettings
-
-Array = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from pathspace_graph.settings.front_end import LimitSettings
 
 UNITS: Final = "stamps are in seconds"
-"""This hint follows where a stamp looks like one in milliseconds or nanoseconds."""
+"""Hint where a stamp looks like one in milliseconds or nanoseconds."""
 TWIST: Final = ("vx", "vy", "wz")
-"""These are the columns of a twist."""
+"""Columns of a twist."""
+MAX_STAMP: Final = 1e11
+"""Largest stamp, s: some three thousand years. Stamps in nanoseconds are larger."""
+MIN_INTERVAL: Final = 1e-3
+"""Least time from a cycle to the next, s. Between nearer ones the odometry is so certain that the system
+loses its digits."""
+MAX_TWISTS: Final = 100_000
+MAX_DETECTIONS: Final = 500
+"""Largest numbers of twists and detections in a cycle, which bound its time."""
+MIN_RANGE: Final = 0.01
+"""Least distance of a detection from the vehicle, m."""
+MIN_SIGMA: Final = 1e-6
+MAX_SIGMA: Final = 100.0
+"""Least and largest standard deviation of a detection in any direction, m."""
 MIN_DETERMINANT: Final = 1e-12
 """A covariance with det <= this * xx * yy is singular to double precision, so not positive definite."""
 MAX_ASYMMETRY: Final = 1e-6
-"""The entries xy and yx of a covariance differ by at most this share of its larger eigenvalue."""
+"""Largest difference of the entries xy and yx of a covariance, by its larger eigenvalue."""
 
 
 @dataclass(frozen=True, eq=False)
 class Newest:
-    """Holds what a cycle goes on from."""
+    """Stamp and twist of the newest cycle in order; None before the first one."""
 
     t: float | None = None
-    """This is the stamp of the newest cycle in order (s); it is None before the first one."""
+    """Stamp, s."""
     twist: Array | None = None
-    """(3,) This twist was measured last, in m/s, m/s and rad/s; it is None before the first one."""
+    """(3,) Twist that was measured last, m/s, m/s and rad/s."""
 
 
 @dataclass(frozen=True, eq=False)
 class Admitted:
-    """Holds a perception cycle that may be used, in arrays of its own."""
+    """A perception cycle that may be used, in arrays of its own."""
 
     odometry: Odometry
-    """These twists are in force from the newest cycle in order to this one; a late cycle has none."""
+    """Twists in force from the newest cycle in order to this one; a late cycle has none."""
     detections: Detections
-    """These are the detections of the cycle that are possible."""
+    """The possible detections."""
     dropped: int = 0
-    """This number of detections was dropped."""
+    """Number of detections that were dropped."""
     late: bool = False
-    """The flag is set where the cycle is older than the newest one, and is used at its own time."""
+    """Whether the cycle is older than the newest one, and is used at its own time."""
     refused: int = 0
-    """This number of cycles was refused since the last one that was used."""
+    """Number of cycles that were refused since the last one that was used."""
     notice: str = ""
-    """This says what was dropped, in the first of the cycles in which that happens."""
+    """What was dropped, in the first of the cycles in which that happens."""
 
     def counted(self, result: CycleResult) -> CycleResult:
-        """Returns the result of the cycle with what was counted at the gate."""
+        """Return the result of the cycle with what was counted at the gate."""
         if not (self.dropped or self.late or self.refused):
             return result
         notice = "; ".join(text for text in (self.notice, result.notice) if text)
@@ -80,14 +92,14 @@ def admit(
     window: Sequence[float] = (),
     used: Sequence[float] = (),
 ) -> Admitted:
-    """Returns a cycle as an estimator may use it, or raises a ReadingError.
+    """Return a cycle as an estimator may use it, or raise a ReadingError.
 
     A cycle that is older than the newest one is late. It is admitted where it lies between the stamps (s) of
     the `window`, whose poses can still take detections, unless its stamp is among those `used`. The twists
     are a stream, and need not begin at the newest cycle: each is held until the next one, and what was in
     force before the newest cycle is left out.
     """
-    t = _stamp(_of_type(Detections, detections, "detections").t, limits)
+    t = _stamp(_of_type(Detections, detections, "detections").t)
     try:
         possible, notice = possible_detections(detections, t, limits)
         stamps, twists = _checked_twists(_of_type(Odometry, odometry, "odometry"), limits)
@@ -105,12 +117,12 @@ def admit(
 
 
 class Gate:
-    """Holds what a cycle must go on from, and counts what was refused."""
+    """Counts what was refused, and remembers which late cycles were used."""
 
     def __init__(self, limits: LimitSettings) -> None:
         self.limits = limits
         self.refused = 0
-        """This number of cycles was refused since the last one that was used."""
+        """Number of cycles that were refused since the last one that was used."""
         self._refused_at: float | None = None  # the stamp (s) of the cycle that has just been refused
         self._late: list[float] = []  # the stamps (s) of late cycles in the window that were used
         self._dropping = False
@@ -118,7 +130,7 @@ class Gate:
     def admit(
         self, odometry: Odometry, detections: Detections, newest: Newest, window: Sequence[float] = ()
     ) -> Admitted:
-        """Returns `admit` with the cycles that were refused meanwhile, or raises and counts one more."""
+        """Return `admit` with the cycles that were refused meanwhile, or raise and count one more."""
         limits = replace(self.limits, silence=inf) if self._goes_on(detections) else self.limits
         try:
             admitted = admit(odometry, detections, limits, newest, window, self._late)
@@ -131,7 +143,7 @@ class Gate:
         return admitted
 
     def _goes_on(self, detections: Detections) -> bool:
-        """Returns whether a cycle goes on from the one that has just been refused.
+        """Return whether a cycle goes on from the one that has just been refused.
 
         One stamp far ahead is an error. Two that agree are of a vehicle that was silent for long, which must
         not be refused for ever.
@@ -140,25 +152,25 @@ class Gate:
         return t is not None and before is not None and 0.0 < t - before <= self.limits.silence
 
     def use_late(self, t: float, window: Sequence[float]) -> None:
-        """Notes that the late cycle at t (s) is used, so that it is not used again."""
+        """Note that the late cycle at t (s) is used, so that it is not used again."""
         self._late = [stamp for stamp in self._late if stamp >= window[0]] + [t]
 
 
 def read_usable_log(folder: Path, limits: LimitSettings) -> Log:
-    """Reads a log whose cycles may all be used; otherwise raises an InputError with file, row and stamp."""
+    """Read a log whose cycles may all be used; otherwise raise an InputError with file, row and stamp."""
     log, newest = read_log(folder), Newest()
-    limits = scaled(limits, scale_of(log))
-    for odometry, detections in split_odometry(log):
+    scale = scale_of(log)
+    for odometry, detections in split_odometry(scaled(log, 1.0 / scale)):
         try:
             admitted = admit(odometry, detections, limits, newest)
         except ReadingError as error:
-            raise _of_file(error, folder, log, odometry) from error
+            raise _of_file(in_scene(error, scale), folder, log, odometry) from error
         newest = Newest(detections.t, admitted.odometry.twist[-1] if len(admitted.odometry.t) else None)
     return log
 
 
 def _of_file(error: ReadingError, folder: Path, log: Log, odometry: Odometry) -> InputError:
-    """Returns an error of a cycle with these twists as one of the log's file, whose header is row 1."""
+    """Return an error of a cycle with these twists as one of the log's file, whose header is row 1."""
     of_odometry, row = error.field.startswith("odometry"), None
     if of_odometry and error.row is not None:
         row = int(log.odometry.t.searchsorted(odometry.t[error.row], side="right")) + 1
@@ -167,7 +179,7 @@ def _of_file(error: ReadingError, folder: Path, log: Log, odometry: Odometry) ->
 
 
 def _stamp_or_none(detections: Any) -> float | None:
-    """Returns the stamp of a cycle (s), or None where it has none."""
+    """Return the stamp of a cycle (s), or None where it has none."""
     t = getattr(detections, "t", None)
     return float(t) if isinstance(t, int | float) and abs(t) < inf else None
 
@@ -175,19 +187,19 @@ def _stamp_or_none(detections: Any) -> float | None:
 # --- stamps ----------------------------------------------------------------------------------------------
 
 
-def _stamp(value: Any, limits: LimitSettings) -> float:
-    """Returns the stamp of a cycle (s)."""
+def _stamp(value: Any) -> float:
+    """Return the stamp of a cycle (s)."""
     try:
         t = float(value)
     except (TypeError, ValueError, OverflowError):
         raise ReadingError("detections.t", "a number", type(value).__name__) from None
-    if not abs(t) <= limits.stamp:
-        raise ReadingError("detections.t", f"at most {limits.stamp:g} s ({UNITS})", t)
+    if not abs(t) <= MAX_STAMP:
+        raise ReadingError("detections.t", f"at most {MAX_STAMP:g} s ({UNITS})", t)
     return t
 
 
 def _check_late(stamps: Array, t: float, window: Sequence[float], used: Sequence[float]) -> None:
-    """Refuses a late cycle at t (s) that is not inside the window, or was used, or brings newer twists."""
+    """Refuse a late cycle at t (s) that is not inside the window, or was used, or brings newer twists."""
     if not window:
         raise ReadingError("detections.t", "a stamp later than the newest cycle", t)
     if t < window[0]:
@@ -200,12 +212,12 @@ def _check_late(stamps: Array, t: float, window: Sequence[float], used: Sequence
 
 
 def _check_order(stamps: Array, t: float, newest: Newest, limits: LimitSettings) -> None:
-    """Refuses twists (k,) that are later than their cycle at t (s), and a long time without any reading."""
+    """Refuse twists (k,) that are later than their cycle at t (s), and a long time without any reading."""
     if len(stamps) and stamps[-1] > t:
         row = int(stamps.searchsorted(t, side="right"))
         raise ReadingError("odometry.t", "none later than the cycle", float(stamps[row]), row)
-    if newest.t is not None and t < newest.t + limits.interval:
-        raise ReadingError("detections.t", f"at least {limits.interval:g} s after the newest cycle", t)
+    if newest.t is not None and t < newest.t + MIN_INTERVAL:
+        raise ReadingError("detections.t", f"at least {MIN_INTERVAL:g} s after the newest cycle", t)
     before = [] if newest.t is None else [newest.t]
     known = np.concatenate([before, stamps, [t]])
     steps = known[1:] - known[:-1]
@@ -222,15 +234,15 @@ def _check_order(stamps: Array, t: float, newest: Newest, limits: LimitSettings)
 
 
 def _checked_twists(odometry: Odometry, limits: LimitSettings) -> tuple[Array, Array]:
-    """Returns the stamps (k,) and the twists (k, 3), all of them finite, possible and in order of time."""
+    """Return the stamps (k,) and the twists (k, 3), all of them finite, possible and in order of time."""
     stamps = _numbers(odometry.t, "odometry.t", (-1,))
     twists = _numbers(odometry.twist, "odometry.twist", (len(stamps), len(TWIST)))
-    if len(stamps) > limits.twists:
-        raise ReadingError("odometry.t", f"at most {limits.twists} twists", len(stamps))
-    good = np.abs(stamps) <= limits.stamp
+    if len(stamps) > MAX_TWISTS:
+        raise ReadingError("odometry.t", f"at most {MAX_TWISTS} twists", len(stamps))
+    good = np.abs(stamps) <= MAX_STAMP
     if not good.all():
         row = int(good.argmin())
-        expected = f"at most {limits.stamp:g} s ({UNITS})"
+        expected = f"at most {MAX_STAMP:g} s ({UNITS})"
         raise ReadingError("odometry.t", expected, float(stamps[row]), row)
     good = stamps[1:] > stamps[:-1]
     if not good.all():
@@ -247,7 +259,7 @@ def _checked_twists(odometry: Odometry, limits: LimitSettings) -> tuple[Array, A
 
 
 def _since(stamps: Array, twists: Array, newest: Newest) -> tuple[Array, Array]:
-    """Returns the stamps (k,) and twists (k, 3) in force since the newest cycle, the first from there on."""
+    """Return the stamps (k,) and twists (k, 3) in force since the newest cycle, the first from there on."""
     if newest.t is None:
         return stamps, twists
     first = int(stamps.searchsorted(newest.t, side="right")) - 1
@@ -263,7 +275,7 @@ def _since(stamps: Array, twists: Array, newest: Newest) -> tuple[Array, Array]:
 
 
 def possible_detections(detections: Detections, t: float, limits: LimitSettings) -> tuple[Detections, str]:
-    """Returns the possible detections of a cycle at t (s), and a notice about the others.
+    """Return the possible detections of a cycle at t (s), and a notice about the others.
 
     A detection is possible if it is finite, within the ranges and the uncertainties of any sensor, and if its
     covariance is symmetric and positive definite. Wrong shapes, types or labels are a ReadingError.
@@ -272,31 +284,31 @@ def possible_detections(detections: Detections, t: float, limits: LimitSettings)
     count = len(points)
     covariances = _numbers(detections.covariances, "detections.covariances", (count, 2, 2))
     labels = _labels(detections.labels, count)
-    if count > limits.detections:
-        raise ReadingError("detections.points_vehicle", f"at most {limits.detections} rows", count)
-    near, definite = _has_range(points, limits), _has_covariance(covariances, limits)
+    if count > MAX_DETECTIONS:
+        raise ReadingError("detections.points_vehicle", f"at most {MAX_DETECTIONS} rows", count)
+    near, definite = _has_range(points, limits.range_max), _has_covariance(covariances)
     good = near & definite
     if good.all():
         return Detections(t, points, covariances, labels), ""
     row = int(good.argmin())
-    expected = f"a distance from {limits.range_min:g} to {limits.range_max:g} m"
+    expected = f"a distance from {MIN_RANGE:g} to {limits.range_max:g} m"
     found: object = points[row].tolist()
     if near[row]:
-        expected = f"a covariance with sigmas from {limits.sigma_min:g} to {limits.sigma_max:g} m"
+        expected = f"a covariance with sigmas from {MIN_SIGMA:g} to {MAX_SIGMA:g} m"
         found = covariances[row].tolist()
     many = f"{count - int(good.sum())} of {count} detections dropped"
     notice = f"{many}: expected {expected}, found {found} in row {row}"
     return Detections(t, points[good], covariances[good], labels[good]), notice
 
 
-def _has_range(points: Array, limits: LimitSettings) -> BoolArray:
-    """Returns whether points (m, 2), vehicle frame, are where a sensor can see; those not finite are not."""
+def _has_range(points: Array, most: float) -> BoolArray:
+    """Return whether points (m, 2), vehicle frame, are where a sensor can see; those not finite are not."""
     distance = np.hypot(points[:, 0], points[:, 1])
-    return np.asarray((distance >= limits.range_min) & (distance <= limits.range_max))
+    return np.asarray((distance >= MIN_RANGE) & (distance <= most))
 
 
-def _has_covariance(covariances: Array, limits: LimitSettings) -> BoolArray:
-    """Returns whether covariances (m, 2, 2) are symmetric and positive definite, and of a possible size.
+def _has_covariance(covariances: Array) -> BoolArray:
+    """Return whether covariances (m, 2, 2) are symmetric and positive definite, and of a possible size.
 
     The smaller eigenvalue is the determinant by the larger one.
     """
@@ -305,13 +317,13 @@ def _has_covariance(covariances: Array, limits: LimitSettings) -> BoolArray:
         det = xx * yy - xy * yx
         largest = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
         good = (xx > 0.0) & (yy > 0.0) & (np.abs(xy - yx) <= MAX_ASYMMETRY * largest)
-        good &= (det > MIN_DETERMINANT * xx * yy) & (det >= limits.sigma_min**2 * largest)
-        good &= largest <= limits.sigma_max**2
+        good &= (det > MIN_DETERMINANT * xx * yy) & (det >= MIN_SIGMA**2 * largest)
+        good &= largest <= MAX_SIGMA**2
     return np.asarray(good)
 
 
 def _labels(values: Any, count: int) -> NDArray[np.int_]:
-    """Returns the labels (m,) of detections as integers."""
+    """Return the labels (m,) of detections as integers."""
     field = "detections.labels"
     labels = _array(values, field, (count,))
     if count and labels.dtype.kind not in "iu":
@@ -328,7 +340,7 @@ def _labels(values: Any, count: int) -> NDArray[np.int_]:
 
 
 def _numbers(values: Any, field: str, shape: tuple[int, ...]) -> Array:
-    """Returns a copy of numbers with a shape, in which -1 stands for any length."""
+    """Return a copy of numbers with a shape, in which -1 stands for any length."""
     array = _array(values, field, shape)
     if array.dtype.kind not in "fiu":
         raise ReadingError(field, "numbers", array.dtype)
@@ -336,7 +348,7 @@ def _numbers(values: Any, field: str, shape: tuple[int, ...]) -> Array:
 
 
 def _array(values: Any, field: str, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Returns values as an array with a shape, in which -1 stands for any length."""
+    """Return values as an array with a shape, in which -1 stands for any length."""
     try:
         array = np.asarray(values)
     except ValueError:
@@ -348,7 +360,7 @@ def _array(values: Any, field: str, shape: tuple[int, ...]) -> NDArray[Any]:
 
 
 def _of_type(kind: type[Any], value: Any, field: str) -> Any:
-    """Returns a value of a type, or raises a ReadingError."""
+    """Return a value of a type, or raise a ReadingError."""
     if not isinstance(value, kind):
         raise ReadingError(field, kind.__name__, type(value).__name__)
     return value

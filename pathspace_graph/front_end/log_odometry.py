@@ -1,13 +1,11 @@
 """The odometry of a whole log, and the priors of the calibrations, which hold the variables of a batch."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.elimination import owners
 from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, pose_key
@@ -15,59 +13,58 @@ from pathspace_graph.graph.odometry import OdometryChain, calibrated_delta, odom
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
-from pathspace_graph.settings.calibration import CalibrationSettings
-from pathspace_graph.settings.mapper import OdometrySettings
+from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
 
-Array = NDArray[np.float64]
+from .motion import mean_bias
 
 
 @dataclass(frozen=True, eq=False)
 class LogOdometry:
-    """Holds the prior of the first pose, and the motion from each cycle's pose to the next."""
+    """The prior of the first pose, and the motion from each cycle's pose to the next."""
 
     stamps: Array
-    """(P,) These are the stamps of the perception cycles (s)."""
+    """(P,) Stamps of the perception cycles, s."""
     first: Array
-    """(3,) The first cycle has this pose in the map frame, by odometry from the first odometry stamp."""
+    """(3,) Pose of the first cycle in the map frame, by odometry from the first odometry stamp."""
     first_information: Array
-    """(3, 3) This is the inverse of the first pose's covariance, map frame."""
+    """(3, 3) Inverse of its covariance, map frame."""
     odometry: OdometryChain
-    """The chain has P - 1 intervals, one from each cycle's pose to the next."""
+    """P - 1 intervals, one from each cycle's pose to the next."""
     twists: Array
-    """(P, 3) These twists were in force at the cycles, in m/s, m/s and rad/s."""
+    """(P, 3) Twists in force at the cycles, m/s, m/s and rad/s."""
     calibration_mean: Array
     """(2,) Prior mean of the calibration: scale error (-), yaw-rate bias (rad/s)."""
     calibration_sigma: Array
     """(2,) Its prior standard deviation."""
     bias: BiasMeasurement | None = None
-    """The vehicle has measured this bias of the yaw rate at rest, where it stood."""
+    """Bias of the yaw rate that the vehicle has measured at rest, where it stood."""
 
     def __len__(self) -> int:
         return len(self.stamps)
 
     def dead_reckoned(self, calibration: Array) -> Array:
-        """Returns poses (P, 3) by odometry alone, corrected by a calibration (2,); theta is not wrapped."""
+        """Return poses (P, 3) by odometry alone, corrected by a calibration (2,); theta is not wrapped."""
         poses = [self.first]
         for interval in self.odometry.intervals:
             poses.append(compose(poses[-1], calibrated_delta(interval, calibration)))
         return np.array(poses)
 
     def terms(self, poses: Array, calibration: Array) -> tuple[Array, Array]:
-        """Returns whitened residuals (P - 1, 3) and their derivatives (P - 1, 3, 8).
+        """Return whitened residuals (P - 1, 3) and their derivatives (P - 1, 3, 8).
 
         The columns of the derivatives are [calibration | pose | next pose].
         """
         return self.odometry.terms(slice(None), poses, calibration)
 
     def prior_cost(self, first: Array, calibration: Array) -> float:
-        """Returns the cost of the priors on the first pose (3,) and on the calibration (2,)."""
+        """Return the cost of the priors on the first pose (3,) and on the calibration (2,)."""
         off = first - self.first
         whitened = (calibration - self.calibration_mean) / self.calibration_sigma
         cost = 0.5 * float(off @ self.first_information @ off + whitened @ whitened)
         return cost + sum(0.5 * float((rows.residual**2).sum()) for rows in self._measured_bias(calibration))
 
     def rows(self, terms: tuple[Array, Array], first: Array, calibration: Array) -> list[Rows]:
-        """Returns the rows of `terms`, and of both priors at a first pose (3,) and a calibration (2,)."""
+        """Return the rows of `terms`, and of both priors at a first pose (3,) and a calibration (2,)."""
         start = np.arange(len(self.odometry))
         root = np.asarray(np.linalg.cholesky(self.first_information).T, np.float64)
         return [
@@ -80,7 +77,7 @@ class LogOdometry:
         ]
 
     def _measured_bias(self, calibration: Array) -> list[Rows]:
-        """Returns the row `(b - value) / sigma` of a bias that was measured at rest, or none."""
+        """Return the row `(b - value) / sigma` of a bias that was measured at rest, or none."""
         if self.bias is None:
             return []
         root = np.array([[0.0, 1.0 / self.bias.sigma]])
@@ -88,14 +85,14 @@ class LogOdometry:
 
 
 def _prior(key: int, root: Array, off: Array) -> Rows:
-    """Returns the rows `root off` on one variable; they belong to the first factor."""
+    """Return the rows `root off` on one variable; they belong to the first factor."""
     return Rows(np.full((len(root), 1), key), root, root @ off, np.zeros(len(root), np.intp))
 
 
 def chained(
     stamps: Sequence[float], motions: Sequence[MeasuredMotion], settings: OdometrySettings
 ) -> LogOdometry:
-    """Returns the odometry of cycles with these stamps (s); each motion leads to the pose of its cycle."""
+    """Return the odometry of cycles with these stamps (s); each motion leads to the pose of its cycle."""
     steps = [motion.odometry for motion in motions]
     return LogOdometry(
         stamps=np.array(stamps),
@@ -109,20 +106,11 @@ def chained(
     )
 
 
-def mean_bias(measured: Sequence[BiasMeasurement]) -> BiasMeasurement | None:
-    """Returns the mean of independent measurements of the bias by their information; None without any."""
-    if not measured:
-        return None
-    information = np.array([one.sigma**-2 for one in measured])
-    values = np.array([one.value for one in measured])
-    return BiasMeasurement(float(information @ values / information.sum()), float(information.sum() ** -0.5))
-
-
 # --- calibrations ----------------------------------------------------------------------------------------
 
 
 def sensor_prior(variables: Variables, settings: CalibrationSettings) -> list[Rows]:
-    """Returns the rows `(b - mean) / sigma` of the sensor's calibration b; none where it is not estimated."""
+    """Return the rows `(b - mean) / sigma` of the sensor's calibration b; none where it is not estimated."""
     if len(variables.sensor) == 0:
         return []
     root = np.diag(1.0 / np.array(settings.sigmas))
@@ -130,5 +118,5 @@ def sensor_prior(variables: Variables, settings: CalibrationSettings) -> list[Ro
 
 
 def sensor_prior_cost(variables: Variables, settings: CalibrationSettings) -> float:
-    """Returns half the sum of squares of `sensor_prior`."""
+    """Return half the sum of squares of `sensor_prior`."""
     return sum(0.5 * float((rows.residual**2).sum()) for rows in sensor_prior(variables, settings))

@@ -12,18 +12,15 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotations, to_map
 from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor
 
 from .sightings import MAD, MAX_RANGE, MIN_SPEED_SHARE, Follower, SeenCycle, Sightings, TwistRecord
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 DRIFT: Final = np.array([0.05, 0.05, 0.0017])
 """Assumed drift of any odometry (m, m, rad per root of s): 0.5 m and 0.9 degrees after 90 s.

@@ -1,15 +1,13 @@
 """Noise that is used in a drive: what the log states, or what the drive itself has shown so far."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import replace
 from math import inf
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.sensor import SENSOR, SENSOR_SIZE
 from pathspace_graph.io.log import Detections, Odometry
@@ -19,8 +17,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .measurement import Measurement
 from .sightings import SeenCycle, TwistRecord
-
-Array = NDArray[np.float64]
 
 FIRST: Final = 8.0
 """Driving time (s) after which noise is measured first."""
@@ -42,11 +38,10 @@ class NoiseLearner:
         """Keep what is known before the drive; `use` is `MapperSettings.noise`."""
         self.known = known
         self.of_odometry = use == "measured" or (use is None and not known.odometry_stated)
-        """The noise of the odometry is the measured one."""
         self.of_detections = use == "measured" or (use is None and not known.detections_stated)
-        """The noise of the detections is the measured one."""
+        """Whether the noise of odometry and detections is the measured one."""
         self.of_sensor = use != "stated"
-        """Constant errors of the sensor are measured: stated noise says nothing of them."""
+        """Whether constant errors of the sensor are measured: stated noise says nothing of them."""
         self.measured = known.measured
         """What was measured so far, or by an earlier look at the whole drive."""
         self._cycles: deque[SeenCycle] = deque(maxlen=MOST_CYCLES)
@@ -146,7 +141,7 @@ class NoiseLearner:
         priors |= {f"sigma_{name}": sigma for name, sigma in zip(SENSOR, sigmas.tolist(), strict=True)}
         return replace(settings, odometry=odometry, calibration=replace(sensor, doubt=inf, **priors))
 
-    def _contradicted(self, settings: MapperSettings) -> NDArray[np.bool_]:
+    def _contradicted(self, settings: MapperSettings) -> BoolArray:
         """Return which errors (5,) of the sensor are measured, and contradict their priors.
 
         What is measured of the scale of the ranges is its ratio to that of the speeds.
@@ -160,7 +155,7 @@ class NoiseLearner:
         return np.asarray(off > sensor.doubt * np.hypot(measured.sensor_sigma, prior))
 
     def used(self, settings: MapperSettings) -> RunNoise:
-        """Returns the noise that is used, and what sets the size of the map where ranges and speeds disagree.
+        """Return the noise that is used, and what sets the size of the map where ranges and speeds disagree.
 
         They do where `calibrated` finds that the scale of the ranges contradicts its prior.
         """
@@ -190,7 +185,7 @@ class NoiseLearner:
 
 
 def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
-    """Returns where noise comes from that is stated or not, is to be measured or not, and is known or not."""
+    """Return where noise comes from that is stated or not, is to be measured or not, and is known or not."""
     if stated and not (measured and known):
         return "stated"
     return "measured" if known else "assumed"

@@ -3,116 +3,144 @@
 Cones stand still, so that the detections tell how the vehicle has moved, in every direction. No cone needs an
 identity: each detection is drawn to the weighted mean of the earlier ones beside it, and the weights sharpen
 from iteration to iteration (EM-ICP; Granger and Pennec 2002).
-"""
 
-from __future__ import annotations
+Matches also tell how much the sensor is turned, and how late it is. A sensor that is turned by psi sees each
+motion turned by -psi. Detections that are late by tau lie too far ahead by `tau v`. While the vehicle goes on
+evenly, that is the same in every cycle, and no match shows it, but each change of the velocity does.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.se2 import rotation, to_map
+from pathspace_graph.factors.se2 import left_of, rotation, to_map
+from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.front_end import MotionSettings
 
-Array = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]
+"""Errors of a sensor that are learned, as indices of its calibration."""
+SIGMAS_ERRORS: Final = (0.02, 0.05)
+"""Standard deviations (rad, s) of yaw and latency before anything is learned: those of a hasty mounting."""
+SIGMAS_CHANGES: Final = (0.001, 0.005)
+"""Their change in a minute (rad, s), one sigma, so that an old value is forgotten."""
+MINUTE: Final = 60.0
 
-_REACHES = 3.0
-"""Remembered detections farther than this many reaches have no weight."""
-_LEAST_SHARE = 1e-6
-"""The pose is held where the determinant of its information, by the product of its diagonal, is larger."""
-MOST_MISFIT = 9.0
-"""A whitened square distance counts at most this much in a misfit that is compared with another."""
-_TINY = float(np.finfo(float).tiny)
+MEMORY: Final = 0.65
+"""Time for which detections are remembered, s: several cycles, over which odometry hardly drifts."""
+MOST_REMEMBERED: Final = 2000
+"""Largest number of remembered detections, which bounds the time of a match."""
+REACH: Final = 1.0
+REACH_LAST: Final = 0.4
+"""Reach in the first and in the last iteration, m: a remembered detection at distance d has the weight
+`exp(-d^2 / 2 reach^2)`. Cones of a row are some 3 m apart."""
+ITERATIONS: Final = 6
+REACHES_CHECK: Final = (REACH, REACH_LAST)
+"""Reaches in the check of the odometry, which begins near the solution."""
+FARTHEST: Final = 3.0
+"""Distance in reaches from which on a remembered detection has no weight."""
+MIN_WEIGHT: Final = 0.7
+"""Least sum of weights of a matched detection."""
+MIN_MATCHED: Final = 3
+"""Least number of matched detections that tell a motion."""
+HUBER: Final = 2.5
+"""Whitened distance beyond which the Huber loss reduces the weight of a matched detection."""
+SIGMA_CONE: Final = 0.05
+"""Standard deviation added to that of a detection, m, since one side of a cone is seen."""
+LEAST_SHARE: Final = 1e-6
+"""Least determinant of a pose's information that holds it, by the product of the diagonal."""
+MOST_MISFIT: Final = 9.0
+"""Largest whitened square distance that counts in a misfit which is compared with another."""
+_TINY: Final = float(np.finfo(float).tiny)
+
+
+def reaches(iterations: int = ITERATIONS) -> list[float]:
+    """Return the reach of each iteration (m), which shrinks by the same factor."""
+    shrink = (REACH_LAST / REACH) ** (1.0 / max(iterations - 1, 1))
+    return [REACH * shrink**k for k in range(iterations)]
 
 
 class RecentDetections:
-    """Holds the detections of the newest cycles in one frame.
+    """The detections of the newest cycles in one frame.
 
     They are corrected by what is known now of the errors of the sensor, so that a cone stays where it is when
     more is learned of them.
     """
 
-    def __init__(self, settings: MotionSettings) -> None:
-        self.settings = settings
+    def __init__(self) -> None:
         self.points: Array = np.zeros((0, 2))
-        """(n, 2) Each detection is at this point in m."""
+        """(n, 2) Place of each detection, m."""
         # a row is [stamp | point as measured | place of the vehicle | derivatives of x | derivatives of y]
-        self._table: Array = np.zeros((0, 5 + 2 * len(settings.sigmas_errors)))
+        self._table: Array = np.zeros((0, 5 + 2 * len(ERRORS)))
 
     def add(self, t: float, measured: Array, columns: Array, pose: Array) -> None:
-        """Adds the detections of a cycle at t (s), measured at (m, 2) in the frame of the pose (3,).
+        """Add the detections of a cycle at t (s), measured at (m, 2) in the frame of the pose (3,).
 
         Their derivatives by e errors of the sensor are the columns (m, 2, e), in the same frame.
         """
         new = np.empty((len(measured), self._table.shape[1]))
         new[:, 0], new[:, 1:3], new[:, 3:5] = t, to_map(measured, pose[None]), pose[:2]
         new[:, 5:] = (rotation(pose[2]) @ columns).reshape(len(measured), new.shape[1] - 5)
-        self._table = np.concatenate([self._table, new])[-self.settings.max_remembered :]
+        self._table = np.concatenate([self._table, new])[-MOST_REMEMBERED:]
         self.points = self._table[:, 1:3]
 
     def correct(self, errors: Array) -> None:
-        """Puts the detections where they are if the sensor has these errors (e,)."""
+        """Put the detections where they are if the sensor has these errors (e,)."""
         columns = self._table[:, 5:].reshape(len(self._table), 2, len(errors))
         self.points = self._table[:, 1:3] + columns @ errors
 
     def forget(self, t: float) -> None:
-        """Drops the detections that are too old at t (s)."""
-        first = int(self._table[:, 0].searchsorted(t - self.settings.memory, side="right"))
+        """Drop the detections that are too old at t (s)."""
+        first = int(self._table[:, 0].searchsorted(t - MEMORY, side="right"))
         self._table = self._table[first:]
         self.points = self._table[:, 1:3]
 
     @property
     def seen_from(self) -> Array:
-        """Returns the mean place (2,) from which the detections were seen."""
+        """Mean place (2,) from which the detections were seen."""
         return np.asarray(self._table[:, 3:5].sum(axis=0) / len(self._table))
 
     def has(self, points: Array) -> BoolArray:
-        """Returns whether each point (m, 2) lies where an earlier detection does."""
-        _, weights = _means(points, self.points, self.settings.reach_last)
-        return np.asarray(weights > self.settings.min_weight)
+        """Return whether each point (m, 2) lies where an earlier detection does."""
+        return np.asarray(_means(points, self.points, REACH_LAST)[1] > MIN_WEIGHT)
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Holds the pose that lays detections on earlier ones."""
+    """The pose that lays detections on earlier ones."""
 
     pose: Array
-    """(3,) This is the pose in the frame of the earlier detections, in m, m and rad."""
+    """(3,) In the frame of the earlier detections, m, m and rad."""
     information: Array
-    """(3, 3) This is the information about the pose, in the same frame, from the matched detections."""
+    """(3, 3) Information about the pose from the matched detections, same frame."""
     is_matched: BoolArray
-    """(m,) The flag is set when a detection lies on earlier ones."""
+    """(m,) Whether each detection lies on earlier ones."""
     misfit: float
-    """This is the mean square of the matched detections' whitened distances."""
+    """Mean square of the matched detections' whitened distances."""
 
     @property
     def matched(self) -> int:
-        """Returns the number of detections that lie on earlier ones."""
+        """Number of detections that lie on earlier ones."""
         return int(self.is_matched.sum())
 
     @property
     def is_certain(self) -> bool:
-        """Returns whether the detections hold the pose in every direction."""
+        """Whether the detections hold the pose in every direction."""
         share = np.linalg.det(self.information) / max(float(self.information.diagonal().prod()), _TINY)
-        return bool(share > _LEAST_SHARE)
+        return bool(share > LEAST_SHARE)
 
 
 def match(
-    recent: RecentDetections,
-    points_vehicle: Array,
-    variances: Array,
-    start: Array,
-    settings: MotionSettings,
-    reaches: Sequence[float],
+    recent: RecentDetections, points_vehicle: Array, variances: Array, start: Array, reaches: Sequence[float]
 ) -> Match:
-    """Lays detections (m, 2), vehicle frame, on the recent ones by Gauss-Newton steps from a pose (3,).
+    """Lay detections (m, 2), vehicle frame, on the recent ones by Gauss-Newton steps from a pose (3,).
 
     Each step minimizes `sum_i |R z_i + t - m_i|^2 / sigma_i^2` with m_i the weighted mean of the recent
-    detections beside the point, and `sigma_i^2 = variance_i (1 + 1/n_i) + sigma_cone^2` with n_i the sum of
+    detections beside the point, and `sigma_i^2 = variance_i (1 + 1/n_i) + SIGMA_CONE^2` with n_i the sum of
     the weights. There is a step for each of the reaches (m). The variances (m,) are those of one coordinate
     (m^2).
     """
@@ -120,47 +148,45 @@ def match(
     for reach in reaches:
         points = to_map(points_vehicle, pose[None])
         means, weights = _means(points, recent.points, reach)
-        matched = weights > settings.min_weight
+        matched = weights > MIN_WEIGHT
         off, arm = (points - means)[matched], (points - pose[:2])[matched]
-        precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + settings.sigma_cone**2)
+        precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + SIGMA_CONE**2)
         square = (off * off).sum(axis=1)
-        precision *= huber_weights(np.sqrt(square * precision), settings.huber)
+        precision *= huber_weights(np.sqrt(square * precision), HUBER)
         information, gradient = _normal_equations(off, arm, precision)
-        if matched.sum() < settings.min_matched:
+        if matched.sum() < MIN_MATCHED:
             break
-        regular = information + np.diag(_LEAST_SHARE * information.diagonal())
+        regular = information + np.diag(LEAST_SHARE * information.diagonal())
         pose = pose - np.linalg.solve(regular, gradient)
     count = int(matched.sum())
     return Match(pose, information, matched, float(square @ precision) / max(count, 1))
 
 
-def misfit_at(
-    recent: RecentDetections, points_vehicle: Array, variances: Array, pose: Array, settings: MotionSettings
-) -> float:
+def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array, pose: Array) -> float:
     """Return the mean square of the whitened distances as `match` has them, at a pose (3,) that is given.
 
     Each counts at most `MOST_MISFIT`, and as much where nothing was detected before.
     """
     points = to_map(points_vehicle, pose[None])
-    means, weights = _means(points, recent.points, settings.reach_last)
-    matched = weights > settings.min_weight
-    variance = variances * (1.0 + 1.0 / np.where(matched, weights, 1.0)) + settings.sigma_cone**2
+    means, weights = _means(points, recent.points, REACH_LAST)
+    matched = weights > MIN_WEIGHT
+    variance = variances * (1.0 + 1.0 / np.where(matched, weights, 1.0)) + SIGMA_CONE**2
     square = np.where(matched, ((points - means) ** 2).sum(axis=1) / variance, MOST_MISFIT)
     return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
 
 
 def _means(points: Array, recent: Array, reach: float) -> tuple[Array, Array]:
-    """Returns the weighted means (m, 2) of recent points (n, 2) beside points (m, 2), and sums of weights."""
+    """Return the weighted means (m, 2) of recent points (n, 2) beside points (m, 2), and sums of weights."""
     dx = points[:, 0, None] - recent[:, 0]
     dy = points[:, 1, None] - recent[:, 1]
     square = (dx * dx + dy * dy) / reach**2
-    weights = np.where(square < _REACHES**2, np.exp(-0.5 * square), 0.0)
+    weights = np.where(square < FARTHEST**2, np.exp(-0.5 * square), 0.0)
     total = weights.sum(axis=1)
-    return (weights @ recent) / np.maximum(total, np.finfo(float).tiny)[:, None], total
+    return (weights @ recent) / np.maximum(total, _TINY)[:, None], total
 
 
 def _normal_equations(off: Array, arm: Array, precision: Array) -> tuple[Array, Array]:
-    """Returns the information (3, 3) and the gradient (3,) of offsets (m, 2) by (x, y, theta)."""
+    """Return the information (3, 3) and the gradient (3,) of offsets (m, 2) by (x, y, theta)."""
     ax, ay = arm.T
     ex, ey = off.T
     w, wx, wy = precision.sum(), -(precision @ ay), precision @ ax
@@ -168,3 +194,91 @@ def _normal_equations(off: Array, arm: Array, precision: Array) -> tuple[Array, 
     information = np.array([[w, 0.0, wx], [0.0, w, wy], [wx, wy, turning]])
     gradient = np.array([precision @ ex, precision @ ey, precision @ (ax * ey - ay * ex)])
     return information, gradient
+
+
+# --- errors of the sensor --------------------------------------------------------------------------------
+
+
+def by_errors(points_vehicle: Array, twist: Array) -> Array:
+    """Return the derivatives (m, 2, 2) of detections (m, 2), vehicle frame, by the yaw and by the latency.
+
+    The vehicle moved with the twist (3,), in m/s, m/s and rad/s. They are two columns of
+    `factors.sensor:by_sensor`.
+    """
+    columns = np.empty((len(points_vehicle), 2, len(ERRORS)))
+    columns[:, :, 0] = left_of(points_vehicle)
+    columns[:, :, 1] = -twist[:2] - twist[2] * columns[:, :, 0]
+    return columns
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """How far a match of detections is off the odometry, in the vehicle frame."""
+
+    off: Array
+    """(3,) m, m and rad."""
+    covariance: Array
+    """(3, 3) Its covariance, for a sensor without errors."""
+    shifts: Array
+    """(3, 2) Its derivatives by the errors of the sensor."""
+
+
+class SensorErrors:
+    """Kalman filter of the errors e = (yaw, latency) of the sensor, in rad and s.
+
+    Detections are corrected by the mean. What is left of the errors shifts a match by
+
+        (d_y, -d_x, 0) (yaw),   mean v - v (latency)
+
+    in the vehicle frame, where d is the way from the place from which the remembered detections were seen in
+    the mean, v the velocity, and mean v that while they were seen.
+    """
+
+    def __init__(self, settings: MotionSettings) -> None:
+        self.mean: Array = np.zeros(len(ERRORS))
+        """(2,) Yaw (rad, to the left) and latency (s)."""
+        self.covariance: Array = np.diag(np.square(SIGMAS_ERRORS))
+        """(2, 2) Their covariance."""
+        self._drift: Array = np.diag(np.square(SIGMAS_CHANGES)) / MINUTE
+        self._velocity: Array = np.zeros(3)
+        self._possible: Array = 0.5 * MEMORY * np.array(settings.accelerations)
+
+    def contradict(self, settings: CalibrationSettings) -> bool:
+        """Return whether the errors contradict the sensor's prior, by `settings.doubt` sigmas."""
+        if not settings.sensor:
+            return False
+        limit, prior = settings.doubt**2, settings.sigmas
+        known = zip(self.mean.tolist(), self.covariance.diagonal().tolist(), ERRORS, strict=True)
+        return any(mean**2 > limit * (variance + prior[at] ** 2) for mean, variance, at in known)
+
+    def covariance_of(self, difference: Difference) -> Array:
+        """Return the covariance (3, 3) of a difference, with what is not known of the errors."""
+        shifts = difference.shifts
+        return np.asarray(difference.covariance + shifts @ self.covariance @ shifts.T)
+
+    def follow(self, velocity: Array, dt: float) -> None:
+        """Take the velocity (3,) of a cycle, which lasted for dt (s), over into the mean velocity."""
+        share = min(dt / (0.5 * MEMORY), 1.0)
+        self._velocity = self._velocity + share * (velocity - self._velocity)
+
+    def shifts(self, way: Array, velocity: Array) -> Array:
+        """Return the derivatives (3, 2) of how far a match is off the odometry, by the errors.
+
+        The way (2,) and the velocity (3,) are in the vehicle frame, in m, m/s, m/s and rad/s. No vehicle
+        changes its velocity by more than its accelerations: that is slip, and not to be taken for latency.
+        """
+        shifts = np.empty((3, len(ERRORS)))
+        shifts[:, 0] = way[1], -way[0], 0.0
+        shifts[:, 1] = np.clip(self._velocity - velocity, -self._possible, self._possible)
+        return shifts
+
+    def update(self, difference: Difference, dt: float) -> None:
+        """Learn from a match that agrees with the odometry, dt (s) after the last cycle.
+
+        Matches share the remembered detections. So one counts by the share of its own time.
+        """
+        shifts, share = difference.shifts, min(dt / MEMORY, 1.0)
+        weighted = share * np.linalg.solve(difference.covariance, shifts).T
+        information = np.linalg.inv(self.covariance + dt * self._drift) + weighted @ shifts
+        self.covariance = np.asarray(np.linalg.inv(information))
+        self.mean = self.mean + self.covariance @ weighted @ difference.off

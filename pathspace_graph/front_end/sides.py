@@ -1,31 +1,70 @@
 """The side of each detection: what is left of the way driven is left, and colours are evidence of it.
 
 A detector may have no colours, and a track may be driven the other way round, with its blue cones on the
-right. The coloured cones beside the path decide together what the colours mean. Where most detections
-have no colour, two rows of cones are followed from beside the vehicle ahead. What is in neither of them stays
-unknown.
+right. The coloured cones beside the path decide together what the colours mean. Where most detections have
+no colour, two rows of cones are followed from beside the vehicle ahead, each cone to the row that it fits
+better. What is in neither of them stays unknown.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.se2 import to_map, wrap_angle
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.candidates import SIDES, in_front_row
 from pathspace_graph.mapping.path import DrivenPath, PathAhead
+from pathspace_graph.mapping.tentative import nearest_within, newest_of
 from pathspace_graph.settings.front_end import SidesSettings
 from pathspace_graph.settings.growth import PathSettings
 
-from .cones import NearCones
-from .rows import Row, follow_rows
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+REACH: Final = 8.0
+"""Length of the predicted path beside which coloured cones say what the colours mean, m."""
+MIN_LATERAL: Final = 0.5
+MAX_LATERAL: Final = 8.0
+"""Distances from the path between which it tells the side of a cone, m."""
+MAJORITY: Final = 2.5
+"""Least ratio of cones on the other colour's side to those on their own where the colours are swapped."""
+ENOUGH_VOTES: Final = 30
+"""Number of cones that settles what the colours mean."""
+REMEMBERED: Final = 0.98
+"""Factor by which the detections so far count less in the share without a colour, from cycle to cycle."""
+MIN_DETECTIONS: Final = 6
+"""Least number of detections of which the share is taken."""
+MERGE_RADIUS: Final = 1.0
+"""Distance within which detections are of one cone, m."""
+FORGET_AFTER: Final = 3.0
+"""Time without a detection after which a cone is forgotten, s."""
+MAX_CONES: Final = 2000
+"""Largest number of cones that are remembered, the ones that were seen last."""
+SIGHTINGS: Final = 2
+"""Detections from which a cone has a side."""
+BEHIND: Final = 8.0
+"""Length behind the vehicle at which the rows begin, m along the path."""
+SURE: Final = 3.0
+"""Length ahead of it up to which the path tells sides, m; beyond, the rows do."""
+BESIDE: Final = 2.0
+"""Distance along the path within which cones stand beside each other, m."""
+LATERAL_GAP: Final = 0.8
+"""Distance from a cone beside it that is nearer to the path, beyond which a cone is of another stretch, m."""
+HALF_WIDTH: Final = 1.5
+"""Distance beside the vehicle at which a row without any cone begins, m."""
+GAP: Final = 8.0
+"""Largest distance of neighbouring cones of a row, m."""
+TURN: Final = 1.3
+"""Largest turn of a row from one cone to the next, rad."""
+TURN_COST: Final = 2.0
+"""The next cone of a row has the least `distance (1 + TURN_COST turn^2)` (rad^-2)."""
+CLEAR: Final = 1.3
+"""Least cost of the next cone of a row in the other row, by its own cost."""
+MIN_WIDTH: Final = 1.8
+"""Least distance of a cone of one row from each cone of the other row, m."""
 
 
 class SideJudge:
@@ -34,31 +73,31 @@ class SideJudge:
     def __init__(self, settings: SidesSettings, path: PathSettings) -> None:
         self.settings = settings
         self.swapped = False
-        """The flag is set where the colours of the log so far are on the other sides."""
+        """Whether the colours of the log so far are on the other sides."""
         self.colourless = False
-        """The flag is set where most detections have no colour, so that the way driven tells their sides."""
+        """Whether most detections have no colour, so that the way driven tells their sides."""
         self._path_settings = path
         self._path: DrivenPath | None = None
-        self._cones = NearCones(settings)
+        self._cones = NearCones()
         self._agreeing = self._opposing = 0  # cones on the side of their colour, and on the other one
         self._known = self._unknown = 0.0  # newest detections with and without a colour
 
     def update(
         self, pose: Array, twists: Array, detections: Detections, *, in_lane: bool = False
     ) -> Detections:
-        """Returns the detections of a cycle with the labels of their sides.
+        """Return the detections of a cycle with the labels of their sides.
 
         The pose (3,) is in the frame of the front end, and the vehicle came there with twists (k, 3). In a
         lane between orange cones it isn't on the road yet, and the colours of others prove nothing.
         """
         labels, self.colourless = detections.labels, self._is_colourless(detections.labels)
-        if not self.colourless and self._agreeing + self._opposing >= self.settings.enough_votes:
+        if not self.colourless and self._agreeing + self._opposing >= ENOUGH_VOTES:
             self._path = None  # it begins anew, if it is needed again
             return self.relabelled(detections, labels) if self.swapped else detections
         self._path = self._path or DrivenPath(self._path_settings)
         self._path.update(pose)
         self._path.steer(twists)
-        path = self._path.ahead(pose, self.settings.reach)
+        path = self._path.ahead(pose, REACH)
         points = to_map(detections.points_vehicle, pose[None])
         cones = self._cones.add(detections.t, points, labels)
         if not in_lane:
@@ -67,26 +106,24 @@ class SideJudge:
         return self.relabelled(detections, sides)
 
     def relabelled(self, detections: Detections, sides: IntArray) -> Detections:
-        """Returns detections with the right colours, and with sides (m,) for those that have none."""
+        """Return detections with the right colours, and with sides (m,) for those that have none."""
         labels = detections.labels
         coloured = LEFT + RIGHT - labels if self.swapped else labels
         labels = np.where(labels == UNKNOWN, sides, coloured)
         return detections if (labels == detections.labels).all() else replace(detections, labels=labels)
 
-    # --- what the colours mean ---------------------------------------------------------------------------
-
     def _judge_colours(self, path: PathAhead) -> None:
-        """Counts cones on the side of their colour and on the other one, and swaps the colours by majority.
+        """Count cones on the side of their colour and on the other one, and swap the colours by majority.
 
         Each cone is counted once, when it is a little ahead.
         """
-        settings, near = self.settings, self._cones
+        near = self._cones
         fresh = np.flatnonzero(~near.judged & near.votes.any(axis=1))
         if len(fresh) == 0:
             return
         stations, lateral = path.locate(near.points[fresh])
-        beside = (np.abs(lateral) > settings.min_lateral) & (np.abs(lateral) < settings.max_lateral)
-        beside &= (stations > path.driven) & (stations < path.driven + settings.reach)
+        beside = (np.abs(lateral) > MIN_LATERAL) & (np.abs(lateral) < MAX_LATERAL)
+        beside &= (stations > path.driven) & (stations < path.driven + REACH)
         near.judged[fresh[beside]] = True
         is_left = near.votes[fresh, LEFT] > near.votes[fresh, RIGHT]
         agree = (lateral > 0.0) == is_left
@@ -95,23 +132,21 @@ class SideJudge:
         winning, losing = self._opposing, self._agreeing
         if self.swapped:
             winning, losing = losing, winning
-        if winning >= settings.min_votes and winning > settings.majority * losing:
+        if winning >= self.settings.min_votes and winning > MAJORITY * losing:
             self.swapped = not self.swapped
 
-    # --- sides without colours ---------------------------------------------------------------------------
-
     def _is_colourless(self, labels: IntArray) -> bool:
-        """Returns whether most detections have no colour, of which the newest ones count most."""
-        settings, unknown = self.settings, int((labels == UNKNOWN).sum())
-        self._unknown = settings.remembered * self._unknown + unknown
-        self._known = settings.remembered * self._known + len(labels) - unknown
+        """Return whether most detections have no colour, of which the newest ones count most."""
+        unknown = int((labels == UNKNOWN).sum())
+        self._unknown = REMEMBERED * self._unknown + unknown
+        self._known = REMEMBERED * self._known + len(labels) - unknown
         total = self._known + self._unknown
-        return total >= settings.min_detections and self._unknown > settings.colourless * total
+        return total >= MIN_DETECTIONS and self._unknown > self.settings.colourless * total
 
     def _sides(self, pose: Array, path: PathAhead) -> IntArray:
-        """Returns the side (n,) of each near cone; it is unknown for those in neither row."""
-        near, settings = self._cones, self.settings
-        seen = np.flatnonzero(near.counts >= settings.sightings)
+        """Return the side (n,) of each near cone; it is unknown for those in neither row."""
+        near = self._cones
+        seen = np.flatnonzero(near.counts >= SIGHTINGS)
         sides = np.full(len(near.points), UNKNOWN)
         if len(seen) == 0:
             return sides
@@ -120,7 +155,7 @@ class SideJudge:
         taken = [cone for row in rows.values() for cone in row.cones]
         ahead = seen[stations > path.driven]
         votes = near.votes[:, ::-1] if self.swapped else near.votes
-        follow_rows(rows, near.points, votes, np.setdiff1d(ahead, taken), settings)
+        follow_rows(rows, near.points, votes, np.setdiff1d(ahead, taken))
         for label, row in rows.items():
             sides[row.cones] = label
         return sides
@@ -128,22 +163,116 @@ class SideJudge:
     def _beginning(
         self, label: int, pose: Array, path: PathAhead, seen: IntArray, stations: Array, lateral: Array
     ) -> Row:
-        """Returns the row of a boundary beside the vehicle, where the path tells the side of each cone.
+        """Return the row of a boundary beside the vehicle, where the path tells the side of each cone.
 
         Of cones beside one another, only the nearest to the path is in the row. The cones `seen` (k,) are at
         these stations and lateral distances (k,). A row without any cone begins beside the vehicle.
         """
-        settings, side = self.settings, SIDES[label] * lateral
-        found = (side > settings.min_lateral) & (side < settings.max_lateral)
-        found &= (stations > path.driven - settings.behind) & (stations < path.driven + settings.sure)
-        order = np.flatnonzero(found)[np.argsort(stations[found])]
-        in_front = in_front_row(stations[order], side[order], settings.beside, settings.lateral_gap)
-        cones = seen[order[in_front]].tolist()
+        side = SIDES[label] * lateral
+        beside = (side > MIN_LATERAL) & (side < MAX_LATERAL)
+        beside &= (stations > path.driven - BEHIND) & (stations < path.driven + SURE)
+        order = np.flatnonzero(beside)[np.argsort(stations[beside])]
+        cones = seen[order[in_front_row(stations[order], side[order], BESIDE, LATERAL_GAP)]].tolist()
         left = np.array([-np.sin(pose[2]), np.cos(pose[2])])
-        row = Row([], pose[:2] + SIDES[label] * settings.half_width * left, float(pose[2]))
+        row = Row([], pose[:2] + SIDES[label] * HALF_WIDTH * left, float(pose[2]))
         for cone in cones[-2:]:
             row.lead_to(cone, self._cones.points[cone])
         if len(cones) < 2:
             row.heading = float(pose[2])
         row.cones = cones
         return row
+
+
+@dataclass
+class Row:
+    """A row of cones, the nearest first."""
+
+    cones: list[int]
+    end: Array
+    """(2,) Point at which the row ends, m."""
+    heading: float
+    """Direction in which it leads there, rad."""
+
+    def lead_to(self, cone: int, point: Array) -> None:
+        """Lead the row on to a cone at a point (2,)."""
+        dx, dy = point - self.end
+        self.cones.append(cone)
+        self.end, self.heading = point, float(np.arctan2(dy, dx))
+
+
+def follow_rows(rows: Mapping[int, Row], points: Array, votes: IntArray, free: IntArray) -> None:
+    """Lead both rows on through free cones (k,), as long as it is clear which cone comes next.
+
+    All cones (n,) have points (n, 2) in m, and votes (n, 2) for the left and the right boundary. The next
+    cone is the one with the least `distance (1 + TURN_COST turn^2)` from the end of its row. It must be far
+    cheaper for that row than for the other one. Where it is not, both rows end: two rows could be confused
+    there.
+    """
+    left = free.tolist()
+    while left:
+        candidates = np.array(left)
+        to_lead = [_costs(rows, label, points, votes, candidates) for label in (LEFT, RIGHT)]
+        costs = np.array([cost for cost, _ in to_lead])
+        within = np.where([distance < GAP for _, distance in to_lead], costs, np.inf)
+        label, best = divmod(int(within.argmin()), len(left))
+        if np.isinf(within[label, best]) or costs[1 - label, best] < CLEAR * within[label, best]:
+            return
+        rows[label].lead_to(left[best], points[left[best]])
+        del left[best]
+
+
+def _costs(
+    rows: Mapping[int, Row], label: int, points: Array, votes: IntArray, cones: IntArray
+) -> tuple[Array, Array]:
+    """Return what it costs a row to lead on to cones (k,), and how far they are from its end (m).
+
+    The cost is infinite where the row may not lead on there.
+    """
+    row, other = rows[label], rows[LEFT + RIGHT - label]
+    dx, dy = (points[cones] - row.end).T
+    distance, turn = np.hypot(dx, dy), wrap_angle(np.arctan2(dy, dx) - row.heading)
+    allowed = np.abs(turn) < TURN
+    allowed &= votes[cones, LEFT + RIGHT - label] <= votes[cones, label] + 1
+    if other.cones:
+        off = points[cones][:, None] - points[other.cones][None]
+        allowed &= np.hypot(off[..., 0], off[..., 1]).min(axis=1) > MIN_WIDTH
+    return np.where(allowed, distance * (1.0 + TURN_COST * turn**2), np.inf), distance
+
+
+class NearCones:
+    """The cones near the vehicle as means of their detections, with the colours in which they were seen."""
+
+    def __init__(self) -> None:
+        self.points: Array = np.zeros((0, 2))
+        """(n, 2) Place of each cone in the frame of the front end, m."""
+        self.counts: IntArray = np.zeros(0, np.intp)
+        """(n,) Number of detections."""
+        self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)
+        """(n, 2) Number of detections with the label of the left and of the right boundary."""
+        self.judged: BoolArray = np.zeros(0, bool)
+        """(n,) Whether the colour of the cone has been compared with its side."""
+        self._last: Array = np.zeros(0)
+
+    def add(self, t: float, points: Array, labels: IntArray) -> IntArray:
+        """Add detections at points (m, 2) with labels (m,), seen at t (s); return the cone (m,) of each."""
+        self._forget(t)
+        cones, known = nearest_within(points, self.points, MERGE_RADIUS)
+        new = int((~known).sum())
+        cones[~known] = len(self.points) + np.arange(new)
+        if new > 0:
+            self.points = np.concatenate([self.points, np.zeros((new, 2))])
+            self.counts = np.concatenate([self.counts, np.zeros(new, np.intp)])
+            self.votes = np.concatenate([self.votes, np.zeros((new, len(BOUNDARIES)), np.intp)])
+            self.judged = np.concatenate([self.judged, np.zeros(new, bool)])
+            self._last = np.concatenate([self._last, np.full(new, t)])
+        coloured = labels != UNKNOWN
+        np.add.at(self.votes, (cones[coloured], labels[coloured]), 1)
+        np.add.at(self.counts, cones, 1)
+        np.add.at(self.points, cones, (points - self.points[cones]) / self.counts[cones, None])
+        self._last[cones] = t
+        return cones
+
+    def _forget(self, t: float) -> None:
+        kept = newest_of(self._last, MAX_CONES) & (self._last > t - FORGET_AFTER)
+        self.points, self.counts, self.votes = self.points[kept], self.counts[kept], self.votes[kept]
+        self.judged, self._last = self.judged[kept], self._last[kept]

@@ -9,15 +9,11 @@ from math import comb
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.measured_noise import MeasuredNoise
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Odometry
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
 MAD: Final = 1.4826
 """Standard deviation of a Gaussian by its median absolute deviation."""
@@ -251,7 +247,7 @@ class TwistRecord:
         return None if orders is None else (orders.min(axis=0), float(np.median(np.diff(self._newest[0]))))
 
     def orders(self) -> Array | None:
-        """Returns the noise (k, 3) of a twist by differences of second to fourth order; None without enough.
+        """Return the noise (k, 3) of a twist by differences of second to fourth order; None without enough.
 
         It is their median absolute value over that of white noise, `sqrt(binomial(2 k, k))`. Where the orders
         differ, the noise is not white, or the motion itself is in it.

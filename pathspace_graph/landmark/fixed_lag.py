@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.se2 import rotated, to_map
-from pathspace_graph.front_end.front_end import FrontEnd
-from pathspace_graph.front_end.late import at_nearest_pose
+from pathspace_graph.front_end.front_end import FrontEnd, at_nearest_pose
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.landmark import landmark_residuals
 from pathspace_graph.factors.noise import huber_weights, whiteners
 from pathspace_graph.factors.sensor import restored
-from pathspace_graph.front_end.late import LateDetections
+from pathspace_graph.front_end.front_end import LateDetections
 from pathspace_graph.graph.keys import POINT, POSE, SENSOR_KEY, landmark_keys, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother

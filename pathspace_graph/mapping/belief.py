@@ -16,8 +16,7 @@ from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor, corrected
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.results import VehicleState
-from pathspace_graph.settings.calibration import CalibrationSettings
-from pathspace_graph.settings.mapper import OdometrySettings
+from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
 
 from .cubature import Transformed, square_root, transform
 from .motion import MeasuredMotion
@@ -60,9 +59,8 @@ class Belief:
         The priors of the sensor are the wide ones: a filter that has explained its errors by something else
         cannot take that back, as a window can.
         """
-        sigmas = np.array([settings.sigma_start, settings.sigma_start, settings.sigma_start_heading])
         calibration = np.array([settings.sigma_scale, settings.sigma_bias, *sensor.widened().sigmas])
-        belief = cls(np.zeros(POSE), np.diag(sigmas**2), calibration)
+        belief = cls(np.zeros(POSE), np.diag(np.square(settings.sigmas_start)), calibration)
         known = np.array([*settings.calibration, *sensor.means])
         belief.mean[POSE : POSE + len(known)] = known
         return belief

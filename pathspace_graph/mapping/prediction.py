@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import inf
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,9 @@ from .motion import MeasuredMotion
 from .path import DrivenPath
 
 Array = NDArray[np.float64]
+
+DOUBT_CYCLES: Final = 10
+"""Cycles from one judgement of all calibrations to the next."""
 
 
 def known_noise(sigma: Array | KnownNoise | None) -> KnownNoise:
@@ -112,7 +116,7 @@ def doubt_calibrations(
     if sensor_doubted and settings.calibration.doubt < inf:
         settings = replace(settings, calibration=settings.calibration.widened())
         _believe(smoother, settings)
-    if smoother.last_step is None or smoother.next_cycle % settings.odometry.doubt_cycles:
+    if smoother.last_step is None or smoother.next_cycle % DOUBT_CYCLES:
         return settings
     variables = smoother.variables
     variance = np.diag(smoother.last_covariance(variables.calibration_keys))

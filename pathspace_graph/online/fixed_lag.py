@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from pathspace_graph.checkpoint import Recovery
 from pathspace_graph.errors import ReadingError, SettingsError
 from pathspace_graph.factors.measured_noise import KnownNoise
-from pathspace_graph.front_end.front_end import FrontEnd, Reading
+from pathspace_graph.front_end.front_end import FrontEnd, Reading, at_nearest_pose
 from pathspace_graph.front_end.gate import Admitted
-from pathspace_graph.front_end.late import at_nearest_pose
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
@@ -109,14 +108,14 @@ class FixedLagMapper(MapperEstimate):
         """Processes one perception cycle: the twists since the last cycle, and its detections.
 
         The call is refused as a ReadingError, and nothing has changed, where it holds anything that cannot be
-        used (`front_end.gate`, `settings.limits`). Impossible detections are dropped and counted in the
+        used (`front_end.gate`, `settings.front_end`). Impossible detections are dropped and counted in the
         result. The next call goes on from the newest cycle that was used. The twists are a stream: each is
         held until the next one, and those in force before the newest cycle are left out. So a caller hands
         over the twists since the last call in order, and where some are lost, the last one is held.
 
         A late cycle, with a stamp before the newest one's, is used at its time if that is inside the window,
         and is refused otherwise. It brings no twists that are newer than the newest cycle, and no factors.
-        Its detections are moved to the pose that is nearest in time (`front_end.late`), and may make the
+        Its detections are moved to the pose that is nearest in time (`front_end.front_end`), and may make the
         curves grow in the next cycle in order. The pose in the result is still the newest one.
 
         Where another process solves the lap as a batch, the call waits for it no longer than the time since

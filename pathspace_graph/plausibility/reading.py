@@ -14,7 +14,7 @@ from pathspace_graph.io.csv_table import Table, read_table
 from pathspace_graph.io.limits import shown
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry, covariances_of, cycles_of
 from pathspace_graph.labels import UNKNOWN, label_from_name
-from pathspace_graph.settings.limits import LimitSettings
+from pathspace_graph.settings.front_end import LimitSettings
 
 from .hint import Hint, because
 from .judge import hints

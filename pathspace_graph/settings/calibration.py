@@ -1,76 +1,123 @@
-"""Settings of self-calibration: the constant errors of the sensor that are estimated along with the map."""
+"""Settings of the constant errors of odometry and sensor, which are estimated along with the map.
+
+The priors are those of a vehicle that was calibrated. Where the drive contradicts one of them, they become
+wide: then odometry or sensor is not what it was said to be. What a drive does not show stays at its prior.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Literal
+from typing import Final, Literal
 
 from .checked import Positive
+
+WIDE_ODOMETRY: Final = 10.0
+"""Standard deviations of the odometry's wide priors by those of a calibrated one."""
+WIDE_SENSOR: Final = 20.0
+"""The same of the sensor's."""
+SIGMAS_START: Final = (1e-4, 1e-4, 1e-5)
+"""Standard deviations (m, m, rad) of the pose at the first odometry stamp.
+
+It is zero by definition, but a variance of zero has no information."""
+
+
+@dataclass(frozen=True)
+class OdometrySettings(Positive):
+    """Priors of the odometry's constant errors."""
+
+    UNLIMITED = ("doubt",)
+    SIGNED = ("scale", "bias")
+
+    scale: float = 0.0
+    """Known scale error of the speeds (-): mean of its prior."""
+    bias: float = 0.0
+    """Known bias of the yaw rate, rad/s."""
+    sigma_scale: float = 0.005
+    """Standard deviation of the scale error (-)."""
+    sigma_bias: float = 0.002
+    """Standard deviation of the bias, rad/s."""
+    doubt: float = 4.0
+    """Contradiction from which both priors become wide, standard deviations; `inf` to hold them always."""
+    hold_scale: bool = False
+    """Whether the prior of the scale never becomes wide, since the speeds set the size of the map."""
+
+    def widened(self) -> OdometrySettings:
+        """Return the settings of wide priors, which are not doubted again."""
+        scale = self.sigma_scale if self.hold_scale else WIDE_ODOMETRY * self.sigma_scale
+        return replace(self, doubt=inf, sigma_scale=scale, sigma_bias=WIDE_ODOMETRY * self.sigma_bias)
+
+    @property
+    def sigmas_calibration(self) -> tuple[float, float]:
+        """Standard deviations of the scale error (-) and of the yaw-rate bias (rad/s)."""
+        return self.sigma_scale, self.sigma_bias
+
+    @property
+    def calibration(self) -> tuple[float, float]:
+        """Known scale error (-) and yaw-rate bias (rad/s)."""
+        return self.scale, self.bias
+
+    @property
+    def sigmas_start(self) -> tuple[float, float, float]:
+        """Standard deviations (m, m, rad) of the pose at the first odometry stamp."""
+        return SIGMAS_START
 
 
 @dataclass(frozen=True)
 class CalibrationSettings(Positive):
-    """Describes how well the sensor's mounting, stamps and ranges are known before the drive.
-
-    The priors are those of a sensor that was calibrated. Where the drive contradicts one of them, they become
-    wide: then the sensor is not what it was said to be. What a drive does not show stays at zero.
-    """
+    """Priors of the sensor's mounting, stamps and ranges."""
 
     UNLIMITED = ("doubt",)
     SIGNED = ("yaw", "lateral", "latency", "range_scale", "range_bias")
 
     sensor: bool = True
-    """The sensor's constant errors are estimated along with the map."""
+    """Whether the sensor's constant errors are estimated along with the map."""
     sigma_yaw: float = 0.001
-    """This is the standard deviation of the sensor's yaw (rad)."""
+    """Standard deviation of the yaw, rad."""
     sigma_lateral: float = 0.005
-    """This is the standard deviation of the sensor's lateral offset (m)."""
+    """Standard deviation of the lateral offset, m."""
     sigma_latency: float = 0.001
-    """This is the standard deviation of the age of detections at their stamps (s)."""
+    """Standard deviation of the latency, s."""
     sigma_range_scale: float = 0.0005
-    """This is the standard deviation of the scale error of the ranges (-)."""
+    """Standard deviation of the scale error of the ranges (-)."""
     sigma_range_bias: float = 0.005
-    """This is the standard deviation of the bias of the ranges (m)."""
+    """Standard deviation of the bias of the ranges, m."""
     yaw: float = 0.0
-    """Known yaw of the sensor, positive to the left (rad): the mean of its prior."""
+    """Known yaw of the sensor, positive to the left, rad: mean of its prior."""
     lateral: float = 0.0
-    """Known lateral offset of the sensor, positive to the left (m)."""
+    """Known lateral offset of the sensor, positive to the left, m."""
     latency: float = 0.0
-    """Known age of detections at their stamps (s); negative where they are newer."""
+    """Known age of detections at their stamps, s; negative where they are newer."""
     range_scale: float = 0.0
     """Known scale error of the ranges (-)."""
     range_bias: float = 0.0
-    """Known bias of the ranges (m)."""
+    """Known bias of the ranges, m."""
     trust: Literal["odometry", "ranges"] | None = None
     """Which of the two sets the size of the map where ranges and speeds disagree: only their ratio can be
     seen. By default the smoother one."""
     doubt: float = 4.0
-    """The drive contradicts a prior by this number of standard deviations. It is infinite where the priors
-    always hold."""
-    wide: float = 20.0
-    """The wide priors have this number of times the standard deviations."""
+    """Contradiction from which the priors become wide, standard deviations; `inf` to hold them always."""
 
     @property
     def sigmas(self) -> tuple[float, ...]:
-        """Returns the standard deviations (5,) in the order of `factors.sensor:SENSOR`, or none."""
-        own = (
+        """Standard deviations (5,) in the order of `factors.sensor:SENSOR`, or none."""
+        sigmas = (
             self.sigma_yaw,
             self.sigma_lateral,
             self.sigma_latency,
             self.sigma_range_scale,
             self.sigma_range_bias,
         )
-        return own if self.sensor else ()
+        return sigmas if self.sensor else ()
 
     @property
     def means(self) -> tuple[float, ...]:
-        """Returns the known errors (5,) in the order of `factors.sensor:SENSOR`, or none."""
-        own = (self.yaw, self.lateral, self.latency, self.range_scale, self.range_bias)
-        return own if self.sensor else ()
+        """Known errors (5,) in the order of `factors.sensor:SENSOR`, or none."""
+        means = (self.yaw, self.lateral, self.latency, self.range_scale, self.range_bias)
+        return means if self.sensor else ()
 
     def widened(self) -> CalibrationSettings:
-        """Returns the settings of wide priors, which are not doubted again.
+        """Return the settings of wide priors, which are not doubted again.
 
         The scale of the ranges stays as it is known: it cannot be told from the scale of the speeds, and the
         size of the map would rest on the wheels alone.
@@ -78,8 +125,8 @@ class CalibrationSettings(Positive):
         return replace(
             self,
             doubt=inf,
-            sigma_yaw=self.wide * self.sigma_yaw,
-            sigma_lateral=self.wide * self.sigma_lateral,
-            sigma_latency=self.wide * self.sigma_latency,
-            sigma_range_bias=self.wide * self.sigma_range_bias,
+            sigma_yaw=WIDE_SENSOR * self.sigma_yaw,
+            sigma_lateral=WIDE_SENSOR * self.sigma_lateral,
+            sigma_latency=WIDE_SENSOR * self.sigma_latency,
+            sigma_range_bias=WIDE_SENSOR * self.sigma_range_bias,
         )

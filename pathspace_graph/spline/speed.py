@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.settings.speed import SpeedSettings
+from pathspace_graph.settings.output import SpeedSettings
 
 Array = NDArray[np.float64]
 

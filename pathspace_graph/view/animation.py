@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -43,7 +43,7 @@ from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES
 from pathspace_graph.run import ObservedCycle, Readings
-from pathspace_graph.settings.view import FilmSettings
+from pathspace_graph.settings.output import FilmSettings
 
 from .film import Film
 
@@ -61,7 +61,7 @@ NOTICE_SECONDS: Final = 2.0
 LEAST_TURN: Final = 0.75
 """An odometry that turns by less than this share of a full turn has driven no lap."""
 
-_STYLE: Final = MapStyle(curve_width=1.4, path_width=0.8, marker_size=2.8)
+_STYLE: Final = MapStyle(curve_width=1.4, path_width=0.8, marker_size=2.8, widest_band=5.0)
 """Lines are wider than on paper, since a film has few pixels."""
 _MAP_PLACE: Final = (0.07, 0.085, 0.69, 0.845)
 """The map has this place in a frame: left, bottom, width, height, as shares of the frame."""
@@ -120,7 +120,6 @@ class Animation:
         title: str = "",
     ) -> None:
         self.settings = settings or FilmSettings()
-        self._style = replace(_STYLE, widest_band=self.settings.widest_band)
         self._film, self._lap, self._truth, self._title = film, lap_seconds, truth, title
         self._begin: float | None = None
         self._frames = 0
@@ -177,10 +176,10 @@ class Animation:
             axes.clear()
             draw_points(axes, self._cones, "x", LIGHT, markersize=3.0, markeredgewidth=0.7, zorder=1)
             for label, boundary in sorted(cycle.map.boundaries.items()):
-                draw_boundary(axes, boundary, label, self._style)
+                draw_boundary(axes, boundary, label, _STYLE)
             path = np.array(self._poses)
-            draw_trajectory(axes, path, self._style)
-            draw_unhealthy(axes, path, self._healths, self._style)
+            draw_trajectory(axes, path, _STYLE)
+            draw_unhealthy(axes, path, self._healths, _STYLE)
             _draw_readings(axes, cycle.readings, path[-1])
             _draw_vehicle(axes, path[-1], cycle.window)
             self._show(path[-1:, :2])

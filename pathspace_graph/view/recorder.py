@@ -27,12 +27,14 @@ from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.run import ObservedCycle
-from pathspace_graph.settings.view import RecordingSettings
+from pathspace_graph.settings.output import RecordingSettings
 
 from . import entities
 
 Array = NDArray[np.float64]
 
+WIDEST_BAND: Final = 5.0
+"""Largest width of a band on either side of its curve, m."""
 VEHICLE: Final = np.array([[1.8, 0.0], [-0.9, 0.7], [-0.9, -0.7], [1.8, 0.0]])
 """The vehicle is shown as this triangle (m, vehicle frame)."""
 LOW, MIDDLE, HIGH, TOP = 10.0, 20.0, 30.0, 40.0
@@ -157,7 +159,7 @@ class Recorder:
         """Returns both edges of a curve's band, or the ellipse of each landmark."""
         if isinstance(boundary, SplineBoundary):
             u = curve_parameters(boundary.spline, self._settings.samples_per_span)
-            return list(uncertainty_band(boundary, u, widest=self._settings.widest_band))
+            return list(uncertainty_band(boundary, u, widest=WIDEST_BAND))
         return list(ellipse_outlines(boundary.points, boundary.covariance))
 
     def _show_vehicle(self, cycle: ObservedCycle) -> None:

@@ -13,7 +13,7 @@ from typing import Any, Final
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import Truth
-from pathspace_graph.settings.view import RecordingSettings
+from pathspace_graph.settings.output import RecordingSettings
 
 from .blueprint import blueprint
 from .recorder import Recorder

@@ -10,7 +10,7 @@ from typing import Protocol
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import Observer
-from pathspace_graph.settings.view import FilmSettings, RecordingSettings
+from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 
 from .animation import COLORS, Animation, lap_seconds
 from .film import check_film_file, film

@@ -20,7 +20,7 @@ from pathspace_graph.export.tables import sampled, write_centre_line, write_poin
 from pathspace_graph.io.csv_table import read_table
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BIG_ORANGE, LEFT, RIGHT
-from pathspace_graph.settings.speed import SpeedSettings
+from pathspace_graph.settings.output import SpeedSettings
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.spline.speed import speed_profile
 

@@ -9,9 +9,7 @@ import pytest
 
 from pathspace_graph.ckf.mapper import CkfMapper
 from pathspace_graph.front_end.front_end import judge_log
-from pathspace_graph.front_end.log_odometry import mean_bias
-from pathspace_graph.front_end.motion import MotionCheck
-from pathspace_graph.front_end.rest import Rest
+from pathspace_graph.front_end.motion import MotionCheck, Rest, mean_bias
 from pathspace_graph.graph.keys import CALIBRATION_KEY
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
@@ -102,7 +100,7 @@ def test_means_are_weighted_by_information() -> None:
 
 
 def test_a_vehicle_that_creeps_is_not_at_rest() -> None:
-    rest, rng = Rest(SIGMA, MotionSettings()), np.random.default_rng(0)
+    rest, rng = Rest(SIGMA), np.random.default_rng(0)
     told = []
     for k in range(40):
         t = 0.1 * k + 0.02 * np.arange(5)

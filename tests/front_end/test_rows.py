@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.front_end.rows import Row, follow_rows
+from pathspace_graph.front_end.sides import GAP, Row, follow_rows
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.settings.front_end import SidesSettings
 
 Array = NDArray[np.float64]
-SETTINGS = SidesSettings()
 
 
 def begun(half_width: float = 1.75) -> dict[int, Row]:
@@ -35,7 +33,7 @@ def bend(radius: float, half_width: float, gap: float, angle: float) -> tuple[Ar
 def followed(rows: dict[int, Row], left: Array, right: Array) -> tuple[list[int], list[int]]:
     points = np.concatenate([left, right])
     votes = np.zeros((len(points), 2), np.intp)
-    follow_rows(rows, points, votes, np.arange(len(points)), SETTINGS)
+    follow_rows(rows, points, votes, np.arange(len(points)))
     return rows[LEFT].cones, rows[RIGHT].cones
 
 
@@ -65,11 +63,11 @@ def test_colours_that_a_cone_was_seen_in_are_kept() -> None:
     """A cone that fits the left row, but was yellow three times, is in neither row."""
     points = np.array([[4.0, 1.75], [4.0, -1.75]])
     rows = begun()
-    follow_rows(rows, points, np.array([[0, 3], [0, 0]]), np.arange(2), SETTINGS)
+    follow_rows(rows, points, np.array([[0, 3], [0, 0]]), np.arange(2))
     assert rows[LEFT].cones == []
     assert rows[RIGHT].cones == [1]
 
 
 def test_a_row_does_not_reach_farther_than_a_gap() -> None:
-    left = np.array([[SETTINGS.gap + 0.1, 1.75]])
+    left = np.array([[GAP + 0.1, 1.75]])
     assert followed(begun(), left, np.zeros((0, 2))) == ([], [])

@@ -2,35 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pathspace_graph.factors.se2 import to_map, to_vehicle
-from pathspace_graph.front_end.scan_matching import MOST_MISFIT, RecentDetections, match, misfit_at
-from pathspace_graph.settings.front_end import MotionSettings
+from pathspace_graph.front_end import scan_matching
+from pathspace_graph.front_end.scan_matching import (
+    ERRORS,
+    MEMORY,
+    MOST_MISFIT,
+    REACH,
+    REACH_LAST,
+    REACHES_CHECK,
+    SIGMA_CONE,
+    RecentDetections,
+    match,
+    misfit_at,
+    reaches,
+)
 
 from ..scenes.jacobians import numeric_jacobian
 
-SETTINGS = MotionSettings()
 CONES = np.array([[2.0, 2.0], [6.0, 2.2], [10.0, 2.0], [2.5, -1.9], [7.0, -2.0], [11.0, -2.1]])
-
-
-def reaches(iterations: int) -> list[float]:
-    return replace(SETTINGS, iterations=iterations).reaches
 
 
 def remember(recent: RecentDetections, t: float, points: np.ndarray) -> None:
     """Adds detections from the origin, by a sensor without errors."""
-    recent.add(t, points, np.zeros((len(points), 2, len(SETTINGS.sigmas_errors))), np.zeros(3))
+    recent.add(t, points, np.zeros((len(points), 2, len(ERRORS))), np.zeros(3))
 
 
 def seen_once(cones: np.ndarray = CONES) -> RecentDetections:
     """The cones as they were detected once, without noise, from the origin."""
-    recent = RecentDetections(SETTINGS)
+    recent = RecentDetections()
     remember(recent, 0.0, cones)
     return recent
 
@@ -43,7 +48,7 @@ def detected(pose: np.ndarray, cones: np.ndarray = CONES) -> np.ndarray:
 def test_exact_detections_give_the_exact_motion(x: float, y: float, theta: float) -> None:
     pose = np.array([x, y, theta])
     start = np.array([x - 0.4, 0.0, 0.0])
-    found = match(seen_once(), detected(pose), np.full(6, 0.01), start, SETTINGS, reaches(8))
+    found = match(seen_once(), detected(pose), np.full(6, 0.01), start, reaches(8))
     np.testing.assert_allclose(found.pose, pose, atol=1e-3)
     assert found.matched == 6
     assert found.is_certain
@@ -60,26 +65,27 @@ def test_the_information_is_that_of_one_detection_and_the_mean_of_n(n: int) -> N
     """Each offset has the variance `v (1 + 1/n) + sigma_cone^2`; its derivatives are numeric ones."""
     seen = detected(POSE, ASYMMETRIC)
     recent = seen_once(np.tile(ASYMMETRIC, (n, 1)))
-    found = match(recent, seen, VARIANCES, POSE, SETTINGS, reaches(1)[-1:])
+    found = match(recent, seen, VARIANCES, POSE, reaches(1)[-1:])
     jacobian = numeric_jacobian(lambda pose: to_map(seen, np.tile(pose, (len(seen), 1))).ravel(), POSE)
-    precision = np.repeat(1.0 / (VARIANCES * (1.0 + 1.0 / n) + SETTINGS.sigma_cone**2), 2)
+    precision = np.repeat(1.0 / (VARIANCES * (1.0 + 1.0 / n) + SIGMA_CONE**2), 2)
     expected = jacobian.T @ (precision[:, None] * jacobian)
     assert np.abs(expected[2, :2]).min() > 100.0  # x and y are told together with the heading
     np.testing.assert_allclose(found.information, expected, rtol=1e-6, atol=1e-6)
     assert found.misfit == pytest.approx(0.0, abs=1e-12)
 
 
-def test_the_covariance_is_that_of_many_noisy_matches() -> None:
+def test_the_covariance_is_that_of_many_noisy_matches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Errors that are whitened by the claimed covariance have the covariance 1, cross terms included."""
     rng, sigma, n = np.random.default_rng(0), 0.02, 3
-    settings = MotionSettings(sigma_cone=1e-6, huber=np.inf)
+    monkeypatch.setattr(scan_matching, "SIGMA_CONE", 1e-6)
+    monkeypatch.setattr(scan_matching, "HUBER", np.inf)
     seen, errors = detected(POSE, ASYMMETRIC), []
     for _ in range(400):
-        recent = RecentDetections(settings)
+        recent = RecentDetections()
         for k in range(n):
             remember(recent, 0.1 * k, ASYMMETRIC + sigma * rng.standard_normal(ASYMMETRIC.shape))
         points = seen + sigma * rng.standard_normal(seen.shape)
-        found = match(recent, points, np.full(len(seen), sigma**2), POSE, settings, [0.4] * 2)
+        found = match(recent, points, np.full(len(seen), sigma**2), POSE, [0.4] * 2)
         errors.append(np.linalg.cholesky(found.information).T @ (found.pose - POSE))
     np.testing.assert_allclose(np.cov(np.array(errors).T), np.eye(3), atol=0.2)
 
@@ -91,21 +97,21 @@ def test_the_misfit_at_a_pose_is_the_mean_square_of_the_whitened_distances(n: in
     recent = seen_once(np.tile(ASYMMETRIC[:3], (n, 1)))
     variances = np.array([0.04, 0.02, 1e-6, 0.01])
     off = np.array([[0.0, 0.2], [0.0, 0.0], [0.0, 0.2], [0.0, 0.0]])
-    weight = n * np.exp(-0.5 * (0.2 / SETTINGS.reach_last) ** 2)
-    square = 0.2**2 / (0.04 * (1.0 + 1.0 / weight) + SETTINGS.sigma_cone**2)
-    found = misfit_at(recent, seen + off, variances, POSE, SETTINGS)
+    weight = n * np.exp(-0.5 * (0.2 / REACH_LAST) ** 2)
+    square = 0.2**2 / (0.04 * (1.0 + 1.0 / weight) + SIGMA_CONE**2)
+    found = misfit_at(recent, seen + off, variances, POSE)
     assert found == pytest.approx((square + 0.0 + 2.0 * MOST_MISFIT) / 4.0)
 
 
 def test_a_detection_of_nothing_has_no_say() -> None:
     points = np.vstack([detected(np.array([0.5, 0.0, 0.0])), [[4.0, 0.0]]])
-    found = match(seen_once(), points, np.full(7, 0.01), np.array([0.3, 0.0, 0.0]), SETTINGS, reaches(6))
+    found = match(seen_once(), points, np.full(7, 0.01), np.array([0.3, 0.0, 0.0]), reaches(6))
     assert found.matched == 6
     np.testing.assert_allclose(found.pose, [0.5, 0.0, 0.0], atol=1e-3)
 
 
 def test_one_cone_holds_no_motion() -> None:
-    found = match(seen_once(CONES[:1]), CONES[:1], np.full(1, 0.01), np.zeros(3), SETTINGS, reaches(3))
+    found = match(seen_once(CONES[:1]), CONES[:1], np.full(1, 0.01), np.zeros(3), reaches(3))
     assert found.matched == 1
     assert not found.is_certain
 
@@ -113,7 +119,7 @@ def test_one_cone_holds_no_motion() -> None:
 def test_detections_of_one_cone_alone_hold_no_motion_however_many_they_are() -> None:
     """All offsets have the same arm, so that the information is singular."""
     points = np.tile(CONES[:1], (5, 1))
-    found = match(seen_once(CONES[:1]), points, np.full(5, 0.01), np.zeros(3), SETTINGS, reaches(6))
+    found = match(seen_once(CONES[:1]), points, np.full(5, 0.01), np.zeros(3), reaches(6))
     assert found.matched == 5
     assert np.isfinite(found.pose).all()
     assert not found.is_certain
@@ -122,13 +128,13 @@ def test_detections_of_one_cone_alone_hold_no_motion_however_many_they_are() -> 
 def test_old_detections_are_forgotten() -> None:
     recent = seen_once()
     remember(recent, 0.1, CONES[:2])
-    recent.forget(SETTINGS.memory + 0.01)
+    recent.forget(MEMORY + 0.01)
     np.testing.assert_array_equal(recent.points, CONES[:2])
 
 
 def test_remembered_detections_follow_what_is_learned_of_the_sensor() -> None:
     """A detection at (4, 0) from (1, 2), which looks to the left, moves by its derivative, turned as well."""
-    recent = RecentDetections(SETTINGS)
+    recent = RecentDetections()
     columns = np.array([[[0.0, -3.0], [4.0, 0.0]]])  # a turned sensor moves it to the left
     recent.add(0.0, np.array([[4.0, 0.0]]), columns, np.array([1.0, 2.0, np.pi / 2]))
     np.testing.assert_allclose(recent.points, [[1.0, 6.0]], atol=1e-12)
@@ -144,4 +150,4 @@ def test_a_detection_is_seen_again_where_one_was() -> None:
 
 def test_the_reaches_shrink_from_the_first_to_the_last() -> None:
     np.testing.assert_allclose(reaches(3), [1.0, np.sqrt(0.4), 0.4])
-    assert SETTINGS.reaches_check == [SETTINGS.reach, SETTINGS.reach_last]
+    assert REACHES_CHECK == (REACH, REACH_LAST)

@@ -10,10 +10,18 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import relative, to_vehicle
 from pathspace_graph.factors.sensor import by_sensor
+from pathspace_graph.front_end import scan_matching
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.motion import MotionCheck
-from pathspace_graph.front_end.scan_matching import RecentDetections, match
-from pathspace_graph.front_end.sensor_errors import ERRORS, Difference, SensorErrors, by_errors
+from pathspace_graph.front_end.scan_matching import (
+    ERRORS,
+    SIGMAS_ERRORS,
+    Difference,
+    RecentDetections,
+    SensorErrors,
+    by_errors,
+    match,
+)
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.calibration import CalibrationSettings
@@ -39,9 +47,9 @@ def test_the_shifts_are_those_of_a_match_of_late_detections_of_a_turned_sensor()
     for pose, twist in ((begin, before), (end, now)):
         exact = to_vehicle(CONES, np.tile(pose, (len(CONES), 1)))
         seen.append(exact - by_errors(exact, twist) @ errors)
-    recent = RecentDetections(SETTINGS)
+    recent = RecentDetections()
     recent.add(0.0, seen[0], by_errors(seen[0], before), begin)
-    found = match(recent, seen[1], np.full(6, 0.01), end, SETTINGS, [0.4] * 6)
+    found = match(recent, seen[1], np.full(6, 0.01), end, [0.4] * 6)
     known = SensorErrors(SETTINGS)
     known.follow(before, 10.0)
     off = relative(end, found.pose)
@@ -51,7 +59,7 @@ def test_the_shifts_are_those_of_a_match_of_late_detections_of_a_turned_sensor()
     assert abs(off[1]) > 5e-3
     recent.correct(errors)
     corrected = seen[1] + by_errors(seen[1], now) @ errors
-    found = match(recent, corrected, np.full(6, 0.01), end, SETTINGS, [0.4] * 6)
+    found = match(recent, corrected, np.full(6, 0.01), end, [0.4] * 6)
     np.testing.assert_allclose(found.pose, end, atol=5e-4)
 
 
@@ -67,13 +75,15 @@ def test_a_drive_at_one_speed_straight_ahead_says_nothing_of_the_latency() -> No
 
 
 @pytest.mark.parametrize("shared", [1, 4])
-def test_matches_give_the_errors_with_the_claimed_covariance(shared: int) -> None:
+def test_matches_give_the_errors_with_the_claimed_covariance(
+    shared: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """All matches of a memory have the same noise, since they share what is remembered."""
     rng, spread, off = np.random.default_rng(0), np.diag([0.05, 0.05, 0.005]) ** 2, []
-    constant = replace(SETTINGS, sigma_yaw_changes=1e-9, sigma_latency_changes=1e-9)
+    monkeypatch.setattr(scan_matching, "SIGMAS_CHANGES", (1e-9, 1e-9))
     for _ in range(200):
-        truth = rng.normal(scale=SETTINGS.sigmas_errors)
-        known = SensorErrors(constant)
+        truth = rng.normal(scale=SIGMAS_ERRORS)
+        known = SensorErrors(SETTINGS)
         for _ in range(12):
             shifts = known.shifts(np.array([3.0, 0.1]), np.array([*rng.normal(scale=1.0, size=2), 0.1]))
             noise = np.sqrt(np.diag(spread)) * rng.standard_normal(3)
@@ -89,7 +99,7 @@ def test_errors_may_change_as_much_in_a_minute_as_the_settings_say() -> None:
     known, nothing = SensorErrors(SETTINGS), Difference(np.zeros(3), np.eye(3), np.zeros((3, 2)))
     for _ in range(600):
         known.update(nothing, 0.1)
-    expected = np.square(SETTINGS.sigmas_errors) + np.square(SETTINGS.sigmas_changes)
+    expected = np.square(SIGMAS_ERRORS) + np.square(scan_matching.SIGMAS_CHANGES)
     np.testing.assert_allclose(known.covariance, np.diag(expected))
 
 

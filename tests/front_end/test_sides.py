@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from pathspace_graph.factors.measured_noise import KnownNoise
-from pathspace_graph.front_end.cones import NearCones
 from pathspace_graph.front_end.front_end import FrontEnd, judge_log
-from pathspace_graph.front_end.sides import SideJudge
+from pathspace_graph.front_end.sides import FORGET_AFTER, NearCones, SideJudge
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, ORANGE, RIGHT, UNKNOWN
 from pathspace_graph.run import split_odometry
@@ -122,7 +121,7 @@ def test_where_colours_are_common_an_unknown_one_stays_unknown() -> None:
 
 
 def test_near_cones_are_means_of_their_detections() -> None:
-    near = NearCones(SidesSettings())
+    near = NearCones()
     first = near.add(0.0, np.array([[0.0, 0.0], [5.0, 0.0]]), np.array([LEFT, UNKNOWN]))
     second = near.add(0.1, np.array([[5.2, 0.0], [0.0, 0.3], [9.0, 9.0]]), np.array([RIGHT, LEFT, UNKNOWN]))
     np.testing.assert_array_equal(first, [0, 1])
@@ -133,14 +132,14 @@ def test_near_cones_are_means_of_their_detections() -> None:
 
 
 def test_near_cones_are_forgotten_once_they_are_old() -> None:
-    near, settings = NearCones(SidesSettings()), SidesSettings()
+    near = NearCones()
     near.add(0.0, np.zeros((1, 2)), np.array([LEFT]))
-    near.add(settings.forget_after + 0.1, np.ones((1, 2)), np.array([LEFT]))
+    near.add(FORGET_AFTER + 0.1, np.ones((1, 2)), np.array([LEFT]))
     np.testing.assert_array_equal(near.points, [[1.0, 1.0]])
 
 
 def test_two_detections_of_a_new_cone_in_one_cycle_are_two_cones() -> None:
-    near = NearCones(SidesSettings())
+    near = NearCones()
     np.testing.assert_array_equal(near.add(0.0, np.zeros((2, 2)), np.array([LEFT, LEFT])), [0, 1])
 
 

@@ -19,7 +19,8 @@ from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.labels import RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
+from pathspace_graph.settings.calibration import OdometrySettings
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.vehicle import integrate
 
 from ..scenes.drives import CYCLE, DT, ODOMETRY_SIGMA, bean_track, exact_log, lap_log, true_poses
@@ -30,14 +31,10 @@ Array = NDArray[np.float64]
 R0 = int(control_keys(1, np.array(0)))
 Factors = Mapping[int, Sequence[gtsam.NonlinearFactor]]
 
-START = 1e-3
-"""Sigma of the first pose in the chains below (m, rad)."""
 CHAIN = MapperSettings(
     lag=0.8,
     steps=3,
-    odometry=OdometrySettings(
-        sigma_scale=1e-9, sigma_bias=1e-9, sigma_start=START, sigma_start_heading=START
-    ),
+    odometry=OdometrySettings(sigma_scale=1e-9, sigma_bias=1e-9),
 )
 """A short window, and an odometry that needs no calibration."""
 
@@ -72,7 +69,7 @@ def between(first: int, second: int, delta: Array) -> gtsam.NonlinearFactor:
 def batch(log: Log, factors: Factors) -> Array:
     """Every pose (n, 3) by GTSAM, from the odometry and the factors."""
     graph, values, pose = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Pose2()
-    start = gtsam.noiseModel.Isotropic.Sigma(3, START)
+    start = gtsam.noiseModel.Diagonal.Sigmas(np.array(CHAIN.odometry.sigmas_start))
     graph.add(gtsam.PriorFactorPose2(pose_key(0), pose, start))
     values.insert(pose_key(0), pose)
     for k, (odometry, cycle) in enumerate(split_odometry(log)):

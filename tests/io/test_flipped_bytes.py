@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError, PathspaceError
-from pathspace_graph.eval.experiment.cells import Cell, Store, failed
+from pathspace_graph.eval.experiment.cells import Cell, Outcome, Store, record_of
 from pathspace_graph.eval.experiment.drives import Drive, NamedTrack
 from pathspace_graph.io.log import FILES, read_log, write_log
 from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
@@ -88,7 +88,9 @@ def test_in_a_cell_of_a_study(tmp_path: Path) -> None:
     track = NamedTrack("round", read_track(write_round_track(tmp_path)))
     cell = Cell(Drive(track, 0, "nominal", SimulationSettings()), "fixed-lag", "default", MapperSettings())
     store = Store(tmp_path)
-    record = failed(cell, ValueError("lost")) | {"laps": [{"lap": 1, "rmse": 0.123456}]}
+    record = record_of(cell, Outcome.failed(cell, ValueError("lost"))) | {
+        "laps": [{"lap": 1, "rmse": 0.123456}]
+    }
     store.write(cell, record)
     assert store.read(cell) == record
     (file,) = (tmp_path / "cells").iterdir()

@@ -71,7 +71,7 @@ def test_the_oracle_starts_each_landmark_at_its_first_detection_with_its_most_fr
 def gtsam_optimum(log: Log, associations: NDArray[np.int_]) -> gtsam.Values:
     """Returns the optimum of the same problem, with GTSAM's own factors as far as it has them."""
     graph, values, settings = gtsam.NonlinearFactorGraph(), gtsam.Values(), MapperSettings().odometry
-    start = np.array([settings.sigma_start, settings.sigma_start, settings.sigma_start_heading])
+    start = np.array(settings.sigmas_start)
     graph.add(gtsam.PriorFactorPose2(X(0), gtsam.Pose2(), gtsam.noiseModel.Diagonal.Sigmas(start)))
     sigmas = gtsam.noiseModel.Diagonal.Sigmas(np.array([settings.sigma_scale, settings.sigma_bias]))
     graph.add(gtsam.PriorFactorPoint2(C(0), np.zeros(2), sigmas))

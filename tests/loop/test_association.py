@@ -15,6 +15,7 @@ from pathspace_graph.loop.association import associate
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.prediction import integrate_odometry, predict
 from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.settings.mapper import GateSettings
 
 from ..scenes.drives import (
     CYCLE,
@@ -96,12 +97,11 @@ def test_the_gate_is_three_sigmas_of_detection_pose_and_curve_together() -> None
     assert found == [LEFT if abs(share) < 1.0 else -1 for share in shares]
 
 
-def test_what_is_rough_off_is_never_used() -> None:
+def test_what_is_rough_off_is_never_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """The gate by sigmas alone would accept both."""
     mapper = driven()
-    mapper.smoother.map.settings = replace(
-        mapper.settings, gate=replace(mapper.settings.gate, chi=100.0, rough=1.0)
-    )
+    monkeypatch.setattr(GateSettings, "rough", 1.0)
+    mapper.smoother.map.settings = replace(mapper.settings, gate=GateSettings(chi=100.0))
     assert used_of(mapper, at([2.9, 3.1]), [LEFT, LEFT]) == [LEFT, -1]
 
 

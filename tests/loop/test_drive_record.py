@@ -15,7 +15,8 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.prediction import integrate_odometry
 from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
+from pathspace_graph.settings.calibration import OdometrySettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.maps import boundary_through
 

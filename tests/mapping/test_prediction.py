@@ -16,7 +16,8 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import doubted, integrate_odometry, predict, smoother_settings
 from pathspace_graph.run import split_odometry
-from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
+from pathspace_graph.settings.calibration import OdometrySettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import DT, ODOMETRY_SIGMA, ahead, exact_log, true_poses
 

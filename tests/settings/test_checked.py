@@ -22,7 +22,6 @@ UNLIMITED = {
     "open_lap.max_cones",
     "odometry.doubt",
     "motion.doubt",
-    "motion.huber",
     "calibration.doubt",
     "closing.gauge_laps",
     "limits.silence",

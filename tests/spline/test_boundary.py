@@ -16,7 +16,7 @@ from ..scenes.maps import boundary_through
 
 Array = NDArray[np.float64]
 
-SPLINE = SplineSettings(spacing=3.0, confirmed_margin=0.5)
+SPLINE = SplineSettings(spacing=3.0)
 
 
 def line(length: float) -> tuple[Boundary, Array]:

@@ -11,7 +11,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import ObservedCycle, run_online
-from pathspace_graph.settings.view import FilmSettings, RecordingSettings
+from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 from pathspace_graph.view.animation import COLORS, Animation, lap_seconds
 from pathspace_graph.view.film import film
 from pathspace_graph.view.recording import recording

@@ -15,7 +15,7 @@ from pathspace_graph.estimators import make_online
 from pathspace_graph.io.log import Log, Odometry, write_log
 from pathspace_graph.run import ObservedCycle, run_online
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.view import FilmSettings
+from pathspace_graph.settings.output import FilmSettings
 from pathspace_graph.view.animation import Animation, lap_seconds
 
 from ..scenes.drives import ahead, bean_track, corridor, detections, exact_log, lap_log

@@ -24,8 +24,8 @@ from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.landmark.oracle import solve_landmarks
-from pathspace_graph.settings.calibration import CalibrationSettings
-from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
+from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.faults import Faults, SensorFaults
 from pathspace_graph.sim.presets import preset
 from pathspace_graph.sim.sensor import SensorSettings
@@ -116,7 +116,7 @@ def test_with_noise_the_errors_are_as_large_as_the_covariance_says() -> None:
 
 
 CERTAIN = MapperSettings(
-    odometry=OdometrySettings(sigma_scale=1e-9, sigma_bias=1e-9, sigma_start=1e-6, sigma_start_heading=1e-6),
+    odometry=OdometrySettings(sigma_scale=1e-9, sigma_bias=1e-9),
     calibration=CalibrationSettings(sensor=False),
 )
 """A vehicle that stands turns by its yaw rate's bias, unless that is known."""

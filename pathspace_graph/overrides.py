@@ -1,0 +1,106 @@
+"""Dotted fields of a tree of settings, such as `spline.degree`, and overrides of them, also from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from pathspace_graph.errors import InputError, SettingsError, check_name
+from pathspace_graph.io.limits import MAX_HEADER_BYTES, shown
+from pathspace_graph.io.parsing import parse_json, parse_toml, read_text
+from pathspace_graph.settings.gone import successor
+
+T = TypeVar("T")
+Overrides = Mapping[str, Any]
+"""New values by dotted field."""
+
+
+def leaves(settings: Any, prefix: str = "") -> dict[str, Any]:
+    """Return the value of every dotted field of a settings dataclass, in order."""
+    found: dict[str, Any] = {}
+    for entry in fields(settings):
+        value = getattr(settings, entry.name)
+        name = f"{prefix}{entry.name}"
+        found |= leaves(value, f"{name}.") if is_dataclass(value) else {name: value}
+    return found
+
+
+def flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested tables with dotted names, which mean the same as TOML's dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        name = f"{prefix}{key}"
+        flat |= flatten(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return flat
+
+
+def override(settings: T, overrides: Overrides, where: str) -> T:
+    """Return the settings with some dotted fields overridden; a wrong field or value is a SettingsError."""
+    known, before = leaves(settings), f"{where}." if where else ""
+    for name, value in overrides.items():
+        if name not in known:
+            check_gone(name, f"{before}{name}")
+            check_name(name, known, f"{where}: expected a known setting" if where else "expected a setting")
+        settings = _set(settings, name.split("."), value, f"{before}{name}")
+    return settings
+
+
+def check_gone(name: str, said: str) -> None:
+    """Raise a SettingsError for a setting that is gone, which tells what took its place."""
+    place = successor(name)
+    if place is not None:
+        raise SettingsError(f"{said}: expected a setting, found one that is gone: {place}")
+
+
+def read_settings(file: Path, settings: T) -> T:
+    """Return the settings with those of a file: TOML in the same nesting, or a run's `summary.json`.
+
+    An InputError names the file and the setting that is wrong, unknown or gone.
+    """
+    text = read_text(file, "a file of settings", MAX_HEADER_BYTES)
+    content = parse_json(text, file) if file.suffix == ".json" else parse_toml(text, file)
+    table = content.get("settings", content) if isinstance(content, dict) else content
+    if not isinstance(table, dict):
+        raise InputError(file, f"expected a table of settings, found {shown(table)}")
+    try:
+        return override(settings, flatten(table), "")
+    except SettingsError as error:
+        raise InputError(file, str(error)) from error
+
+
+def _set(settings: Any, path: list[str], value: Any, where: str) -> Any:
+    name, *rest = path
+    if rest:
+        new = _set(getattr(settings, name), rest, value, where)
+    else:
+        new = as_type(value, get_type_hints(type(settings))[name], where)
+    try:
+        return replace(settings, **{name: new})
+    except SettingsError as error:
+        raise error if str(error).startswith(where) else SettingsError(f"{where}: {error}") from error
+
+
+def as_type(value: Any, hint: Any, where: str) -> Any:
+    """Return a value of TOML in the type of a field: a list as a tuple, a whole number as a float."""
+    arguments = get_args(hint)
+    if get_origin(hint) is Literal and value in arguments:
+        return value
+    if get_origin(hint) in (Union, UnionType):
+        if value is None and NoneType in arguments:
+            return None
+        (hint,) = (entry for entry in arguments if entry is not NoneType)
+        return as_type(value, hint, where)
+    if get_origin(hint) is tuple and isinstance(value, list | tuple):
+        each = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
+        if len(each) == len(value):
+            return tuple(as_type(v, h, where) for v, h in zip(value, each, strict=True))
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is float and (is_number or value in ("inf", "-inf")):  # JSON has these as texts
+        return float(value)
+    if isinstance(hint, type) and type(value) is hint:
+        return value
+    name = hint.__name__ if isinstance(hint, type) else str(hint)
+    raise SettingsError(f"{where}: expected a value of type {name}, found {shown(value)}")

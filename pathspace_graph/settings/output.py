@@ -1,0 +1,52 @@
+"""Settings of what is made of a map or a run: a speed profile, a recording for the live viewer, a film."""
+
+from dataclasses import dataclass
+
+from .checked import Positive
+
+
+@dataclass(frozen=True)
+class SpeedSettings(Positive):
+    """How fast a vehicle may be on its tyres; the defaults are those of a careful Formula Student car."""
+
+    UNLIMITED = ("top",)
+
+    lateral: float = 10.0
+    """Largest lateral acceleration, m/s^2: the friction coefficient times gravity."""
+    forward: float = 5.0
+    """Largest acceleration on a straight, m/s^2."""
+    braking: float = 8.0
+    """Largest deceleration on a straight, m/s^2."""
+    top: float = 30.0
+    """Largest speed, m/s."""
+
+
+@dataclass(frozen=True)
+class RecordingSettings(Positive):
+    """The recording of a run for the live viewer."""
+
+    band_every: int = 10
+    """Cycles from one band to the next, since a band needs the joint covariance of the map; where the map is
+    replaced, it has one too. The curves are shown in every cycle."""
+    samples_per_span: int = 6
+    """Lines in each span of a curve."""
+
+
+@dataclass(frozen=True)
+class FilmSettings(Positive):
+    """The film of a run."""
+
+    UNLIMITED = ("laps",)
+
+    seconds_per_lap: float = 10.0
+    """Time of film for a lap, s."""
+    frames_per_second: float = 12.5
+    """Frames in a second; a frame of a .gif begins at a multiple of 0.01 s."""
+    width: int = 780
+    """Width of a frame, pixels."""
+    height: int = 520
+    """Height of a frame, pixels."""
+    laps: float = float("inf")
+    """Laps after which the film ends; the mapping goes on without it."""
+    hold: float = 2.0
+    """Time for which the last frame is shown, s."""

@@ -1,0 +1,168 @@
+"""Options: a short help and a full one, settings from a file, and names that are gone."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from math import inf
+from pathlib import Path
+
+import pytest
+
+from pathspace_graph.cli import main, parse_command
+from pathspace_graph.io.files import write_json
+from pathspace_graph.options import ESSENTIAL
+from pathspace_graph.overrides import leaves
+from pathspace_graph.settings.gone import GONE, successor
+from pathspace_graph.settings.mapper import GateSettings, MapperSettings
+
+SCREEN = 50
+"""Lines of a screen."""
+ONLINE = ["LOG", "--out", "MAP"]
+
+
+def help_of(command: str, option: str, capsys: pytest.CaptureFixture[str]) -> str:
+    assert main([command, option]) == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["online", "batch", "compare", "demo", "scale", "simulate", "convert"])
+def test_the_short_help_fits_two_screens_and_names_the_long_one(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    text = help_of(command, "--help", capsys)
+    assert len(text.splitlines()) <= 2 * SCREEN
+    assert max(map(len, text.splitlines())) <= 100
+    assert f"pathspace-graph {command} --help-all" in text
+
+
+def test_the_short_help_has_the_essential_settings_and_the_long_one_has_all(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert set(ESSENTIAL) <= set(leaves(MapperSettings()))
+    short, whole = help_of("online", "--help", capsys), help_of("online", "--help-all", capsys)
+    assert "--lag 3.0" in short
+    for name in leaves(MapperSettings()):
+        option = name.replace("_", "-").split(".")[-1]
+        assert option in whole, name
+        assert (f"--{name.replace('_', '-')} " in short or name == "calibration.sensor") == (
+            name in ESSENTIAL
+        )
+    assert "--settings FILE" in short
+    assert "--settings FILE" in whole
+
+
+def test_a_flag_in_the_short_help_is_the_one_that_changes_something(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert "--calibration.no-sensor" in help_of("online", "--help", capsys)
+    command = parse_command("online", [*ONLINE, "--calibration.no-sensor"])
+    assert command.settings.calibration.sensor is False
+
+
+# --- settings from a file --------------------------------------------------------------------------------
+
+
+CHANGED = replace(
+    MapperSettings(),
+    lag=2.0,
+    scale=0.1,
+    gate=GateSettings(chi=2.5, huber=inf),
+    open_lap=replace(MapperSettings().open_lap, ends=(3, 7)),
+)
+
+
+@pytest.mark.parametrize("command", ["online", "batch", "compare", "scale", "demo"])
+def test_every_command_that_estimates_reads_what_a_summary_holds(command: str, tmp_path: Path) -> None:
+    file = tmp_path / "summary.json"
+    write_json(file, {"estimator": "fixed-lag", "settings": asdict(CHANGED), "laps": 1})
+    places = ["LOG"] if command in ("online", "batch", "compare") else []
+    assert parse_command(command, [*places, "--out", "X", "--settings", str(file)]).settings == CHANGED
+
+
+def test_options_on_the_command_line_stand_over_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "my.toml"
+    file.write_text("lag = 2\ngate.huber = inf\n[spline]\ndegree = 2\n")
+    given = parse_command("online", [*ONLINE, "--gate.chi", "4", f"--settings={file}", "--lag", "5"])
+    assert given.out == Path("MAP")
+    assert given.settings.lag == 5.0
+    assert given.settings.gate == GateSettings(chi=4.0, huber=inf)
+    assert given.settings.spline == replace(MapperSettings().spline, degree=2)
+
+
+BAD_FILES = {
+    "unknown name": ("gate.chii = 3\n", "'gate.chii', the nearest is 'gate.chi'"),
+    "name of a group": ("gate = 3\n", "'gate'"),
+    "gone": (
+        "motion.memory = 0.65\n",
+        "motion.memory: expected a setting, found one that is gone: a constant",
+    ),
+    "wrong type": ('lag = "long"\n', "lag: expected a value of type float, found 'long'"),
+    "wrong word": ('spline.knots = "none"\n', "spline.knots: expected"),
+    "out of range": ("gate.chi = -1\n", "gate.chi: expected a positive number, found -1"),
+    "no TOML": ("lag 3\n", "row 1"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_a_bad_file_is_one_line_with_file_and_name(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, (content, says) = tmp_path / "my.toml", BAD_FILES[case]
+    file.write_text(content)
+    assert main(["online", *ONLINE, "--settings", str(file)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert str(file) in error
+    assert says in error
+
+
+@pytest.mark.parametrize("content", ["[1]", '{"settings": 3}', "{", '{"settings": {"lag": null}}'])
+def test_a_bad_summary_is_one_line_too(
+    content: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "summary.json"
+    file.write_text(content)
+    assert main(["batch", *ONLINE, "--settings", str(file)]) == 2
+    assert capsys.readouterr().err.startswith(f"pathspace-graph: {file}")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--settings"], "--settings: expected one file, found none"),
+        (["--settings", "--lag", "3"], "--settings: expected one file, found none"),
+        (["--settings", "a.toml", "--settings", "b.toml"], "--settings: expected one file, found two"),
+        (["--settings", "none.toml"], "none.toml: expected a file of settings, found none"),
+        (["--motion.memory", "3"], "--motion.memory: expected a setting, found one that is gone: a constant"),
+        (["--sides.half-width=3"], "--sides.half-width: expected a setting, found one that is gone"),
+        (["--film.widest-band", "3"], "--film.widest-band: expected a setting, found one that is gone"),
+    ],
+)
+def test_options_that_are_wrong_or_gone_are_one_line(
+    options: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["online", *ONLINE, *options]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+
+
+# --- names that are gone ---------------------------------------------------------------------------------
+
+
+def gone() -> list[tuple[str, str]]:
+    lines = GONE.replace("\n ", " ").strip().splitlines()
+    groups = [line.partition(": ") for line in lines]
+    entries = [(group, entry.split(" ", 1)) for group, _, rest in groups for entry in rest.split(", ")]
+    return [(f"{group}.{name}".lstrip("."), place) for group, (name, place) in entries]
+
+
+def test_what_is_gone_is_no_setting_and_its_new_name_is_one() -> None:
+    known, names = set(leaves(MapperSettings())), [name for name, _ in gone()]
+    assert len(set(names)) == len(names)
+    assert known.isdisjoint(names)
+    for name, place in gone():
+        assert place[1:] in known if place.startswith(">") else place
+        assert place.lstrip(">") in str(successor(name))
+    assert successor("lag") is None
