@@ -20,7 +20,7 @@ import tyro
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.limits import MAX_INTEGER, shown
-from pathspace_graph.overrides import check_gone, leaves, read_settings
+from pathspace_graph.io.overrides import check_gone, leaves, read_settings
 from pathspace_graph.settings.mapper import MapperSettings
 
 HELP: Final = ("-h", "--help")
@@ -33,7 +33,7 @@ ESSENTIAL: Final = (
     *("lag", "max_poses", "steps", "noise", "scale"),
     *("limits.silence", "limits.range_max"),
     *("spline.degree", "spline.spacing", "spline.size_share", "spline.knots", "spline.sigma_model"),
-    *("gate.chi", "gate.huber", "gate.view_ahead", "place.use", "growth.sightings"),
+    *("gate.chi", "gate.huber", "gate.view_ahead", "growth.sightings"),
     *("motion.doubt", "sides.colourless", "batch.start"),
     *("odometry.scale", "odometry.bias", "odometry.sigma_scale", "odometry.sigma_bias"),
     *("calibration.sensor", "calibration.trust", "calibration.yaw", "calibration.lateral"),
@@ -104,10 +104,12 @@ def _is_required(entry: Field[Any]) -> bool:
 
 def _check_options(command: type[Any], arguments: list[str]) -> None:
     """Raise a SettingsError for an option of the estimators that is gone."""
+    known = leaves(MapperSettings())
     for word in arguments if _estimates(command) else ():
         option = word.partition("=")[0]
-        if option.startswith("--"):
-            check_gone(option[2:].replace("-", "_"), option)
+        name = option.removeprefix("--").replace("-", "_")
+        if option.startswith("--") and name not in known:
+            check_gone(name, option)
 
 
 # --- help ------------------------------------------------------------------------------------------------
@@ -157,11 +159,14 @@ def _groups(command: type[Any]) -> Iterator[tuple[str, str]]:
     """Yield the groups of options that are not explained, with their number and what they are."""
     hints, texts = get_type_hints(command), _texts(command)
     for entry in fields(command):
-        kind = hints[entry.name]
+        kind: Any = hints[entry.name]
         if entry.name == "settings":
             yield from () if _estimates(command) else _groups(kind)
         elif is_dataclass(kind):
-            yield f"--{entry.name}.* ({len(leaves(kind()))})", _first_sentence(texts.get(entry.name, ""))
+            yield (
+                f"--{entry.name}.* ({len(leaves(hints[entry.name]()))})",
+                _first_sentence(texts.get(entry.name, "")),
+            )
 
 
 def _option(name: str, hint: Any, value: Any) -> str:

@@ -27,8 +27,8 @@ from pathspace_graph.cli import COMMANDS, parse_command
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import write_log
+from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.results import write_result
-from pathspace_graph.overrides import leaves
 from pathspace_graph.run import run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim import track_files

@@ -23,7 +23,7 @@ BELOW_MAPPING = {
     "scale",
 }
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
-BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "plausibility", "overrides"}
+BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "plausibility"}
 
 ARROWS: dict[str, set[str]] = {
     **{leaf: set() for leaf in sorted(LEAVES)},
@@ -31,7 +31,7 @@ ARROWS: dict[str, set[str]] = {
     "settings": set(),
     "laps": set(),
     "spline": {"factors", "settings"},
-    "io": {"spline", "factors"},
+    "io": {"spline", "factors", "settings"},
     "sim": {"io"},
     "export": {"settings", "spline", "io"},
     "convert": {"io", "factors"},
@@ -58,8 +58,7 @@ ARROWS: dict[str, set[str]] = {
     "commands": BELOW_EVAL
     | {"export", "convert", "view"}
     | {f"eval.{room}" for room in ("metrics", "figures", "experiment", "benchmark")},
-    "overrides": {"io", "settings"},
-    "options": {"io", "settings", "overrides"},
+    "options": {"io", "settings"},
     "frames": {"io"},
     "cli": {"options", "commands"},
     "__main__": {"cli"},

@@ -15,7 +15,7 @@ from pathspace_graph.estimators import DEFAULT_BATCH
 from pathspace_graph.eval.metrics.metric import METRICS
 from pathspace_graph.eval.metrics.reference import from_batch
 from pathspace_graph.eval.metrics.summary import versions
-from pathspace_graph.overrides import leaves
+from pathspace_graph.io.overrides import leaves
 
 from .cells import Cell, Record
 from .drives import Drive

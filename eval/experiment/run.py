@@ -15,8 +15,8 @@ from pathspace_graph.errors import InputError, OutputError
 from pathspace_graph.io.files import check_target, remove_manifest, to_plain, write_json
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.manifest import verified
+from pathspace_graph.io.overrides import flatten
 from pathspace_graph.io.parsing import read_json
-from pathspace_graph.overrides import flatten
 
 from .cells import Cell, Outcome, Record, Store, record_cell, record_of
 from .drives import Drive, NamedTrack, load_tracks, try_drive

@@ -49,7 +49,7 @@ put down elsewhere."""
 MISFIT_ODOMETRY: Final = 2.0
 """Least misfit at the odometry's own pose in a contradiction."""
 MISFIT_RATIO: Final = 1.3
-"""The same by that of the match."""
+"""Least ratio of that misfit to the one of the match."""
 MAX_CHANGE: Final = 3.5
 """Largest difference of a motion from the one before, in `SIGMAS_CHANGE`."""
 SIGMAS_CHANGE: Final = (3.0, 1.0, 0.5)
@@ -62,7 +62,7 @@ WIDENING: Final = 1.5
 HOLD: Final = 0.15
 """Time for which a twist is held without a loss of certainty, s."""
 HOLD_INTERVALS: Final = 3.0
-"""The same in the shortest intervals between two twists; the longer time counts."""
+"""Shortest intervals between two twists for which it is held so; the longer time counts."""
 STUCK: Final = 3
 """Twists in a cycle that are equal to the one before, to the last digit, from which readings have stuck where
 the vehicle could not change its velocity so."""

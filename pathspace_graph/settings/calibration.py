@@ -15,7 +15,7 @@ from .checked import Positive
 WIDE_ODOMETRY: Final = 10.0
 """Standard deviations of the odometry's wide priors by those of a calibrated one."""
 WIDE_SENSOR: Final = 20.0
-"""The same of the sensor's."""
+"""Standard deviations of the sensor's wide priors by those of a calibrated one."""
 SIGMAS_START: Final = (1e-4, 1e-4, 1e-5)
 """Standard deviations (m, m, rad) of the pose at the first odometry stamp.
 

@@ -100,7 +100,7 @@ class GateSettings(Positive):
     """Farthest place on a curve that a detection may belong to, m ahead of the vehicle along the curve."""
 
     view_behind: ClassVar[float] = 4.0
-    """The same behind the vehicle, m."""
+    """Farthest such place behind the vehicle, m."""
     chi_unknown: ClassVar[float] = 1.5
     """Gate of a detection of unknown colour, in standard deviations of its own uncertainty alone. The large
     cones of a start line stand beside the boundary, and would bend it."""

@@ -378,8 +378,8 @@ def test_help_explains_the_options_that_commands_share(capsys: pytest.CaptureFix
 
 
 def test_help_shows_each_text_as_one_paragraph(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["online", "--help"]) == 0
-    assert "Poses stay in the window for this time (s)." in capsys.readouterr().out
+    assert main(["online", "--help-all"]) == 0
+    assert "Time that poses stay in the window, s." in capsys.readouterr().out
     for group in (MapperSettings(), MapperSettings().closing):
         for entry in fields(group):
             assert entry.metadata["help"].endswith(".") and "\n" not in entry.metadata["help"], entry.name

@@ -10,13 +10,14 @@ import pytest
 
 from pathspace_graph.cli import main, parse_command
 from pathspace_graph.io.files import write_json
+from pathspace_graph.io.overrides import leaves
 from pathspace_graph.options import ESSENTIAL
-from pathspace_graph.overrides import leaves
 from pathspace_graph.settings.gone import GONE, successor
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 
 SCREEN = 50
 """Lines of a screen."""
+MOST_SETTINGS = 120
 ONLINE = ["LOG", "--out", "MAP"]
 
 
@@ -166,3 +167,8 @@ def test_what_is_gone_is_no_setting_and_its_new_name_is_one() -> None:
         assert place[1:] in known if place.startswith(">") else place
         assert place.lstrip(">") in str(successor(name))
     assert successor("lag") is None
+
+
+def test_the_estimators_have_few_settings() -> None:
+    """A number that neither a user nor a study changes is a constant."""
+    assert len(leaves(MapperSettings())) <= MOST_SETTINGS

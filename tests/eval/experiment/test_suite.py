@@ -8,7 +8,7 @@ import pytest
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.experiment.faults import CLEAN, Fault, fault_of, kinds, only, strongest, suite
-from pathspace_graph.overrides import leaves
+from pathspace_graph.io.overrides import leaves
 from pathspace_graph.sim.faults import Faults
 from pathspace_graph.sim.simulate import SimulationSettings
 
