@@ -171,22 +171,6 @@ def cluster(
     return without_folds(cones.where(enough), periodic, settings.batch.cones)
 
 
-def places(u: Array, weight: Array, length: float, periodic: bool, settings: MapperSettings) -> Array:
-    """Returns the places (k,) of cones along a curve (m): the weighted means of their detections' u (m,).
-
-    u is in [0, length], and weight (m,) is the information of the detections (1/m^2).
-    """
-    peaks, member = _clusters(u, weight, length, periodic, settings)
-    inside = member >= 0
-    u, weight, member = u[inside], weight[inside], member[inside]
-    offset = u - peaks[member]
-    if periodic:
-        offset -= length * np.round(offset / length)
-    total, moment = (np.bincount(member, terms, len(peaks)) for terms in (weight, weight * offset))
-    mean = peaks + moment / np.maximum(total, np.finfo(float).tiny)
-    return np.asarray(mean[_often_seen(np.bincount(member, minlength=len(peaks)), settings)])
-
-
 def _clusters(
     u: Array, weight: Array, length: float, periodic: bool, settings: MapperSettings
 ) -> tuple[Array, IntArray]:

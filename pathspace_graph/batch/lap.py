@@ -31,7 +31,7 @@ from pathspace_graph.settings.batch import BatchSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 
-from .association import add_drive, associate, find_anywhere, locate_poses
+from .association import add_drive, associate, locate_poses
 from .closure import evidence, is_true_closure, objection
 from .dead_reckoning import start_odometry
 from .gauge import curve_gauge
@@ -95,8 +95,6 @@ class LapMarginal:
     """(n,) This is the mean of the marginal."""
     information: Array
     """(n, n) This is the information of the marginal, the inverse of its covariance."""
-    places: dict[int, Array]
-    """For each boundary, its cones have these parameters (k,) on the simplified curve (m)."""
     scatter: dict[int, Array]
     """For each boundary, cones scatter about the curve by this sigma (m,) at each control point (m)."""
     cones: dict[int, Array]
@@ -132,7 +130,6 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
             first_kept=lap.first_kept,
             mean=mean,
             information=information,
-            places=places_on(few, at.state, system),
             scatter={label: scatter.sigma(label, b.abscissae) for label, b in few.boundaries.items()},
             cones=scatter.places,
             seconds=time.perf_counter() - begin,
@@ -201,15 +198,6 @@ def marginal_of(
     covariance = T @ covariance @ T.T
     here = np.concatenate([calibrations, few.map_points.ravel(), state.poses[first_kept]])
     return np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), np.float64), here + T @ shift
-
-
-def places_on(few: State, dense: State, system: BatchSystem) -> dict[int, Array]:
-    """Returns the parameters (k,) of the cones' places on the curves that were simplified, by label."""
-    found = {}
-    for label, u in system.places_by_label(dense).items():
-        points = dense.boundaries[label].evaluate(dense.control_points(label), u)
-        found[label] = find_anywhere(few.boundaries[label], few.control_points(label), points).u
-    return found
 
 
 def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Rows]:

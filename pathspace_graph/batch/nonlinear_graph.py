@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry
@@ -38,10 +37,8 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     across the curve, divided by the root of their robust weights. So it is a graph of plain least squares.
     Each control point is anchored where it is. At an optimum the gradient is zero, and the linearization is
     that of the optimization. But the error isn't its robust cost, and some decimetres away from the optimum
-    the weights would be others. There is no such factor for places of cones, where SettingsError is raised.
+    the weights would be others.
     """
-    if system.places is not None:
-        raise SettingsError(f"graph: expected place.use none, found {system.settings.place.use}")
     graph = gtsam.NonlinearFactorGraph()
     for factor in drive_factors(system, at):
         graph.add(factor)

@@ -129,8 +129,6 @@ class Optimizer:
         system.detections.correct(state.variables.sensor)
         if not held:
             associate(state, system.detections, system.settings, gate, strict)
-            if strict and system.settings.place.use == "cones":
-                system.place(state)
         return self._settled(state, held)
 
     def _settled(self, state: State, held: bool) -> Evaluation:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.projection import PlaceRows, ProjectionRows, project, sigma_across
+from pathspace_graph.factors.projection import ProjectionRows, project
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import SensorRows, range_rates, sensor_rows
 from pathspace_graph.front_end.log_odometry import LogOdometry, sensor_prior, sensor_prior_cost
@@ -18,13 +18,10 @@ from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph
 from pathspace_graph.graph.keys import SENSOR_KEY, are_poses, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
-from pathspace_graph.mapping.cone_places import ConePlaces, lay_out_places
-from pathspace_graph.mapping.detections import NOWHERE, DetectionTable
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import Boundary
 
-from .cones import places
 from .gauge import CurveGauge, curve_gauge
 
 Array = NDArray[np.float64]
@@ -85,25 +82,6 @@ class Projected:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """Holds the detections that are of a cone's place, and how far past it they lie at a state."""
-
-    rows: IntArray
-    """These are the rows (m,) of the detections in their table."""
-    along: PlaceRows
-    """These are their residuals and derivatives."""
-    sigma: Array
-    """These are their standard deviations (m,) along the curve in m."""
-    by: SensorRows
-    """This is how their residuals depend on the calibration of the sensor."""
-
-    @property
-    def whitened(self) -> Array:
-        """Returns the residuals (m,) in sigmas."""
-        return np.asarray(self.by.factor * self.along.residual / self.sigma)
-
-
-@dataclass(frozen=True, eq=False)
 class Evaluation:
     """Holds the problem at one state."""
 
@@ -111,8 +89,6 @@ class Evaluation:
     """This is the state."""
     projected: dict[int, Projected]
     """These are the used detections of each boundary."""
-    placed: Placed | None
-    """These are the detections that are of a place, or none if there are no places."""
     odometry: tuple[Array, Array]
     """These are the residuals and derivatives of `LogOdometry.terms`."""
     cost: float
@@ -131,18 +107,15 @@ class BatchSystem:
         self.kernel = kernel
         self.gauges: dict[int, CurveGauge] = {}
         """These are the weak priors of each boundary."""
-        self.places: ConePlaces | None = None
-        """These are the cones' places along the curves, where the settings ask for them."""
-        self._sigma, self._sigma_along = np.ones(len(detections)), np.ones(len(detections))
-        self._inside = np.ones(len(detections), bool)
-        self._rates, self._rates_along = np.zeros((2, len(detections), 2))
+        self._sigma, self._inside = np.ones(len(detections)), np.ones(len(detections), bool)
+        self._rates = np.zeros((len(detections), 2))
 
     def begin(self, state: State) -> None:
         """Makes the gauges anew, which hold the control points where they are now.
 
         The optimizer calls this when knots have changed.
         """
-        sigma, self.places = self.settings.batch.sigma_slide, None
+        sigma = self.settings.batch.sigma_slide
         self.gauges = {label: curve_gauge(state, label, sigma) for label in state.boundaries}
 
     # --- cost --------------------------------------------------------------------------------------------
@@ -155,7 +128,6 @@ class BatchSystem:
         of the curve.
         """
         projected = {label: self._project(state, label, hold) for label in state.boundaries}
-        placed = None if self.places is None else self._placed(state, self.places, hold)
         odometry = self.chain.terms(state.poses, state.calibration)
         cost = self._detections_cost(projected) + 0.5 * float((odometry[0] ** 2).sum())
         cost += sum(
@@ -163,47 +135,7 @@ class BatchSystem:
         )
         cost += self.chain.prior_cost(state.poses[0], state.calibration)
         cost += sensor_prior_cost(state.variables, self.settings.calibration)
-        if placed is not None:
-            cost += float(self.kernel.loss(placed.whitened).sum())
-        return Evaluation(state, projected, placed, odometry, cost)
-
-    def place(self, state: State) -> None:
-        """Associates the detections in use with the cones' places, which are found first if there are none.
-
-        A place is the mean of the parameters of a cone's detections, and then a constant: that the cone lies
-        elsewhere along the track is left to the control points, of which there is about one for each cone.
-        """
-        if self.places is None:
-            own = {label: self._places_of(boundary, label) for label, boundary in state.boundaries.items()}
-            self.places = lay_out_places(state.curves, own)
-        self.places.associate(self.detections, state.curves, self.settings.place)
-
-    def places_by_label(self, state: State) -> dict[int, Array]:
-        """Returns the parameters (k,) of the places on each curve, none where the settings ask for none."""
-        if self.places is None:
-            return {}
-        starts = self.places.starts
-        return {label: self.places.u[starts[c] : starts[c + 1]] for c, label in enumerate(state.boundaries)}
-
-    def _places_of(self, boundary: Boundary, label: int) -> Array:
-        """Returns the places (k,) of the cones of a boundary on its curve."""
-        rows, low = self.detections.used_on(label), boundary.tables.low
-        weight = 1.0 / np.trace(self.detections.covariance[rows], axis1=1, axis2=2)
-        u = boundary.tables.inside(self.detections.u[rows]) - low
-        return low + places(u, weight, boundary.length, boundary.periodic, self.settings)
-
-    def _placed(self, state: State, places: ConePlaces, hold: bool) -> Placed:
-        detections = self.detections
-        rows = np.flatnonzero(detections.used & (detections.place != NOWHERE))
-        poses = state.variables.poses_at(detections.cycle[rows])
-        points = to_map(detections.corrected(rows, state.variables.sensor), poses)
-        along = places.along(detections.place[rows], state.map_points, points, poses)
-        if hold:
-            covariances, sigma = detections.covariance[rows], self.settings.place.sigma
-            self._sigma_along[rows] = sigma_across(along.tangent_unit, covariances, poses, sigma)
-            self._rates_along[rows] = range_rates(along.tangent_unit, poses, detections.measured[rows])
-        by = self._by_sensor(state, rows, along.tangent_unit, along.residual, self._rates_along[rows])
-        return Placed(rows, along, self._sigma_along[rows], by)
+        return Evaluation(state, projected, odometry, cost)
 
     def _project(self, state: State, label: int, hold: bool) -> Projected:
         detections = self.detections
@@ -250,8 +182,6 @@ class BatchSystem:
             points = state.control_points(label)
             groups += [self.detection_rows(at, label), gauge.beside(points, state.poses)]
             groups += [gauge.smooth(points, state.poses), gauge.anchor()]
-        if at.placed is not None:
-            groups.append(self.place_rows(at, at.placed))
         return groups
 
     def detection_rows(self, at: Evaluation, label: int) -> Rows:
@@ -265,20 +195,6 @@ class BatchSystem:
             jacobian=_jacobian(p.by, by_control, p.projection.by_pose) * scale[:, None],
             residual=p.by.factor * p.projection.residual * scale,
             owner=owners(cycle, label),
-        )
-
-    def place_rows(self, at: Evaluation, placed: Placed) -> Rows:
-        """Returns the rows of the detections of a place on [control points of the place's span | pose]."""
-        assert self.places is not None
-        place, cycle = self.detections.place[placed.rows], self.detections.cycle[placed.rows]
-        scale = np.sqrt(self.kernel.weights(placed.whitened)) / placed.sigma
-        by_control = placed.along.by_control.reshape(len(cycle), -1)
-        keys = self.places.keys[place]
-        return Rows(
-            keys=np.column_stack([*self._sensor_keys(at.state, cycle), keys, pose_keys(cycle)]),
-            jacobian=_jacobian(placed.by, by_control, placed.along.by_pose) * scale[:, None],
-            residual=placed.by.factor * placed.along.residual * scale,
-            owner=owners(cycle, self.detections.boundary[placed.rows]),
         )
 
     def _sensor_keys(self, state: State, cycles: IntArray) -> list[IntArray]:

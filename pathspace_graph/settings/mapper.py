@@ -41,9 +41,6 @@ class SplineSettings(Positive):
     """This is the standard deviation (m) of a cone's distance from the curve; its square is added to the
     variance of each detection across the curve. A cone has the same offset each time it is detected, so this
     is larger than the offsets themselves, which are about 0.1 m."""
-    residual: Literal["across", "point"] = "across"
-    """The residual of a detection online is its distance across the curve, or with `point` its offset from
-    its foot point in both directions, as if that were a landmark. `point` is for comparison only."""
     sigma_shape: float = 0.1
     """This is the standard deviation (m) of what a curve with few control points cannot follow. It is added
     to the covariance of a closed map, since no number of detections averages it out."""
@@ -126,22 +123,6 @@ class GateSettings(Positive):
     station_room: float = 40.0
     """This is the length (m) at the end of an open curve that is searched when the vehicle has lost its
     place."""
-
-
-@dataclass(frozen=True)
-class PlaceSettings(Positive):
-    """Describes the places of the cones along a closed curve, which hold the vehicle along the track."""
-
-    use: Literal["none", "cones"] = "none"
-    """With `cones`, each cone has a place on the closed curve: an arc length, with which detections are
-    associated along the curve only. With `none`, detections say nothing along the curve."""
-    sigma: float = 0.1
-    """This is the standard deviation (m) of a cone's place along the curve. Its square is added to the
-    variance of each detection along the curve."""
-    room: float = 1.0
-    """A detection is of the place next to its foot point if that is nearer than this (m along the curve)."""
-    apart: float = 2.0
-    """The second nearest place must be farther away than the nearest one by this factor."""
 
 
 @dataclass(frozen=True)
@@ -257,8 +238,6 @@ class MapperSettings(Positive):
     """These settings describe the weak priors on what detections leave free."""
     gate: GateSettings = field(default_factory=GateSettings)
     """These settings describe which detections are used, and how much they weigh."""
-    place: PlaceSettings = field(default_factory=PlaceSettings)
-    """These settings describe the places of the cones along a closed curve."""
     path: PathSettings = field(default_factory=PathSettings)
     """These settings describe the driven path and the predicted path ahead."""
     growth: GrowthSettings = field(default_factory=GrowthSettings)

@@ -17,10 +17,9 @@ from pathspace_graph.graph.gaussian import factorize, graph_of
 from pathspace_graph.io.log import Log
 from pathspace_graph.loop import drive_record
 from pathspace_graph.loop.drive_record import DriveRecord, LapBatch
-from pathspace_graph.mapping.detections import NOWHERE
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.mapper import MapperSettings, PlaceSettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import bean_track, lap_log, map_log, noisy, replay
 
@@ -62,17 +61,6 @@ def test_the_map_is_within_the_noise() -> None:
     truth = log().truth
     assert truth is not None
     assert lap_metrics(run()[0].map(), truth, 0).rmse < 0.05
-
-
-def test_the_detections_are_of_places_from_the_swap_on() -> None:
-    mapper, results = map_log(log(), FixedLagMapper(MapperSettings(place=PlaceSettings("cones"))))
-    track = mapper.smoother.map
-    assert track.places is not None and any(result.jump is not None for result in results)
-    assert (track.detections.place[track.detections.used] != NOWHERE).mean() > 0.9
-    cycles = np.arange(mapper.smoother.first_cycle, mapper.smoother.next_cycle)
-    across, along = track.rows(cycles)
-    assert len(along) > 0.9 * len(across)
-    assert run()[0].smoother.map.places is None
 
 
 def test_the_same_log_gives_the_same_map_to_the_bit() -> None:
