@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from pathspace_graph.ckf.fit import SplineMeasurement, fit_detections
+from pathspace_graph.ckf.update import SplineMeasurement, fit_detections
 from pathspace_graph.mapping.cubature import cubature_points, square_root
 from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.sim.geometry import left_normals, unit
@@ -98,7 +98,7 @@ def fit(scene: FitScene | None = None) -> Fit:
     covariances = _ray_covariances(detections - np.array(scene.vehicle), scene.sigmas)
     foot_u = curve.foot_points(detections).u
     basis = curve.basis_matrix(foot_u)
-    settings = CkfSettings(ridge=scene.ridge, penalty="solution")
+    settings = CkfSettings(ridge=scene.ridge)
     measurement = fit_detections(basis, detections, covariances, curve.control_points, settings)
     sigma_points = _sigma_points(detections, covariances)
     innovations = sigma_points - basis @ curve.control_points
