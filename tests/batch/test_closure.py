@@ -9,17 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.closure import Evidence, evidence, is_true_closure, is_worth_trying, objection
-from pathspace_graph.batch.dead_reckoning import start_odometry
-from pathspace_graph.batch.mapper import (
-    BatchMapper,
-    find_optimum,
-    find_optimum_from_odometry,
-    own_settings,
-)
-from pathspace_graph.batch.optimizer import Optimizer
-from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
-from pathspace_graph.batch.system import BatchSystem, Biweight
+from pathspace_graph.batch.lap import Evidence, evidence, is_true_closure, is_worth_trying, objection
+from pathspace_graph.batch.mapper import BatchMapper, find_optimum_from_odometry
+from pathspace_graph.batch.optimizer import LOOSE_GATE, Optimizer
+from pathspace_graph.batch.start import Recurrence, find_recurrence, start_odometry
+from pathspace_graph.batch.system import BatchSystem, Biweight, own_settings
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
@@ -33,7 +27,6 @@ from ..scenes.drives import noisy
 Array = NDArray[np.float64]
 
 SETTINGS = own_settings(MapperSettings())
-CLOSURE = SETTINGS.batch.closure
 
 BELIEVED = Evidence(closed=True, used=0.95, used_again=0.95, misfit=1.0, gap=6.0, overlap=40.0, sigma=0.05)
 
@@ -72,8 +65,8 @@ def test_a_closed_result_needs_evidence_in_every_respect(against: dict[str, floa
 def optimizer_of(log: Log) -> Optimizer:
     """Returns the optimizer of a log's batch."""
     chain = judge_log(log, log.noise, SETTINGS).chain
-    system = BatchSystem(DetectionTable.of(log.cycles), chain, SETTINGS, Biweight(SETTINGS.batch.loose_gate))
-    return Optimizer(system, SETTINGS.batch)
+    system = BatchSystem(DetectionTable.of(log.cycles), chain, SETTINGS, Biweight(LOOSE_GATE))
+    return Optimizer(system)
 
 
 @cache
@@ -85,7 +78,7 @@ def driven(laps: float) -> Log:
 def test_a_course_that_is_driven_again_is_closed() -> None:
     """The longest gap is that of a few cones, and the overlap is what was driven of the second lap."""
     optimizer = optimizer_of(driven(1.4))
-    at, convergence = find_optimum_from_odometry(optimizer, SETTINGS)
+    at, convergence = find_optimum_from_odometry(optimizer)
     found = evidence(at, optimizer.system.detections, SETTINGS)
     assert convergence.converged
     assert is_true_closure(found, SETTINGS)
@@ -102,7 +95,7 @@ def test_a_loop_that_is_closed_short_of_the_lap_is_not_believed() -> None:
     driven_to = find_recurrence(chain.dead_reckoned(np.zeros(2)), SETTINGS).driven
     too_short = Recurrence(driven_to, 0.75 * COURSE, 2.0 * np.pi, 1.0)
     state = start_odometry(chain, detections, SETTINGS, too_short)
-    at, _ = find_optimum(optimizer, state, SETTINGS)
+    at, _ = optimizer.find(state)
     assert not is_true_closure(evidence(at, detections, SETTINGS), SETTINGS)
 
 

@@ -8,8 +8,14 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.dead_reckoning import align_laps, lap_correspondences, start_odometry
-from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
+from pathspace_graph.batch.start import (
+    LAP_SIGMAS,
+    Recurrence,
+    align_laps,
+    find_recurrence,
+    lap_correspondences,
+    start_odometry,
+)
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.keys import pose_keys
@@ -24,8 +30,6 @@ from ..scenes.drives import ahead, corridor, exact_log, true_poses
 Array = NDArray[np.float64]
 
 SETTINGS = MapperSettings()
-LAPS = SETTINGS.batch.laps
-SIGMAS = np.array(LAPS.sigmas)
 SCALE, BIAS = 0.004, 0.004
 """The odometry has this scale error [-] and this bias of the yaw rate (rad/s)."""
 
@@ -49,7 +53,7 @@ def by_hand() -> Recurrence:
 
 def test_each_lap_passes_every_reference_pose_once() -> None:
     """Reference poses stand at 0 and 7.5 m of each lap, and poses at 0, 3, 6 ... m."""
-    found = lap_correspondences(by_hand(), LAPS)
+    found = lap_correspondences(by_hand())
     np.testing.assert_array_equal(found.cycles * 3.0, [0.0, 9.0, 15.0, 24.0, 30.0, 39.0])
     np.testing.assert_array_equal(found.reference, [0, 1, 0, 1, 0, 1])
     np.testing.assert_allclose(found.turns, 2.0 * np.pi * np.array([0, 0, 1, 1, 2, 2]))
@@ -57,7 +61,7 @@ def test_each_lap_passes_every_reference_pose_once() -> None:
 
 def test_reference_poses_begin_at_the_first_pose_that_passes_them() -> None:
     """The heading is counted without the whole laps before."""
-    found, poses = lap_correspondences(by_hand(), LAPS), np.random.default_rng(0).normal(size=(14, 3))
+    found, poses = lap_correspondences(by_hand()), np.random.default_rng(0).normal(size=(14, 3))
     np.testing.assert_array_equal(found.references_at(poses), poses[[0, 3]])
     later = replace(
         found, cycles=found.cycles[2:], reference=found.reference[2:], turns=found.turns[2:]
@@ -66,10 +70,10 @@ def test_reference_poses_begin_at_the_first_pose_that_passes_them() -> None:
 
 
 def test_the_rows_are_whitened_differences_and_their_derivatives() -> None:
-    found, rng = lap_correspondences(by_hand(), LAPS), np.random.default_rng(1)
+    found, rng = lap_correspondences(by_hand()), np.random.default_rng(1)
     poses, references = rng.normal(size=(14, 3)), rng.normal(size=(2, 3))
     rows, h = found.rows(poses, references), 1e-6
-    expected = (poses[5] - references[0] - [0.0, 0.0, 2.0 * np.pi]) / SIGMAS
+    expected = (poses[5] - references[0] - [0.0, 0.0, 2.0 * np.pi]) / LAP_SIGMAS
     np.testing.assert_allclose(rows.residual[6:9], expected)
     np.testing.assert_array_equal(rows.keys[6], pose_keys(np.array([5, 14])))
     for k in range(3):
@@ -87,7 +91,7 @@ def test_the_drift_of_the_odometry_is_taken_out() -> None:
     """Dead reckoning ends metres away, the aligned laps within decimetres. The bias has a prior."""
     log, chain = drifting()
     reckoned, truth = chain.dead_reckoned(np.zeros(2)), true_poses(log)
-    poses, calibration = align_laps(chain, find_recurrence(reckoned, SETTINGS), LAPS)
+    poses, calibration = align_laps(chain, find_recurrence(reckoned, SETTINGS))
     assert np.hypot(*(reckoned - truth)[-1, :2]) > 2.0
     assert np.hypot(*(poses - truth)[:, :2].T).max() < 0.7
     np.testing.assert_allclose(calibration[1], BIAS, rtol=0.3)
@@ -97,8 +101,8 @@ def test_what_is_aligned_is_a_minimum_of_odometry_and_correspondences() -> None:
     """The gradient by every pose is that of the odometry alone where a pose has no correspondence."""
     _, chain = drifting()
     recurrence = find_recurrence(chain.dead_reckoned(np.zeros(2)), SETTINGS)
-    poses, calibration = align_laps(chain, recurrence, LAPS)
-    free = np.setdiff1d(np.arange(1, len(poses) - 1), lap_correspondences(recurrence, LAPS).cycles)
+    poses, calibration = align_laps(chain, recurrence)
+    free = np.setdiff1d(np.arange(1, len(poses) - 1), lap_correspondences(recurrence).cycles)
     h = 1e-5
     for k in free[:: len(free) // 8]:
         for axis in range(3):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -20,7 +19,8 @@ from pathspace_graph.batch.lap import (
     solve_lap,
 )
 from pathspace_graph.batch.mapper import BatchMapper
-from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
+from pathspace_graph.batch.optimizer import Effort
+from pathspace_graph.batch.start import Recurrence, find_recurrence
 from pathspace_graph.batch.system import BatchSystem, Evaluation
 from pathspace_graph.eval.metrics.table1 import lap_metrics
 from pathspace_graph.front_end.front_end import judge_log
@@ -143,11 +143,8 @@ def test_the_mean_of_the_marginal_is_near_the_optimum_by_its_own_covariance() ->
 
 
 def test_few_rounds_do_not_converge() -> None:
-    settings = MapperSettings()
-    hurried = replace(settings, open_lap=replace(settings.open_lap, rough_rounds=1, rounds=1))
-    marginal = solve_lap(open_lap(hurried))
-    assert marginal is not None
-    assert not marginal.convergence.converged
+    _, _, convergence = lap_optimum(open_lap(), Effort(rough_rounds=1, rounds=1, knot_passes=1))
+    assert not convergence.converged
 
 
 def test_the_lap_itself_is_not_changed() -> None:

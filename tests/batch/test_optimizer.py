@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.optimizer import Optimizer, Schedule, extrapolation_factor
+from pathspace_graph.batch.optimizer import (
+    GATE_FACTOR,
+    LOOSE_GATE,
+    TOLERANCE_DECREASE,
+    Optimizer,
+    Schedule,
+    extrapolation_factor,
+)
 from pathspace_graph.batch.system import BatchSystem
+from pathspace_graph.graph.elimination import Damping
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -37,8 +43,9 @@ def test_the_gate_shrinks_by_its_factor_to_its_last_value() -> None:
     system, state = noisy()
     gates: list[float] = []
     schedule = Schedule(gate=8.0, rounds=12, tolerance=1e9)
-    _, convergence = Optimizer(system, BATCH).run(state, schedule, lambda: gates.append(system.kernel.gate))
-    expected = [8.0 * BATCH.gate_factor**k for k in range(2)] + [BATCH.gate]
+    optimizer = Optimizer(system, on_round=lambda: gates.append(system.kernel.gate))
+    _, convergence = optimizer.run(state, schedule)
+    expected = [8.0 * GATE_FACTOR**k for k in range(2)] + [BATCH.gate]
     np.testing.assert_allclose(gates, expected)
     assert convergence.converged
     assert convergence.rounds == len(gates)
@@ -47,11 +54,11 @@ def test_the_gate_shrinks_by_its_factor_to_its_last_value() -> None:
 def test_it_ends_where_nothing_changes_any_more() -> None:
     """The gradient is small there, and another run changes neither cost nor curves."""
     system, state = noisy()
-    at, convergence = Optimizer(system, BATCH).run(state, Schedule(BATCH.gate, 40))
+    at, convergence = Optimizer(system).run(state, Schedule(BATCH.gate, 40))
     assert convergence.converged
     assert convergence.cost == at.cost
     assert convergence.steps >= convergence.rounds
-    again, _ = Optimizer(system, BATCH).run(at.state, Schedule(BATCH.gate, 40))
+    again, _ = Optimizer(system).run(at.state, Schedule(BATCH.gate, 40))
     np.testing.assert_allclose(again.cost, at.cost, rtol=1e-4)
     np.testing.assert_allclose(again.state.poses, at.state.poses, atol=5e-3)
 
@@ -59,9 +66,9 @@ def test_it_ends_where_nothing_changes_any_more() -> None:
 def test_the_predicted_decrease_is_that_of_a_linear_problem() -> None:
     """Near the optimum an undamped step makes the cost smaller by just that."""
     system, state = noisy()
-    optimizer = Optimizer(system, BATCH)
+    optimizer = Optimizer(system)
     at, convergence = optimizer.run(state, Schedule(BATCH.gate, 40))
-    assert optimizer.predicted_decrease(at) <= BATCH.tolerance_decrease
+    assert optimizer.predicted_decrease(at) <= TOLERANCE_DECREASE
     np.testing.assert_allclose(convergence.gradient, np.sqrt(2.0 * optimizer.predicted_decrease(at)))
     off = np.random.default_rng(4).normal(0.0, 1e-3, len(at.state.variables.values))
     beside = system.evaluate(system.retract(at.state, off))
@@ -75,14 +82,14 @@ def test_a_tolerance_ends_it_sooner() -> None:
     rounds = []
     for tolerance in (1.0, 100.0):
         system, state = noisy()
-        _, convergence = Optimizer(system, BATCH).run(state, Schedule(BATCH.gate, 40, tolerance))
+        _, convergence = Optimizer(system).run(state, Schedule(BATCH.gate, 40, tolerance))
         rounds.append(convergence.rounds)
     assert rounds[1] < rounds[0]
 
 
 def test_without_rounds_left_it_has_not_converged() -> None:
     system, state = noisy()
-    _, convergence = Optimizer(system, BATCH).run(state, Schedule(gate=8.0, rounds=2))
+    _, convergence = Optimizer(system).run(state, Schedule(gate=8.0, rounds=2))
     assert not convergence.converged
     assert convergence.rounds == 2
     assert convergence.reason == "no round left"
@@ -91,10 +98,10 @@ def test_without_rounds_left_it_has_not_converged() -> None:
 def test_the_cost_never_grows_in_a_step() -> None:
     """The associations of the first round are those of the last one here, so costs can be compared."""
     system, state = noisy()
-    start = Optimizer(system, BATCH).align_poses(state, 1, BATCH.gate)
+    start = Optimizer(system).align_poses(state, 1, BATCH.gate)
     costs = []
     for rounds in (1, 2, 4, 8):
-        at, _ = Optimizer(system, BATCH).run(start, Schedule(BATCH.gate, rounds))
+        at, _ = Optimizer(system).run(start, Schedule(BATCH.gate, rounds))
         costs.append(at.cost)
     assert (np.diff(costs) < 1e-3).all()
 
@@ -102,8 +109,7 @@ def test_the_cost_never_grows_in_a_step() -> None:
 def test_a_damping_that_is_too_large_leaves_the_map_beside_its_poses() -> None:
     """The poses are free, as they aren't damped, and the map goes with them."""
     system, state = noisy()
-    damped = replace(BATCH, damping=1e12, damping_most=1e13, damping_least=1e12)
-    optimizer = Optimizer(system, damped)
+    optimizer = Optimizer(system, damping=Damping(first=1e12, least=1e12, most=1e13))
     at, _ = optimizer.run(state, Schedule(BATCH.gate, 1))
     assert np.abs(at.state.poses - state.poses).max() > 1e-3
     for label, gauge in system.gauges.items():
@@ -113,8 +119,8 @@ def test_a_damping_that_is_too_large_leaves_the_map_beside_its_poses() -> None:
 
 def test_where_no_damping_is_allowed_nothing_moves() -> None:
     system, state = noisy()
-    refused = replace(BATCH, damping=1.0, damping_most=0.1)
-    at, _ = Optimizer(system, refused).run(state, Schedule(BATCH.gate, 1))
+    refused = Optimizer(system, damping=Damping(first=1.0, most=0.1))
+    at, _ = refused.run(state, Schedule(BATCH.gate, 1))
     np.testing.assert_array_equal(at.state.variables.values, state.variables.values)
 
 
@@ -123,7 +129,7 @@ def test_the_poses_alone_are_aligned_beside_the_map() -> None:
     system, truth = straight(4.0)
     shifted = truth.copy()
     shifted.variables.poses[1:, 1] += 0.3
-    aligned = Optimizer(system, BATCH).align_poses(shifted, 3, BATCH.loose_gate)
+    aligned = Optimizer(system).align_poses(shifted, 3, LOOSE_GATE)
     np.testing.assert_array_equal(aligned.map_points, truth.map_points)
     np.testing.assert_array_equal(aligned.calibration, truth.calibration)
     np.testing.assert_allclose(aligned.poses[:, 1], truth.poses[:, 1], atol=0.02)
@@ -138,12 +144,10 @@ def test_steps_that_shrink_by_one_share_lead_to_their_limit_at_once(share: float
     limit, off = np.array([1.0, -2.0, 3.0]), np.array([0.5, 0.1, -0.3])
     points = [limit + share**k * off for k in range(3)]
     before, step = points[1] - points[0], points[2] - points[1]
-    np.testing.assert_allclose(
-        points[1] + extrapolation_factor(step, before, BATCH) * step, limit, atol=1e-12
-    )
+    np.testing.assert_allclose(points[1] + extrapolation_factor(step, before) * step, limit, atol=1e-12)
 
 
 @pytest.mark.parametrize("step", [[0.0, 1.0], [-0.5, 0.0], [1.2, 0.0], [0.1, 0.0]])
 def test_other_steps_are_left_as_they_are(step: list[float]) -> None:
-    assert extrapolation_factor(np.array(step), np.array([1.0, 0.0]), BATCH) == 1.0
-    assert extrapolation_factor(np.array(step), np.zeros(2), BATCH) == 1.0
+    assert extrapolation_factor(np.array(step), np.array([1.0, 0.0])) == 1.0
+    assert extrapolation_factor(np.array(step), np.zeros(2)) == 1.0

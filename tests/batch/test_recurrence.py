@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.recurrence import Recurrence, find_recurrence, profile_of
+from pathspace_graph.batch.start import PROFILE_STEP, Recurrence, find_recurrence, profile_of
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.batch import COURSE, course_curvature
@@ -14,7 +14,6 @@ from ..scenes.batch import COURSE, course_curvature
 Array = NDArray[np.float64]
 
 SETTINGS = MapperSettings()
-STEP = SETTINGS.batch.recurrence.profile_step
 
 
 def path(curvature: Array, ds: float) -> Array:
@@ -36,7 +35,7 @@ def test_a_lap_is_found_in_spite_of_a_drift(laps: float, drift: float) -> None:
     """The drift changes the turn of a lap, but not the whole turns nearest to it."""
     recurrence = find_recurrence(laps_of_course(laps, drift), SETTINGS)
     assert recurrence.recurs
-    np.testing.assert_allclose(recurrence.lap, COURSE, atol=STEP)
+    np.testing.assert_allclose(recurrence.lap, COURSE, atol=PROFILE_STEP)
     np.testing.assert_allclose(recurrence.turn, 2.0 * np.pi + drift * COURSE, atol=0.02)
     np.testing.assert_allclose(recurrence.whole_turn, 2.0 * np.pi)
 
@@ -75,15 +74,15 @@ def test_the_search_climbs_to_the_peak_of_a_smooth_track() -> None:
     s = np.arange(0.0, 1.6 * 400.0, 0.6)
     curvature = 2.0 * np.pi / 400.0 * (1.0 - np.cos(4.0 * np.pi * s / 400.0))
     recurrence = find_recurrence(path(curvature, 0.6), SETTINGS)
-    np.testing.assert_allclose(recurrence.lap, 400.0, atol=2.0 * STEP)
+    np.testing.assert_allclose(recurrence.lap, 400.0, atol=2.0 * PROFILE_STEP)
     assert recurrence.correlation > 0.99
 
 
 def test_correlations_are_those_of_the_two_stretches() -> None:
     poses = laps_of_course(1.5, 3e-4)
     driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-    profile = profile_of(poses, driven, SETTINGS.batch.recurrence)
-    lag = round(COURSE / STEP)
+    profile = profile_of(poses, driven)
+    lag = round(COURSE / PROFILE_STEP)
     first, second = profile.curvature[:-lag], profile.curvature[lag:]
     expected = 1.0 - np.mean((first - second) ** 2) / (np.mean(first**2) + np.mean(second**2))
     found = profile.correlations(np.array([lag // 2, lag]), SETTINGS.closing)

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.ckf import expansion
 from pathspace_graph.ckf.expansion import Expansion, beyond_end, proximity_chain
+from pathspace_graph.ckf.mapper import REACH
 from pathspace_graph.ckf.state import CurveState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
@@ -29,7 +31,7 @@ def path_along_x(x: float, settings: MapperSettings) -> PathAhead:
     path = DrivenPath(settings.path)
     for at in np.arange(0.0, x + 0.25, 0.5):
         path.update(np.array([at, 0.0, 0.0]))
-    return path.ahead(np.array([x, 0.0, 0.0]), settings.ckf.reach)
+    return path.ahead(np.array([x, 0.0, 0.0]), REACH)
 
 
 def expanded(
@@ -76,8 +78,9 @@ def test_the_curve_is_extended_to_the_last_point_of_the_chain() -> None:
     np.testing.assert_allclose(end_of(state), [18.5, 2.0], atol=0.05)
 
 
-def test_a_long_extension_takes_a_point_between() -> None:
-    state = straight_rows(MapperSettings(ckf=CkfSettings(stretch=5.0)))
+def test_a_long_extension_takes_a_point_between(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(expansion, "STRETCH", 5.0)
+    state = straight_rows()
     expanded(state, np.array([[18.5, 2.0], [16.5, 2.0]]))
     assert state.curves[LEFT].size == 6
     np.testing.assert_allclose(end_of(state), [18.5, 2.0], atol=0.05)

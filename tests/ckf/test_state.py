@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.ckf.state import CurveState
+from pathspace_graph.ckf.state import SIGMA_START, CurveState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import HEAD, Belief
 from pathspace_graph.settings.comparison import CkfSettings
@@ -38,10 +38,9 @@ def test_a_new_curve_runs_along_its_detections() -> None:
     assert curve.domain == (0.0, 12.0)
     np.testing.assert_allclose(curve.control_points, [[2, 1], [6, 1], [8, 3], [8, 7]], atol=1e-6)
     variances = np.diagonal(state.covariance(LEFT))
-    sigma_start = state.settings.ckf.sigma_start
-    np.testing.assert_allclose(variances[[0, 1, 6, 7]], 0.01 + sigma_start**2, atol=1e-9)
+    np.testing.assert_allclose(variances[[0, 1, 6, 7]], 0.01 + SIGMA_START**2, atol=1e-9)
     interpolated = (2.0**2 + 4.0**2) / 6.0**2 * 0.01  # a third of the way between two detections
-    np.testing.assert_allclose(variances[2:6], interpolated + sigma_start**2, atol=1e-9)
+    np.testing.assert_allclose(variances[2:6], interpolated + SIGMA_START**2, atol=1e-9)
 
 
 def test_an_extension_leaves_the_old_curve_as_it_was_and_ends_at_the_detection() -> None:

@@ -23,7 +23,7 @@ from pathspace_graph.landmark.association import (
     predict,
     squared_mahalanobis,
 )
-from pathspace_graph.landmark.state import AMBIGUOUS, UNASSOCIATED
+from pathspace_graph.landmark.landmark_map import AMBIGUOUS, UNASSOCIATED
 from pathspace_graph.settings.comparison import LandmarkSettings
 from pathspace_graph.settings.growth import GrowthSettings
 
@@ -124,17 +124,17 @@ def test_the_prediction_is_that_of_a_step_with_the_new_pose() -> None:
     smoother = driven(6, noise=0.0)
     drive_on(smoother, 6, (SPEED, 0.0, 0.3))
     landmarks, state = np.array([2, 0]), smoother.map.state
-    found = predict(smoother, landmarks)
+    predicted, covariances = predict(smoother, landmarks)
     pose, points = smoother.variables.poses[-1].copy(), state.landmarks[landmarks]
     rows = landmark_residuals(np.tile(pose, (2, 1)), points, np.zeros((2, 2)))
-    np.testing.assert_allclose(found.points_vehicle, rows.residual)
+    np.testing.assert_allclose(predicted, rows.residual)
     before = smoother.variables.values.copy()
     smoother.step()
     np.testing.assert_allclose(smoother.variables.values, before, atol=0.1)
     for k, landmark in enumerate(landmarks.tolist()):
         covariance = smoother.last_covariance(np.array([pose_key(6), state.keys[landmark]]))
         h = np.concatenate([rows.by_pose[k], rows.by_landmark[k]], axis=1)
-        np.testing.assert_allclose(found.covariances[k], h @ covariance @ h.T, rtol=2e-3)
+        np.testing.assert_allclose(covariances[k], h @ covariance @ h.T, rtol=2e-3)
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.landmark.closing import JointCompatibility, LoopPairs, detect_loop, optimize_loop
-from pathspace_graph.landmark.merging import merge
+from pathspace_graph.landmark.association import merge
+from pathspace_graph.landmark.fixed_lag import JointCompatibility, LoopPairs, detect_loop, optimize_loop
 
 from .scenes import driven, with_covariance
 
@@ -22,7 +22,7 @@ def four_landmarks() -> tuple[JointCompatibility, Array, Array]:
     root = rng.normal(0.0, 0.4, (8, 8))
     covariance = root @ root.T + 0.05 * np.eye(8)
     smoother = with_covariance(points, np.full(4, LEFT), covariance)
-    test = JointCompatibility(smoother, np.array([2, 3]), np.array([0, 1]), scale=1.5, sigma=0.1)
+    test = JointCompatibility(smoother, np.array([2, 3]), np.array([0, 1]), scale=1.5)
     order = np.array([4, 5, 6, 7, 0, 1, 2, 3])
     return test, points[[2, 3, 0, 1]], 1.5**2 * covariance[np.ix_(order, order)]
 
