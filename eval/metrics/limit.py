@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pathspace_graph.io.log import Detections, Log, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.landmark.oracle import LandmarkSolution, solve_landmarks
+from pathspace_graph.landmark.batch import LandmarkSolution, solve_landmarks
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.knots import FitSettings
 from pathspace_graph.settings.mapper import MapperSettings

@@ -9,8 +9,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.batch.mapper import BatchResult
-from pathspace_graph.batch.recurrence import path_lengths
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult

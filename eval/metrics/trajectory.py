@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.recurrence import path_lengths
+from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.factors.se2 import wrap_angle
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.results import VehicleState
