@@ -46,10 +46,8 @@ class CurveGauge:
     gradient, so it isn't part of the cost."""
 
     def terms(self, control_points: Array, beside: Array) -> tuple[Array, Array, Array]:
-        """Return whitened residuals (m,) of control points (m, 2), each beside its pose (m, 3).
-
-        Also return their derivatives by the control point (m, 2) and by the pose (m, 3).
-        """
+        """Return whitened residuals (m,) of control points (m, 2) beside poses (m, 3), and derivatives by
+        both."""
         heading = _headings(beside) / self.sigma
         arm = control_points - beside[:, :2]
         by_theta = heading[:, 0] * arm[:, 1] - heading[:, 1] * arm[:, 0]
@@ -118,8 +116,8 @@ class CurveGauge:
     def damping(self, control_points: Array, poses: Array, weight: float) -> Rows:
         """Return rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
 
-        They damp how a control point moves as seen from the pose beside it, in 1/m^2. A map that swings with
-        its poses, as an error of the yaw rate swings it, is not damped. J is the quarter turn.
+        They damp how a control point moves as seen from the pose beside it, in 1/m^2, and not a map that
+        swings with its poses, as an error of the yaw rate swings it. J is the quarter turn.
         """
         arm = control_points - poses[self.cycle, :2]
         by_point, by_theta = np.tile(np.eye(POINT), (len(arm), 1)), np.column_stack([arm[:, 1], -arm[:, 0]])
@@ -144,10 +142,8 @@ class CurveGauge:
 
 
 def curve_gauge(state: State, label: int, sigma: float, until: int | None = None) -> CurveGauge:
-    """Return the gauge of a curve that holds each control point where it is now beside its pose.
-
-    Only poses of the cycles before `until` hold control points.
-    """
+    """Return the gauge that holds each control point where it is now, beside a pose of a cycle before
+    `until`."""
     boundary, control_points, poses = state.boundaries[label], state.control_points(label), state.poses
     mean_spacing = boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)
     cycle = _nearest_poses(state, label, until, mean_spacing)

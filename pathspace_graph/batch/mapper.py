@@ -111,8 +111,7 @@ class BatchMapper:
     ) -> None:
         """Keep the settings, and the standard deviation (3,) of a measured twist (m/s, m/s, rad/s).
 
-        `online` makes the online mapper whose map the optimization begins with. A start from odometry needs
-        none.
+        `online` makes the online mapper whose map the optimization begins with, if not at odometry.
         """
         self.settings = settings or MapperSettings()
         self.online = online
@@ -221,7 +220,6 @@ def _map(state: State, joint: Array, scatter: Scatter) -> Map:
 
 
 def _orange(judged: JudgedLog, state: State, settings: MapperSettings) -> dict[int, PointBoundary]:
-    """Return the orange cones by label, as the poses place them."""
     cones, twists = OrangeCones(settings.growth, settings.spline.sigma_shape), judged.chain.twists
     for k, detections in enumerate(judged.orange):
         cones.add(Sighting(k, state.poses[k], twists[k], detections), state.variables.sensor)

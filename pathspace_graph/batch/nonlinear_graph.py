@@ -30,11 +30,9 @@ SAME: Final = 1e-3
 def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:
     """Return every factor of the problem, on the keys of `graph.keys`.
 
-    The graph holds what a round of the optimization holds, as it is at `at`: the associations, and the sigmas
-    across the curve, divided by the root of their robust weights. So it is a graph of plain least squares.
-    Each control point is anchored where it is. At an optimum the gradient is zero, and the linearization is
-    that of the optimization. But the error isn't its robust cost, and some decimetres away from the optimum
-    the weights would be others.
+    It is a graph of plain least squares, and holds the associations as they are at `at`, and the sigmas
+    across the curve divided by the root of their robust weights. Each control point is anchored where it is.
+    At an optimum its linearization is that of the optimization; its error isn't the robust cost.
     """
     graph = gtsam.NonlinearFactorGraph()
     for factor in drive_factors(system, at):
@@ -57,11 +55,7 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
 
 
 def _priors(chain: LogOdometry, heading: float) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield the priors of the first pose and of the calibration.
-
-    GTSAM's tangents of a pose are in its own frame, so the information is rotated by the heading (rad).
-    """
-    map_from_pose = np.eye(POSE)
+    map_from_pose = np.eye(POSE)  # GTSAM's tangents of a pose are in its own frame
     map_from_pose[:2, :2] = rotation(heading)
     information = map_from_pose.T @ chain.first_information @ map_from_pose
     noise = gtsam.noiseModel.Gaussian.Information(information)
@@ -74,7 +68,6 @@ def _priors(chain: LogOdometry, heading: float) -> Iterator[gtsam.NonlinearFacto
 
 
 def _gauge(gauge: CurveGauge, control_points: Array) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield the weak priors of a curve, which has control points (m, 2)."""
     keys = gauge.keys.tolist()
     anchor = gtsam.noiseModel.Isotropic.Sigma(2, gauge.sigma_anchor)
     for j, (key, point) in enumerate(zip(keys, control_points, strict=True)):

@@ -117,8 +117,8 @@ class Optimizer:
     def find(self, state: State) -> tuple[Evaluation, Convergence]:
         """Return the optimum on curves with about one knot for each cone, which meet the cones.
 
-        The poses are first aligned beside the map of the start. The optimum is searched again if the number
-        of cones has changed: then one was missing or was a duplicate.
+        The poses are first aligned beside the map of the start. The search is repeated if the number of cones
+        has changed: then one was missing or was a duplicate.
         """
         system, effort = self.system, self.effort
         detections, settings = system.detections, system.settings
@@ -185,10 +185,7 @@ class Optimizer:
         return self._settled(state, held)
 
     def _settled(self, state: State, held: bool) -> Evaluation:
-        """Return the problem with foot points that stay where they are when they are refined again.
-
-        Where one is still on its way along a tight bend, the cost changes without a step.
-        """
+        """Return the problem with foot points that have arrived: else the cost changes without a step."""
         at = self.system.evaluate(state, hold=not held)
         for _ in range(SETTLE):
             self._keep_foot_points(at)
@@ -211,8 +208,8 @@ class Optimizer:
     def _movement(self, before: State, after: State) -> float:
         """Return how far a curve has moved across itself (m), seen from the poses beside its control points.
 
-        A motion along itself doesn't count, nor a motion of the curve with its poses: `predicted_decrease`
-        judges the latter in sigmas, since the end of a long open road swings by metres within its own.
+        A motion of the curve with its poses doesn't count: `predicted_decrease` judges it in sigmas, since
+        the end of a long open road swings by metres within its own.
         """
         farthest = 0.0
         for label, gauge in self.system.gauges.items():
@@ -227,10 +224,10 @@ class Optimizer:
         return farthest
 
     def predicted_decrease(self, at: Evaluation) -> float:
-        """Return by how much an undamped step would make the cost smaller, if the problem were linear.
+        """Return `1/2 g' H^-1 g` with gradient g and information H: the gain of an undamped step if it were
+        linear.
 
-        This is half of `g' H^-1 g`, with gradient g and information H: a step of one sigma in any direction
-        has 1/2, however far it leads in metres.
+        A step of one sigma in any direction has 1/2, however far it leads in metres.
         """
         problem, layout = self.system.eliminated(at), at.state.variables.layout
         step = problem.step(np.zeros(problem.map.size))
@@ -241,10 +238,7 @@ class Optimizer:
         return Convergence(converged, reason, rounds, self.steps, at.cost, norm)
 
     def _step(self, at: Evaluation) -> Evaluation:
-        """Return the problem after a step that makes the cost smaller, or the same one if there is none.
-
-        The damping (1/m^2) grows until such a step is found.
-        """
+        """Return the problem after the least damped step that makes the cost smaller, or the same one."""
         damping = self._damping
         self._keep_foot_points(at)
         graph = self.system.linear_graph(at)

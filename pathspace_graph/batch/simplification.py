@@ -61,10 +61,8 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
 
 
 def size_share(cones: Mapping[int, int], batch: BatchSettings) -> float:
-    """Return the control points per cone, from the numbers of cones of the boundaries.
-
-    The result is the settings' own share, or what the settings' size leaves for both boundaries together.
-    """
+    """Return the control points per cone: the settings' share, or their size over all cones of the
+    boundaries."""
     total = sum(cones.values())
     return batch.size_share if batch.size is None or total == 0 else batch.size / total
 
@@ -97,9 +95,8 @@ def _fit(points: Array, periodic: bool, settings: MapperSettings, least: int, mo
 def extended(points: Array, beyond: float) -> Array:
     """Return cones (k, 2) with a point before the first and one after the last, `beyond` metres straight on.
 
-    There are at least two cones. Detections scatter about their cone, so that half of those of the last one
-    lie beyond it. Without that much of the curve after it, any motion of its end would put some of them into
-    use and others out of it. Nothing is added where `beyond` is zero.
+    There are at least two cones. Half of the detections of the last one lie beyond it, and any motion of an
+    end there would put some of them into use and others out of it. Nothing is added where `beyond` is zero.
     """
     if beyond == 0.0:
         return points
@@ -131,10 +128,10 @@ def simplify(
     """Return the same poses beside curves on few knots, and the joint covariance (n, n) of their control
     points (paper: Simplification).
 
-    `C_new = F C_old`, so the covariance is `F Sigma F'`, with Sigma the given covariance of the state's
-    control points. The optimum isn't solved for on few knots: such a curve would pass its cones by a
-    decimetre, on the same side in every lap, which no number of detections averages out. In the first seconds
-    that turns the vehicle, and with it the whole map, by up to a degree, several times its claimed sigma.
+    `C_new = F C_old`, so the covariance is `F Sigma F'`, with Sigma that of the state's control points. The
+    optimum isn't solved for on few knots: such a curve passes its cones by a decimetre, on the same side in
+    every lap. In the first seconds that turns vehicle and map by up to a degree, several times the claimed
+    sigma.
     """
     few, change = simplified(state, detections, settings)
     associate_again(few, detections, settings)
@@ -198,10 +195,10 @@ class Scatter:
     """How far cones lie from the simplified curves: a variance to be added to that of the curves.
 
     `sigma^2(u) = seen^2 + (d / s)^2 (unseen^2 - seen^2)`, where d is the distance along the curve from u to
-    the nearest detected cone, and s is the usual distance of two such cones. A detected cone is missed by
-    `seen`. A cone that was never detected (d = s) is missed by as much as a detected one that is left out
-    where the knots are chosen and the curve is fitted: that is a cross-validation. Without the scatter, the
-    claimed covariance is right at detected cones, and several times too small at the others.
+    the nearest detected cone, and s is the usual distance of two such cones. A cone that was never detected
+    (d = s) is missed by as much as a detected one that is left out of knots and fit (cross-validation).
+    Without the scatter, the claimed covariance is right at detected cones, and several times too small at the
+    others.
     """
 
     LENGTHS: ClassVar = {"seen": 1, "unseen": 1, "places": 1, "lengths": 1}
@@ -248,7 +245,7 @@ def cross_validated(points: Array, periodic: bool, settings: MapperSettings, sha
     """Return the distance of each cone (k, 2) from a curve that is fitted without it, in m, in any order.
 
     `share` is the number of control points per cone. The first and the last cone of an open curve are never
-    left out, since nothing is known beyond them, so they have no distance.
+    left out, since nothing is known beyond them.
     """
     number = np.arange(len(points))
     ends = np.zeros(len(points), bool) if periodic else (number == 0) | (number == len(points) - 1)

@@ -241,9 +241,8 @@ def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Arra
 def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
     """Make both curves periodic, on curvature-weighted knots (paper: Simplification).
 
-    observed holds the confirmed cones by label. With given knots, sampling the curve and fitting it by least
-    squares is linear in the control points. So the matrix gives the mean and covariance of the cubature
-    transform.
+    observed holds the confirmed cones by label. With given knots, sampling the curve and fitting it is linear
+    in the control points. So the matrix gives the mean and covariance of the cubature transform.
     """
     for label in state.curves:
         boundary = state.boundary(label)

@@ -67,10 +67,8 @@ class CurveState:
         )
 
     def locate_vehicle(self) -> None:
-        """Update the vehicle's parameter on each curve, near the last one.
-
-        If the foot point there has the wrong direction or is too far away, the whole curve is searched.
-        """
+        """Update the vehicle's parameter on each curve: near the last one, or on the whole curve if it has
+        left."""
         gate = self.settings.gate
         heading = np.array([np.cos(self.pose[2]), np.sin(self.pose[2])])
         for label, last in self.pose_u.items():
@@ -135,11 +133,7 @@ class CurveState:
         self.belief.reorder(np.insert(order, end - added, np.arange(count - added, count)))
 
     def replace(self, label: int, curve: BSpline, matrix: Array, sigma: float) -> None:
-        """Replace a curve by one on other knots.
-
-        The new control points are `matrix` (k, n) times the old ones, plus noise of standard deviation sigma
-        (m).
-        """
+        """Replace a curve by one with `matrix` (k, n) times its control points, plus noise of sigma (m)."""
         start = self.offset(label)
         stop = start + self.curves[label].size
         self.belief.transform_points(start, stop, matrix, np.full(len(matrix), sigma))

@@ -161,9 +161,8 @@ def associate_created(
 ) -> tuple[IntArray, IntArray]:
     """Return the rows of the detections that belong to new landmarks (k, 2), and the landmark of each.
 
-    points (m, 2) are the detections in the map frame, and cycles (m,) are their perception cycles. A
-    detection belongs to the nearest landmark if that is within the merge radius. Only the nearest detection
-    of each cycle belongs to a landmark.
+    points (m, 2), map frame, are the detections of cycles (m,). One belongs to the nearest landmark within
+    the merge radius, and only the nearest detection of each cycle does.
     """
     if len(points) == 0 or len(landmarks) == 0:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
@@ -228,8 +227,8 @@ def compatible_pairs(
 def merge(smoother: LandmarkSmoother, gone: IntArray, kept: IntArray) -> None:
     """Merge the landmarks at positions `gone` (k,) into those at `kept` (k,), and make one step.
 
-    The merge is the exact constraint that both are equal, so no information is lost. The step is needed since
-    the variables of the last one have changed.
+    The merge is the exact constraint that both are equal. The variables of the last step have changed with
+    it.
     """
     keys = smoother.map.state.keys
     smoother.merge(keys[gone], keys[kept])

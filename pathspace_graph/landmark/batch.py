@@ -304,7 +304,7 @@ class Reassociation:
             detections.take(rows[chosen], numbers[landmark])
 
     def _confirmed(self, rows: IntArray) -> Array:
-        """Return the tracks (k, 2) with enough of these detections, map frame, m; a batch forgets none."""
+        """Return the tracks (k, 2) with enough of these detections, map frame; a batch forgets none."""
         detections = self.detections
         tentative = TentativeTracks(replace(self.settings.growth, forget_after=np.inf))
         poses = self.state.variables.poses_at(detections.cycle[rows])
@@ -378,8 +378,7 @@ def solve_landmarks(
 ) -> LandmarkSolution:
     """Minimize all squared Mahalanobis distances over poses, calibration and landmarks; no loss is robust.
 
-    associations (R,) holds the landmark of each detection in file order; negative ones are left out. The pose
-    at the first odometry stamp is (0, 0, 0). The start is `start_oracle`.
+    associations (R,) holds the landmark of each detection in file order; negative ones are left out.
     """
     settings = settings or MapperSettings()
     settings = replace(settings, gate=replace(settings.gate, huber=np.inf))

@@ -127,7 +127,6 @@ class LandmarkFixedLag:
         return replace(self._result(detections.t, watch.laps), readings=used)
 
     def _use(self, new: slice, t: float, watch: Stopwatch, cycle: int | None = None) -> None:
-        """Associate new detections, create landmarks, and step to the optimum."""
         associate_newest(self.smoother, new, self._eligible(), cycle)
         watch.lap("associate")
         created = self._create(new, t)
@@ -136,10 +135,7 @@ class LandmarkFixedLag:
             self.smoother.step()
 
     def _create(self, new: slice, t: float) -> bool:
-        """Add detections without a landmark to the tentative tracks, and make confirmed ones landmarks.
-
-        Return whether there are new landmarks.
-        """
+        """Add detections without a landmark to the tracks, and return whether any became landmarks."""
         detections, created = self.smoother.map.detections, False
         free = new.start + np.flatnonzero(detections.landmark[new] == UNASSOCIATED)
         for label, tentative in self.tentative.items():
@@ -172,8 +168,7 @@ class LandmarkFixedLag:
     def _eligible(self) -> BoolArray:
         """Return which landmarks (n,) may be associated. Near the start they exclude the old ones.
 
-        Until the loop has closed, all detections there share the drift of the lap. So one detection alone
-        can't tell which of the old landmarks it shows.
+        Until the loop has closed, one detection alone can't tell which of the old landmarks it shows.
         """
         every = np.ones(len(self.smoother.map.state), bool)
         return every if self.closed or not self._near_start() else ~self._old()
@@ -334,10 +329,8 @@ class JointCompatibility:
 def detect_loop(
     smoother: LandmarkSmoother, recent: IntArray, old: IntArray, reach: float
 ) -> LoopPairs | None:
-    """Return the pairs of the best hypothesis, or None if it is not clear or has too few pairs.
-
-    Old landmarks farther than `reach` (m) from all recent ones are not tested.
-    """
+    """Return the pairs, within `reach` (m), of the best hypothesis; None if it is not clear or has too
+    few."""
     points = smoother.map.state.landmarks
     old = old[nearest_within(points[old], points[recent], reach)[1]]
     if len(recent) < MIN_PAIRS or len(old) < MIN_PAIRS:
@@ -363,9 +356,7 @@ def _is_acceptable(smoother: LandmarkSmoother, pairs: LoopPairs) -> bool:
 
 
 def optimize_loop(smoother: LandmarkSmoother, pairs: LoopPairs) -> None:
-    """Solve the whole loop with the pairs held together, each submap relinearized in its own frame.
-
-    The caller merges the pairs next.
-    """
+    """Solve the whole loop with the pairs held together, each submap in its own frame; the caller merges
+    them."""
     smoother.map.loop_pairs = smoother.map.state.numbers[np.column_stack([pairs.recent, pairs.old])]
     smoother.solve_loop(smoother.map.settings.closing.iterations, None)
