@@ -20,7 +20,6 @@ from pathspace_graph.landmark.batch import LandmarkBatch
 from pathspace_graph.landmark.ckf import LandmarkCkf
 from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.online.incremental import incremental_fixed_lag
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .errors import SettingsError
@@ -68,7 +67,6 @@ ONLINE: Final[dict[str, MakeOnline]] = {
     "landmark-fixed-lag": LandmarkFixedLag,
     "ckf": CkfMapper,
     "landmark-ckf": LandmarkCkf,
-    "incremental-fixed-lag": incremental_fixed_lag,
     centerline_online.NAME: centerline_online.CenterlineMapper,
 }
 """Each online estimator is made from its settings and what is known of the noise; one of another package is

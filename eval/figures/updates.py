@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pathspace_graph.ckf.expansion import beyond_end, proximity_chain
-from pathspace_graph.ckf.fit import SplineMeasurement, fit_detections
+from pathspace_graph.ckf.update import SplineMeasurement, fit_detections
 from pathspace_graph.factors.bspline import end_change_matrix
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.mapping.cubature import cubature_points, square_root

@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
+from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.batch.mapper import BatchResult
-from pathspace_graph.batch.recurrence import path_lengths
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult

@@ -14,7 +14,7 @@ from pathspace_graph.io.log import Detections, Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
-from pathspace_graph.landmark.oracle import LandmarkSolution, solve_landmarks
+from pathspace_graph.landmark.batch import LandmarkSolution, solve_landmarks
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.knots import FitSettings
 from pathspace_graph.settings.mapper import MapperSettings

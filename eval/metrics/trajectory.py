@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from pathspace_graph.batch.recurrence import path_lengths
+from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.factors.se2 import to_map, to_vehicle, wrap_angle
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary

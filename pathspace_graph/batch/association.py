@@ -1,28 +1,54 @@
-"""Where the poses are along the curves, and which detections of a log belong to which curve."""
+"""Where the poses are along the curves, which detections belong to which curve, and to which cone."""
 
-from __future__ import annotations
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.projection import project
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import to_map, to_vehicle
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.labels import UNKNOWN
+from pathspace_graph.mapping.candidates import SIDES, in_front_row
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
+from pathspace_graph.mapping.tentative import nearest_within
 from pathspace_graph.settings.batch import AssociationSettings
+from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+DENSITY_STEP: Final = 0.1
+"""Cones are peaks of the density of detections along a curve, which is sampled at this step (m)."""
+SEPARATION: Final = 0.6
+"""Least distance of two cones along a curve, as a share of `growth.merge_radius`. It is less than 1, as the
+inner curve of a bend is shorter than the distances of its cones add up to."""
+BANDWIDTH: Final = 0.4
+"""Standard deviation of the Gaussian that smooths the density, as a share of that least distance."""
+SHARP: Final = 0.6
+"""Largest standard deviation of detections that say where a cone stands, m."""
+SHARP_SHARE: Final = 0.1
+"""All detections say it where fewer than this share of them is that certain."""
+MIN_SHARE: Final = 0.1
+"""A cluster with fewer detections than this share of the median cluster's is no cone."""
+MIN_SHARE_BESIDE: Final = 0.3
+"""The same for a cluster beside a curve, whose detections aren't used."""
+MIN_CONES: Final = 4
+"""A curve is fitted to no fewer cones than this, and no cone is removed where there are fewer."""
+FOLD_COSINE: Final = 0.5
+"""The row of cones folds back at a cone where the cosine of its turn is less than minus this value."""
+FOLD_DISTANCE: Final = 1.5
+"""A cone at which the row folds back is a duplicate if its nearer neighbour is closer than this (m)."""
+
+
+# --- poses along the curves ------------------------------------------------------------------------------
 
 
 def add_drive(state: State, poses: Array, calibration: Array, settings: AssociationSettings) -> None:
-    """Adds the poses (P, 3) of all cycles to a state that has its curves already.
+    """Add the poses (P, 3) of all cycles to a state that has its curves already.
 
     The calibration is that of the odometry (2,), or of odometry and sensor (7,).
     """
@@ -32,22 +58,20 @@ def add_drive(state: State, poses: Array, calibration: Array, settings: Associat
 
 
 def locate_poses(state: State, settings: AssociationSettings) -> None:
-    """Sets `pose_u`: the parameter of each curve's nearest point that runs in the direction of each pose.
+    """Set `pose_u`: the parameter of each curve's nearest point that runs in the direction of each pose.
 
     Without the heading, a pose in a hairpin could be put beside the other leg. On a closed curve the
     parameter goes on from lap to lap. On an open one it goes on with the drive: where the curve has drifted
     over a stretch of itself, the poses are not put beside that stretch.
     """
+    poses = state.poses
+    heading = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
     for label, boundary in state.boundaries.items():
         count = int(np.ceil(boundary.length / settings.step))
         u = boundary.tables.low + boundary.length * (np.arange(count) + 0.5) / count
         position, tangent = (boundary.evaluate(state.control_points(label), u, order) for order in (0, 1))
         tangent /= np.maximum(np.hypot(*tangent.T), np.finfo(float).tiny)[:, None]
-        poses = state.poses
-        offset_x = poses[:, :1] - position[:, 0]
-        offset_y = poses[:, 1:2] - position[:, 1]
-        heading = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
-        square = offset_x**2 + offset_y**2
+        square = (poses[:, :1] - position[:, 0]) ** 2 + (poses[:, 1:2] - position[:, 1]) ** 2
         square[heading @ tangent.T < SAME_DIRECTION] += settings.direction_penalty**2
         if boundary.periodic:
             state.pose_u[label] = np.unwrap(u[square.argmin(axis=1)], period=boundary.length)
@@ -57,7 +81,7 @@ def locate_poses(state: State, settings: AssociationSettings) -> None:
 
 
 def _along(square: Array, steps: Array) -> IntArray:
-    """Returns the samples (P,) beside which the poses are, of least total squared distance (P, n).
+    """Return the samples (P,) beside which the poses are, of least total squared distance (P, n).
 
     From a pose to the next, the sample changes by no more than the next of `steps` (P - 1,).
     """
@@ -72,18 +96,24 @@ def _along(square: Array, steps: Array) -> IntArray:
     return samples
 
 
+def path_lengths(poses: Array) -> Array:
+    """Return the path length (P,) from the first of poses (P, 3) to each of them (m)."""
+    return np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+
+
+# --- detections on the curves ----------------------------------------------------------------------------
+
+
 def associate(
     state: State, detections: DetectionTable, settings: MapperSettings, gate: float, strict: bool
 ) -> None:
-    """Associates every detection anew: it is used where it lies within `gate` sigmas of its curve.
+    """Associate every detection anew: it is used where it lies within `gate` sigmas of its curve.
 
-    A detection is searched for on the stretch of the curve that its pose sees.
-    `strict` means that the curves are about where they belong. Then a detection that fits nowhere in that
-    stretch is searched for on the whole of a closed curve, since the sensor sees much later stretches across
-    the infield. An open curve has drifted against itself by more than the gate from one stretch to a far one.
-    A detection that happened to fit there would say that it has not, so it isn't compared.
-    And a detection of unknown colour goes to the curve that it fits better. It isn't used before, since
-    cones that belong to no boundary stand beside the track. A known colour is always believed.
+    A detection is searched for on the stretch of the curve that its pose sees. `strict` means that the curves
+    are about where they belong. Then one that fits nowhere there is searched for on the whole of a closed
+    curve, since the sensor sees across the infield. An open curve has drifted against itself by more than the
+    gate, so a detection that happened to fit far away isn't compared. And one of unknown colour goes to the
+    curve that it fits better, not before, since cones of no boundary stand beside the track.
     """
     boundary_of, u = np.full(len(detections), UNKNOWN), detections.u.copy()
     for whole in (False, True) if strict else (False,):
@@ -111,7 +141,7 @@ def _misfit(
     rows: IntArray,
     whole: bool,
 ) -> tuple[Array, Array]:
-    """Returns how far each of the rows (m,) is from a curve, in sigmas (m,), and its foot point u (m,).
+    """Return how far each of the rows (m,) is from a curve, in sigmas (m,), and its foot point u (m,).
 
     The distance is infinite where the detection can't belong to the curve. `whole` searches the whole curve.
     """
@@ -128,7 +158,7 @@ def _misfit(
 
 
 def find_anywhere(boundary: Boundary, control_points: Array, points: Array) -> FootPoints:
-    """Returns the foot points of points (m, 2) on a whole curve."""
+    """Return the foot points of points (m, 2) on a whole curve."""
     low, high = (np.full(len(points), end) for end in (boundary.tables.low, boundary.tables.high))
     return boundary.find(control_points, points, low, high)
 
@@ -136,7 +166,7 @@ def find_anywhere(boundary: Boundary, control_points: Array, points: Array) -> F
 def _nearest_in_view(
     state: State, cycles: IntArray, points: Array, label: int, settings: MapperSettings
 ) -> Array:
-    """Returns the parameter (m,) nearest to each point (m, 2) on the stretch that its cycle's pose sees."""
+    """Return the parameter (m,) nearest to each point (m, 2) on the stretch that its cycle's pose sees."""
     boundary, gate, step = state.boundaries[label], settings.gate, settings.batch.association.step
     ahead = np.arange(-gate.view_behind, gate.view_ahead + step, step)
     u = state.pose_u[label][:, None] + ahead
@@ -144,3 +174,184 @@ def _nearest_in_view(
     square = (seen[cycles, :, 0] - points[:, :1]) ** 2
     square += (seen[cycles, :, 1] - points[:, 1:]) ** 2
     return np.asarray(u[cycles, square.argmin(axis=1)])
+
+
+# --- cones of a curve ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Cones:
+    """Cones of a boundary in the order of travel."""
+
+    points: Array
+    """Weighted means (k, 2) of the cones' detections in m, map frame."""
+    u: Array
+    """Parameters (k,) along the curve or path (m)."""
+    count: IntArray
+    """Numbers (k,) of detections."""
+
+    def where(self, chosen: BoolArray | IntArray) -> "Cones":
+        """Return the chosen cones, in the order in which they are chosen."""
+        return Cones(self.points[chosen], self.u[chosen], self.count[chosen])
+
+    def merged(self, other: "Cones") -> "Cones":
+        """Return the cones of both, ordered by parameter."""
+        pairs = zip((self.points, self.u, self.count), (other.points, other.u, other.count), strict=True)
+        both = Cones(*(np.concatenate(pair) for pair in pairs))
+        return both.where(np.argsort(both.u, kind="stable"))
+
+
+def cones_of_curve(state: State, detections: DetectionTable, label: int, settings: MapperSettings) -> Cones:
+    """Return the cones of a boundary whose curve the state has.
+
+    A cone that is often detected beside the curve, but too far from it to be used, belongs to it as well: the
+    curve cuts a corner there. On a closed curve parameters are counted from the beginning of the drive, and
+    the cones are ordered as the vehicle passed them: in a hairpin the curve may have taken two in the wrong
+    order.
+    """
+    boundary, begin = state.boundaries[label], first_parameter(state, label)
+    rows = sharp(np.flatnonzero(detections.label == label), detections)
+    points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
+    used = detections.used[rows] & (detections.boundary[rows] == label)
+    beside, on_curve, u = used.copy(), used.copy(), detections.u[rows].copy()
+    beside[~used], on_curve[~used], u[~used] = _beside(
+        state, points[~used], detections.cycle[rows[~used]], label, settings
+    )
+    u = np.mod(u - begin, boundary.length) if boundary.periodic else u - begin
+    weight = certainty(detections, rows)
+
+    def clustered(chosen: BoolArray) -> Cones:
+        along = points[chosen], u[chosen], weight[chosen]
+        return cluster(*along, boundary.length, boundary.periodic, settings)
+
+    cones = clustered(on_curve)
+    if len(cones.u) == 0:
+        return cones
+    near = nearest_within(points, cones.points, settings.growth.merge_radius)[1]
+    others = clustered(beside & ~on_curve & ~near)
+    cones = cones.merged(others.where(others.count >= MIN_SHARE_BESIDE * np.median(cones.count)))
+    if boundary.periodic:
+        cones = along_drive(cones, last_lap(state, label), label, settings.growth)
+    return without_folds(cones, boundary.periodic)
+
+
+def cone_counts(state: State, detections: DetectionTable, settings: MapperSettings) -> list[int]:
+    """Return the number of cones of each boundary."""
+    return [len(cones_of_curve(state, detections, label, settings).u) for label in state.boundaries]
+
+
+def certainty(detections: DetectionTable, rows: IntArray) -> Array:
+    """Return the weights (m,) of detections, the inverse traces of their covariances (1/m^2)."""
+    return np.asarray(1.0 / np.trace(detections.covariance[rows], axis1=1, axis2=2))
+
+
+def sharp(rows: IntArray, detections: DetectionTable) -> IntArray:
+    """Return the rows whose detections say where a cone stands; those of far ones are smeared over
+    several."""
+    sigma = np.sqrt(0.5 * np.trace(detections.covariance[rows], axis1=1, axis2=2))
+    certain = rows[sigma < SHARP]
+    return certain if len(certain) >= SHARP_SHARE * len(rows) else rows
+
+
+def first_parameter(state: State, label: int) -> float:
+    """Return the parameter of a curve from which those of its cones are counted."""
+    boundary = state.boundaries[label]
+    return float(state.pose_u[label][0]) if boundary.periodic else boundary.tables.low
+
+
+def last_lap(state: State, label: int) -> Array:
+    """Return the poses (l, 3) of the last lap around a closed curve, map frame."""
+    pose_u = state.pose_u[label]
+    return np.asarray(state.poses[pose_u > pose_u[-1] - state.boundaries[label].length])
+
+
+def along_drive(cones: Cones, lap: Array, label: int, settings: GrowthSettings) -> Cones:
+    """Return the cones of the row nearest to the poses (l, 3) of a lap, in the order in which these pass it.
+
+    A cone is passed at the path length of its nearest pose, plus its distance ahead of that pose. What stands
+    behind the row belongs to another stretch, or is smeared between two rows by far detections.
+    """
+    offset = cones.points[:, None] - lap[:, :2]
+    nearest = (offset**2).sum(axis=2).argmin(axis=1)
+    ahead, left = to_vehicle(cones.points, lap[nearest]).T
+    station, side = path_lengths(lap)[nearest] + ahead, SIDES[label] * left
+    front = in_front_row(station, side, settings.beside, settings.lateral_gap)
+    order = np.argsort(station, kind="stable")
+    return cones.where(order[front[order]])
+
+
+def _beside(
+    state: State, points: Array, cycles: IntArray, label: int, settings: MapperSettings
+) -> tuple[BoolArray, BoolArray, Array]:
+    """Return which points (m, 2) lie beside a curve, which lie about its end, and their foot points u (m,).
+
+    Half of the detections of the cone at which an open curve ends lie beyond its end. On an open curve, a
+    point lies on the stretch that the pose of its cycle (m,) sees.
+    """
+    boundary, control_points = state.boundaries[label], state.control_points(label)
+    if boundary.periodic:
+        foot = find_anywhere(boundary, control_points, points)
+    else:
+        u = state.pose_u[label][cycles]
+        low, high = u - settings.gate.view_behind, u + settings.gate.view_ahead
+        ends = boundary.tables.low, boundary.tables.high
+        foot = boundary.find(control_points, points, np.clip(low, *ends), np.clip(high, *ends))
+    distance = np.hypot(*(points - foot.position).T)
+    beside = foot.interior & (distance < settings.gate.rough)
+    return beside, ~foot.interior & (distance < settings.growth.merge_radius), foot.u
+
+
+def without_folds(cones: Cones, periodic: bool) -> Cones:
+    """Return the cones without duplicates, at which their row folds back on itself over a short distance."""
+    points = cones.points
+    if len(points) < MIN_CONES:
+        return cones
+    into, out = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
+    lengths = np.hypot(*into.T), np.hypot(*out.T)
+    cosine = (into * out).sum(axis=1) / np.maximum(lengths[0] * lengths[1], np.finfo(float).tiny)
+    folded = (cosine < -FOLD_COSINE) & (np.minimum(*lengths) < FOLD_DISTANCE)
+    if not periodic:
+        folded[[0, -1]] = False
+    return without_folds(cones.where(~folded), periodic) if folded.any() else cones
+
+
+# --- clustering ------------------------------------------------------------------------------------------
+
+
+def cluster(
+    points: Array, u: Array, weight: Array, length: float, periodic: bool, settings: MapperSettings
+) -> Cones:
+    """Return a cone at each peak of the density of detections (m, 2) along a curve or a path.
+
+    u (m,) in [0, length] are the parameters of the detections (m), and weight (m,) is their information
+    (1/m^2). A cone has at least `growth.sightings` detections, all within the merge radius of their peak.
+    """
+    radius = settings.growth.merge_radius
+    peaks = _peaks(u, weight, length, periodic, SEPARATION * radius)
+    if len(peaks) == 0:
+        return Cones(np.zeros((0, 2)), peaks, np.zeros(0, np.intp))
+    distance = np.abs(u[:, None] - peaks)
+    if periodic:
+        distance = np.minimum(distance, length - distance)
+    nearest = distance.argmin(axis=1)
+    inside = distance[np.arange(len(u)), nearest] < radius
+    member = nearest[inside]
+    count = np.bincount(member, minlength=len(peaks))
+    sums = [np.bincount(member, terms[inside], len(peaks)) for terms in (weight, *(weight * points.T))]
+    means = np.column_stack(sums[1:]) / np.maximum(sums[0], np.finfo(float).tiny)[:, None]
+    enough = count >= max(settings.growth.sightings, MIN_SHARE * float(np.median(count)))
+    return without_folds(Cones(means, peaks, count).where(enough), periodic)
+
+
+def _peaks(u: Array, weight: Array, length: float, periodic: bool, apart: float) -> Array:
+    """Return the parameters (k,) of the smoothed density's maxima, which are `apart` (m) at least."""
+    bins = max(int(np.ceil(length / DENSITY_STEP)), 1)
+    step = length / bins
+    density = np.bincount(np.minimum((u / step).astype(np.intp), bins - 1).clip(0), weight, bins)
+    reach = round(apart / step)
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * step / (BANDWIDTH * apart)) ** 2)
+    padded = np.pad(density, reach, "wrap" if periodic else "constant")
+    smooth = np.convolve(padded, kernel, "same")
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(smooth, reach), 2 * reach + 1)
+    highest = (smooth > 0.0) & (smooth >= windows.max(axis=1))
+    return np.asarray((np.flatnonzero(highest[reach : reach + bins]) + 0.5) * step, np.float64)

@@ -1,12 +1,11 @@
 """Weak priors on what detections leave free of a whole curve: the place of control points along it, shape."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.gauge import smoothness_matrix
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.elimination import owners
@@ -14,17 +13,14 @@ from pathspace_graph.graph.keys import POINT, POSE, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.mapping.state import State
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-
-POINTS_A_FACTOR = 8
-"""The smoothness of this number of neighbouring control points makes one factor. One factor for all of them
-would join the whole curve in the elimination. The number changes the speed, not the result."""
+POINTS_A_FACTOR: Final = 8
+"""Neighbouring control points in one factor of their anchors. One factor for all of them would join the whole
+curve in the elimination. The number changes the speed, not the result."""
 
 
 @dataclass(frozen=True, eq=False)
 class CurveGauge:
-    """Holds the residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` and `R_k' D c / sigma_smoothness`.
+    """The residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` and `R_k' D c / sigma_smoothness` of a curve.
 
     p_k is the position of the pose that control point c_j of the curve began beside, h_k is its heading, and
     R_k its rotation. D is `smoothness_matrix`. A detection constrains nothing along a curve, so control
@@ -33,48 +29,41 @@ class CurveGauge:
     """
 
     label: int
-    """This is the label of the boundary."""
     keys: IntArray
-    """These are the keys (m,) of its control points."""
+    """Keys (m,) of the control points."""
     cycle: IntArray
-    """Each entry (m,) is the perception cycle of the pose beside a control point."""
+    """Perception cycles (m,) of the poses beside them."""
     ahead: Array
-    """Each entry (m,) is the distance of a control point ahead of its pose (m)."""
+    """Distances (m,) of the control points ahead of their poses (m)."""
     sigma: float
-    """This is the standard deviation of that distance (m)."""
+    """Standard deviation of that distance (m)."""
     smoothness: Array
-    """This is D (r, m)."""
+    """D (r, m)."""
     sigma_smoothness: float
-    """This is the standard deviation of a second difference (m)."""
+    """Standard deviation of a second difference (m)."""
     sigma_anchor: float
-    """This standard deviation (m) holds each control point where it is linearized. The anchor has no
+    """Standard deviation (m) that holds each control point where it is linearized. The anchor has no
     gradient, so it isn't part of the cost."""
 
     def terms(self, control_points: Array, beside: Array) -> tuple[Array, Array, Array]:
-        """Returns whitened residuals (m,) of control points (m, 2), each beside its pose (m, 3).
-
-        Also returns their derivatives by the control point (m, 2) and by the pose (m, 3).
-        """
-        heading = np.column_stack([np.cos(beside[:, 2]), np.sin(beside[:, 2])]) / self.sigma
+        """Return whitened residuals (m,) of control points (m, 2) beside poses (m, 3), and derivatives by
+        both."""
+        heading = _headings(beside) / self.sigma
         arm = control_points - beside[:, :2]
         by_theta = heading[:, 0] * arm[:, 1] - heading[:, 1] * arm[:, 0]
         residual = (heading * arm).sum(axis=1) - self.ahead / self.sigma
         return residual, heading, np.column_stack([-heading, by_theta])
 
     def beside(self, control_points: Array, poses: Array) -> Rows:
-        """Returns the same as rows on [control point | pose], from all poses (P, 3)."""
+        """Return the same as rows on [control point | pose], from all poses (P, 3)."""
         residual, by_point, by_pose = self.terms(control_points, poses[self.cycle])
-        return Rows(
-            keys=np.column_stack([self.keys, pose_keys(self.cycle)]),
-            jacobian=np.column_stack([by_point, by_pose]),
-            residual=residual,
-            owner=owners(self.cycle, self.label),
-        )
+        jacobian = np.column_stack([by_point, by_pose])
+        return Rows(self._keys_beside, jacobian, residual, owners(self.cycle, self.label))
 
     def bending(self, control_points: Array, poses: Array) -> tuple[Array, Array, Array]:
-        """Returns the second differences as the poses beside their middles see them, whitened (r, 2).
+        """Return the second differences as the poses beside their middles see them, whitened (r, 2).
 
-        Also returns their derivatives by the three control points (r, 2, 6) and by the pose (r, 2, 3). In the
+        Also return their derivatives by the three control points (r, 2, 6) and by the pose (r, 2, 3). In the
         map frame a second difference turns with the map, and Gauss-Newton would take that turn for a change
         of shape. It would know the heading at the end of a winding road better than any measurement does.
         """
@@ -89,18 +78,8 @@ class CurveGauge:
         by_pose[:, 0, 2], by_pose[:, 1, 2] = residual[:, 1], -residual[:, 0]
         return residual, by_control.reshape(len(residual), POINT, -1), by_pose
 
-    @property
-    def neighbours(self) -> IntArray:
-        """Returns the three control points (r, 3) of each second difference, by index."""
-        return np.asarray((np.arange(len(self.smoothness))[:, None] + np.arange(3)) % len(self.keys))
-
-    @property
-    def middle_cycle(self) -> IntArray:
-        """Returns the cycle (r,) of the pose beside the middle of each second difference."""
-        return np.asarray(self.cycle[self.neighbours[:, 1]])
-
     def smooth(self, control_points: Array, poses: Array) -> Rows:
-        """Returns the same as rows on [three control points | pose], two rows for each second difference."""
+        """Return the same as rows on [three control points | pose], two rows for each second difference."""
         residual, by_control, by_pose = self.bending(control_points, poses)
         keys = np.column_stack([self.keys[self.neighbours], pose_keys(self.middle_cycle)])
         return Rows(
@@ -110,62 +89,69 @@ class CurveGauge:
             owner=np.repeat(owners(self.middle_cycle, self.label), POINT),
         )
 
+    @property
+    def neighbours(self) -> IntArray:
+        """Return the three control points (r, 3) of each second difference, by index."""
+        return np.asarray((np.arange(len(self.smoothness))[:, None] + np.arange(3)) % len(self.keys))
+
+    @property
+    def middle_cycle(self) -> IntArray:
+        """Return the cycle (r,) of the pose beside the middle of each second difference."""
+        return np.asarray(self.cycle[self.neighbours[:, 1]])
+
+    @property
+    def _keys_beside(self) -> IntArray:
+        return np.column_stack([self.keys, pose_keys(self.cycle)])
+
     def anchor(self) -> Rows:
-        """Returns rows that hold each control point where it is."""
+        """Return rows that hold each control point where it is.
+
+        The numbers of their factors are negative, so that they differ from those of cycles.
+        """
         keys = np.repeat(self.keys, POINT)
         jacobian = np.tile(np.eye(POINT), (len(self.keys), 1)) / self.sigma_anchor
-        return Rows(keys[:, None], jacobian, np.zeros(len(keys)), self._owners(keys))
-
-    def _owners(self, keys: IntArray) -> IntArray:
-        """Returns the factor of each row on control points alone, by its first key.
-
-        The numbers are negative, so that they differ from those of cycles.
-        """
-        return np.asarray(-1 - self.label - 2 * (indices(keys) // POINTS_A_FACTOR))
+        owner = np.asarray(-1 - self.label - 2 * (indices(keys) // POINTS_A_FACTOR))
+        return Rows(keys[:, None], jacobian, np.zeros(len(keys)), owner)
 
     def damping(self, control_points: Array, poses: Array, weight: float) -> Rows:
-        """Returns rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
+        """Return rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
 
-        They damp how a control point moves as seen from the pose beside it, in 1/m^2. A map that swings with
-        its poses, as an error of the yaw rate swings it, is not damped. J is the quarter turn.
+        They damp how a control point moves as seen from the pose beside it, in 1/m^2, and not a map that
+        swings with its poses, as an error of the yaw rate swings it. J is the quarter turn.
         """
         arm = control_points - poses[self.cycle, :2]
         by_point, by_theta = np.tile(np.eye(POINT), (len(arm), 1)), np.column_stack([arm[:, 1], -arm[:, 0]])
-        keys = np.column_stack([self.keys, pose_keys(self.cycle)])
         return Rows(
-            keys=np.repeat(keys, POINT, axis=0),
+            keys=np.repeat(self._keys_beside, POINT, axis=0),
             jacobian=np.sqrt(weight) * np.column_stack([by_point, -by_point, by_theta.ravel()]),
             residual=np.zeros(POINT * len(arm)),
             owner=np.repeat(owners(self.cycle, self.label), POINT),
         )
 
     def carried(self, control_points: Array, poses: Array, poses_after: Array) -> Array:
-        """Returns control points (m, 2) moved rigidly with the poses beside them, from and to (P, 3)."""
+        """Return control points (m, 2) moved rigidly with the poses beside them, from and to (P, 3)."""
         before, after = poses[self.cycle], poses_after[self.cycle]
         turned = np.column_stack([np.zeros((len(before), 2)), after[:, 2] - before[:, 2]])
         return after[:, :2] + to_map(control_points - before[:, :2], turned)
 
     def cost(self, control_points: Array, poses: Array) -> float:
-        """Returns half the sum of the squared residuals at control points (m, 2) and all poses (P, 3)."""
+        """Return half the sum of the squared residuals at control points (m, 2) and all poses (P, 3)."""
         beside, _, _ = self.terms(control_points, poses[self.cycle])
         smooth = self.smoothness @ control_points / self.sigma_smoothness
         return 0.5 * float(beside @ beside + (smooth**2).sum())
 
 
 def curve_gauge(state: State, label: int, sigma: float, until: int | None = None) -> CurveGauge:
-    """Returns the gauge of a curve that holds each control point where it is now beside its pose.
-
-    Only poses of the cycles before `until` hold control points.
-    """
+    """Return the gauge that holds each control point where it is now, beside a pose of a cycle before
+    `until`."""
     boundary, control_points, poses = state.boundaries[label], state.control_points(label), state.poses
     mean_spacing = boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)
     cycle = _nearest_poses(state, label, until, mean_spacing)
-    heading = np.column_stack([np.cos(poses[cycle, 2]), np.sin(poses[cycle, 2])])
     return CurveGauge(
         label=label,
         keys=state.keys(label),
         cycle=cycle,
-        ahead=(heading * (control_points - poses[cycle, :2])).sum(axis=1),
+        ahead=(_headings(poses[cycle]) * (control_points - poses[cycle, :2])).sum(axis=1),
         sigma=sigma,
         smoothness=smoothness_matrix(boundary.abscissae, boundary.length if boundary.periodic else None),
         sigma_smoothness=boundary.gauge.sigma_smoothness * mean_spacing,
@@ -173,8 +159,12 @@ def curve_gauge(state: State, label: int, sigma: float, until: int | None = None
     )
 
 
+def _headings(poses: Array) -> Array:
+    return np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+
+
 def _nearest_poses(state: State, label: int, until: int | None, room: float) -> IntArray:
-    """Returns (m,) the pose nearest to where each control point acts, of those with the curve's direction.
+    """Return (m,) the pose nearest to where each control point acts, of those with the curve's direction.
 
     On an open curve, it is one of those whose places along the curve are nearest, give or take `room` (m): a
     curve that has drifted over itself would else be tied to a pose of another stretch.

@@ -1,7 +1,8 @@
 """The batch of the open lap: what an online mapper goes on from after its loop has closed.
 
-Where no registration closes the loop, though the drive says that a lap is over, the batch begins at odometry
-and closes it. Its result counts only if the detections are for it.
+Where no registration closes the loop, though the drive's own recurrence says that a lap is over, the batch
+begins at odometry and closes it. Its result is believed by what the detections of the second lap say, never
+by patience.
 
 Online, every measurement of the first lap is linearized while the map is still open, and the curves are
 sparse. Both turn the map by several tenths of a degree. Here the same measurements are solved again as a
@@ -9,65 +10,86 @@ batch, on curves that meet the cones. The result is a marginal: what the poses t
 about the simplified map, the calibration and the oldest pose of the window.
 """
 
-from __future__ import annotations
-
 import time
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system, linear_graph
 from pathspace_graph.graph.keys import POSE, are_poses, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
+from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.registration import by_motion, sigma_of_information
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.batch import BatchSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.crossing import boundaries_cross, polylines_cross, sampled
 
-from .association import add_drive, associate, find_anywhere, locate_poses
-from .closure import evidence, is_true_closure, objection
-from .dead_reckoning import start_odometry
+from .association import add_drive
 from .gauge import curve_gauge
-from .knots import boundary_of
-from .mapper import find_optimum, own_settings
-from .optimizer import Convergence, Optimizer
-from .recurrence import Recurrence
-from .simplification import scatter_of_cones, simplified
-from .system import BatchSystem, Biweight, Evaluation
+from .optimizer import LOOSE_GATE, Convergence, Effort, Optimizer
+from .simplification import associate_again, boundary_of, scatter_of_cones, simplified
+from .start import Recurrence, start_odometry
+from .system import BatchSystem, Biweight, Evaluation, own_settings
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+USED_AGAIN: Final = 0.85
+"""Least share of the detections after the first lap on a closed result, as a part of that of the first
+lap."""
+MISFIT: Final = 1.5
+"""Most distance of detections after the first lap from its curves, in sigmas (root mean square)."""
+GAP: Final = 25.0
+"""Longest stretch of a boundary without detections on it (m)."""
+OVERLAP: Final = 15.0
+"""Least length that has been driven again (m)."""
+SIGMA: Final = 0.3
+"""The detections after the first lap hold their drive beside the curves by this standard deviation at most
+(m), in every direction."""
+WIDER: Final = 2.5
+"""No point of a boundary is farther from the road driven than this number of times its distance beside it."""
+MOSTLY: Final = 95.0
+"""Percentile of the poses' distances: the drive may begin or end off the track."""
+FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, knot_passes=1, tolerance=10.0)
+"""A lap that begins at the online map, so that its batch is in time."""
+FROM_ODOMETRY: Final = Effort(rounds=24, knot_passes=1, tolerance=10.0)
+"""A lap that begins at odometry."""
+
+
+# --- the lap ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedMap:
-    """Holds a map that has just been closed, and the poses beside it."""
+    """A map that has just been closed, and the poses beside it."""
 
     splines: dict[int, BSpline]
-    """These are the closed curves by label, map frame."""
+    """Closed curves by label, map frame."""
     poses: Array
-    """(P, 3) These are the poses of all cycles, map frame."""
+    """(P, 3) Poses of all cycles, map frame."""
     calibration: Array
-    """(2,) or (7,) This is the calibration of the odometry, and of the sensor where it is estimated."""
+    """(2,) or (7,) Calibration of the odometry, and of the sensor where it is estimated."""
 
 
 @dataclass(frozen=True, eq=False)
 class OpenLap:
-    """Holds everything measured from the start to the closing cycle, and what to begin with."""
+    """Everything measured from the start to the closing cycle, and what to begin with."""
 
     settings: MapperSettings
-    """These are the settings of the online mapper."""
+    """Settings of the online mapper."""
     chain: LogOdometry
-    """This is the odometry between all cycles."""
+    """Odometry between all cycles."""
     detections: DetectionTable
-    """These are the detections of all cycles; their associations are found anew."""
+    """Detections of all cycles; their associations are found anew."""
     first_kept: int
     """The poses from this cycle on stay variables of the window."""
     start: ClosedMap | Recurrence
@@ -76,39 +98,36 @@ class OpenLap:
 
 @dataclass(frozen=True, eq=False)
 class LapMarginal:
-    """Holds the batch's map on few knots, and what the poses before `first_kept` know about it.
+    """The batch's map on few knots, and what the poses before `first_kept` know about it.
 
     The marginal is a Gaussian of [calibration | control points, left first | pose of `first_kept`].
     """
 
     convergence: Convergence
-    """This is how the optimization ended."""
     splines: dict[int, BSpline]
-    """These are the simplified closed curves by label, map frame."""
+    """Simplified closed curves by label, map frame."""
     calibration: Array
-    """(2,) or (7,) This is the calibration of odometry and sensor at the optimum."""
+    """(2,) or (7,) Calibration of odometry and sensor at the optimum."""
     poses: Array
-    """(P, 3) These are the poses of all cycles of the lap, map frame."""
+    """(P, 3) Poses of all cycles of the lap, map frame."""
     first_kept: int
     """The marginal has all measurements of the poses before this cycle, and none of later ones."""
     mean: Array
-    """(n,) This is the mean of the marginal."""
+    """(n,) Mean of the marginal."""
     information: Array
-    """(n, n) This is the information of the marginal, the inverse of its covariance."""
-    places: dict[int, Array]
-    """For each boundary, its cones have these parameters (k,) on the simplified curve (m)."""
+    """(n, n) Its information, the inverse of its covariance."""
     scatter: dict[int, Array]
-    """For each boundary, cones scatter about the curve by this sigma (m,) at each control point (m)."""
+    """Standard deviation (m,) of each boundary's cones about the curve at each control point (m)."""
     cones: dict[int, Array]
-    """For each boundary, the cones that were detected are at these parameters (k,) of its curve (m)."""
+    """Parameters (k,) of each boundary's detected cones on its curve (m)."""
     seconds: float
-    """The solution took this wall time (s)."""
+    """Wall time (s)."""
     objection: str = ""
     """What speaks against the map; empty where nothing does."""
 
 
 def solve_lap(lap: OpenLap) -> LapMarginal | None:
-    """Returns the marginal of an open lap at the optimum of its batch. It uses one thread.
+    """Return the marginal of an open lap at the optimum of its batch. It uses one thread.
 
     The result is None where the search begins at odometry and ends at a loop that the detections are against.
     """
@@ -121,8 +140,7 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
             return None
         few, change = simplified(at.state, detections, settings)
         information, mean = marginal_of(system, at, few, change, lap.first_kept)
-        locate_poses(few, settings.batch.association)
-        associate(few, detections, settings, settings.batch.gate, strict=True)
+        associate_again(few, detections, settings)
         scatter = scatter_of_cones(few, detections, settings)
         return LapMarginal(
             convergence=convergence,
@@ -132,7 +150,6 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
             first_kept=lap.first_kept,
             mean=mean,
             information=information,
-            places=places_on(few, at.state, system),
             scatter={label: scatter.sigma(label, b.abscissae) for label, b in few.boundaries.items()},
             cones=scatter.places,
             seconds=time.perf_counter() - begin,
@@ -140,49 +157,25 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
         )
 
 
-def lap_optimum(lap: OpenLap) -> tuple[BatchSystem, Evaluation, Convergence]:
-    """Returns the problem of a lap, its optimum on curves that meet the cones, and how it was found."""
-    settings, detections = _capped(lap), deepcopy(lap.detections)
-    system = BatchSystem(detections, lap.chain, settings, Biweight(settings.batch.loose_gate))
-    optimizer = Optimizer(system, settings.batch)
-    at, convergence = find_optimum(optimizer, _start(lap, settings), settings)
-    return system, at, convergence
-
-
-def _capped(lap: OpenLap) -> MapperSettings:
-    """Returns the batch's settings with fewer rounds and looser tolerances, so that the result is in time."""
-    settings, own = own_settings(lap.settings), lap.settings.open_lap
-    known = isinstance(lap.start, ClosedMap)
-    batch: BatchSettings = settings.batch
-    return replace(
-        settings,
-        batch=replace(
-            batch,
-            rough_rounds=own.rough_rounds if known else batch.rough_rounds,
-            max_rounds=own.rounds if known else own.rounds_from_odometry,
-            knot_passes=1,
-            tolerance_cost=own.tolerance * batch.tolerance_cost,
-            tolerance_curve=own.tolerance * batch.tolerance_curve,
-            tolerance_decrease=own.tolerance * batch.tolerance_decrease,
-        ),
-    )
-
-
-def _start(lap: OpenLap, settings: MapperSettings) -> State:
-    """Returns the closed curves of the online map with all poses beside them, or the start from odometry."""
-    if isinstance(lap.start, Recurrence):
-        return start_odometry(lap.chain, lap.detections, settings, lap.start)
-    state = State()
-    for label, spline in lap.start.splines.items():
-        state.add_boundary(label, *boundary_of(spline, settings))
-    add_drive(state, lap.start.poses, lap.start.calibration, settings.batch.association)
-    return state
+def lap_optimum(lap: OpenLap, effort: Effort | None = None) -> tuple[BatchSystem, Evaluation, Convergence]:
+    """Return the problem of a lap, its optimum on curves that meet the cones, and how it was found."""
+    settings, detections, start = own_settings(lap.settings), deepcopy(lap.detections), lap.start
+    system = BatchSystem(detections, lap.chain, settings, Biweight(LOOSE_GATE))
+    if isinstance(start, Recurrence):
+        state = start_odometry(lap.chain, lap.detections, settings, start)
+    else:
+        state = State()
+        for label, spline in start.splines.items():
+            state.add_boundary(label, *boundary_of(spline, settings))
+        add_drive(state, start.poses, start.calibration, settings.batch.association)
+    effort = effort or (FROM_ODOMETRY if isinstance(start, Recurrence) else FROM_MAP)
+    return system, *Optimizer(system, effort).find(state)
 
 
 def marginal_of(
     system: BatchSystem, at: Evaluation, few: State, change: Array, first_kept: int
 ) -> tuple[Array, Array]:
-    """Returns information (n, n) and mean (n,) of [calibration | few control points | oldest kept pose].
+    """Return information (n, n) and mean (n,) of [calibration | few control points | oldest kept pose].
 
     Only factors of poses before `first_kept` are summed, linearized at the optimum, since the window has the
     others. `change` F maps the dense control points to the few. So the covariance is `T Sigma T'` with
@@ -190,9 +183,8 @@ def marginal_of(
     """
     state = at.state
     calibrations = state.variables.calibrations
-    kept = np.concatenate(
-        [state.variables.calibration_keys, state.map_keys, pose_keys(np.array([first_kept]))]
-    )
+    oldest = pose_keys(np.array([first_kept]))
+    kept = np.concatenate([state.variables.calibration_keys, state.map_keys, oldest])
     graph = linear_graph(rows_before(system, at, first_kept), state.variables)
     information, vector = eliminated_system(graph, Layout(kept))
     covariance = np.linalg.inv(information)
@@ -203,20 +195,10 @@ def marginal_of(
     return np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), np.float64), here + T @ shift
 
 
-def places_on(few: State, dense: State, system: BatchSystem) -> dict[int, Array]:
-    """Returns the parameters (k,) of the cones' places on the curves that were simplified, by label."""
-    found = {}
-    for label, u in system.places_by_label(dense).items():
-        points = dense.boundaries[label].evaluate(dense.control_points(label), u)
-        found[label] = find_anywhere(few.boundaries[label], few.control_points(label), points).u
-    return found
-
-
 def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Rows]:
-    """Returns the rows of the batch that hold a pose before `first_kept` or no pose at all.
+    """Return the rows of the batch that hold a pose before `first_kept` or no pose at all.
 
-    The rows that hold each control point beside a pose are made anew with poses that leave, so that none of
-    them is lost.
+    Those that hold a control point beside a pose are made anew with poses that leave, so that none is lost.
     """
     state, sigma = at.state, system.settings.batch.sigma_slide
     gauges = {label: curve_gauge(state, label, sigma, first_kept) for label in state.boundaries}
@@ -224,8 +206,136 @@ def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Ro
     return [rows.where(_is_before(rows.keys, first_kept)) for rows in groups if len(rows)]
 
 
-def _is_before(keys: IntArray, cycle: int) -> NDArray[np.bool_]:
-    """Returns whether each row's first pose is of an earlier cycle than this, or it has no pose."""
+def _is_before(keys: IntArray, cycle: int) -> BoolArray:
+    """Return whether each row's first pose is of an earlier cycle than this, or it has no pose."""
     cycles = np.where(are_poses(keys), indices(keys), -1)
     first = np.where(are_poses(keys), cycles, np.iinfo(np.intp).max).min(axis=1)
     return np.asarray((first < cycle) | ~are_poses(keys).any(axis=1))
+
+
+# --- when a loop is tried, and believed ------------------------------------------------------------------
+
+
+def is_worth_trying(recurrence: Recurrence, settings: MapperSettings) -> bool:
+    """Return whether the path driven says that a lap and a good part of another one have been driven."""
+    closure = settings.batch.closure
+    long_enough = float(recurrence.driven[-1]) >= closure.laps * recurrence.lap
+    return recurrence.recurs and long_enough and recurrence.correlation >= closure.min_correlation
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for or against a closed result."""
+
+    closed: bool
+    """True where both boundaries are closed."""
+    used: float
+    """Share of the coloured detections of the first lap that lies on the curves."""
+    used_again: float
+    """Share of those after the first lap."""
+    misfit: float
+    """Root mean square distance of those from their curves, in sigmas."""
+    gap: float
+    """Longest stretch of a boundary on which no detection lies (m)."""
+    overlap: float
+    """Length over which the boundary that was driven less far has been driven again (m)."""
+    sigma: float
+    """Standard deviation in the worst direction by which the detections after the first lap hold their drive
+    in place, beside the curves (m). It is infinite on a straight, whose stretches all agree."""
+
+
+def evidence(at: Evaluation, detections: DetectionTable, settings: MapperSettings) -> Evidence:
+    """Return the evidence for or against an optimum whose curves are closed."""
+    state = at.state
+    coloured = np.isin(detections.label, list(state.boundaries))
+    again = _is_after_first_lap(state)[detections.cycle] & coloured
+    chosen = {label: again[projected.rows] for label, projected in at.projected.items()}
+    feet = [p.foot.where(chosen[label]) for label, p in at.projected.items()]
+    whitened = [p.whitened[chosen[label]] for label, p in at.projected.items()]
+    lengths = {label: boundary.length for label, boundary in state.boundaries.items()}
+    driven = {label: u[-1] - u[0] for label, u in state.pose_u.items()}
+    overlaps = [float(np.clip(driven[b] - length, 0.0, length)) for b, length in lengths.items()]
+    gaps = [_longest_gap(p.foot.u, lengths[label]) for label, p in at.projected.items()]
+    return Evidence(
+        closed=set(lengths) == set(BOUNDARIES) and all(b.periodic for b in state.boundaries.values()),
+        used=_share(detections.used, coloured & ~again),
+        used_again=_share(detections.used, again),
+        misfit=_rms(np.concatenate([np.zeros(0), *whitened])),
+        gap=max(gaps, default=np.inf),
+        overlap=min(overlaps, default=0.0),
+        sigma=_sigma_of_motion(feet, settings.closing.sigma_reading),
+    )
+
+
+def is_true_closure(found: Evidence, settings: MapperSettings) -> bool:
+    """Return whether the evidence is for a closed result, in every respect."""
+    return (
+        found.closed
+        and found.used >= settings.batch.closure.used
+        and found.used_again >= USED_AGAIN * found.used
+        and found.misfit <= MISFIT
+        and found.gap <= GAP
+        and found.overlap >= OVERLAP
+        and found.sigma <= SIGMA
+    )
+
+
+def objection(found: Evidence, splines: Mapping[int, BSpline], poses: Array, settings: MapperSettings) -> str:
+    """Return what speaks against a map of closed curves around the poses (P, 3) of a lap; empty for nothing.
+
+    The boundaries of a road don't cross, the vehicle crosses neither and has driven beside all of both, and
+    the detections of the lap lie on them.
+    """
+    step, driven = settings.finding.sample, poses[:, :2]
+    if boundaries_cross(splines, step):
+        return "its boundaries cross"
+    for curve in (sampled(spline, step) for spline in splines.values()):
+        if polylines_cross(curve, driven):
+            return "the vehicle would have crossed a boundary"
+        aside = float(np.percentile(KDTree(curve).query(driven)[0], MOSTLY))
+        wider = float(np.max(KDTree(driven).query(curve)[0])) / aside
+        if wider > WIDER:
+            return f"a boundary would be {wider:.1f} times as far from the drive as it is beside it"
+    if found.used < settings.batch.closure.used:
+        return f"only {found.used:.0%} of the detections lie on its boundaries".replace("%", " %")
+    return ""
+
+
+def _is_after_first_lap(state: State) -> BoolArray:
+    """Return which poses (P,) are beside a stretch of every boundary that was driven a lap before."""
+    again = np.ones(len(state.poses), bool)
+    for label, boundary in state.boundaries.items():
+        u = state.pose_u[label]
+        again &= u - u[0] >= boundary.length
+    return again
+
+
+def _longest_gap(u: Array, length: float) -> float:
+    """Return the longest stretch (m) of a closed curve of a length without any of the parameters u (m,)."""
+    if len(u) == 0:
+        return length
+    places = np.sort(np.mod(u, length))
+    return float(np.diff(places, append=places[0] + length).max())
+
+
+def _share(used: BoolArray, among: BoolArray) -> float:
+    return float(used[among].mean()) if among.any() else 0.0
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.inf
+
+
+def _sigma_of_motion(feet: Sequence[FootPoints], sigma_reading: float) -> float:
+    """Return the largest standard deviation (m) of a rigid motion that detections hold across curves.
+
+    The motion turns about the mean of the foot points. Each detection has this sigma (m).
+    """
+    normal, point = (
+        np.concatenate([np.zeros((0, 2)), *(getattr(foot, name) for foot in feet)])
+        for name in ("normal_unit", "position")
+    )
+    if len(point) == 0:
+        return np.inf
+    jacobian = by_motion(normal, point - point.mean(axis=0)) / sigma_reading
+    return sigma_of_information(jacobian.T @ jacobian)

@@ -1,19 +1,17 @@
 """The offline batch: every pose, every detection and both curves of a log in one least-squares problem."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import SettingsError, solving
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.front_end.front_end import JudgedLog, judge_log
@@ -37,63 +35,50 @@ from pathspace_graph.scale.door import log_at_scale
 from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .closure import evidence, is_true_closure
-from .cones import cone_counts
-from .dead_reckoning import start_odometry
-from .knots import reknot
+from .lap import evidence, is_true_closure
 from .nonlinear_graph import nonlinear_graph
-from .optimizer import Convergence, Optimizer, Schedule
-from .recurrence import find_recurrence
+from .optimizer import LOOSE_GATE, Convergence, Optimizer
 from .simplification import Scatter, map_block, scatter_of_cones, simplify
-from .start import CurveMapper, start_online
-from .system import BatchSystem, Biweight, Evaluation
+from .start import CurveMapper, find_recurrence, start_odometry, start_online
+from .system import BatchSystem, Biweight, Evaluation, own_settings
 
-Array = NDArray[np.float64]
-
-NAME = "spline"
-"""This is the name of the estimator on the command line."""
+NAME: Final = "spline"
+"""Name of the estimator on the command line."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BatchResult(BatchRun):
-    """Holds the result of a batch optimization, how it ended, and its uncertainty."""
+    """The result of a batch optimization, how it ended, and its uncertainty."""
 
     LENGTHS: ClassVar = RunResult.LENGTHS | {"map_covariance": 2, "scatter": 0, "online": 0}
 
     convergence: Convergence
-    """This is how the optimization ended."""
     map_covariance: Array
-    """This is the joint covariance (2m, 2m) of the control points of both boundaries, left first, in m^2. It
-    comes from the measurements alone: the scatter of the cones isn't added."""
+    """Joint covariance (2m, 2m) of the control points of both boundaries, left first, in m^2. It comes from
+    the measurements alone: the scatter of the cones isn't added."""
     scatter: Scatter
-    """This is how far cones lie from the map's curves, which have too few control points to follow them."""
+    """How far cones lie from the map's curves, which have too few control points to follow them."""
     calibration: Array
-    """This is the calibration (2,): scale error of the speeds [-], bias of the yaw rate [rad/s]."""
+    """Calibration (2,): scale error of the speeds [-], bias of the yaw rate [rad/s]."""
     online: RunResult | None
-    """This is the online run that the batch began with, if it did."""
+    """Online run that the batch began with, if it did."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """This is the wall time of each stage (s)."""
+    """Wall time of each stage (s)."""
     system: BatchSystem
-    """This is the problem that was solved, on curves with about one knot for each cone."""
+    """Problem that was solved, on curves with about one knot for each cone."""
     optimum: Evaluation
-    """This is the problem at the optimum."""
+    """Problem at the optimum."""
 
     @cached_property
     def pose_covariances(self) -> Array:
-        """Returns the marginal covariance (n, 3, 3) of each pose (x, y, theta), map frame.
-
-        It is computed when it is first asked for.
-        """
+        """Return the marginal covariance (n, 3, 3) of each pose (x, y, theta), map frame, computed once."""
         with threadpool_limits(limits=1):
             weights = self.scale ** np.array(POSE, float)
             return np.outer(weights, weights) * self.system.eliminated(self.optimum).pose_marginals
 
     @cached_property
     def vehicle_state(self) -> VehicleState:
-        """Returns the last pose and the calibration, with their joint covariance.
-
-        It is computed when it is first asked for.
-        """
+        """Return the last pose and the calibration, with their joint covariance, computed once."""
         variables, last = self.optimum.state.variables, pose_key(len(self.trajectory) - 1)
         with threadpool_limits(limits=1):
             keys = variables.layout.keys
@@ -105,24 +90,18 @@ class BatchResult(BatchRun):
         return scaled(VehicleState.split(pose, variables.calibrations, covariance), self.scale)
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Returns the whole problem at the optimum as GTSAM's nonlinear factors (see `nonlinear_graph`).
-
-        Its lengths are over the scale.
-        """
+        """Return the whole problem at the optimum by `nonlinear_graph`; its lengths are over the scale."""
         return nonlinear_graph(self.system, self.optimum)
 
     def values(self) -> gtsam.Values:
-        """Returns the optimum: control points l_j and r_j, calibration b_0, poses x_k.
-
-        Its lengths are over the scale.
-        """
+        """Return the optimum over the scale: control points l_j and r_j, calibration b_0, poses x_k."""
         variables = self.optimum.state.variables
         return variables.gtsam_values(variables.keys)
 
 
 @log_at_scale
 class BatchMapper:
-    """A batch mapper maps a whole log at once."""
+    """Maps a whole log at once."""
 
     def __init__(
         self,
@@ -130,10 +109,9 @@ class BatchMapper:
         odometry_sigma: Array | KnownNoise | None = None,
         online: Callable[[MapperSettings, KnownNoise], CurveMapper] | None = None,
     ) -> None:
-        """Keeps the settings, and the standard deviation (3,) of a measured twist (m/s, m/s, rad/s).
+        """Keep the settings, and the standard deviation (3,) of a measured twist (m/s, m/s, rad/s).
 
-        `online` makes the online mapper whose map the optimization begins with. A start from odometry needs
-        none.
+        `online` makes the online mapper whose map the optimization begins with, if not at odometry.
         """
         self.settings = settings or MapperSettings()
         self.online = online
@@ -142,7 +120,7 @@ class BatchMapper:
     def solve(
         self, log: Log, start: Start | None = None, on_round: Callable[[], None] | None = None
     ) -> BatchResult:
-        """Returns the optimum, which is searched from an online map or from odometry alone.
+        """Return the optimum, which is searched from an online map or from odometry alone.
 
         By default `batch.start` decides. `on_round` is called after each round. SettingsError if there is no
         online mapper to begin with, and SolveError where the log leaves no way to an optimum.
@@ -151,21 +129,21 @@ class BatchMapper:
             return self._solve(log, start or self.settings.batch.start, on_round)
 
     def _solve(self, log: Log, start: Start, on_round: Callable[[], None] | None) -> BatchResult:
-        settings, batch, watch = own_settings(self.settings), self.settings.batch, Stopwatch()
-        judged = judge_log(log, self.noise, settings)
+        watch = Stopwatch()
+        judged = judge_log(log, self.noise, own_settings(self.settings))
         settings = judged.settings
         chain, detections = judged.chain, DetectionTable.of(judged.cycles, twists=judged.chain.twists)
-        system = BatchSystem(detections, chain, settings, Biweight(batch.loose_gate))
-        optimizer = Optimizer(system, batch)
+        system = BatchSystem(detections, chain, settings, Biweight(LOOSE_GATE))
+        optimizer = Optimizer(system, on_round=on_round)
         watch.lap("integrate")
         if start == "odometry":
             online = None
-            at, convergence = find_optimum_from_odometry(optimizer, settings, on_round)
+            at, convergence = find_optimum_from_odometry(optimizer)
         else:
             state, online = self._start_online(log)
             watch.lap("start")
-            at, convergence = find_optimum(optimizer, state, settings, on_round)
-        at, convergence = _with_doubt(optimizer, at, convergence, settings, on_round)
+            at, convergence = optimizer.find(state)
+        at, convergence = _with_doubt(optimizer, at, convergence)
         watch.lap("optimum")
         joint = system.eliminated(at).joint(at.state.map_keys)
         watch.lap("covariance")
@@ -196,84 +174,42 @@ class BatchMapper:
         )
 
     def _start_online(self, log: Log) -> tuple[State, RunResult]:
-        """Returns the start from an online run of the log, and the run."""
         if self.online is None:
             raise SettingsError("start online: expected an online mapper to begin with, found none")
         return start_online(log, self.online(replace(self.settings, scale=1.0), self.noise))
 
 
-def _with_doubt(
-    optimizer: Optimizer,
-    at: Evaluation,
-    convergence: Convergence,
-    settings: MapperSettings,
-    on_round: Callable[[], None] | None,
-) -> tuple[Evaluation, Convergence]:
-    """Returns the optimum, searched again while it contradicts the prior of a calibration."""
-    system, variables = optimizer.system, at.state.variables
-    variance = np.diag(system.eliminated(at).joint(variables.calibration_keys))
-    believed = doubted(variables.calibrations, variance, settings)
-    if believed == settings:
-        return at, convergence
-    system.settings = believed
-    system.chain = replace(system.chain, calibration_sigma=np.array(believed.odometry.sigmas_calibration))
-    at, convergence = find_optimum(optimizer, at.state, believed, on_round)
-    return _with_doubt(optimizer, at, convergence, believed, on_round)
-
-
-def find_optimum_from_odometry(
-    optimizer: Optimizer, settings: MapperSettings, on_round: Callable[[], None] | None = None
-) -> tuple[Evaluation, Convergence]:
-    """Returns the optimum whose search begins at odometry alone.
+def find_optimum_from_odometry(optimizer: Optimizer) -> tuple[Evaluation, Convergence]:
+    """Return the optimum whose search begins at odometry alone.
 
     Where the path recurs, the loop is closed, and it stays closed if the detections are for it.
     """
-    chain, detections = optimizer.system.chain, optimizer.system.detections
+    system = optimizer.system
+    chain, detections, settings = system.chain, system.detections, system.settings
     recurrence = find_recurrence(chain.dead_reckoned(np.zeros(CALIBRATION_SIZE)), settings)
     state = start_odometry(chain, detections, settings, recurrence)
-    at, convergence = find_optimum(optimizer, state, settings, on_round)
+    at, convergence = optimizer.find(state)
     if not state.closed or is_true_closure(evidence(at, detections, settings), settings):
         return at, convergence
-    state = start_odometry(chain, detections, settings, recurrence.denied())
-    return find_optimum(optimizer, state, settings, on_round)
+    return optimizer.find(start_odometry(chain, detections, settings, recurrence.denied()))
 
 
-def find_optimum(
-    optimizer: Optimizer,
-    state: State,
-    settings: MapperSettings,
-    on_round: Callable[[], None] | None = None,
+def _with_doubt(
+    optimizer: Optimizer, at: Evaluation, convergence: Convergence
 ) -> tuple[Evaluation, Convergence]:
-    """Returns the optimum on curves with about one knot for each cone, which meet the cones.
-
-    The poses are first aligned beside the map of the start. The optimum is searched again if the number of
-    cones has changed: then one was missing or was a duplicate.
-    """
-    batch, detections = settings.batch, optimizer.system.detections
-    state = optimizer.align_poses(state, batch.pose_steps, batch.loose_gate)
-    rough = Schedule(batch.loose_gate, batch.rough_rounds, batch.rough_tolerance)
-    at, _ = optimizer.run(reknot(state, detections, settings, dense=True), rough, on_round)
-    fine = Schedule(batch.gate, batch.max_rounds)
-    for _ in range(batch.knot_passes):
-        cones = cone_counts(at.state, detections, settings)
-        at, convergence = optimizer.run(reknot(at.state, detections, settings, dense=True), fine, on_round)
-        if cone_counts(at.state, detections, settings) == cones:
-            break
-    return at, convergence
-
-
-def own_settings(settings: MapperSettings) -> MapperSettings:
-    """Returns the settings with the batch's own values in the groups that it shares with online mapping."""
-    batch = settings.batch
-    return replace(
-        settings,
-        spline=replace(settings.spline, sigma_model=batch.sigma_model),
-        gauge=replace(settings.gauge, sigma_smoothness=batch.sigma_smoothness),
-    )
+    """Return the optimum, searched again while it contradicts the prior of a calibration."""
+    system, variables = optimizer.system, at.state.variables
+    variance = np.diag(system.eliminated(at).joint(variables.calibration_keys))
+    believed = doubted(variables.calibrations, variance, system.settings)
+    if believed == system.settings:
+        return at, convergence
+    system.settings = believed
+    system.chain = replace(system.chain, calibration_sigma=np.array(believed.odometry.sigmas_calibration))
+    return _with_doubt(optimizer, *optimizer.find(at.state))
 
 
 def _map(state: State, joint: Array, scatter: Scatter) -> Map:
-    """Returns the curves with their covariance, to which the scatter of the cones is added."""
+    """Return the curves with their covariance, to which the scatter of the cones is added."""
     boundaries = {}
     for label, boundary in state.boundaries.items():
         block = map_block(state, label)
@@ -284,7 +220,6 @@ def _map(state: State, joint: Array, scatter: Scatter) -> Map:
 
 
 def _orange(judged: JudgedLog, state: State, settings: MapperSettings) -> dict[int, PointBoundary]:
-    """Returns the orange cones by label, as the poses place them."""
     cones, twists = OrangeCones(settings.growth, settings.spline.sigma_shape), judged.chain.twists
     for k, detections in enumerate(judged.orange):
         cones.add(Sighting(k, state.poses[k], twists[k], detections), state.variables.sensor)
@@ -294,7 +229,7 @@ def _orange(judged: JudgedLog, state: State, settings: MapperSettings) -> dict[i
 def _records(
     state: State, detections: DetectionTable, chain: LogOdometry, seconds: float
 ) -> tuple[tuple[CycleRecord, ...], int]:
-    """Returns a record of each cycle, with its share of the seconds, and the number of complete laps."""
+    """Return a record of each cycle, with its share of the seconds, and the number of complete laps."""
     left, right = (state.boundaries[b].size if b in state.boundaries else 0 for b in (LEFT, RIGHT))
     used = np.bincount(detections.cycle[detections.used], minlength=len(chain)).tolist()
     offered = np.bincount(detections.cycle, minlength=len(chain)).tolist()

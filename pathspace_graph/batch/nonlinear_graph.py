@@ -1,15 +1,13 @@
 """The problem of a whole log as GTSAM's own nonlinear factors."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator, MutableSequence
+from collections.abc import Callable, Iterator, MutableSequence
 from dataclasses import replace
+from typing import Final
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry
@@ -20,28 +18,22 @@ from pathspace_graph.spline.boundary import Boundary
 from .gauge import CurveGauge
 from .system import BatchSystem, Evaluation
 
-Array = NDArray[np.float64]
-
-ROOM = 4.0
-"""A factor searches its foot points within this distance (m along the curve) of where they are."""
-HALVINGS = 6
-"""The room is halved at most this number of times while another foot point in it is nearer. That happens
-where a bend turns about a detection."""
-SAME = 1e-3
+ROOM: Final = 4.0
+"""A factor searches its foot points this far (m along the curve) from where they are."""
+HALVINGS: Final = 6
+"""Times that the room is halved at most while another foot point in it is nearer: where a bend turns about a
+detection."""
+SAME: Final = 1e-3
 """Two foot points closer than this (m along the curve) are the same."""
 
 
 def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:
-    """Returns every factor of the problem, on the keys of `graph.keys`.
+    """Return every factor of the problem, on the keys of `graph.keys`.
 
-    The graph holds what a round of the optimization holds, as it is at `at`: the associations, and the sigmas
-    across the curve, divided by the root of their robust weights. So it is a graph of plain least squares.
-    Each control point is anchored where it is. At an optimum the gradient is zero, and the linearization is
-    that of the optimization. But the error isn't its robust cost, and some decimetres away from the optimum
-    the weights would be others. There is no such factor for places of cones, where SettingsError is raised.
+    It is a graph of plain least squares, and holds the associations as they are at `at`, and the sigmas
+    across the curve divided by the root of their robust weights. Each control point is anchored where it is.
+    At an optimum its linearization is that of the optimization; its error isn't the robust cost.
     """
-    if system.places is not None:
-        raise SettingsError(f"graph: expected place.use none, found {system.settings.place.use}")
     graph = gtsam.NonlinearFactorGraph()
     for factor in drive_factors(system, at):
         graph.add(factor)
@@ -52,8 +44,9 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
 
 
 def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.NonlinearFactor]:
-    """Yields all factors that hold no control point: odometry, first pose and the priors of calibrations."""
-    yield from _odometry(system.chain)
+    """Yield all factors that hold no control point: odometry, first pose and the priors of calibrations."""
+    for k, interval in enumerate(system.chain.odometry.intervals):
+        yield odometry_factor(k, interval)
     yield from _priors(system.chain, at.state.poses[0, 2])
     sensor_key = at.state.variables.sensor_key
     if sensor_key is not None:
@@ -61,18 +54,8 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
         yield gtsam.PriorFactorVector(sensor_key, np.array(system.settings.calibration.means), sigmas)
 
 
-def _odometry(chain: LogOdometry) -> Iterator[gtsam.NonlinearFactor]:
-    """Yields the odometry factor between every two neighbouring cycles."""
-    for k, interval in enumerate(chain.odometry.intervals):
-        yield odometry_factor(k, interval)
-
-
 def _priors(chain: LogOdometry, heading: float) -> Iterator[gtsam.NonlinearFactor]:
-    """Yields the priors of the first pose and of the calibration.
-
-    GTSAM's tangents of a pose are in its own frame, so the information is rotated by the heading (rad).
-    """
-    map_from_pose = np.eye(POSE)
+    map_from_pose = np.eye(POSE)  # GTSAM's tangents of a pose are in its own frame
     map_from_pose[:2, :2] = rotation(heading)
     information = map_from_pose.T @ chain.first_information @ map_from_pose
     noise = gtsam.noiseModel.Gaussian.Information(information)
@@ -85,7 +68,6 @@ def _priors(chain: LogOdometry, heading: float) -> Iterator[gtsam.NonlinearFacto
 
 
 def _gauge(gauge: CurveGauge, control_points: Array) -> Iterator[gtsam.NonlinearFactor]:
-    """Yields the weak priors of a curve, which has control points (m, 2)."""
     keys = gauge.keys.tolist()
     anchor = gtsam.noiseModel.Isotropic.Sigma(2, gauge.sigma_anchor)
     for j, (key, point) in enumerate(zip(keys, control_points, strict=True)):
@@ -96,47 +78,45 @@ def _gauge(gauge: CurveGauge, control_points: Array) -> Iterator[gtsam.Nonlinear
 
 
 def beside_factor(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
-    """Returns the factor that holds control point j of a curve beside its pose."""
+    """Return the factor that holds control point j of a curve beside its pose."""
     only = slice(j, j + 1)
     one = replace(gauge, keys=gauge.keys[only], cycle=gauge.cycle[only], ahead=gauge.ahead[only])
-    keys = [int(gauge.keys[j]), pose_key(gauge.cycle[j])]
-
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: MutableSequence[Array] | None) -> Array:
-        pose = values.atPose2(keys[1])
-        residual, by_point, by_pose = one.terms(values.atPoint2(keys[0])[None], pose_array(pose)[None])
-        if H is not None:
-            by_pose[:, :2] = by_pose[:, :2] @ rotation(pose.theta())
-            H[0], H[1] = by_point, by_pose
-        return residual
-
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), keys, error)
+    return _factor_beside(one.keys, int(gauge.cycle[j]), 1, one.terms)
 
 
 def bending_factor(gauge: CurveGauge, row: int) -> gtsam.CustomFactor:
-    """Returns the factor of a second difference of a curve, as the pose beside it sees it."""
+    """Return the factor of a second difference of a curve, as the pose beside it sees it."""
     chosen, cycle = gauge.neighbours[row], int(gauge.middle_cycle[row])
-    only = replace(
-        gauge,
-        keys=gauge.keys[chosen],
-        cycle=np.zeros(3, np.intp),
-        smoothness=gauge.smoothness[row, chosen][None],
-    )
-    keys = [*gauge.keys[chosen].tolist(), pose_key(cycle)]
+    keys, smoothness = gauge.keys[chosen], gauge.smoothness[row, chosen][None]
+    only = replace(gauge, keys=keys, cycle=np.zeros(3, np.intp), smoothness=smoothness)
+    return _factor_beside(keys, cycle, POINT, only.bending)
+
+
+def _factor_beside(
+    points: IntArray, cycle: int, size: int, terms: Callable[[Array, Array], tuple[Array, Array, Array]]
+) -> gtsam.CustomFactor:
+    """Return the factor of `size` whitened residuals of control points (k,) as the pose of a cycle sees them.
+
+    GTSAM's tangents of a pose are in its own frame.
+    """
+    keys = [*points.tolist(), pose_key(cycle)]
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: MutableSequence[Array] | None) -> Array:
-        points = np.array([values.atPoint2(key) for key in keys[:3]])
-        pose = pose_array(values.atPose2(keys[3]))
-        residual, by_control, by_pose = only.bending(points, pose[None])
+        pose = values.atPose2(keys[-1])
+        at = np.array([values.atPoint2(key) for key in keys[:-1]])
+        residual, by_points, by_pose = terms(at, pose_array(pose)[None])
         if H is not None:
-            H[0], H[1], H[2] = np.split(by_control[0], 3, axis=1)
-            H[3] = by_pose[0]
-        return np.asarray(residual[0])
+            by_pose[..., :2] = by_pose[..., :2] @ rotation(pose.theta())
+            for k, block in enumerate(np.split(by_points.reshape(size, -1), len(points), axis=1)):
+                H[k] = block
+            H[len(points)] = by_pose.reshape(size, POSE)
+        return residual.ravel()
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(POINT), keys, error)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), keys, error)
 
 
 def _projections(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.CustomFactor]:
-    """Returns a factor for each cycle, of its used detections on a boundary that have any weight.
+    """Return a factor for each cycle, of its used detections on a boundary that have any weight.
 
     The covariances are isotropic, so that a detection keeps its sigma when the curve's direction changes.
     """
@@ -163,7 +143,7 @@ def _projections(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.
 
 
 def _room(boundary: Boundary, control_points: Array, points: Array, u: Array) -> Array:
-    """Returns the room (m,) about u in which the nearest foot point of each point (m, 2) is that at u."""
+    """Return the room (m,) about u in which the nearest foot point of each point (m, 2) is that at u."""
     room = np.full(len(u), ROOM)
     for _ in range(HALVINGS):
         nearest = boundary.find(control_points, points, u - room, u + room).u

@@ -1,89 +1,151 @@
 """Levenberg-Marquardt on a whole log, in rounds that refresh foot points, gates and weights."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import left_of
-from pathspace_graph.graph.elimination import Elimination
+from pathspace_graph.graph.elimination import Damping, Elimination
 from pathspace_graph.graph.gaussian import graph_of
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.batch import BatchSettings
 
-from .association import associate, locate_poses
+from .association import associate, cone_counts, locate_poses
+from .simplification import reknot
 from .system import BatchSystem, Biweight, Evaluation, moved
 
-Array = NDArray[np.float64]
-
+LOOSE_GATE: Final = 8.0
+"""Gate of the first round (sigmas)."""
+GATE_FACTOR: Final = 0.7
+"""The gate is multiplied by this from each round to the next, down to `batch.gate`."""
 SEARCH: Final = 20
 """Associations are found anew in this number of rounds."""
 SETTLE: Final = 8
 """Foot points are refined again at most this number of times before a step."""
+POSE_STEPS: Final = 3
+"""Gauss-Newton steps of the poses alone at first, while the map of the start is held."""
+ROUGH_TOLERANCE: Final = 8.0
+"""The tolerances are multiplied by this in the first optimization, on knots that follow the start."""
+TOLERANCE_COST: Final = 1e-5
+"""At convergence, |cost_before - cost_after| over a round is at most this share of the cost."""
+TOLERANCE_CURVE: Final = 2e-3
+"""No point of a curve then moves farther than this across it in a round, as seen from its poses (m)."""
+TOLERANCE_DECREASE: Final = 5e-3
+"""An undamped step would then make the cost smaller by no more than this. A step of one sigma in any
+direction makes it smaller by 1/2, also where it swings a whole map by metres."""
+CURVE_SAMPLES: Final = 2
+"""Points in each knot interval at which the movement of a curve is measured."""
+SHARES: Final = (0.3, 0.97)
+"""Between these, the share that a step has of the one before lets it be extended to the sum of those that
+would follow it."""
+
+
+REASONS: Final = {True: "nothing changes any more", False: "no round left"}
+"""Why an optimization ended, by whether it has converged."""
 
 
 @dataclass(frozen=True, eq=False)
 class Convergence:
-    """Holds how an optimization ended."""
+    """How an optimization ended."""
 
     converged: bool
-    """This is true where nothing changed any more."""
+    """True where nothing changed any more."""
     reason: str
-    """This is why the optimization stopped."""
     rounds: int
-    """Foot points, gates and weights were refreshed this number of times."""
+    """Times that foot points, gates and weights were refreshed."""
     steps: int
-    """This is the number of Levenberg-Marquardt steps, including rejected ones."""
+    """Levenberg-Marquardt steps, including rejected ones."""
     cost: float
-    """This is half the sum of squares with robust losses at the end."""
+    """Half the sum of squares with robust losses at the end."""
     gradient: float
-    """This is the norm `sqrt(g' H^-1 g)` of the gradient g at the end, with H the information of all
-    variables. It is the distance of the linear problem's optimum in joint sigmas. A slow common motion of the
-    whole map counts as much in it as that of a control point."""
+    """Norm `sqrt(g' H^-1 g)` of the gradient g at the end, with H the information of all variables: the
+    distance of the linear problem's optimum in joint sigmas. A slow common motion of the whole map counts as
+    much in it as that of a control point."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """Says how an optimization goes on from round to round."""
+    """How an optimization goes on from round to round."""
 
     gate: float
-    """The first round has this gate (sigmas)."""
+    """Gate of the first round (sigmas)."""
     rounds: int
-    """The optimization ends after this number of rounds at the latest."""
+    """Most rounds."""
     tolerance: float = 1.0
-    """Every tolerance of the settings is multiplied by this."""
+    """Factor of every tolerance."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long the optimum of a log is searched for."""
+
+    rough_rounds: int = 24
+    """Most rounds of the first optimization, on knots that follow the start."""
+    rounds: int = 80
+    """Most rounds of a later one; one that uses them all is reported as not converged."""
+    knot_passes: int = 2
+    """Most later ones; there is more than one only if the number of cones has changed."""
+    tolerance: float = 1.0
+    """Factor of every tolerance."""
 
 
 class Optimizer:
-    """An optimizer takes a state to the minimum of the problem."""
+    """An optimizer takes a state to the minimum of the problem; it calls `on_round` after each round."""
 
-    def __init__(self, system: BatchSystem, settings: BatchSettings) -> None:
+    def __init__(
+        self,
+        system: BatchSystem,
+        effort: Effort | None = None,
+        on_round: Callable[[], None] | None = None,
+        damping: Damping | None = None,
+    ) -> None:
         self.system = system
-        self.settings = settings
+        self.settings = system.settings.batch
+        self.effort = effort or Effort()
         self.steps = 0
-        """This is the number of steps that were tried."""
-        self._damping = settings.damping
-        self._last_step: Array | None = None
-        """This is the last step of the map and the calibration."""
+        """Steps that were tried."""
+        self._on_round = on_round
+        self._damping = damping or Damping()
+        self._last_step: Array | None = None  # of the map and the calibration
 
-    # --- rounds ------------------------------------------------------------------------------------------
+    def find(self, state: State) -> tuple[Evaluation, Convergence]:
+        """Return the optimum on curves with about one knot for each cone, which meet the cones.
 
-    def run(
-        self, state: State, schedule: Schedule, on_round: Callable[[], None] | None = None
-    ) -> tuple[Evaluation, Convergence]:
-        """Optimizes in rounds until nothing changes, and returns the problem there.
+        The poses are first aligned beside the map of the start. The search is repeated if the number of cones
+        has changed: then one was missing or was a duplicate.
+        """
+        system, effort = self.system, self.effort
+        detections, settings = system.detections, system.settings
+        rough = Schedule(LOOSE_GATE, effort.rough_rounds, ROUGH_TOLERANCE)
+        fine = Schedule(self.settings.gate, effort.rounds)
+        state = self.align_poses(state, POSE_STEPS, LOOSE_GATE)
+        at, _ = self.run(reknot(state, detections, settings, dense=True), rough)
+        for _ in range(effort.knot_passes):
+            cones = cone_counts(at.state, detections, settings)
+            at, convergence = self.run(reknot(at.state, detections, settings, dense=True), fine)
+            if cone_counts(at.state, detections, settings) == cones:
+                break
+        return at, convergence
 
-        The gate shrinks from the schedule's to that of the settings (graduated robust weights), and only then
-        may the optimization end. Each round takes one step. After `SEARCH` rounds, or half of them,
-        associations and sigmas stay as they are: where two rows are near, some would change for ever.
+    def align_poses(self, state: State, steps: int, gate: float) -> State:
+        """Return the state after Gauss-Newton steps of the poses alone, beside its map and calibration."""
+        self.system.begin(state)
+        for _ in range(steps):
+            state = moved(state, self.system.poses_alone(self._refreshed(state, gate, False)))
+        return state
+
+    def run(self, state: State, schedule: Schedule) -> tuple[Evaluation, Convergence]:
+        """Optimize in rounds until nothing changes, and return the problem there.
+
+        Each round takes one step. The gate shrinks to that of the settings (graduated robust weights), and
+        only then may it end. After `SEARCH` rounds, or half of them, associations and sigmas stay as they
+        are: where two rows are near, some would change for ever.
         """
         system, gate = self.system, schedule.gate
         locate_poses(state, self.settings.association)
@@ -100,69 +162,60 @@ class Optimizer:
             before = self._refreshed(state, gate, strict, held)
             at = self._step(before)
             state, gain, cost = at.state, abs(cost - at.cost), at.cost
-            if on_round is not None:
-                on_round()
+            if self._on_round is not None:
+                self._on_round()
             if strict and self._is_still(before, at, gain, schedule.tolerance):
                 at = self._refreshed(state, gate, strict, held)
                 decrease = self.predicted_decrease(at)
-                if decrease <= schedule.tolerance * self.settings.tolerance_decrease:
-                    return at, self._report(at, number, "nothing changes any more", decrease)
-            gate *= self.settings.gate_factor
+                if decrease <= schedule.tolerance * (self.effort.tolerance * TOLERANCE_DECREASE):
+                    return at, self._report(at, number, decrease, True)
+            gate *= GATE_FACTOR
         assert at is not None
-        return at, self._report(at, schedule.rounds, "no round left", self.predicted_decrease(at), False)
-
-    def align_poses(self, state: State, steps: int, gate: float) -> State:
-        """Returns the state after Gauss-Newton steps of the poses alone, beside its map and calibration."""
-        self.system.begin(state)
-        for _ in range(steps):
-            state = moved(state, self.system.poses_alone(self._refreshed(state, gate, False)))
-        return state
+        return at, self._report(at, schedule.rounds, self.predicted_decrease(at), False)
 
     def _refreshed(self, state: State, gate: float, strict: bool, held: bool = False) -> Evaluation:
-        """Returns the problem of a new round: with new places of the poses, associations and sigmas.
-
-        Associations and sigmas are those of the round before if `held`.
-        """
+        """Return the problem of a new round; associations and sigmas are those of the round before if
+        `held`."""
         system = self.system
         if not strict:
             locate_poses(state, self.settings.association)
         system.detections.correct(state.variables.sensor)
         if not held:
             associate(state, system.detections, system.settings, gate, strict)
-            if strict and system.settings.place.use == "cones":
-                system.place(state)
         return self._settled(state, held)
 
     def _settled(self, state: State, held: bool) -> Evaluation:
-        """Returns the problem with foot points that stay where they are when they are refined again.
-
-        Where one is still on its way along a tight bend, the cost changes without a step.
-        """
+        """Return the problem with foot points that have arrived: else the cost changes without a step."""
         at = self.system.evaluate(state, hold=not held)
         for _ in range(SETTLE):
             self._keep_foot_points(at)
             before, at = at, self.system.evaluate(state, hold=not held)
-            if abs(before.cost - at.cost) <= self.settings.tolerance_cost * at.cost:
+            if abs(before.cost - at.cost) <= self.effort.tolerance * TOLERANCE_COST * at.cost:
                 break
         return at
 
+    def _keep_foot_points(self, at: Evaluation) -> None:
+        """Let later evaluations refine the foot points from where they are now."""
+        for projected in at.projected.values():
+            self.system.detections.refine(projected.rows, projected.foot.u)
+
     def _is_still(self, before: Evaluation, after: Evaluation, gain: float, tolerance: float) -> bool:
-        """Returns whether a round has changed neither the curves, as their poses see them, nor the cost."""
-        settings = self.settings
-        still = self._movement(before.state, after.state) <= tolerance * settings.tolerance_curve
-        return still and gain <= tolerance * settings.tolerance_cost * after.cost
+        """Return whether a round has changed neither the curves, as their poses see them, nor the cost."""
+        curve, cost = (self.effort.tolerance * t for t in (TOLERANCE_CURVE, TOLERANCE_COST))
+        still = self._movement(before.state, after.state) <= tolerance * curve
+        return still and gain <= tolerance * cost * after.cost
 
     def _movement(self, before: State, after: State) -> float:
-        """Returns how far a curve has moved across itself (m), seen from the poses beside its control points.
+        """Return how far a curve has moved across itself (m), seen from the poses beside its control points.
 
-        A motion along itself doesn't count, nor a motion of the curve with its poses: `predicted_decrease`
-        judges the latter in sigmas, since the end of a long open road swings by metres within its own.
+        A motion of the curve with its poses doesn't count: `predicted_decrease` judges it in sigmas, since
+        the end of a long open road swings by metres within its own.
         """
         farthest = 0.0
         for label, gauge in self.system.gauges.items():
             boundary, points = before.boundaries[label], before.control_points(label)
             offset = gauge.carried(points, before.poses, after.poses) - after.control_points(label)
-            count = max(int(self.settings.curve_samples * boundary.size), 2)
+            count = max(CURVE_SAMPLES * boundary.size, 2)
             u = np.linspace(boundary.tables.low, boundary.tables.high, count)
             normal = left_of(boundary.evaluate(after.control_points(label), u, 1))
             normal /= np.maximum(np.hypot(*normal.T), np.finfo(float).tiny)[:, None]
@@ -171,49 +224,41 @@ class Optimizer:
         return farthest
 
     def predicted_decrease(self, at: Evaluation) -> float:
-        """Returns by how much an undamped step would make the cost smaller, if the problem were linear.
+        """Return `1/2 g' H^-1 g` with gradient g and information H: the gain of an undamped step if it were
+        linear.
 
-        This is half of `g' H^-1 g`, with gradient g and information H: a step of one sigma in any direction
-        has 1/2, however far it leads in metres.
+        A step of one sigma in any direction has 1/2, however far it leads in metres.
         """
         problem, layout = self.system.eliminated(at), at.state.variables.layout
         step = problem.step(np.zeros(problem.map.size))
         return -0.5 * float(gradient(self.system.rows(at), layout) @ step)
 
-    def _report(
-        self, at: Evaluation, rounds: int, reason: str, decrease: float, converged: bool = True
-    ) -> Convergence:
-        norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
+    def _report(self, at: Evaluation, rounds: int, decrease: float, converged: bool) -> Convergence:
+        norm, reason = float(np.sqrt(2.0 * max(decrease, 0.0))), REASONS[converged]
         return Convergence(converged, reason, rounds, self.steps, at.cost, norm)
 
-    # --- steps -------------------------------------------------------------------------------------------
-
     def _step(self, at: Evaluation) -> Evaluation:
-        """Returns the problem after a step that makes the cost smaller, or the same one if there is none.
-
-        The damping grows until such a step is found.
-        """
-        settings = self.settings
+        """Return the problem after the least damped step that makes the cost smaller, or the same one."""
+        damping = self._damping
         self._keep_foot_points(at)
         graph = self.system.linear_graph(at)
-        while self._damping <= settings.damping_most:
+        while not damping.exhausted:
             self.steps += 1
-            trial = self._trial(at, graph, self._damping)
+            trial = self._trial(at, graph, damping.weight)
             if trial is not None:
-                self._damping = max(settings.damping_down * self._damping, settings.damping_least)
+                damping.lower()
                 self._keep_foot_points(trial)
                 return trial
-            self._damping *= settings.damping_up
-        self._damping = settings.damping
+            damping.grow()
+        damping.reset()
         return at
 
     def _trial(self, at: Evaluation, graph: gtsam.GaussianFactorGraph, damping: float) -> Evaluation | None:
-        """Returns the problem after a damped step (1/m^2), or None if the cost has grown."""
+        """Return the problem after a damped step (1/m^2), or None if the cost has grown."""
         state = at.state
+        damped = graph_of(graph, self.system.damping(state, damping))
         try:
-            problem = Elimination(
-                graph_of(graph, self.system.damping(state, damping)), state.variables.layout
-            )
+            problem = Elimination(damped, state.variables.layout)
             step = problem.step(np.zeros(problem.map.size))
         except SingularSystemError:
             return None
@@ -221,32 +266,27 @@ class Optimizer:
         if trial.cost > at.cost:
             return None
         before, self._last_step = self._last_step, step[: problem.map.size]
-        factor = 1.0 if before is None else extrapolation_factor(self._last_step, before, self.settings)
+        factor = 1.0 if before is None else extrapolation_factor(self._last_step, before)
         if factor > 1.0:
             farther = self.system.evaluate(self.system.retract(state, factor * step))
             trial = min(trial, farther, key=lambda evaluation: evaluation.cost)
         return trial
 
-    def _keep_foot_points(self, at: Evaluation) -> None:
-        """Lets later evaluations refine the foot points from where they are now."""
-        for projected in at.projected.values():
-            self.system.detections.refine(projected.rows, projected.foot.u)
 
+def extrapolation_factor(step: Array, before: Array) -> float:
+    """Return `1 / (1 - r)`: how much longer a step (n,) is made, r being its share of the step before.
 
-def extrapolation_factor(step: Array, before: Array, settings: BatchSettings) -> float:
-    """Returns `1 / (1 - r)`: how much longer a step (n,) is made, r being its share of the step before.
-
-    This is Aitken's process for vectors, with r by least squares. The result is 1 where r isn't between the
-    settings' bounds. Robust weights, held sigmas and foot points on a curve that bends let Gauss-Newton
-    converge only linearly, slowest where few detections hold the curve.
+    This is Aitken's process for vectors, with r by least squares. The result is 1 where r isn't between
+    `SHARES`. Robust weights, held sigmas and foot points on a curve that bends let Gauss-Newton converge only
+    linearly, slowest where few detections hold the curve.
     """
     square = float(before @ before)
     share = float(step @ before) / square if square > 0.0 else 0.0
-    return 1.0 / (1.0 - share) if settings.share_least < share < settings.share_most else 1.0
+    return 1.0 / (1.0 - share) if SHARES[0] < share < SHARES[1] else 1.0
 
 
 def gradient(groups: Sequence[Rows], layout: Layout) -> Array:
-    """Returns the gradient `J' r` (n,) of all rows, by the columns of the layout."""
+    """Return the gradient `J' r` (n,) of all rows, by the columns of the layout."""
     groups = [rows for rows in groups if len(rows)]
     columns = np.concatenate([rows.columns(layout).ravel() for rows in groups])
     slopes = np.concatenate([(rows.jacobian * rows.residual[:, None]).ravel() for rows in groups])

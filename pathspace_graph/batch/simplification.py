@@ -1,51 +1,151 @@
-"""Simplification: the optimum's curves on few knots, their covariance, and how far cones lie from them."""
+"""Knots of the batch's curves: about one for each cone at the optimum, few of them in the map.
 
-from __future__ import annotations
+Simplification: the optimum's curves on few knots, their covariance, and how far cones lie from them.
+"""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.graph.keys import CONTROL_LETTERS, POINT
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.batch import BatchSettings
+from pathspace_graph.settings.knots import FitSettings
+from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
 from pathspace_graph.spline.boundary import Boundary
-from pathspace_graph.spline.knots import refit
+from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.cone_knots import chosen_breaks
+from pathspace_graph.spline.knots import fit_spline, refit
 
-from .association import associate, find_anywhere, locate_poses
-from .cones import cones_of_curve, first_parameter
-from .knots import fit_through, reknot
+from .association import MIN_CONES, associate, cones_of_curve, find_anywhere, first_parameter, locate_poses
 
-Array = NDArray[np.float64]
-
+MIN_SIZE_SHARE: Final = 0.6
+"""The map's curves are tried with at least this share of the largest number of control points."""
 ALIKE: Final = (3.0, 0.01)
 """Parameters of two curves through the same cones differ by less than `a + b L` (m), with L their length."""
+FOLDS: Final = 4
+"""Groups of the cross-validation, which the cones are dealt to in turn. So the neighbours of a cone that is
+left out are always there."""
+FOOT_ROOM: Final = 1.5
+"""The foot point of a cone is searched this far (m along the curve) from its own place."""
+
+
+# --- knots -----------------------------------------------------------------------------------------------
+
+
+def reknot(state: State, detections: DetectionTable, settings: MapperSettings, dense: bool = False) -> State:
+    """Return the state with every curve fitted anew through the cones along it.
+
+    `dense` places so many knots that the curves meet the cones; else they are as few as the map has.
+    """
+    state = state.copy()
+    cones = {label: cones_of_curve(state, detections, label, settings) for label in state.boundaries}
+    share = size_share({label: len(found.u) for label, found in cones.items()}, settings.batch)
+    for label, boundary in list(state.boundaries.items()):
+        points = cones[label].points
+        if len(points) < MIN_CONES:
+            continue
+        if dense:
+            beyond = 0.0 if boundary.periodic else settings.growth.merge_radius
+            spline = dense_fit_through(extended(points, beyond), boundary.periodic, settings)
+        else:
+            spline = fit_through(points, boundary.periodic, settings, share)
+        state.replace_boundary(label, *boundary_of(spline, settings))
+    return state
+
+
+def size_share(cones: Mapping[int, int], batch: BatchSettings) -> float:
+    """Return the control points per cone: the settings' share, or their size over all cones of the
+    boundaries."""
+    total = sum(cones.values())
+    return batch.size_share if batch.size is None or total == 0 else batch.size / total
+
+
+def fit_through(points: Array, periodic: bool, settings: MapperSettings, share: float) -> BSpline:
+    """Return a curve through ordered cones (k, 2), which has at most `share` control points for each."""
+    least_size = settings.spline.min_size
+    most = max(least_size, int(share * len(points)))
+    return _fit(points, periodic, settings, max(least_size, int(MIN_SIZE_SHARE * most)), most)
+
+
+def dense_fit_through(points: Array, periodic: bool, settings: MapperSettings) -> BSpline:
+    """Return a curve through cones (k, 2) on nearly a knot for each."""
+    size = max(settings.spline.min_size, int(settings.batch.dense_share * len(points)))
+    return _fit(points, periodic, settings, size, size)
+
+
+def _fit(points: Array, periodic: bool, settings: MapperSettings, least: int, most: int) -> BSpline:
+    """Return the curve of `least` to `most` control points that fits best.
+
+    A closed one begins at the cone nearest to the start, so that similar cones give similar knots.
+    """
+    if periodic:
+        points = np.roll(points, -int(np.hypot(*points.T).argmin()), axis=0)
+    fit = FitSettings(degree=settings.spline.degree)
+    chosen = chosen_breaks(points, periodic, fit, least, most)
+    return fit_spline(points, chosen.size, periodic, fit, chosen.breaks)
+
+
+def extended(points: Array, beyond: float) -> Array:
+    """Return cones (k, 2) with a point before the first and one after the last, `beyond` metres straight on.
+
+    There are at least two cones. Half of the detections of the last one lie beyond it, and any motion of an
+    end there would put some of them into use and others out of it. Nothing is added where `beyond` is zero.
+    """
+    if beyond == 0.0:
+        return points
+    ends, inner = points[[0, -1]], points[[1, -2]]
+    ahead = (ends - inner) / np.maximum(np.hypot(*(ends - inner).T), np.finfo(float).tiny)[:, None]
+    first, last = ends + beyond * ahead
+    return np.concatenate([first[None], points, last[None]])
+
+
+def boundary_of(spline: BSpline, settings: MapperSettings) -> tuple[Boundary, Array]:
+    """Return a boundary that is the given curve, all of it confirmed, and its control points (m, 2)."""
+    spline = spline if spline.periodic else spline.unclamp()
+    boundary = Boundary(spline.knots, spline.periodic, exact_settings(settings.spline), settings.gauge)
+    boundary.confirmed_end = boundary.tables.high
+    return boundary, spline.distinct_control_points
+
+
+def exact_settings(spline: SplineSettings) -> SplineSettings:
+    """Return a curve's settings with foot points that are more exact than online: an optimum needs it."""
+    return replace(spline, refine_iterations=2, refine_room=8.0, search_iterations=4)
+
+
+# --- simplification --------------------------------------------------------------------------------------
 
 
 def simplify(
     state: State, covariance: Array, detections: DetectionTable, settings: MapperSettings
 ) -> tuple[State, Array]:
-    """Returns the same poses beside curves on few knots, and the joint covariance (n, n) of their control
+    """Return the same poses beside curves on few knots, and the joint covariance (n, n) of their control
     points (paper: Simplification).
 
-    `C_new = F C_old`, so the covariance is `F Sigma F'`, with Sigma the given covariance of the state's
-    control points. The optimum isn't solved for on few knots: such a curve would pass its cones by a
-    decimetre, on the same side in every lap, which no number of detections averages out. In the first seconds
-    that turns the vehicle, and with it the whole map, by up to a degree, several times its claimed sigma.
+    `C_new = F C_old`, so the covariance is `F Sigma F'`, with Sigma that of the state's control points. The
+    optimum isn't solved for on few knots: such a curve passes its cones by a decimetre, on the same side in
+    every lap. In the first seconds that turns vehicle and map by up to a degree, several times the claimed
+    sigma.
     """
     few, change = simplified(state, detections, settings)
-    locate_poses(few, settings.batch.association)
-    associate(few, detections, settings, settings.batch.gate, strict=True)
+    associate_again(few, detections, settings)
     return few, change @ covariance @ change.T
 
 
+def associate_again(few: State, detections: DetectionTable, settings: MapperSettings) -> None:
+    """Place the poses beside simplified curves, and associate the detections with these."""
+    locate_poses(few, settings.batch.association)
+    associate(few, detections, settings, settings.batch.gate, strict=True)
+
+
 def simplified(state: State, detections: DetectionTable, settings: MapperSettings) -> tuple[State, Array]:
-    """Returns the same poses beside curves on few knots, and the change F (k, n) of the control points."""
+    """Return the same poses beside curves on few knots, and the change F (k, n) of the control points."""
     few = reknot(state, detections, settings)
     change = np.zeros((few.map_points.size, state.map_points.size))
     for label, boundary in state.boundaries.items():
@@ -56,17 +156,18 @@ def simplified(state: State, detections: DetectionTable, settings: MapperSetting
 
 
 def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:
-    """Returns F (m_new, m_old): least squares over points of the old curve and their foot points on the new.
+    """Return F (m_new, m_old): least squares over points of the old curve and their foot points on the new.
 
     old_points (m_old, 2) and new_points (m_new, 2) are the curves' control points. An open dense curve goes
     on beyond the ends of the new one, which doesn't count.
     """
-
     splines = old.spline(old_points), new.spline(new_points)
     if new.periodic:
-        return refit(
-            *splines, lambda u: find_anywhere(new, new_points, old.evaluate(old_points, u)).u
-        ).new_from_old
+
+        def nearest_on_new(u: Array) -> Array:
+            return find_anywhere(new, new_points, old.evaluate(old_points, u)).u
+
+        return refit(*splines, nearest_on_new).new_from_old
     # an open curve that passes the same cones again lies on itself, so it is searched near the same place
     ends, quarter = np.array([new.tables.low, new.tables.high]), 0.25 * (old.tables.high - old.tables.low)
     low = np.array([old.tables.low, old.tables.high - quarter])
@@ -82,7 +183,7 @@ def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Ar
 
 
 def map_block(state: State, label: int) -> slice:
-    """Returns where the control points of a boundary are in a joint covariance of all boundaries."""
+    """Return where the control points of a boundary are in a joint covariance of all boundaries."""
     return Layout(state.map_keys).block(CONTROL_LETTERS[label])
 
 
@@ -91,28 +192,28 @@ def map_block(state: State, label: int) -> slice:
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Holds how far cones lie from the simplified curves: a variance to be added to that of the curves.
+    """How far cones lie from the simplified curves: a variance to be added to that of the curves.
 
     `sigma^2(u) = seen^2 + (d / s)^2 (unseen^2 - seen^2)`, where d is the distance along the curve from u to
-    the nearest detected cone, and s is the usual distance of two such cones. A detected cone is missed by
-    `seen`. A cone that was never detected (d = s) is missed by as much as a detected one that is left out
-    where the knots are chosen and the curve is fitted: that is a cross-validation. Without the scatter, the
-    claimed covariance is right at detected cones, and several times too small at the others.
+    the nearest detected cone, and s is the usual distance of two such cones. A cone that was never detected
+    (d = s) is missed by as much as a detected one that is left out of knots and fit (cross-validation).
+    Without the scatter, the claimed covariance is right at detected cones, and several times too small at the
+    others.
     """
 
     LENGTHS: ClassVar = {"seen": 1, "unseen": 1, "places": 1, "lengths": 1}
 
     seen: float
-    """This is the root mean square distance of the detected cones from the curves (m)."""
+    """Root mean square distance of the detected cones from the curves (m)."""
     unseen: float
-    """This is their root mean square distance from curves that are fitted without them (m)."""
+    """The same from curves that are fitted without them (m)."""
     places: dict[int, Array]
-    """For each boundary, these are the parameters (k,) of its detected cones (m)."""
+    """Parameters (k,) of the detected cones of each boundary (m)."""
     lengths: dict[int, float]
-    """For each boundary, this is the length of a closed curve in units of its parameter, else infinity."""
+    """Length of each closed curve in units of its parameter, else infinity."""
 
     def sigma(self, label: int, u: Array) -> Array:
-        """Returns the standard deviation (m,) of the scatter at parameters u (m,) of a boundary, in m."""
+        """Return the standard deviation (m,) of the scatter at parameters u (m,) of a boundary, in m."""
         places = self.places.get(label, np.zeros(0))
         if len(places) < 2:
             return np.full(len(u), self.unseen)
@@ -126,14 +227,13 @@ class Scatter:
 
 
 def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperSettings) -> Scatter:
-    """Returns the scatter of the detected cones about the curves of the state."""
+    """Return the scatter of the detected cones about the curves of the state."""
     seen, unseen = [np.zeros(0)], [np.zeros(0)]
     places, lengths = {}, {}
-    room = settings.batch.scatter.foot_room
     for label, boundary in state.boundaries.items():
         cones = cones_of_curve(state, detections, label, settings)
         u, share = first_parameter(state, label) + cones.u, boundary.size / max(len(cones.u), 1)
-        foot = boundary.find(state.control_points(label), cones.points, u - room, u + room)
+        foot = boundary.find(state.control_points(label), cones.points, u - FOOT_ROOM, u + FOOT_ROOM)
         seen.append(foot.distance)
         unseen.append(cross_validated(cones.points, boundary.periodic, settings, share))
         places[label] = foot.u
@@ -142,17 +242,17 @@ def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperS
 
 
 def cross_validated(points: Array, periodic: bool, settings: MapperSettings, share: float) -> Array:
-    """Returns the distance of each cone (k, 2) from a curve that is fitted without it, in m, in any order.
+    """Return the distance of each cone (k, 2) from a curve that is fitted without it, in m, in any order.
 
     `share` is the number of control points per cone. The first and the last cone of an open curve are never
-    left out, since nothing is known beyond them, so they have no distance.
+    left out, since nothing is known beyond them.
     """
-    folds, number = settings.batch.scatter.folds, np.arange(len(points))
+    number = np.arange(len(points))
     ends = np.zeros(len(points), bool) if periodic else (number == 0) | (number == len(points) - 1)
     distances = [np.zeros(0)]
-    for fold in range(folds):
-        out = (number % folds == fold) & ~ends
-        if (~out).sum() < settings.batch.cones.min_count:
+    for fold in range(FOLDS):
+        out = (number % FOLDS == fold) & ~ends
+        if (~out).sum() < MIN_CONES:
             continue
         spline = fit_through(points[~out], periodic, settings, share)
         low, high = (np.full(out.sum(), end) for end in spline.domain)
@@ -163,5 +263,4 @@ def cross_validated(points: Array, periodic: bool, settings: MapperSettings, sha
 
 
 def _rms(values: Array) -> float:
-    """Returns the root mean square, 0 of nothing."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

@@ -1,23 +1,66 @@
-"""The start of the batch from an online run of the same log: its final map, and all of its poses there."""
+"""The start of the batch: from an online run of the same log, or from odometry alone.
 
-from __future__ import annotations
+From odometry, the curvature of the path driven says how long a lap is. The laps are brought together by
+dead reckoning, and the curves begin as those through the cones beside lap 1.
+"""
 
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import fft, ifft, next_fast_len
 
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE
+from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.front_end.log_odometry import LogOdometry
+from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_keys
+from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.variables import Variables
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.candidates import SIDES
+from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.path import along_and_across
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import OnlineEstimator, run_online
+from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
-from .association import add_drive
-from .knots import exact_settings
+from .association import MIN_CONES, add_drive, certainty, cluster, path_lengths
+from .simplification import boundary_of, exact_settings, fit_through
 
-Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+PROFILE_STEP: Final = 0.5
+"""The path driven is sampled at this step (m)."""
+SMOOTHING: Final = 3.0
+"""The curvature is averaged over this length (m)."""
+CORRELATION_SHARE: Final = 0.8
+"""A lap is about the shortest lag whose correlation is at least this share of the largest one."""
+RECURS: Final = 0.7
+"""Least correlation of the curvature with itself a lap later. On a track of two loops of which one is wider,
+it is 0.56 at most after one of them."""
+MIN_OVERLAP: Final = 20.0
+"""The path must go on for this length (m) after a lap, or else the lap isn't found: over less, straights
+agree with straights."""
+REFERENCE_STEP: Final = 8.0
+"""Distance of the reference poses that every lap passes (m)."""
+LAP_SIGMAS: Final = np.array([1.5, 1.5, 0.15])
+"""Standard deviations of a lap's pose about the reference pose that it passes (m, m, rad)."""
+ALIGN_STEPS: Final = 8
+"""Gauss-Newton steps at most that bring the laps together."""
+ALIGN_TOLERANCE: Final = 1e-6
+"""They are brought together when a step moves nothing farther than this (m, rad)."""
+MAX_LATERAL: Final = 15.0
+"""A boundary has detections nearer to the driven path than this (m)."""
+
+
+# --- from an online run ----------------------------------------------------------------------------------
 
 
 class CurveMapper(OnlineEstimator, Protocol):
@@ -25,40 +68,284 @@ class CurveMapper(OnlineEstimator, Protocol):
 
     @property
     def boundaries(self) -> dict[int, Boundary]:
-        """Returns the curves by label, without their control points."""
+        """Return the curves by label, without their control points."""
 
     @property
     def calibrations(self) -> Array:
-        """Returns the calibration of the odometry (2,), or of odometry and sensor (7,)."""
+        """Return the calibration of the odometry (2,), or of odometry and sensor (7,)."""
 
     @property
     def closed(self) -> bool:
-        """Returns whether the loop has closed."""
+        """Return whether the loop has closed."""
 
     def control_points(self, label: int) -> Array:
-        """Returns the control points (m, 2) of a boundary in m, map frame."""
+        """Return the control points (m, 2) of a boundary in m, map frame."""
 
     @property
     def corrected_poses(self) -> Array:
-        """Returns the poses (k, 3) of the first k cycles as the closing of the loop has corrected them."""
+        """Return the poses (k, 3) of the first k cycles as the closing of the loop has corrected them."""
 
 
 def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
-    """Returns the final map of an online run with all of its poses, and the run."""
+    """Return the final map of an online run with all of its poses, and the run."""
     run = run_online(log, mapper)
     settings: MapperSettings = mapper.settings
-    state, batch = State(), settings.batch
-    for label, boundary in mapper.boundaries.items():
-        exact = exact_settings(boundary.settings, batch)
-        own = Boundary(boundary.knots, boundary.periodic, exact, boundary.gauge)
-        own.confirmed_end = boundary.confirmed_end
-        state.add_boundary(label, own, mapper.control_points(label))
+    state = State()
+    for label, known in mapper.boundaries.items():
+        boundary = Boundary(known.knots, known.periodic, exact_settings(known.settings), known.gauge)
+        boundary.confirmed_end = known.confirmed_end
+        state.add_boundary(label, boundary, mapper.control_points(label))
     corrected = mapper.corrected_poses
     poses = unwrap(np.concatenate([corrected, run.trajectory[len(corrected) :]]))
-    add_drive(state, poses, mapper.calibrations, batch.association)
+    add_drive(state, poses, mapper.calibrations, settings.batch.association)
     return state, run
 
 
 def unwrap(poses: Array) -> Array:
-    """Returns poses (n, 3) whose headings have no jump."""
+    """Return poses (n, 3) whose headings have no jump."""
     return np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]) if len(poses) else poses
+
+
+# --- the length of a lap ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Recurrence:
+    """The length of the path driven, and after which length it recurs."""
+
+    driven: Array
+    """Path lengths (P,) from the first pose to each pose (m)."""
+    lap: float
+    """Path length of a lap (m), infinite where the path doesn't recur."""
+    turn: float
+    """Change of the heading in a lap, by the odometry (rad)."""
+    correlation: float
+    """How well the curvature agrees with itself a lap later, 1 where it is the same."""
+
+    @property
+    def recurs(self) -> bool:
+        """Return whether a lap was found."""
+        return bool(np.isfinite(self.lap))
+
+    def denied(self) -> "Recurrence":
+        """Return the same path without a lap."""
+        return Recurrence(self.driven, np.inf, 0.0, 0.0)
+
+    @property
+    def whole_turn(self) -> float:
+        """Return the whole turns nearest to the change of the heading in a lap (rad)."""
+        return float(2.0 * np.pi * np.round(self.turn / (2.0 * np.pi)))
+
+
+def find_recurrence(poses: Array, settings: MapperSettings) -> Recurrence:
+    """Return the shortest path length after which the curvature of dead-reckoned poses (P, 3) recurs.
+
+    From the first lag whose correlation is a large share of the best one's, the search climbs to a lag that
+    is the best within `closing.radius` after it. That is the lap.
+    """
+    closing, driven = settings.closing, path_lengths(poses)
+    profile = profile_of(poses, driven)
+    first, last = int(closing.min_path / PROFILE_STEP), int(MIN_OVERLAP / PROFILE_STEP)
+    lags = np.arange(first, len(profile.heading) - last)
+    scores = profile.correlations(lags, closing) if len(lags) else np.zeros(0)
+    if not scores.max(initial=-np.inf) >= RECURS:
+        return Recurrence(driven, np.inf, 0.0, 0.0)
+    best = int(np.argmax(scores >= CORRELATION_SHARE * scores.max()))
+    reach = int(closing.radius / PROFILE_STEP)
+    while (step := int(np.argmax(scores[best : best + reach]))) > 0:
+        best += step
+    lag = int(lags[best])
+    turn = float(np.median(profile.heading[lag:] - profile.heading[:-lag]))
+    return Recurrence(driven, lag * PROFILE_STEP, turn, float(scores[best]))
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """The path driven, sampled at steps of PROFILE_STEP along it."""
+
+    position: Array
+    """Positions (n, 2) in m, in the frame of the poses."""
+    heading: Array
+    """Headings (n,) in rad, not wrapped."""
+    curvature: Array
+    """Averaged curvatures (n,) in 1/m."""
+
+    def correlations(self, lags: IntArray, settings: ClosingSettings) -> Array:
+        """Return how well the curvature agrees with itself each of the lags (l,) later, in samples.
+
+        The result (l,) is `1 - mean((a - b)^2) / (mean(a^2) + mean(b^2))`, 1 where both are the same. It is
+        -inf where the path isn't back at about the same place and heading after that lag, by the limits of a
+        loop closure. All sums over the overlap come from a Fourier transform.
+        """
+        off = self.position - self.position.mean(axis=0)
+        place, curvature = off[:, 0] + 1j * off[:, 1], self.curvature.astype(complex)
+        square = _mean_square_difference(place, lags)
+        along = _mean_products(np.exp(1j * self.heading), lags).real
+        radius = settings.radius + settings.drift * lags * PROFILE_STEP
+        power = np.maximum(_mean_squares(curvature, lags), np.finfo(float).tiny)
+        agreement = 1.0 - _mean_square_difference(curvature, lags) / power
+        back = (square < radius**2) & (along > np.cos(settings.heading))
+        return np.where(back, agreement, -np.inf)
+
+
+def profile_of(poses: Array, driven: Array) -> Profile:
+    """Return the path through poses (P, 3) with path lengths (P,), sampled at equal steps."""
+    s = np.arange(0.0, driven[-1], PROFILE_STEP)
+    x, y, heading = (np.interp(s, driven, poses[:, k]) for k in range(POSE))
+    half, number = max(int(0.5 * SMOOTHING / PROFILE_STEP), 1), np.arange(len(s))
+    later, before = np.minimum(number + half, len(s) - 1), np.maximum(number - half, 0)
+    return Profile(np.column_stack([x, y]), heading, (heading[later] - heading[before]) / SMOOTHING)
+
+
+def _mean_square_difference(values: ComplexArray, lags: IntArray) -> Array:
+    """Return the mean of `|v(i + lag) - v(i)|^2` for each lag (l,)."""
+    return np.asarray(_mean_squares(values, lags) - 2.0 * _mean_products(values, lags).real)
+
+
+def _mean_squares(values: ComplexArray, lags: IntArray) -> Array:
+    """Return the mean of `|v(i)|^2 + |v(i + lag)|^2` for each lag (l,)."""
+    total = np.append(0.0, np.cumsum(np.abs(values) ** 2))
+    count = len(values) - lags
+    return np.asarray((total[count] + total[-1] - total[lags]) / count)
+
+
+def _mean_products(values: ComplexArray, lags: IntArray) -> ComplexArray:
+    """Return the mean of `v(i + lag) conj(v(i))` for each lag (l,)."""
+    transform = fft(values, next_fast_len(2 * len(values)))
+    return np.asarray(ifft(np.abs(transform) ** 2)[lags] / (len(values) - lags))
+
+
+# --- from odometry ---------------------------------------------------------------------------------------
+
+
+def start_odometry(
+    chain: LogOdometry,
+    detections: DetectionTable,
+    settings: MapperSettings,
+    recurrence: Recurrence | None = None,
+) -> State:
+    """Return poses by dead reckoning, and curves through the cones that were seen in the first lap.
+
+    Where the path recurs, every lap is made to pass the same places first, and the curves are closed;
+    otherwise they are open. By default the path driven says whether it recurs.
+    """
+    calibration = np.array(settings.calibrations)
+    poses = chain.dead_reckoned(calibration[:CALIBRATION_SIZE])
+    recurrence = recurrence or find_recurrence(poses, settings)
+    if recurrence.recurs:
+        poses, calibration[:CALIBRATION_SIZE] = align_laps(chain, recurrence)
+    state = State()
+    for label in BOUNDARIES:
+        _begin_boundary(state, label, poses, recurrence, detections, settings)
+    add_drive(state, poses, calibration, settings.batch.association)
+    return state
+
+
+def align_laps(chain: LogOdometry, recurrence: Recurrence) -> tuple[Array, Array]:
+    """Return the poses (P, 3) and the calibration (2,) at which every lap passes the same reference poses.
+
+    Gauss-Newton minimizes the odometry's cost and that of the lap correspondences. The reference poses are
+    unknown, too: their keys are those of cycles after the last one. The search begins at the yaw-rate bias by
+    which the heading changes by whole turns in a lap.
+    """
+    seconds = (chain.stamps[-1] - chain.stamps[0]) / (recurrence.driven[-1] / recurrence.lap)
+    calibration = np.array([0.0, (recurrence.turn - recurrence.whole_turn) / seconds])
+    correspondences, poses = lap_correspondences(recurrence), chain.dead_reckoned(calibration)
+    poses, variables = np.concatenate([poses, correspondences.references_at(poses)]), Variables()
+    variables.insert(np.array([CALIBRATION_KEY]), calibration)
+    variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
+    count = len(chain)
+    for _ in range(ALIGN_STEPS):
+        poses, calibration = variables.poses[:count], variables.calibration
+        rows = chain.rows(chain.terms(poses, calibration), poses[0], calibration)
+        rows.append(correspondences.rows(poses, variables.poses[count:]))
+        step = Elimination(linear_graph(rows, variables), variables.layout).step(np.zeros(CALIBRATION_SIZE))
+        variables.values = variables.values + step
+        if np.abs(step).max() < ALIGN_TOLERANCE:
+            break
+    return variables.poses[:count], variables.calibration
+
+
+@dataclass(frozen=True, eq=False)
+class LapCorrespondences:
+    """Residuals `(x_k - reference_k - (0, 0, turns_k)) / sigmas` of poses k that pass a reference pose."""
+
+    cycles: IntArray
+    """Perception cycles (k,) of the poses."""
+    reference: IntArray
+    """Numbers (k,) of the reference poses that they pass."""
+    turns: Array
+    """Change of the heading (k,) in the whole laps before each pose (rad)."""
+
+    def references_at(self, poses: Array) -> Array:
+        """Return the reference poses (c, 3): the first of the poses (P, 3) that passes each of them."""
+        first = np.unique(self.reference, return_index=True)[1]
+        return poses[self.cycles[first]] - self.turns[first, None] * [0.0, 0.0, 1.0]
+
+    def rows(self, poses: Array, references: Array) -> Rows:
+        """Return whitened rows at poses (P, 3) and reference poses (c, 3), whose keys follow the poses'."""
+        off = poses[self.cycles] - references[self.reference]
+        off[:, 2] -= self.turns
+        keys = pose_keys(np.column_stack([self.cycles, len(poses) + self.reference]))
+        jacobian = np.concatenate([np.diag(1.0 / LAP_SIGMAS), np.diag(-1.0 / LAP_SIGMAS)], axis=1)
+        return Rows(
+            keys=np.repeat(keys, POSE, axis=0),
+            jacobian=np.tile(jacobian, (len(off), 1)),
+            residual=(off / LAP_SIGMAS).ravel(),
+            owner=np.repeat(owners(self.cycles), POSE),
+        )
+
+
+def lap_correspondences(recurrence: Recurrence) -> LapCorrespondences:
+    """Return the correspondences of the poses nearest to where each lap passes each reference pose.
+
+    A lap has a whole number of reference poses, equally spaced by REFERENCE_STEP at most.
+    """
+    count = max(int(np.ceil(recurrence.lap / REFERENCE_STEP)), 1)
+    places = recurrence.driven / recurrence.lap * count
+    cycles = _nearest_cycles(places)
+    reference = np.mod(np.round(places[cycles]).astype(np.intp), count)
+    turns = recurrence.whole_turn * np.round((places[cycles] - reference) / count)
+    return LapCorrespondences(cycles, reference, turns)
+
+
+def _nearest_cycles(places: Array) -> IntArray:
+    """Return the cycle nearest to each whole number that the increasing places (P,) pass."""
+    whole = np.arange(np.ceil(places[0]), np.floor(places[-1]) + 1.0)
+    after = np.clip(np.searchsorted(places, whole), 1, len(places) - 1)
+    nearer = np.abs(places[after - 1] - whole) < np.abs(places[after] - whole)
+    return np.unique(np.where(nearer, after - 1, after))
+
+
+def _begin_boundary(
+    state: State,
+    label: int,
+    poses: Array,
+    recurrence: Recurrence,
+    detections: DetectionTable,
+    settings: MapperSettings,
+) -> None:
+    """Add a curve through the cones of a boundary that were seen in the first lap, if there are enough.
+
+    They lie beside its path. A detection whose station isn't about that of its cycle belongs to a stretch
+    that is driven later.
+    """
+    first_lap, gate = recurrence.driven < recurrence.lap, settings.gate
+    rows = np.flatnonzero((detections.label == label) & first_lap[detections.cycle])
+    if len(rows) == 0 or first_lap.sum() < 2:
+        return
+    cycles = detections.cycle[rows]
+    path, stations = poses[first_lap, :2], recurrence.driven[first_lap]
+    if recurrence.recurs:
+        path, stations = np.concatenate([path, path[:1]]), np.append(stations, recurrence.lap)
+    length = recurrence.lap if recurrence.recurs else float(stations[-1]) + settings.growth.reach
+    points = to_map(detections.point[rows], poses[cycles])
+    station, lateral = along_and_across(points, path, stations)
+    side, ahead = SIDES[label] * lateral, station - recurrence.driven[cycles]
+    kept = (side > settings.growth.min_lateral) & (side < MAX_LATERAL)
+    kept &= (ahead > -gate.view_behind) & (ahead < gate.view_ahead) & (station >= 0.0) & (station < length)
+    weight = certainty(detections, rows[kept])
+    cones = cluster(points[kept], station[kept], weight, length, recurrence.recurs, settings)
+    if len(cones.u) >= MIN_CONES:
+        spline = fit_through(cones.points, recurrence.recurs, settings, settings.batch.size_share)
+        state.add_boundary(label, *boundary_of(spline, settings))

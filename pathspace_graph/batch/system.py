@@ -1,16 +1,14 @@
 """The least-squares problem of a whole log: its cost at a state, and its linear factors there."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.projection import PlaceRows, ProjectionRows, project, sigma_across
+from pathspace_graph.factors.projection import ProjectionRows, project
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import SensorRows, range_rates, sensor_rows
 from pathspace_graph.front_end.log_odometry import LogOdometry, sensor_prior, sensor_prior_cost
@@ -18,18 +16,21 @@ from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph
 from pathspace_graph.graph.keys import SENSOR_KEY, are_poses, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
-from pathspace_graph.mapping.cone_places import ConePlaces, lay_out_places
-from pathspace_graph.mapping.detections import NOWHERE, DetectionTable
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import Boundary
 
-from .cones import places
 from .gauge import CurveGauge, curve_gauge
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
+
+def own_settings(settings: MapperSettings) -> MapperSettings:
+    """Return the settings with the batch's own values in the groups that it shares with online mapping."""
+    batch = settings.batch
+    return replace(
+        settings,
+        spline=replace(settings.spline, sigma_model=batch.sigma_model),
+        gauge=replace(settings.gauge, sigma_smoothness=batch.sigma_smoothness),
+    )
 
 
 @dataclass(frozen=True)
@@ -41,19 +42,19 @@ class Biweight:
     """
 
     gate: float
-    """This is the gate g in sigmas."""
+    """Gate g in sigmas."""
 
     def loss(self, whitened: Array) -> Array:
-        """Returns `rho(z)` (m,) of whitened residuals z (m,)."""
+        """Return `rho(z)` (m,) of whitened residuals z (m,)."""
         return np.asarray(self.gate**2 / 6.0 * (1.0 - self._inner(whitened) ** 3))
 
     def weights(self, whitened: Array) -> Array:
-        """Returns the robust weights `rho'(z) / z = (1 - z^2 / g^2)^2` (m,)."""
+        """Return the robust weights `rho'(z) / z = (1 - z^2 / g^2)^2` (m,)."""
         return np.asarray(self._inner(whitened) ** 2)
 
     @property
     def ceiling(self) -> float:
-        """Returns the loss of a detection that isn't used, which is that at the gate."""
+        """Return the loss of a detection that isn't used, which is that at the gate."""
         return float(self.loss(np.array([self.gate]))[0])
 
     def _inner(self, whitened: Array) -> Array:
@@ -62,61 +63,41 @@ class Biweight:
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """Holds the detections that are used on one boundary, projected on its curve at a state."""
+    """The m detections that are used on one boundary, projected on its curve at a state.
+
+    A round holds `sigma` and `inside`, so that the cost does not jump where an end of an open curve slides
+    past a detection.
+    """
 
     rows: IntArray
-    """These are the rows (m,) of the detections in their table."""
+    """Rows (m,) of the detections in their table."""
     foot: FootPoints
-    """These are their foot points."""
     projection: ProjectionRows
-    """These are their residuals and derivatives."""
+    """Residuals and derivatives."""
     sigma: Array
-    """These are their standard deviations (m,) across the curve in m, which a round holds."""
+    """Standard deviations (m,) across the curve in m."""
     inside: BoolArray
-    """Each flag (m,) is set where the foot point was inside the curve when the round began. A round holds it,
-    so that the cost does not jump where an end of an open curve slides past a detection."""
+    """Set (m,) where the foot point was inside the curve when the round began."""
     by: SensorRows
-    """This is how their residuals depend on the calibration of the sensor."""
+    """How the residuals depend on the calibration of the sensor."""
 
     @property
     def whitened(self) -> Array:
-        """Returns the residuals (m,) in sigmas."""
+        """Return the residuals (m,) in sigmas."""
         return np.asarray(self.by.factor * self.projection.residual / self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """Holds the detections that are of a cone's place, and how far past it they lie at a state."""
-
-    rows: IntArray
-    """These are the rows (m,) of the detections in their table."""
-    along: PlaceRows
-    """These are their residuals and derivatives."""
-    sigma: Array
-    """These are their standard deviations (m,) along the curve in m."""
-    by: SensorRows
-    """This is how their residuals depend on the calibration of the sensor."""
-
-    @property
-    def whitened(self) -> Array:
-        """Returns the residuals (m,) in sigmas."""
-        return np.asarray(self.by.factor * self.along.residual / self.sigma)
-
-
-@dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Holds the problem at one state."""
+    """The problem at one state."""
 
     state: State
-    """This is the state."""
     projected: dict[int, Projected]
-    """These are the used detections of each boundary."""
-    placed: Placed | None
-    """These are the detections that are of a place, or none if there are no places."""
+    """Used detections of each boundary."""
     odometry: tuple[Array, Array]
-    """These are the residuals and derivatives of `LogOdometry.terms`."""
+    """Residuals and derivatives of `LogOdometry.terms`."""
     cost: float
-    """This is half the sum of squares, with the robust losses of the detections."""
+    """Half the sum of squares, with the robust losses of the detections."""
 
 
 class BatchSystem:
@@ -130,32 +111,22 @@ class BatchSystem:
         self.settings = settings
         self.kernel = kernel
         self.gauges: dict[int, CurveGauge] = {}
-        """These are the weak priors of each boundary."""
-        self.places: ConePlaces | None = None
-        """These are the cones' places along the curves, where the settings ask for them."""
-        self._sigma, self._sigma_along = np.ones(len(detections)), np.ones(len(detections))
-        self._inside = np.ones(len(detections), bool)
-        self._rates, self._rates_along = np.zeros((2, len(detections), 2))
+        """Weak priors of each boundary."""
+        count = len(detections)
+        self._sigma, self._inside, self._rates = np.ones(count), np.ones(count, bool), np.zeros((count, 2))
 
     def begin(self, state: State) -> None:
-        """Makes the gauges anew, which hold the control points where they are now.
-
-        The optimizer calls this when knots have changed.
-        """
-        sigma, self.places = self.settings.batch.sigma_slide, None
+        """Make the gauges anew, which hold the control points where they are now, when knots have changed."""
+        sigma = self.settings.batch.sigma_slide
         self.gauges = {label: curve_gauge(state, label, sigma) for label in state.boundaries}
 
-    # --- cost --------------------------------------------------------------------------------------------
-
     def evaluate(self, state: State, hold: bool = False) -> Evaluation:
-        """Returns the problem at a state; foot points are refined from those that the detections have.
+        """Return the problem at a state; foot points are refined from those that the detections have.
 
-        `hold` sets the sigma of each detection across its curve, and whether its foot point is inside the
-        curve, which later evaluations keep. The derivatives leave out that the sigma depends on the direction
-        of the curve.
+        `hold` sets what later evaluations keep. The derivatives leave out that the sigma depends on the
+        direction of the curve.
         """
         projected = {label: self._project(state, label, hold) for label in state.boundaries}
-        placed = None if self.places is None else self._placed(state, self.places, hold)
         odometry = self.chain.terms(state.poses, state.calibration)
         cost = self._detections_cost(projected) + 0.5 * float((odometry[0] ** 2).sum())
         cost += sum(
@@ -163,83 +134,31 @@ class BatchSystem:
         )
         cost += self.chain.prior_cost(state.poses[0], state.calibration)
         cost += sensor_prior_cost(state.variables, self.settings.calibration)
-        if placed is not None:
-            cost += float(self.kernel.loss(placed.whitened).sum())
-        return Evaluation(state, projected, placed, odometry, cost)
-
-    def place(self, state: State) -> None:
-        """Associates the detections in use with the cones' places, which are found first if there are none.
-
-        A place is the mean of the parameters of a cone's detections, and then a constant: that the cone lies
-        elsewhere along the track is left to the control points, of which there is about one for each cone.
-        """
-        if self.places is None:
-            own = {label: self._places_of(boundary, label) for label, boundary in state.boundaries.items()}
-            self.places = lay_out_places(state.curves, own)
-        self.places.associate(self.detections, state.curves, self.settings.place)
-
-    def places_by_label(self, state: State) -> dict[int, Array]:
-        """Returns the parameters (k,) of the places on each curve, none where the settings ask for none."""
-        if self.places is None:
-            return {}
-        starts = self.places.starts
-        return {label: self.places.u[starts[c] : starts[c + 1]] for c, label in enumerate(state.boundaries)}
-
-    def _places_of(self, boundary: Boundary, label: int) -> Array:
-        """Returns the places (k,) of the cones of a boundary on its curve."""
-        rows, low = self.detections.used_on(label), boundary.tables.low
-        weight = 1.0 / np.trace(self.detections.covariance[rows], axis1=1, axis2=2)
-        u = boundary.tables.inside(self.detections.u[rows]) - low
-        return low + places(u, weight, boundary.length, boundary.periodic, self.settings)
-
-    def _placed(self, state: State, places: ConePlaces, hold: bool) -> Placed:
-        detections = self.detections
-        rows = np.flatnonzero(detections.used & (detections.place != NOWHERE))
-        poses = state.variables.poses_at(detections.cycle[rows])
-        points = to_map(detections.corrected(rows, state.variables.sensor), poses)
-        along = places.along(detections.place[rows], state.map_points, points, poses)
-        if hold:
-            covariances, sigma = detections.covariance[rows], self.settings.place.sigma
-            self._sigma_along[rows] = sigma_across(along.tangent_unit, covariances, poses, sigma)
-            self._rates_along[rows] = range_rates(along.tangent_unit, poses, detections.measured[rows])
-        by = self._by_sensor(state, rows, along.tangent_unit, along.residual, self._rates_along[rows])
-        return Placed(rows, along, self._sigma_along[rows], by)
+        return Evaluation(state, projected, odometry, cost)
 
     def _project(self, state: State, label: int, hold: bool) -> Projected:
-        detections = self.detections
+        detections, sensor = self.detections, state.variables.sensor
         rows = detections.used_on(label)
+        measured, twists = detections.measured[rows], detections.twist[rows]
         poses = state.variables.poses_at(detections.cycle[rows])
-        points = to_map(detections.corrected(rows, state.variables.sensor), poses)
+        points = to_map(detections.corrected(rows, sensor), poses)
         foot = state.boundaries[label].refine(state.control_points(label), points, detections.u[rows])
         sigma_model = self.settings.spline.sigma_model
         projection = project(points, detections.covariance[rows], poses, foot, sigma_model)
         if hold:
             self._sigma[rows], self._inside[rows] = projection.sigma, foot.interior
-            self._rates[rows] = range_rates(foot.normal_unit, poses, detections.measured[rows])
-        by = self._by_sensor(state, rows, foot.normal_unit, foot.distance, self._rates[rows])
+            self._rates[rows] = range_rates(foot.normal_unit, poses, measured)
+        rates = self._rates[rows]
+        by = sensor_rows(foot.normal_unit, foot.distance, poses, measured, twists, sensor, rates)
         return Projected(rows, foot, projection, self._sigma[rows], self._inside[rows], by)
-
-    def _by_sensor(
-        self, state: State, rows: IntArray, directions: Array, residual: Array, rates: Array
-    ) -> SensorRows:
-        """Returns how residuals (m,) along unit vectors (m, 2), map frame, depend on the sensor.
-
-        A round holds the `rates` (m, 2), as it holds the sigmas.
-        """
-        detections, variables = self.detections, state.variables
-        poses = variables.poses_at(detections.cycle[rows])
-        measured, twists = detections.measured[rows], detections.twist[rows]
-        return sensor_rows(directions, residual, poses, measured, twists, variables.sensor, rates)
 
     def _detections_cost(self, projected: dict[int, Projected]) -> float:
         used = sum(int(p.inside.sum()) for p in projected.values())
         losses = sum(float(self.kernel.loss(p.whitened[p.inside]).sum()) for p in projected.values())
         return losses + self.kernel.ceiling * (len(self.detections) - used)
 
-    # --- linear factors ----------------------------------------------------------------------------------
-
     def rows(self, at: Evaluation, gauges: Mapping[int, CurveGauge] | None = None) -> list[Rows]:
-        """Returns every whitened row of Gauss-Newton at a state; those of detections have robust weights.
+        """Return every whitened row of Gauss-Newton at a state; those of detections have robust weights.
 
         Other gauges than the problem's own may take their place.
         """
@@ -248,115 +167,87 @@ class BatchSystem:
         groups += sensor_prior(state.variables, self.settings.calibration)
         for label, gauge in (gauges or self.gauges).items():
             points = state.control_points(label)
-            groups += [self.detection_rows(at, label), gauge.beside(points, state.poses)]
-            groups += [gauge.smooth(points, state.poses), gauge.anchor()]
-        if at.placed is not None:
-            groups.append(self.place_rows(at, at.placed))
+            groups += [
+                self.detection_rows(at, label),
+                gauge.beside(points, state.poses),
+                gauge.smooth(points, state.poses),
+                gauge.anchor(),
+            ]
         return groups
 
     def detection_rows(self, at: Evaluation, label: int) -> Rows:
-        """Returns the rows of the used detections on [control points of their span | pose]."""
+        """Return the rows of the used detections on [sensor | control points of their span | pose]."""
         p, state = at.projected[label], at.state
-        cycle, scale = self.detections.cycle[p.rows], self.scale(p)
+        cycle, scale, factor = self.detections.cycle[p.rows], self.scale(p), p.by.factor[:, None]
         control = state.keys(label)[state.boundaries[label].columns(p.foot.span)]
         by_control = p.projection.by_control.reshape(len(cycle), 2 * control.shape[1])
+        jacobian = [p.by.by_sensor, factor * by_control, factor * p.projection.by_pose]
+        sensor = [np.full_like(cycle, SENSOR_KEY)] if len(state.variables.sensor) else []
         return Rows(
-            keys=np.column_stack([*self._sensor_keys(state, cycle), control, pose_keys(cycle)]),
-            jacobian=_jacobian(p.by, by_control, p.projection.by_pose) * scale[:, None],
+            keys=np.column_stack([*sensor, control, pose_keys(cycle)]),
+            jacobian=np.concatenate(jacobian, axis=1) * scale[:, None],
             residual=p.by.factor * p.projection.residual * scale,
             owner=owners(cycle, label),
         )
 
-    def place_rows(self, at: Evaluation, placed: Placed) -> Rows:
-        """Returns the rows of the detections of a place on [control points of the place's span | pose]."""
-        assert self.places is not None
-        place, cycle = self.detections.place[placed.rows], self.detections.cycle[placed.rows]
-        scale = np.sqrt(self.kernel.weights(placed.whitened)) / placed.sigma
-        by_control = placed.along.by_control.reshape(len(cycle), -1)
-        keys = self.places.keys[place]
-        return Rows(
-            keys=np.column_stack([*self._sensor_keys(at.state, cycle), keys, pose_keys(cycle)]),
-            jacobian=_jacobian(placed.by, by_control, placed.along.by_pose) * scale[:, None],
-            residual=placed.by.factor * placed.along.residual * scale,
-            owner=owners(cycle, self.detections.boundary[placed.rows]),
+    def scale(self, projected: Projected) -> Array:
+        """Return the factor (m,) that whitens and weights each row (1/m), zero for those not inside."""
+        return np.asarray(
+            np.sqrt(self.kernel.weights(projected.whitened)) * projected.inside / projected.sigma
         )
 
-    def _sensor_keys(self, state: State, cycles: IntArray) -> list[IntArray]:
-        """Returns the key of the sensor's calibration for each row (m,), if it is estimated."""
-        return [np.full_like(cycles, SENSOR_KEY)] if len(state.variables.sensor) else []
-
-    def scale(self, projected: Projected) -> Array:
-        """Returns the factor (m,) that whitens and weights each row (1/m), zero for those not inside."""
-        weights = self.kernel.weights(projected.whitened)
-        return np.asarray(np.sqrt(weights) * projected.inside / projected.sigma)
-
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
-        """Returns all rows as a linear graph, whose solution is the change from the state."""
+        """Return all rows as a linear graph, whose solution is the change from the state."""
         return linear_graph(self.rows(at), at.state.variables)
 
     def eliminated(self, at: Evaluation) -> Elimination:
-        """Returns the linear problem with its poses eliminated."""
+        """Return the linear problem with its poses eliminated."""
         return Elimination(self.linear_graph(at), at.state.variables.layout)
 
     def damping(self, state: State, weight: float) -> gtsam.GaussianFactorGraph:
-        """Returns factors that damp how control points move as seen from the poses beside them (1/m^2)."""
-        rows = [
-            gauge.damping(state.control_points(label), state.poses, weight)
-            for label, gauge in self.gauges.items()
-        ]
+        """Return factors that damp how control points move as seen from the poses beside them (1/m^2)."""
+        points, poses = state.control_points, state.poses
+        rows = [gauge.damping(points(label), poses, weight) for label, gauge in self.gauges.items()]
         return linear_graph(rows, state.variables)
 
     def retract(self, state: State, step: Array) -> State:
-        """Returns the state after a step (n,), taken in relative coordinates.
+        """Return the state after a step (n,), taken in relative coordinates.
 
-        The step changes each pose as seen from the pose before, and each control point as seen from the pose
-        beside it. A map that swings by a large angle keeps its shape then, which the same step in map
-        coordinates would stretch.
+        It changes each pose as seen from the pose before, and each control point as seen from the pose beside
+        it. So a map that swings by a large angle keeps its shape, which map coordinates would stretch.
         """
         linear = moved(state, step)
         after, poses, goal = linear.copy(), state.poses, linear.poses
         driven = seen_from(poses[1:, :2], poses[:-1], goal[1:, :2], goal[:-1])
-        after.poses[1:, :2] = goal[0, :2] + np.cumsum(rotated(driven, goal[:-1, 2]), axis=0)
+        after.poses[1:, :2] = goal[0, :2] + np.cumsum(turned(driven, goal[:-1, 2]), axis=0)
         for label, gauge in self.gauges.items():
             points, k = after.control_points(label), gauge.cycle
-            points[:] = to_map(
-                seen_from(state.control_points(label), poses[k], points, goal[k]), after.poses[k]
-            )
+            seen = seen_from(state.control_points(label), poses[k], points, goal[k])
+            points[:] = to_map(seen, after.poses[k])
         return after
 
     def poses_alone(self, at: Evaluation) -> Array:
-        """Returns the step (3 P,) of the poses while the map and the calibration are held."""
+        """Return the step (3 P,) of the poses while the map and the calibration are held."""
         keys = at.state.variables.keys
         graph = linear_graph(fix_map(self.rows(at)), at.state.variables)
         return Elimination(graph, Layout(keys[are_poses(keys)])).poses_given(np.zeros(0))
 
 
-def _jacobian(by: SensorRows, by_control: Array, by_pose: Array) -> Array:
-    """Returns derivatives (m, n) by [calibration of the sensor | control points | pose]."""
-    factor = by.factor[:, None]
-    return np.concatenate([by.by_sensor, factor * by_control, factor * by_pose], axis=1)
-
-
 def seen_from(points: Array, poses: Array, points_after: Array, poses_after: Array) -> Array:
-    """Returns points (m, 2) in the frames of poses (m, 3) after a step, to first order in the step.
-
-    The step leads from points and poses to those after it, all of them in the map frame.
-    """
+    """Return points (m, 2) in the frames of poses (m, 3) after a step, to first order; all are in the map
+    frame."""
     arm, change = points - poses[:, :2], points_after - points - poses_after[:, :2] + poses[:, :2]
     turn = (poses_after[:, 2] - poses[:, 2])[:, None]
-    return rotated(arm + change + turn * np.column_stack([arm[:, 1], -arm[:, 0]]), -poses[:, 2])
+    return turned(arm + change + turn * np.column_stack([arm[:, 1], -arm[:, 0]]), -poses[:, 2])
 
 
-def rotated(vectors: Array, angles: Array) -> Array:
-    """Returns vectors (m, 2), each turned by its angle (m,) in rad."""
+def turned(vectors: Array, angles: Array) -> Array:
+    """Return vectors (m, 2), each turned by its angle (m,) in rad."""
     return to_map(vectors, np.column_stack([np.zeros((len(angles), 2)), angles]))
 
 
 def moved(state: State, step: Array) -> State:
-    """Returns the state after a step (n,) of its last n entries in map coordinates.
-
-    These are all variables, or the poses alone.
-    """
+    """Return the state after a step (n,) of all variables, or of the poses alone, in map coordinates."""
     after = state.copy()
     after.variables.values[len(after.variables.values) - len(step) :] += step
     return after

@@ -1,38 +1,60 @@
-"""The paper's spline filter: predict, classify, expand, update, close, simplify."""
+"""The paper's spline filter: predict, classify, expand, update, close, simplify (paper: Results for the
+loop)."""
 
-from __future__ import annotations
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.measured_noise import KnownNoise
+from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.front_end.front_end import FrontEnd
+from pathspace_graph.graph.keys import POINT, POSE, pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
+from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import known_noise
-from pathspace_graph.mapping.registration import near_start
+from pathspace_graph.mapping.registration import Motion, near_start, register
+from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.scale.door import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.knots import refit
 
-from .closing import associate_early_segment, simplify, update_by_correspondences
 from .expansion import Expansion
 from .state import CurveState
 from .update import OnCurve, classify, update
 
-Array = NDArray[np.float64]
+REACH: Final = 9.0
+"""A curve is extended up to this far ahead of the vehicle (m along the predicted path)."""
+SIGMA_MATCH: Final = 0.6
+"""Standard deviation (m) of a detection in the registration with the early segment. It is larger than
+`closing.sigma_reading`, since the filter's early segment is worse."""
+PATIENCE: Final = 30.0
+"""Once this length of the beginning has been driven again (m), it closes the loop, however uncertain the
+position is: `SIGMA_PATIENCE` (m) replaces `closing.sigma_max`."""
+SIGMA_PATIENCE: Final = 1000.0
+SIGMA_TIE: Final = 0.15
+"""Standard deviation (m) of the distance between the end of a curve and its beginning where the loop
+closes."""
+TIE_REACH: Final = 1.0
+"""Points of the end that the registration leaves farther from the beginning than this (m) are no
+correspondences."""
 
 
 @at_scale
 class CkfMapper:
     """Maps a track's two boundaries by a cubature Kalman filter over the pose and all control points.
 
-    `fit.py` lists what the paper leaves open, and what was chosen. `odometry_sigma` (3,) is the standard
+    `ckf.update` lists what the paper leaves open, and what was chosen. `odometry_sigma` (3,) is the standard
     deviation of a twist reading (m/s, m/s, rad/s).
     """
 
@@ -43,22 +65,17 @@ class CkfMapper:
         noise = known_noise(odometry_sigma)
         self.odometry_sigma = noise.odometry
         self.front_end = FrontEnd(self.settings, noise)
-        """It judges the readings of each cycle."""
         self.state = CurveState(
             Belief.at_start(self.settings.odometry, self.settings.calibration), self.settings
         )
-        """This holds the pose, the curves and their joint covariance."""
         self.path = DrivenPath(self.settings.path)
-        """This is the path driven."""
         self.expansion = Expansion(self.settings)
-        """This holds what is not on a curve yet."""
         self.closed = False
-        """This tells whether the loop has closed, so that the map has its final size."""
         self._recent: list[tuple[Array, Detections]] = []
         self._last_check = 0.0
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Processes one perception cycle: the twists since the last one, and the detections of now.
+        """Process one perception cycle: the twists since the last one, and the detections of now.
 
         A cycle that cannot be used is a ReadingError and changes nothing. So is one that is late, since a
         filter has no earlier pose that could take its detections.
@@ -81,26 +98,26 @@ class CkfMapper:
         return cycle.counted(self._result(detections.t, used, watch.laps))
 
     def _predict(self, motion: MeasuredMotion) -> None:
-        """Predicts the pose by the motion since the last cycle, and locates it on the curves."""
+        """Predict the pose by the motion since the last cycle, and locate it on the curves."""
         self.state.belief.follow(motion)
         self.state.locate_vehicle()
         self.path.update(self.state.pose.copy())
         self.path.steer(motion.twists)
 
     def _expand(self, detections: Detections, found: dict[int, OnCurve]) -> dict[int, OnCurve]:
-        """Expands the curves; then detections on the new stretch update it with the rest."""
+        """Expand the curves; then detections on the new stretch update it with the rest."""
         if self.closed:
             return found
         self.expansion.observe(self.state, detections)
         free = np.ones(len(detections.labels), bool)
         for on in found.values():
             free[on.rows] = False
-        path_ahead = self.path.ahead(self.state.pose, self.settings.ckf.reach)
+        path_ahead = self.path.ahead(self.state.pose, REACH)
         extended = self.expansion.expand(self.state, detections, path_ahead, free)
         return classify(self.state, detections) if extended else found
 
     def _close(self, detections: Detections) -> None:
-        """Looks for the early segment after the shortest lap, and closes and simplifies both curves there."""
+        """Look for the early segment after the shortest lap, and close and simplify both curves there."""
         settings, state = self.settings.closing, self.state
         if self.closed:
             return
@@ -122,7 +139,7 @@ class CkfMapper:
         return CycleResult(t, self.state.pose.copy(), (left, right), used, self.closed, stages)
 
     def map(self) -> Map:
-        """Returns the map as it stands, with the joint covariance of each boundary's control points."""
+        """Return the map as it stands, with the joint covariance of each boundary's control points."""
         state = self.state
         curves = {b: SplineBoundary(state.spline(b), state.covariance(b)) for b in state.curves}
         keys = [state.columns(b, np.arange(curve.size)) for b, curve in sorted(state.curves.items())]
@@ -130,14 +147,121 @@ class CkfMapper:
         return Map(self.closed, curves, state.belief.covariance[np.ix_(columns, columns)])
 
     def noise_used(self) -> RunNoise:
-        """Returns the noise that is used now, and what was measured so far."""
+        """Return the noise that is used now, and what was measured so far."""
         return self.front_end.noise_used
 
     def vehicle_state(self) -> VehicleState:
-        """Returns the newest pose and the calibration, with their joint covariance."""
+        """Return the newest pose and the calibration, with their joint covariance."""
         return self.state.belief.vehicle_state()
 
     def outline(self) -> Map:
-        """Returns a copy of the present map without covariances."""
+        """Return a copy of the present map without covariances."""
         curves = {b: SplineBoundary(self.state.spline(b), NO_COVARIANCE) for b in self.state.curves}
         return Map(self.closed, curves)
+
+
+# --- closing and simplification --------------------------------------------------------------------------
+
+
+def associate_early_segment(
+    state: CurveState, cycles: list[tuple[Array, Detections]], beginning: Array
+) -> Motion | None:
+    """Return the motion that moves the newest detections onto the beginning of the curves, or None.
+
+    cycles holds the poses (3,) and detections of the last few seconds, oldest first. beginning holds the
+    poses (k, 3) of the first stretch of the drive. The result is None if the registration fails.
+    """
+    closing = replace(
+        state.settings.closing,
+        sigma_reading=SIGMA_MATCH,
+        patience=PATIENCE,
+        sigma_patience=SIGMA_PATIENCE,
+    )
+    covariance = state.belief.covariance[:POSE, :POSE]
+    times = [detections.t for _, detections in cycles]
+    found = register(_recent(state, cycles), times, covariance, beginning, closing)
+    return None if found is None else found.motion
+
+
+def _recent(state: CurveState, cycles: list[tuple[Array, Detections]]) -> CurveMap:
+    """Return the curves, the newest poses and their detections as the registration takes them."""
+    track = CurveMap(state.settings)
+    for label in state.curves:
+        track.state.add_boundary(label, state.boundary(label), state.control_points(label))
+    for cycle, (pose, detections) in enumerate(cycles):
+        track.variables.insert(pose_keys(np.array([cycle])), pose)
+        track.detections.append(detections, cycle)
+    track.detections.used[:] = True  # a filter keeps no record of what its curves explained
+    return track
+
+
+def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
+    """Make one Kalman update: the end of each curve lies on its beginning, at the correspondences.
+
+    `n . (S(u) - S(w)) = 0` with sigma `SIGMA_TIE`, where u is a parameter near the end, w that of the
+    point of the early segment on which the motion moves S(u), and n the normal there. Along the tangent the
+    residual is the same, but all k correspondences there are one result of the registration. So each of them
+    has sqrt(k) times its sigma. Returns False, and does nothing, if the end of a curve has not reached its
+    beginning yet.
+    """
+    overlaps = {label: _overlap(state, label, motion) for label in state.curves}
+    if not all(len(u) for u, _ in overlaps.values()):
+        return False
+    rows, columns = [], []
+    for label, (u, w) in overlaps.items():
+        spline = state.spline(label)
+        basis = spline.basis_matrix(u) - spline.basis_matrix(w)
+        tangents = spline.tangent_unit(w)
+        normals = left_of(tangents)
+        by_axis = [(basis[:, :, None] * axis[:, None, :]).reshape(len(u), -1) for axis in (normals, tangents)]
+        rows.append(np.concatenate(by_axis))
+        columns.append(state.columns(label, np.arange(spline.size)))
+    matrix = block_diag(*rows)
+    along, counts = state.settings.closing.sigma_max, [len(r) // 2 for r in rows]
+    sigma = np.concatenate([np.repeat([SIGMA_TIE, along * np.sqrt(k)], k) for k in counts])
+    measured, noise = np.zeros(len(matrix)), np.diag(sigma**2)
+    state.belief.update(np.concatenate(columns), lambda x: x @ matrix.T, measured, noise)
+    return True
+
+
+def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Array]:
+    """Return parameters (k,) near the end of a curve, and those (k,) of the points they are moved on."""
+    closing, spline = state.settings.closing, state.spline(label)
+    high = spline.domain[1]
+    low = max(high - closing.beginning - closing.join_margin, closing.join_share * high)
+    u = np.arange(low, high, closing.overlap_step)
+    moved = motion.apply(spline.evaluate(u))
+    zero = np.zeros(len(u))
+    beginning = min(closing.beginning, closing.beginning_share * high)
+    foot = state.foot_points(label, moved, zero, zero + beginning)
+    on = foot.interior & (np.abs(foot.distance) < TIE_REACH)
+    return u[on], foot.u[on]
+
+
+def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
+    """Make both curves periodic, on curvature-weighted knots (paper: Simplification).
+
+    observed holds the confirmed cones by label. With given knots, sampling the curve and fitting it is linear
+    in the control points. So the matrix gives the mean and covariance of the cubature transform.
+    """
+    for label in state.curves:
+        boundary = state.boundary(label)
+        points, zero = np.array(observed[label]).reshape(-1, POINT), np.zeros(len(observed[label]))
+        foot = boundary.find(state.control_points(label), points, zero, zero + boundary.confirmed_end)
+        boundary.cone_parameters = np.sort(foot.u).tolist()
+        periodic = make_periodic(
+            boundary, state.control_points(label), state.settings, state.settings.ckf.knots
+        )
+        curve, matrix = periodic_refit(state.spline(label), periodic, state.settings)
+        state.replace(label, curve, matrix, state.settings.spline.sigma_simplify)
+        state.pose_u[label] = float(periodic.overlap.new_parameter(np.array([state.pose_u[label]]))[0])
+
+
+def periodic_refit(
+    spline: BSpline, periodic: PeriodicCurve, settings: MapperSettings
+) -> tuple[BSpline, Array]:
+    """Return the closed curve, and the matrix (m, n) from the open curve's control points to its own."""
+    degree = settings.spline.degree
+    points = np.concatenate([periodic.points, periodic.points[:degree]])
+    curve = BSpline(periodic.knots, points, degree, periodic=True)
+    return curve, refit(spline, curve, periodic.overlap.new_parameter).new_from_old

@@ -224,3 +224,28 @@ def _eliminated(
     for conditional in reversed(factors_of(graph_of(tree))):  # a tree gives its root first
         net.push_back(cast("gtsam.GaussianConditional", conditional))
     return net, remaining
+
+
+class Damping:
+    """Levenberg-Marquardt's weight: it falls by a tenth after each step that is taken, and grows else."""
+
+    def __init__(self, first: float = 1e-2, least: float = 1e-6, most: float = 1e6) -> None:
+        self._first, self._least, self._most = first, least, most
+        self.weight = first
+
+    @property
+    def exhausted(self) -> bool:
+        """Return whether the weight is larger than any that is worth trying."""
+        return self.weight > self._most
+
+    def lower(self) -> None:
+        """Follow a step that made the cost smaller."""
+        self.weight = max(0.1 * self.weight, self._least)
+
+    def grow(self) -> None:
+        """Follow a step that made the cost larger."""
+        self.weight *= 5.0
+
+    def reset(self) -> None:
+        """Begin again at the first weight."""
+        self.weight = self._first

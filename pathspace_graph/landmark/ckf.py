@@ -14,12 +14,10 @@ Landmarks are never merged, and the loop never closes. So ghosts stay, as the pa
 the drift of a lap is larger than the distance between cones, all landmarks of a lap may be ghosts.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.front_end.front_end import FrontEnd
@@ -30,16 +28,13 @@ from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
 from pathspace_graph.mapping.prediction import known_noise
-from pathspace_graph.mapping.tentative import TentativeTracks
+from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.scale.door import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .association import Association, Gates, associate, compatible, pair_costs
-from .state import UNASSOCIATED, landmark_counts, point_map
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from .association import ROUGH, Association, Gates, associate, compatible, pair_costs
+from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 
 
 @at_scale
@@ -56,16 +51,15 @@ class LandmarkCkf:
         noise = known_noise(odometry_sigma)
         self.odometry_sigma = noise.odometry
         self.front_end = FrontEnd(self.settings, noise)
-        """It judges the readings of each cycle."""
         self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
-        """This is the state `x = [pose | calibration | landmarks]`."""
+        """State `x = [pose | calibration | landmarks]`."""
         self.labels: IntArray = np.zeros(0, np.intp)
-        """(n,) These are the labels of the landmarks."""
+        """(n,) Labels of the landmarks."""
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
-        """These tracks by label are not landmarks yet."""
+        """Tracks by label that are not landmarks yet."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Processes one perception cycle: the twists since the last one, and the detections of now.
+        """Process one perception cycle: the twists since the last one, and the detections of now.
 
         A cycle that cannot be used is a ReadingError and changes nothing. So is one that is late, since a
         filter has no earlier pose that could take its detections.
@@ -88,26 +82,20 @@ class LandmarkCkf:
         )
 
     def _associate(self, detections: Detections) -> Association:
-        """Assigns the detections to the nearby landmarks, by the joint covariance of pose and landmarks."""
-        settings, nearby = self.settings.landmark, self._nearby(detections)
+        """Assign the detections to the nearby landmarks, by the joint covariance of pose and landmarks."""
+        points = to_map(detections.points_vehicle, self.belief.pose[None])
+        nearby = np.flatnonzero(nearest_within(self.belief.points, points, ROUGH)[1])
         predicted, covariances = self._predict(nearby)
         cost = pair_costs(detections.points_vehicle, detections.covariances, predicted, covariances)
         cost[~compatible(detections.labels, self.labels[nearby])] = np.inf
-        found = associate(cost, Gates.of(settings))
+        found = associate(cost, Gates.of(self.settings.landmark))
         matched = found.landmark != UNASSOCIATED
         landmark = np.full(len(detections.labels), UNASSOCIATED, np.intp)
         landmark[matched] = nearby[found.landmark[matched]]
         return Association(landmark, found.new)
 
-    def _nearby(self, detections: Detections) -> IntArray:
-        """Returns the landmarks within the rough gate of any detection."""
-        points = to_map(detections.points_vehicle, self.belief.pose[None])
-        offset = self.belief.points[:, None] - points[None]
-        distance = np.hypot(offset[..., 0], offset[..., 1]).min(axis=1, initial=np.inf)
-        return np.flatnonzero(distance < self.settings.landmark.rough)
-
     def _predict(self, landmarks: IntArray) -> tuple[Array, Array]:
-        """Returns where landmarks (k,) should be detected (k, 2) and covariances (k, 2, 2), vehicle frame."""
+        """Return where landmarks (k,) should be detected (k, 2) and covariances (k, 2, 2), vehicle frame."""
         k = len(landmarks)
         if k == 0:
             return np.zeros((0, POINT)), np.zeros((0, POINT, POINT))
@@ -116,7 +104,7 @@ class LandmarkCkf:
         return predicted.mean.reshape(k, POINT), blocks[np.arange(k), :, np.arange(k)]
 
     def _update(self, detections: Detections, landmark: IntArray) -> None:
-        """Makes one Kalman update with all associated detections."""
+        """Make one Kalman update with all associated detections."""
         rows = np.flatnonzero(landmark != UNASSOCIATED)
         if len(rows) == 0:
             return
@@ -125,8 +113,8 @@ class LandmarkCkf:
         measured = detections.points_vehicle[rows].ravel()
         self.belief.update(columns, self.belief.measuring(landmark[rows]), measured, noise)
 
-    def _create(self, detections: Detections, new: NDArray[np.bool_]) -> None:
-        """Adds a landmark for each track that has enough detections beyond the gate of every landmark.
+    def _create(self, detections: Detections, new: BoolArray) -> None:
+        """Add a landmark for each track that has enough detections beyond the gate of every landmark.
 
         It is placed at the nearest detection of this cycle, and the track is kept if there is none.
         """
@@ -149,17 +137,17 @@ class LandmarkCkf:
             self.labels = np.concatenate([self.labels, detections.labels[rows]])
 
     def map(self) -> Map:
-        """Returns the map as it stands, with the joint covariance of each boundary's landmarks."""
+        """Return the map as it stands, with the joint covariance of each boundary's landmarks."""
         return point_map(self.belief.points, self.labels, self.belief.covariance[HEAD:, HEAD:], False)
 
     def noise_used(self) -> RunNoise:
-        """Returns the noise that is used now, and what was measured so far."""
+        """Return the noise that is used now, and what was measured so far."""
         return self.front_end.noise_used
 
     def vehicle_state(self) -> VehicleState:
-        """Returns the newest pose and the calibration, with their joint covariance."""
+        """Return the newest pose and the calibration, with their joint covariance."""
         return self.belief.vehicle_state()
 
     def outline(self) -> Map:
-        """Returns a copy of the present map without covariances."""
+        """Return a copy of the present map without covariances."""
         return point_map(self.belief.points, self.labels, None, False)

@@ -1,15 +1,21 @@
-"""The Hungarian landmark graph online: cones are points in the same fixed-lag smoother as the curves."""
+"""The Hungarian landmark graph online: cones are points in the same fixed-lag smoother as the curves.
 
-from __future__ import annotations
+The loop closes where enough of the landmarks seen now are those of the beginning. The landmarks seen now and
+those not seen for long have one joint covariance. So a set of pairs can be tested as a whole, since each
+accepted pair moves all others (joint compatibility, Neira and Tardos 2001).
+"""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.stats import chi2
 
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.front_end.front_end import FrontEnd, at_nearest_pose
+from pathspace_graph.graph.keys import POINT
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
@@ -24,19 +30,36 @@ from pathspace_graph.mapping.prediction import (
     vehicle_state,
 )
 from pathspace_graph.mapping.registration import near_start
-from pathspace_graph.mapping.tentative import TentativeTracks
+from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Readings, Stopwatch
 from pathspace_graph.scale.door import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .association import associate_created, associate_newest
-from .closing import detect_loop, optimize_loop
-from .landmark_map import LandmarkMap
-from .merging import find_duplicates, merge
-from .state import UNASSOCIATED, landmark_counts, point_map
+from .association import (
+    Gates,
+    associate_created,
+    associate_newest,
+    find_duplicates,
+    merge,
+    squared_mahalanobis,
+)
+from .landmark_map import (
+    SIGMA_MERGE,
+    UNASSOCIATED,
+    LandmarkMap,
+    LandmarkSmoother,
+    landmark_counts,
+    point_map,
+)
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+UNSEEN: Final = 40.0
+"""A landmark that was not detected along this length of the driven path (m) belongs to an earlier stretch.
+Until the loop has closed, no detection near the start is associated with it."""
+MIN_PAIRS: Final = 4
+"""Landmarks that must be recognized together to close the loop, a third of them of each colour."""
+MIN_LEAD: Final = 2.0
+"""The recognized pairs must score this much better than any other set, where each landmark counts as one gate
+(landmarks)."""
 
 
 @at_scale
@@ -54,25 +77,19 @@ class LandmarkFixedLag:
         noise = known_noise(odometry_sigma)
         self.odometry_sigma = noise.odometry
         self.front_end = FrontEnd(self.settings, noise)
-        """It judges the readings of each cycle."""
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), LandmarkMap(self.settings))
-        """This holds the variables, the window and its prior."""
         self.smoother.window.exact = True
         self.path = DrivenPath(self.settings.path)
-        """This is the path driven."""
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
-        """These tracks by label are not landmarks yet."""
+        """Tracks by label that are not landmarks yet."""
         self.believed = self.settings
-        """These are the settings with the priors of the calibrations as they are now."""
+        """Settings with the priors of the calibrations as they are now."""
         self.closed = False
-        """This tells whether the loop has closed."""
-        self._last_detected: Array = np.zeros(
-            0
-        )  # path driven (m) when each landmark was last seen, by number
+        self._last_detected: Array = np.zeros(0)  # path driven (m) at each landmark's last sight, by number
         self._last_check = 0.0
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Processes one perception cycle: the twists since the last one, and the detections of now.
+        """Process one perception cycle: the twists since the last one, and the detections of now.
 
         A cycle that cannot be used is a ReadingError and changes nothing. One that is late is used as
         `FixedLagMapper.update` says.
@@ -86,12 +103,7 @@ class LandmarkFixedLag:
         predict(self.smoother, self.path, motion, detections.t, self.settings)
         watch.lap("predict")
         new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, motion.odometry.twist)
-        associate_newest(self.smoother, new, self._eligible())
-        watch.lap("associate")
-        created = self._create(new, detections.t)
-        watch.lap("create")
-        for _ in range(self.settings.steps_grown if created else self.settings.steps):
-            self.smoother.step()
+        self._use(new, detections.t, watch)
         if not self.closed:
             self.believed = doubt_calibrations(
                 self.smoother, self.believed, reading.sensor_doubted, reading.measured
@@ -104,32 +116,32 @@ class LandmarkFixedLag:
         return cycle.counted(self._result(detections.t, watch.laps))
 
     def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
-        """Uses the detections of a late cycle at its time, without a pose of their own."""
+        """Use the detections of a late cycle at its time, without a pose of their own."""
         detections = self.front_end.use_late(detections, self.smoother.times)
         late = at_nearest_pose(self.smoother, detections, self.settings.motion)
         new = self.smoother.map.add_late(late)
-        associate_newest(self.smoother, new, self._eligible(), late.cycle)
-        watch.lap("associate")
-        created = self._create(new, detections.t)
-        watch.lap("create")
-        for _ in range(self.settings.steps_grown if created else self.settings.steps):
-            self.smoother.step()
+        self._use(new, detections.t, watch, late.cycle)
         watch.lap("update")
         used = int(self.smoother.map.detections.used[new].sum())
         return replace(self._result(detections.t, watch.laps), readings=used)
 
-    def _create(self, new: slice, t: float) -> bool:
-        """Adds detections without a landmark to the tentative tracks, and makes confirmed ones landmarks.
+    def _use(self, new: slice, t: float, watch: Stopwatch, cycle: int | None = None) -> None:
+        associate_newest(self.smoother, new, self._eligible(), cycle)
+        watch.lap("associate")
+        created = self._create(new, t)
+        watch.lap("create")
+        for _ in range(self.settings.steps_grown if created else self.settings.steps):
+            self.smoother.step()
 
-        Returns whether there are new landmarks.
-        """
+    def _create(self, new: slice, t: float) -> bool:
+        """Add detections without a landmark to the tracks, and return whether any became landmarks."""
         detections, created = self.smoother.map.detections, False
-        rows = new.start + np.flatnonzero(detections.landmark[new] == UNASSOCIATED)
+        free = new.start + np.flatnonzero(detections.landmark[new] == UNASSOCIATED)
         for label, tentative in self.tentative.items():
-            own = rows[detections.label[rows] == label]
-            poses = self.smoother.variables.poses_at(detections.cycle[own])
-            covariances = rotated(detections.covariance[own], poses[:, 2])
-            tentative.add(to_map(detections.point[own], poses), covariances, t)
+            rows = free[detections.label[free] == label]
+            poses = self.smoother.variables.poses_at(detections.cycle[rows])
+            covariances = rotated(detections.covariance[rows], poses[:, 2])
+            tentative.add(to_map(detections.point[rows], poses), covariances, t)
             confirmed = tentative.confirmed()
             if len(confirmed):
                 self._add_landmarks(label, tentative.points[confirmed].copy())
@@ -138,7 +150,7 @@ class LandmarkFixedLag:
         return created
 
     def _add_landmarks(self, label: int, points: Array) -> None:
-        """Adds landmarks at points (k, 2), and associates the detections in the window that created them.
+        """Add landmarks at points (k, 2), and associate the detections in the window that created them.
 
         A point without any such detection is left out, since nothing would hold the landmark.
         """
@@ -152,11 +164,10 @@ class LandmarkFixedLag:
         detections.take(rows[chosen], numbers)
         state.vote(detections.label[rows[chosen]], numbers)
 
-    def _eligible(self) -> NDArray[np.bool_]:
-        """Returns which landmarks (n,) may be associated. Near the start they exclude the old ones.
+    def _eligible(self) -> BoolArray:
+        """Return which landmarks (n,) may be associated. Near the start they exclude the old ones.
 
-        Until the loop has closed, all detections there share the drift of the lap. So one detection alone
-        can't tell which of the old landmarks it shows.
+        Until the loop has closed, one detection alone can't tell which of the old landmarks it shows.
         """
         every = np.ones(len(self.smoother.map.state), bool)
         return every if self.closed or not self._near_start() else ~self._old()
@@ -164,17 +175,16 @@ class LandmarkFixedLag:
     def _near_start(self) -> bool:
         return near_start(self.path, self.smoother.variables.poses[-1], self.settings.closing)
 
-    def _old(self) -> NDArray[np.bool_]:
+    def _old(self) -> BoolArray:
         last_detected = self._last_detected[self.smoother.map.state.numbers]
-        return np.asarray(last_detected < self.path.length - self.settings.landmark.unseen)
+        return np.asarray(last_detected < self.path.length - UNSEEN)
 
     def _close(self) -> None:
-        """Closes the loop or, once it has closed, merges duplicates; this is tried every few metres."""
+        """Close the loop or, once it has closed, merge duplicates; this is tried every few metres."""
         detections, state, length = self.smoother.map.detections, self.smoother.map.state, self.path.length
         detected = np.unique(detections.landmark[detections.used])
-        self._last_detected = np.append(
-            self._last_detected, np.zeros(state.next_number - len(self._last_detected))
-        )
+        unknown = np.zeros(state.next_number - len(self._last_detected))
+        self._last_detected = np.append(self._last_detected, unknown)
         self._last_detected[detected] = length
         if length - self._last_check < self.settings.closing.check_interval:
             return
@@ -191,11 +201,10 @@ class LandmarkFixedLag:
                 self.closed, self.smoother.window.exact = True, False
 
     def _merge(self, gone: IntArray, kept: IntArray) -> None:
-        if len(gone) == 0:
-            return
-        numbers = self.smoother.map.state.numbers
-        np.maximum.at(self._last_detected, numbers[kept], self._last_detected[numbers[gone]])
-        merge(self.smoother, gone, kept)
+        if len(gone):
+            numbers = self.smoother.map.state.numbers
+            np.maximum.at(self._last_detected, numbers[kept], self._last_detected[numbers[gone]])
+            merge(self.smoother, gone, kept)
 
     def _result(self, t: float, stages: dict[str, float]) -> CycleResult:
         detections, sizes = self.smoother.map.detections, landmark_counts(self.smoother.map.state.labels)
@@ -203,19 +212,24 @@ class LandmarkFixedLag:
         return CycleResult(t, self.smoother.variables.poses[-1].copy(), sizes, used, self.closed, stages)
 
     def map(self) -> Map:
-        """Returns the map as it stands, with the joint covariance of each boundary's landmarks."""
+        """Return the map as it stands, with the joint covariance of each boundary's landmarks."""
         state = self.smoother.map.state
         if len(state) == 0:
             return Map(self.closed, {})
         joint = self.smoother.last_covariance(state.keys)
         return point_map(state.landmarks, state.labels, joint, self.closed)
 
+    def outline(self) -> Map:
+        """Return a copy of the present map without covariances."""
+        state = self.smoother.map.state
+        return point_map(state.landmarks, state.labels, None, self.closed)
+
     def window_poses(self) -> Array:
-        """Returns a copy of the poses (P, 3) in the window, the oldest first, map frame."""
+        """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
         return self.smoother.variables.poses.copy()
 
     def readings(self) -> Readings:
-        """Returns the detections of the newest cycle as they were used or gated, with their landmarks."""
+        """Return the detections of the newest cycle as they were used or gated, with their landmarks."""
         table, state = self.smoother.map.detections, self.smoother.map.state
         rows = np.flatnonzero(table.cycle == self.smoother.next_cycle - 1)
         used = table.used[rows]
@@ -225,14 +239,123 @@ class LandmarkFixedLag:
         return Readings(points, table.label[rows], used, feet)
 
     def noise_used(self) -> RunNoise:
-        """Returns the noise that is used now, and what was measured so far."""
+        """Return the noise that is used now, and what was measured so far."""
         return self.front_end.noise_used
 
     def vehicle_state(self) -> VehicleState:
-        """Returns the newest pose and the calibration, with their joint covariance."""
+        """Return the newest pose and the calibration, with their joint covariance."""
         return vehicle_state(self.smoother)
 
-    def outline(self) -> Map:
-        """Returns a copy of the present map without covariances."""
-        state = self.smoother.map.state
-        return point_map(state.landmarks, state.labels, None, self.closed)
+
+# --- closing ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class LoopPairs:
+    """A hypothesis: pairs of landmarks that are the same cone."""
+
+    recent: IntArray
+    """(k,) Positions of landmarks that were seen lately."""
+    old: IntArray
+    """(k,) Positions of the landmarks of the beginning that they are."""
+    distance: float
+    """Squared Mahalanobis distance of all pairs together, with 2 k degrees of freedom."""
+
+    def score(self, gate: float) -> float:
+        """Return `k gate - d^2`: how much better the pairs explain the detections than new landmarks do."""
+        return len(self.recent) * gate - self.distance
+
+    def overlaps(self, other: "LoopPairs") -> bool:
+        """Return whether both hypotheses have a pair in common."""
+        pairs = set(zip(self.recent.tolist(), self.old.tolist(), strict=True))
+        return not pairs.isdisjoint(zip(other.recent.tolist(), other.old.tolist(), strict=True))
+
+
+class JointCompatibility:
+    """Tests sets of pairs against the joint Gaussian of some recent and some old landmarks.
+
+    `scale` multiplies all standard deviations. Two estimates of one cone may differ a little more than their
+    covariance says (SIGMA_MERGE).
+    """
+
+    def __init__(self, smoother: LandmarkSmoother, recent: IntArray, old: IntArray, scale: float) -> None:
+        state = smoother.map.state
+        self.recent, self.old = recent, old
+        both = np.concatenate([recent, old])
+        self.mean = state.landmarks[both].copy()
+        self.covariance = scale**2 * smoother.last_covariance(state.keys[both])
+        self.same_label = state.labels[recent][:, None] == state.labels[old][None]
+
+    def distances(self, mean: Array, covariance: Array) -> Array:
+        """Return the squared Mahalanobis distances (k, n) of all pairs; other labels give infinity."""
+        k, points = len(self.recent), len(mean)
+        blocks = covariance.reshape(points, POINT, points, POINT).transpose(0, 2, 1, 3)
+        marginal = blocks[np.arange(points), np.arange(points)]
+        cross = blocks[:k, k:]
+        spread = marginal[:k, None] + marginal[None, k:] - cross - np.swapaxes(cross, 2, 3)
+        spread = spread + SIGMA_MERGE**2 * np.eye(POINT)
+        return np.where(self.same_label, squared_mahalanobis(mean[:k, None] - mean[None, k:], spread), np.inf)
+
+    def conditioned(self, mean: Array, covariance: Array, i: int, j: int) -> tuple[Array, Array]:
+        """Return the Gaussian given that recent landmark i is old landmark j: one Kalman update."""
+        a, b = POINT * i, POINT * (len(self.recent) + j)
+        cross = covariance[:, a : a + POINT] - covariance[:, b : b + POINT]
+        spread = cross[a : a + POINT] - cross[b : b + POINT] + SIGMA_MERGE**2 * np.eye(POINT)
+        gain = np.linalg.solve(spread, cross.T).T
+        innovation = mean[i] - mean[len(self.recent) + j]
+        return mean - (gain @ innovation).reshape(-1, POINT), covariance - gain @ cross.T
+
+    def grow(self, i: int, j: int, gate: float) -> LoopPairs:
+        """Return a hypothesis that begins with one pair and adds the best pair while that is in the gate.
+
+        Each pair is tested given those before it.
+        """
+        mean, covariance, total = self.mean, self.covariance, 0.0
+        distances = self.distances(mean, covariance)
+        free = np.ones(distances.shape, bool)
+        chosen: list[tuple[int, int]] = []
+        while distances[i, j] < gate:
+            chosen.append((i, j))
+            total += float(distances[i, j])
+            free[i], free[:, j] = False, False
+            mean, covariance = self.conditioned(mean, covariance, i, j)
+            distances = np.where(free, self.distances(mean, covariance), np.inf)
+            i, j = divmod(int(distances.argmin()), distances.shape[1])
+        index = np.array(chosen, np.intp).reshape(-1, 2)
+        return LoopPairs(self.recent[index[:, 0]], self.old[index[:, 1]], total)
+
+
+def detect_loop(
+    smoother: LandmarkSmoother, recent: IntArray, old: IntArray, reach: float
+) -> LoopPairs | None:
+    """Return the pairs, within `reach` (m), of the best hypothesis; None if it is not clear or has too
+    few."""
+    points = smoother.map.state.landmarks
+    old = old[nearest_within(points[old], points[recent], reach)[1]]
+    if len(recent) < MIN_PAIRS or len(old) < MIN_PAIRS:
+        return None
+    gate = Gates.of(smoother.map.settings.landmark).match
+    test = JointCompatibility(smoother, recent, old, smoother.map.settings.closing.prior_scale)
+    seeds = np.argwhere(test.distances(test.mean, test.covariance) < gate)
+    if len(seeds) == 0:
+        return None
+    hypotheses = [test.grow(int(i), int(j), gate) for i, j in seeds]
+    best = max(hypotheses, key=lambda pairs: pairs.score(gate))
+    others = [pairs.score(gate) for pairs in hypotheses if not pairs.overlaps(best)]
+    clear = best.score(gate) - max(others, default=0.0) >= MIN_LEAD * gate
+    return best if clear and _is_acceptable(smoother, best) else None
+
+
+def _is_acceptable(smoother: LandmarkSmoother, pairs: LoopPairs) -> bool:
+    """Return whether there are enough pairs of either label, which are compatible as a whole."""
+    settings, labels = smoother.map.settings.landmark, smoother.map.state.labels[pairs.recent]
+    enough = all((labels == label).sum() >= MIN_PAIRS // 3 for label in BOUNDARIES)
+    joint = chi2.ppf(settings.create, POINT * len(labels)) if len(labels) else 0.0
+    return bool(enough and len(labels) >= MIN_PAIRS and pairs.distance < joint)
+
+
+def optimize_loop(smoother: LandmarkSmoother, pairs: LoopPairs) -> None:
+    """Solve the whole loop with the pairs held together, each submap in its own frame; the caller merges
+    them."""
+    smoother.map.loop_pairs = smoother.map.state.numbers[np.column_stack([pairs.recent, pairs.old])]
+    smoother.solve_loop(smoother.map.settings.closing.iterations, None)

@@ -12,10 +12,9 @@ import numpy as np
 from joblib.externals import loky
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.closure import is_worth_trying
-from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
-from pathspace_graph.batch.recurrence import Recurrence, find_recurrence, path_lengths
-from pathspace_graph.batch.start import unwrap
+from pathspace_graph.batch.association import path_lengths
+from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, is_worth_trying, solve_lap
+from pathspace_graph.batch.start import Recurrence, find_recurrence, unwrap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.front_end.log_odometry import chained

@@ -397,7 +397,6 @@ def start_anew(smoother: CurveSmoother, first_cycle: int, found: RefinedMotion) 
     smoother.add_pose_prior(smoother.next_cycle - 1, found.covariance * settings.finding.widening**2)
     locate_poses(state, settings.batch.association)
     reassociate(smoother)
-    smoother.map.place_detections(0)
     for _ in range(settings.finding.steps):
         smoother.step(settings.sigma_step)
     jump = state.poses[-1] - before

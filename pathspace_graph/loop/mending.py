@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from pathspace_graph.batch.knots import fit_through
+from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
-from pathspace_graph.batch.recurrence import path_lengths
+from pathspace_graph.batch.simplification import fit_through
 from pathspace_graph.factors.se2 import to_map, to_vehicle
 from pathspace_graph.labels import NAMES
 from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother

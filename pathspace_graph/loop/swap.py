@@ -41,8 +41,6 @@ def go_on_from(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
     keys = np.concatenate([state.variables.calibration_keys, *added, pose_keys(np.array([first]))])
     smoother.set_prior(keys, marginal.mean, marginal.information)
     reassociate(smoother)
-    if marginal.places:
-        smoother.map.set_places(marginal.places)
     for _ in range(settings.closing.iterations):
         smoother.step(settings.closing.sigma_step)
     return np.asarray(state.poses[-1] - before)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
-from pathspace_graph.batch.recurrence import Recurrence
+from pathspace_graph.batch.start import Recurrence
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Evidence, Health, HealthMonitor
 from pathspace_graph.labels import BOUNDARIES

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -11,16 +11,15 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.gauge import pair_residuals
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.projection import offset_from_foot_point, project, sigma_across
+from pathspace_graph.factors.projection import project
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.graph.keys import CONTROL_LETTERS, POSE, SENSOR_KEY, control_keys, pose_keys
+from pathspace_graph.graph.keys import CONTROL_LETTERS, SENSOR_KEY, control_keys, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Gauge
 
-from .cone_places import ConePlaces, lay_out_places
-from .detections import NOWHERE, DetectionTable
+from .detections import DetectionTable
 from .state import State
 
 Array = NDArray[np.float64]
@@ -50,8 +49,6 @@ class CurveMap:
         """The cones of a closed boundary were detected at these parameters (k,) (m), where they are known."""
         self.reached_inactive = False
         """The flag is set when a foot point of the latest `rows` has slid to an inactive part of a curve."""
-        self.places: ConePlaces | None = None
-        """These are the cones' places along the closed curves, once they are known."""
         self._found: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
 
     # --- detections --------------------------------------------------------------------------------------
@@ -64,10 +61,9 @@ class CurveMap:
         """Returns `w_i n_i . (R z_i + t - S(u_i)) / sigma_i` for the detections in use of ascending cycles.
 
         The keys are [pose | control points of the span]; w is the root of the Huber weight, and zero if the
-        foot point is not interior. The residual `point` has two rows for each detection. The refined
-        parameters u are stored in the table only by `linearized`.
+        foot point is not interior. The refined parameters u are stored in the table only by `linearized`.
         """
-        state, detections, settings = self.state, self.detections, self.settings
+        state, detections = self.state, self.detections
         if not state.boundaries or len(cycles) == 0:
             return []
         rows = np.flatnonzero(detections.used & detections.in_cycles(cycles))
@@ -77,14 +73,9 @@ class CurveMap:
         points = to_map(detections.corrected(rows, self.variables.sensor), poses)
         foot = curves.refine(state.map_points, points, curve, detections.u[rows])
         self._found, self.reached_inactive = (rows, foot.u), curves.reaches_inactive(curve, foot)
-        kind = self._to_point if settings.spline.residual == "point" else self._across
-        jacobian, residual = kind(rows, points, poses, foot)
+        jacobian, residual = self._across(rows, points, poses, foot)
         keys = np.concatenate([self.measuring_keys(cycle), curves.keys[foot.columns]], axis=1)
-        doubled = len(residual) // max(len(rows), 1)
-        groups = [Rows(np.repeat(keys, doubled, axis=0), jacobian, residual, np.repeat(cycle, doubled))]
-        if self.places is not None:
-            groups.append(self._place_rows(self.places, rows, points, poses))
-        return groups
+        return [Rows(keys, jacobian, residual, cycle)]
 
     def measuring_keys(self, cycles: IntArray) -> IntArray:
         """Returns the keys (m, k) that the detections of cycles (m,) depend on beside the curves.
@@ -116,59 +107,6 @@ class CurveMap:
         factor = by.factor[:, None]
         jacobian = np.concatenate([factor * projected.by_pose, by.by_sensor, factor * by_control], axis=1)
         return jacobian * weight[:, None], residual * weight
-
-    def _to_point(self, rows: IntArray, points: Array, poses: Array, foot: FootPoints) -> tuple[Array, Array]:
-        """Returns the weighted Jacobian (2 m, 3 + q + 2 (degree + 1)) and residual (2 m,) of offsets.
-
-        The whitened offsets lead from the foot points to the detections; both rows of a detection are
-        adjacent. The arguments are those of `_across`.
-        """
-        settings, detections = self.settings, self.detections
-        covariances, sigma_model = detections.covariance[rows], settings.spline.sigma_model
-        projected = offset_from_foot_point(points, covariances, poses, foot, sigma_model)
-        size = np.hypot(projected.residual[:, 0], projected.residual[:, 1])
-        weight = np.repeat(np.sqrt(huber_weights(size, settings.gate.huber)) * foot.interior, 2)
-        twice, length = np.repeat(rows, 2), len(weight)
-        vectors, residual = projected.by_pose[:, :, :2].reshape(-1, 2), projected.residual.ravel()
-        norm = np.hypot(vectors[:, 0], vectors[:, 1])
-        unit, both = vectors / norm[:, None], np.repeat(poses, 2, axis=0)
-        by = detections.sensor_rows(twice, unit, residual / norm, both, self.variables.sensor)
-        factor, by_control = by.factor[:, None], projected.by_control.reshape(length, 2 * foot.basis.shape[1])
-        by_sensor = by.by_sensor * norm[:, None]
-        blocks = factor * projected.by_pose.reshape(length, POSE), by_sensor, factor * by_control
-        return np.concatenate(blocks, axis=1) * weight[:, None], by.factor * residual * weight
-
-    def _place_rows(self, places: ConePlaces, rows: IntArray, points: Array, poses: Array) -> Rows:
-        """Returns `w_i t . (R z_i + t - S(u_k)) / sigma_i` for the detections (m,) that are of a place u_k.
-
-        The keys are `measuring_keys` and the control points of the place's span. points (m, 2) and poses
-        (m, 3) are in the map frame.
-        """
-        detections, settings = self.detections, self.settings
-        placed = np.flatnonzero(detections.place[rows] != NOWHERE)
-        rows, points, poses = rows[placed], points[placed], poses[placed]
-        place, cycle = detections.place[rows], detections.cycle[rows]
-        along = places.along(place, self.state.map_points, points, poses)
-        sigma = sigma_across(along.tangent_unit, detections.covariance[rows], poses, settings.place.sigma)
-        sensor = self.variables.sensor
-        by = detections.sensor_rows(rows, along.tangent_unit, along.residual, poses, sensor)
-        whitened = by.factor * along.residual / sigma
-        weight = np.sqrt(huber_weights(whitened, settings.gate.huber)) / sigma
-        keys = np.concatenate([self.measuring_keys(cycle), places.keys[place]], axis=1)
-        factor = by.factor[:, None]
-        blocks = factor * along.by_pose, by.by_sensor, factor * along.flat_by_control
-        jacobian = np.concatenate(blocks, axis=1)
-        return Rows(keys, jacobian * weight[:, None], by.factor * along.residual * weight, cycle)
-
-    def set_places(self, u: Mapping[int, Array]) -> None:
-        """Sets the cones' places on each closed curve, by label, and associates the window's detections."""
-        self.places = lay_out_places(self.state.curves, u)
-        self.place_detections(0)
-
-    def place_detections(self, since: int) -> None:
-        """Associates the detections in use, from the row `since` on, with the places along their curves."""
-        if self.places is not None:
-            self.places.associate(self.detections, self.state.curves, self.settings.place, since)
 
     def linearized(self, cycles: IntArray) -> None:
         """Accepts the latest `rows`, of these cycles: the graph holds them from now on."""

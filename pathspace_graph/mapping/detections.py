@@ -17,9 +17,6 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-NOWHERE = -1
-"""This stands for the place of a detection that is of no cone."""
-
 
 @dataclass
 class DetectionColumns:
@@ -133,21 +130,12 @@ class DetectionTable(DetectionColumns):
     used: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
     """The flag is set when the detection is a row of the factor graph."""
 
-    place: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Each detection in use is of the cone with this number among the places, or NOWHERE."""
-
     def _clear_associations(self) -> None:
         self.boundary, self.u, self.used = self.label.copy(), np.zeros(len(self)), np.zeros(len(self), bool)
-        self.place = np.full(len(self), NOWHERE)
 
     def take(self, rows: IntArray, boundary: IntArray | int, u: Array) -> None:
         """Puts detections into use on a boundary, with the parameters (m,) of their foot points."""
         self.used[rows], self.boundary[rows], self.u[rows], self.changed[rows] = True, boundary, u, True
-        self.place[rows] = NOWHERE
-
-    def put(self, rows: IntArray, place: IntArray) -> None:
-        """Associates detections in use with places (m,), which may be NOWHERE."""
-        self.place[rows], self.changed[rows] = place, True
 
     def release(self, rows: IntArray) -> None:
         """Takes detections out of use; those of unknown colour may join either boundary again."""

@@ -150,15 +150,8 @@ class MapperEstimate:
         """Returns the window as GTSAM factors: projection, spacing, smoothness, odometry, your own and prior.
 
         The factors hold the active variables, which `values` returns. The graph shares nothing with the
-        mapper: optimize it, print its errors, or compute its marginals with GTSAM's own classes. There is no
-        such factor for `spline.residual` "point" or for places of cones, where SettingsError is raised.
+        mapper: optimize it, print its errors, or compute its marginals with GTSAM's own classes.
         """
-        if self.settings.spline.residual != "across":
-            raise SettingsError(
-                f"graph: expected spline.residual across, found {self.settings.spline.residual}"
-            )
-        if self.settings.place.use != "none":
-            raise SettingsError(f"graph: expected place.use none, found {self.settings.place.use}")
         return window_graph(self.smoother)
 
     def values(self) -> gtsam.Values:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -25,7 +24,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.association import associate, associate_late
 from pathspace_graph.loop.closing import apply_correspondences, optimize_loop, simplify
 from pathspace_graph.loop.track_loop import LoopRefusedError, TrackLoop
-from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
+from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.prediction import (
     known_noise,
@@ -46,13 +45,6 @@ from .growth import Growth
 Array = NDArray[np.float64]
 
 
-class Solver(Protocol):
-    """A solver replaces the smoother's own step; `incremental` has one."""
-
-    def step(self, smoother: CurveSmoother, sigma_step: float) -> None:
-        """Moves the smoother's variables to the estimate, and leaves its `last_step` for gating."""
-
-
 def careful(process: partial[CycleResult]) -> partial[CycleResult]:
     """Returns the call that processes the same cycle and leaves the loop as it is."""
     return partial(process.func, *process.args, careful=True)
@@ -71,7 +63,6 @@ class FixedLagMapper(MapperEstimate):
         self,
         settings: MapperSettings | None = None,
         odometry_sigma: Array | KnownNoise | None = None,
-        solver: Solver | None = None,
     ) -> None:
         self.settings = settings or MapperSettings()
         noise = known_noise(odometry_sigma)
@@ -81,8 +72,6 @@ class FixedLagMapper(MapperEstimate):
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), CurveMap(self.settings))
         """The smoother holds the variables, the factors of the window, and the prior."""
         self.smoother.window.exact = True
-        self.solver = solver
-        """The solver replaces the smoother's own step, unless it is None."""
         self.path = DrivenPath(self.settings.path)
         """This is the path that the vehicle has driven."""
         self.growth = Growth(self.settings.growth)
@@ -92,7 +81,7 @@ class FixedLagMapper(MapperEstimate):
         self.smoother.followers = [self.smoother.map, self.path, self.growth, self.orange]
         self.loop = TrackLoop(self.smoother, self.path)
         """This closes the loop of the track, and looks after the closed map."""
-        if self.settings.open_lap.prior == "window" or solver is not None:
+        if self.settings.open_lap.prior == "window":
             self.loop.record.give_up("no batch of the lap was asked for")
         self.recovery = Recovery()
         """It takes the mapper back where an update fails."""
@@ -171,11 +160,10 @@ class FixedLagMapper(MapperEstimate):
         self._classify(reading)  # detections that no curve explains may expand one
         watch.lap("classify")
         self._expand()
-        if self.solver is None:
-            deactivate_distant(self.smoother)
+        deactivate_distant(self.smoother)
         watch.lap("expand")
         for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
-            self._step()
+            self.smoother.step(self.settings.sigma_step)
         watch.lap("update")
         learned = self.loop.doubt_calibrations(reading)
         closes = self._close()
@@ -234,13 +222,6 @@ class FixedLagMapper(MapperEstimate):
             text for text in (" ".join(f"an update failed{why}".split()), consequence, notice) if text
         )
 
-    def _step(self) -> None:
-        """Takes one Gauss-Newton step, relinearized at the current estimate, or the solver's step."""
-        if self.solver is None:
-            self.smoother.step(self.settings.sigma_step)
-        else:
-            self.solver.step(self.smoother, self.settings.sigma_step)
-
     def _admit(
         self, odometry: Odometry, detections: Detections, factors: Sequence[gtsam.NonlinearFactor]
     ) -> Admitted:
@@ -266,12 +247,11 @@ class FixedLagMapper(MapperEstimate):
         self.loop.record.measured_late(late.cycle, late.detections)
         if self.boundaries and not self.loop.is_searching:
             associate_late(self.smoother, new)
-            track.place_detections(new.start)
         if not self.closed:
             self.growth.observe(self.smoother, new, detections.t)
         watch.lap("classify")
         for _ in range(self.settings.steps):
-            self._step()
+            self.smoother.step(self.settings.sigma_step)
         watch.lap("update")
         used = int(track.detections.used[new].sum())
         return replace(self._result(detections.t, watch.laps, None, ""), readings=used)
@@ -289,8 +269,6 @@ class FixedLagMapper(MapperEstimate):
         cycle, twist = self.smoother.next_cycle - 1, motion.odometry.twist
         self.orange.add(Sighting(cycle, self.poses[-1].copy(), twist, reading.orange), self._sensor)
         self.loop.record.measured(t, motion, reading.detections)
-        if self.solver is not None:
-            self.smoother.submaps = None  # another solver's loop closure relinearizes no submap
         return reading
 
     @property
@@ -310,7 +288,6 @@ class FixedLagMapper(MapperEstimate):
         tested = None
         if self.boundaries:
             tested = associate(self.smoother, self._grown, use=not self.loop.is_searching)
-            self.smoother.map.place_detections(new.start)
         self.loop.judge(tested, new, reading)
         if not self.closed:
             self.growth.observe(self.smoother, new, detections.t)
@@ -359,11 +336,8 @@ class FixedLagMapper(MapperEstimate):
         """Writes the whole mapper to one file, from which `restore` makes one that goes on to the same map.
 
         Nothing of the mapper changes. An earlier file is kept as a numbered backup, and at each moment the
-        old or the new file is there. A factor of your own or another solver cannot be saved. SettingsError is
-        raised while there is one, which for a factor is as long as one of its poses is in the window.
+        old or the new file is there. SettingsError is raised while a factor of your own is in the window.
         """
-        if self.solver is not None:
-            raise SettingsError(f"save: expected the mapper's own solver, found {type(self.solver).__name__}")
         count = self.smoother.user_factors.count
         if count:
             raise SettingsError(f"save: expected no factors of your own in the window, found {count}")

@@ -1,7 +1,5 @@
 """Settings of knots: what they follow, and how a curve is fitted on them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,7 +11,7 @@ Knots = Literal["cones", "curvature"]
 
 @dataclass(frozen=True)
 class BreakSettings:
-    """Describes how a curve's knots follow its curvature (paper: Simplification)."""
+    """How a curve's knots follow its curvature (paper: Simplification)."""
 
     baseline: float = 0.5
     """This share in [0, 1] of the knots is spread evenly along the curve, so that straights keep their
@@ -31,17 +29,14 @@ class BreakSettings:
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Describes how a spline is fitted to ordered points."""
+    """How a spline is fitted to ordered points."""
 
     degree: int = 3
-    """The curve has this degree p."""
+    """Degree p of the curve."""
     smoothness: float = 1e-3
-    """The bending integral of |S''|^2 has this weight (m^3) beside the sum of squared distances."""
+    """Weight (m^3) of the bending integral of |S''|^2 beside the sum of squared distances."""
     rounds: int = 4
-    """The knots are placed anew by curvature this number of times, after a first fit on evenly spaced
-    ones."""
+    """Times that the knots are placed anew by curvature, after a first fit on evenly spaced ones."""
     refits: int = 4
-    """On each set of knots, the curve is fitted by least squares this number of times, with refreshed foot
-    points."""
+    """Least-squares fits on each set of knots, with refreshed foot points."""
     breaks: BreakSettings = BreakSettings()
-    """These settings describe the placement of the knots."""

@@ -41,9 +41,6 @@ class SplineSettings(Positive):
     """Standard deviation of a cone's distance from the curve, m; its square is added to the variance of each
     detection across the curve. A cone has the same offset each time it is detected, so this is larger than
     the offsets themselves, which are about 0.1 m."""
-    residual: Literal["across", "point"] = "across"
-    """Residual of a detection online: its distance across the curve, or with `point` its offset from its foot
-    point in both directions, as if that were a landmark. `point` is for comparison only."""
     sigma_shape: float = 0.1
     """Standard deviation of what a curve with few control points cannot follow, m. It is added to the
     covariance of a closed map, since no number of detections averages it out."""
@@ -123,21 +120,6 @@ class GateSettings(Positive):
 
 
 @dataclass(frozen=True)
-class PlaceSettings(Positive):
-    """The places of the cones along a closed curve, which hold the vehicle along the track."""
-
-    use: Literal["none", "cones"] = "none"
-    """With `cones`, each cone has a place on the closed curve: an arc length, with which detections are
-    associated along the curve only. With `none`, detections say nothing along the curve."""
-    sigma: float = 0.1
-    """Standard deviation of a cone's place along the curve, m, which is added to that of each detection."""
-
-    room: ClassVar[float] = 1.0
-    """Largest distance of a detection's foot point from its cone's place, m along the curve."""
-    apart: ClassVar[float] = 2.0
-    """Least distance of the second nearest place, by that of the nearest one."""
-
-
 @dataclass(frozen=True)
 class FarSettings(Positive):
     """The inactive part of the map, which is not solved for in every cycle: it changes speed, not results."""
@@ -189,8 +171,6 @@ class MapperSettings(Positive):
     """The weak priors on what detections leave free."""
     gate: GateSettings = field(default_factory=GateSettings)
     """Which detections are used, and how much they weigh."""
-    place: PlaceSettings = field(default_factory=PlaceSettings)
-    """The places of the cones along a closed curve."""
     path: PathSettings = field(default_factory=PathSettings)
     """The driven path and the predicted path ahead."""
     growth: GrowthSettings = field(default_factory=GrowthSettings)

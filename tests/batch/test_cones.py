@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.cones import (
+from pathspace_graph.batch.association import (
     Cones,
     along_drive,
     cluster,
     cones_of_curve,
-    places,
     without_folds,
 )
 from pathspace_graph.labels import LEFT, RIGHT
@@ -38,11 +37,12 @@ def test_every_cluster_is_a_cone() -> None:
     np.testing.assert_array_equal(cones.count, np.full(len(true), 30))
 
 
-def test_a_place_is_the_weighted_mean_of_the_parameters_of_a_cone() -> None:
-    """Those of the first cone lie on both sides of the beginning of a closed curve of 20 m."""
-    u, weight = np.array([0.2, 19.9, 19.9, 8.0, 8.4, 8.4]), np.array([2.0, 1.0, 1.0, 3.0, 0.5, 0.5])
-    found = places(u, weight, 20.0, True, SETTINGS)
-    np.testing.assert_allclose(np.mod(np.sort(found), 20.0), [0.05, 8.1])
+def test_detections_on_both_sides_of_the_beginning_of_a_closed_curve_are_of_one_cone() -> None:
+    u = np.array([0.2, 19.9, 19.9, 8.0, 8.4, 8.4])
+    points = np.column_stack([np.mod(u + 10.0, 20.0), np.zeros(6)])
+    cones = cluster(points, u, np.array([2.0, 1.0, 1.0, 3.0, 0.5, 0.5]), 20.0, True, SETTINGS)
+    np.testing.assert_array_equal(cones.count, [3, 3])
+    np.testing.assert_allclose(np.sort(cones.points[:, 0]), [10.05, 18.1])
 
 
 def test_a_cluster_of_few_detections_is_no_cone() -> None:

@@ -8,8 +8,14 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.dead_reckoning import LAP_SIGMAS, align_laps, lap_correspondences, start_odometry
-from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
+from pathspace_graph.batch.start import (
+    LAP_SIGMAS,
+    Recurrence,
+    align_laps,
+    find_recurrence,
+    lap_correspondences,
+    start_odometry,
+)
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.keys import pose_keys

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.knots import boundary_of, dense_fit_through, fit_through, reknot, size_share
+from pathspace_graph.batch.simplification import (
+    MIN_SIZE_SHARE,
+    boundary_of,
+    dense_fit_through,
+    fit_through,
+    reknot,
+    size_share,
+)
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -59,15 +66,14 @@ def test_a_fixed_size_is_shared_by_the_cones_of_both_boundaries() -> None:
 
 
 def test_a_boundary_of_a_curve_is_that_curve_all_of_it_confirmed() -> None:
-    """Its foot points are those of the batch."""
+    """Its foot points are more exact than online."""
     spline = fit_through(np.column_stack([np.arange(0.0, 40.0, 2.0), np.zeros(20)]), False, SETTINGS, 0.5)
     boundary, points = boundary_of(spline, SETTINGS)
     u = np.linspace(*spline.domain, 30)
     np.testing.assert_allclose(boundary.evaluate(points, u), spline.evaluate(u), atol=1e-9)
     assert boundary.confirmed_end == boundary.tables.high
-    own = SETTINGS.batch.foot_points
-    assert boundary.settings.refine_room == own.refine_room
-    assert boundary.settings.search_iterations == own.search_iterations
+    assert boundary.settings.refine_room > SETTINGS.spline.refine_room
+    assert boundary.settings.search_iterations > SETTINGS.spline.search_iterations
 
 
 def test_new_knots_leave_the_poses_and_the_given_state_as_they_are() -> None:

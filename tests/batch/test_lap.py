@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from copy import deepcopy
 from functools import cache
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from pathspace_graph.batch.lap import (
 )
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.optimizer import Effort
-from pathspace_graph.batch.recurrence import Recurrence, find_recurrence
+from pathspace_graph.batch.start import Recurrence, find_recurrence
 from pathspace_graph.batch.system import BatchSystem, Evaluation
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.front_end.front_end import judge_log
@@ -35,7 +34,7 @@ from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.settings.mapper import MapperSettings, PlaceSettings
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.knots import fit_spline
 
 from ..scenes.batch import COURSE, course_log
@@ -76,8 +75,8 @@ def solved() -> LapMarginal:
 
 
 @cache
-def optimum(use: Literal["none", "cones"] = "none") -> tuple[BatchSystem, Evaluation]:
-    system, at, _ = lap_optimum(open_lap(MapperSettings(place=PlaceSettings(use))))
+def optimum() -> tuple[BatchSystem, Evaluation]:
+    system, at, _ = lap_optimum(open_lap())
     return system, at
 
 
@@ -88,10 +87,8 @@ def later(rows: Rows, cycle: int) -> Rows:
     return rows.where(np.asarray(poses.any(axis=1) & (first >= cycle)))
 
 
-@pytest.mark.parametrize("use", ["none", "cones"])
-def test_the_marginal_and_the_window_are_the_whole_problem(use: Literal["none", "cones"]) -> None:
-    system, at = optimum(use)
-    assert (at.placed is not None) == (use == "cones")
+def test_the_marginal_and_the_window_are_the_whole_problem() -> None:
+    system, at = optimum()
     state, first = at.state, len(log().cycles) - WINDOW
     unchanged = np.eye(state.map_points.size)
     information, mean = marginal_of(system, at, state, unchanged, first)
@@ -143,16 +140,6 @@ def test_the_mean_of_the_marginal_is_near_the_optimum_by_its_own_covariance() ->
     optimum = np.concatenate([marginal.calibration, *points, marginal.poses[first]])
     off = optimum - marginal.mean
     assert off @ marginal.information @ off < len(off)
-
-
-def test_the_cones_have_their_places_on_the_simplified_curves() -> None:
-    marginal, truth = solve_lap(open_lap(MapperSettings(place=PlaceSettings("cones")))), log().truth
-    assert truth is not None and solved().places == {}
-    for label, u in marginal.places.items():
-        cones = truth.cones[truth.cone_labels == label]
-        offset = marginal.splines[label].evaluate(u)[:, None] - cones
-        assert len(u) == pytest.approx(len(cones), abs=1)
-        assert np.median(np.hypot(offset[:, :, 0], offset[:, :, 1]).min(axis=1)) < 0.1
 
 
 def test_few_rounds_do_not_converge() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.recurrence import Recurrence, find_recurrence, profile_of
+from pathspace_graph.batch.start import PROFILE_STEP, Recurrence, find_recurrence, profile_of
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.batch import COURSE, course_curvature

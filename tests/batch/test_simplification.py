@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.knots import reknot
-from pathspace_graph.batch.simplification import Scatter, cross_validated, new_from_old, simplify
+from pathspace_graph.batch.simplification import Scatter, cross_validated, new_from_old, reknot, simplify
 from pathspace_graph.labels import LEFT
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State

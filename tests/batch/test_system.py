@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.association import associate, locate_poses
-from pathspace_graph.batch.dead_reckoning import start_odometry
-from pathspace_graph.batch.mapper import own_settings
 from pathspace_graph.batch.optimizer import gradient
-from pathspace_graph.batch.system import BatchSystem, Biweight, moved
+from pathspace_graph.batch.start import start_odometry
+from pathspace_graph.batch.system import BatchSystem, Biweight, moved, own_settings
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.keys import pose_key
@@ -64,21 +62,6 @@ def test_the_gradient_is_that_of_the_cost() -> None:
         slope = (costs[0] - costs[1]) / (2.0 * h)
         np.testing.assert_allclose(-negative_gradient @ direction, slope, rtol=1e-4)
     np.testing.assert_allclose(gradient(system.rows(at), layout), -negative_gradient, atol=1e-7)
-
-
-def test_the_gradient_is_that_of_the_cost_with_the_places_of_the_cones() -> None:
-    system, state = copy.deepcopy(small_system())
-    system.place(state)
-    at, layout = system.evaluate(state, hold=True), state.variables.layout
-    assert at.placed is not None and len(at.placed.rows) > 0.8 * system.detections.used.sum()
-    assert at.cost > small_system()[0].evaluate(state).cost
-    _, negative_gradient = system.linear_graph(at).hessian(layout.ordering)
-    rng = np.random.default_rng(6)
-    for _ in range(5):
-        direction, h = rng.normal(size=layout.size), 1e-5
-        costs = [system.evaluate(moved(state, s * h * direction)).cost for s in (1.0, -1.0)]
-        slope = (costs[0] - costs[1]) / (2.0 * h)
-        np.testing.assert_allclose(-negative_gradient @ direction, slope, rtol=1e-4)
 
 
 def test_the_step_is_that_of_gtsam() -> None:

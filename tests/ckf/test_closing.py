@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.ckf.closing import associate_early_segment, simplify, update_by_correspondences
+from pathspace_graph.ckf.mapper import associate_early_segment, simplify, update_by_correspondences
 from pathspace_graph.ckf.state import CurveState
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.registration import Motion

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,12 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.bspline import clamped_knots, periodic_knots, uniform_knots
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
-from pathspace_graph.factors.projection import (
-    along_from_place,
-    offset_from_foot_point,
-    project,
-    sigma_across,
-)
+from pathspace_graph.factors.projection import project, sigma_across
 from pathspace_graph.factors.se2 import to_map, to_vehicle
 from pathspace_graph.factors.spans import SpanPolynomials
 
@@ -214,88 +206,3 @@ def test_sigma_across_against_monte_carlo() -> None:
     samples = turned @ normal + rng.normal(0.0, SIGMA_MODEL, count)
     sigma = sigma_across(normal[None], covariance[None], np.array([[5.0, -3.0, theta]]), SIGMA_MODEL)
     assert abs(samples.std() / sigma[0] - 1.0) < 5.0 / np.sqrt(2.0 * count)
-
-
-# --- both directions, the foot point held ----------------------------------------------------------------
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), degree=st.integers(1, 4), kind=st.sampled_from(["open", "periodic"]))
-def test_jacobians_of_the_offset_from_a_held_foot_point(seed: int, degree: int, kind: str) -> None:
-    """The whitening of isotropic detections does not turn with the pose; foot points stay fixed."""
-    rng = np.random.default_rng(seed)
-    tables, distinct = random_curve(rng, degree, kind)
-    pose = np.append(rng.uniform(-20.0, 20.0, 2), rng.uniform(-np.pi, np.pi))
-    points, u = points_beside(rng, tables, distinct, rng.uniform(-5.0, 5.0, 15))
-    found, vehicle = find(tables, distinct, points, u), to_vehicle(points, pose[None])
-    covariances = np.tile(0.01 * np.eye(2), (len(u), 1, 1))
-    columns = control_columns(tables, found.span)
-
-    def function(pose: Array, control: Array) -> tuple[Array, Array, Array]:
-        position = np.einsum("mj,mjd->md", found.basis, control.reshape(-1, 2)[columns])
-        held, poses = replace(found, position=position), np.tile(pose, (len(u), 1))
-        rows = offset_from_foot_point(to_map(vehicle, poses), covariances, poses, held, SIGMA_MODEL)
-        by_control = np.zeros((len(u), 2, len(distinct), 2))
-        for row, at in enumerate(columns):
-            np.add.at(by_control[row], (slice(None), at), rows.by_control[row])
-        return rows.residual.ravel(), rows.by_pose.reshape(-1, 3), by_control.reshape(2 * len(u), -1)
-
-    assert_jacobians(function, [pose, distinct.ravel()])
-
-
-def test_the_offset_is_as_unlikely_as_the_detection_and_turns_with_it() -> None:
-    """|r|^2 is the squared Mahalanobis distance by the covariance in the map frame; both see one distance."""
-    rng = np.random.default_rng(7)
-    tables, distinct = random_curve(rng, 3, "open")
-    points, u = points_beside(rng, tables, distinct, rng.uniform(-3.0, 3.0, 20))
-    foot, poses = find(tables, distinct, points, u), np.column_stack([*points.T, rng.uniform(-3, 3, len(u))])
-    covariances = np.tile(np.array([[0.04, 0.015], [0.015, 0.01]]), (len(u), 1, 1))
-    rows = offset_from_foot_point(points, covariances, poses, foot, SIGMA_MODEL)
-    for row, theta in enumerate(poses[:, 2]):
-        R = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
-        S = R @ covariances[row] @ R.T + SIGMA_MODEL**2 * np.eye(2)
-        d = foot.distance[row] * foot.normal_unit[row]
-        assert np.sum(rows.residual[row] ** 2) == pytest.approx(d @ np.linalg.solve(S, d))
-    round_ones = np.tile(0.01 * np.eye(2), (len(u), 1, 1))
-    across = project(points, round_ones, poses, foot, SIGMA_MODEL)
-    both = offset_from_foot_point(points, round_ones, poses, foot, SIGMA_MODEL)
-    np.testing.assert_allclose(
-        np.linalg.norm(both.residual, axis=1), np.abs(across.residual) / across.sigma, rtol=1e-6
-    )
-
-
-# --- the place of a cone ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("degree", [1, 2, 3, 4])
-@pytest.mark.parametrize("seed", range(4))
-def test_jacobians_far_from_the_place(degree: int, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    tables = SpanPolynomials(periodic_knots(SPACING * np.arange(11.0), degree), degree, True)
-    (basis, slope), _ = tables.evaluate(rng.uniform(0.0, 30.0, 1), 1)
-    control = np.column_stack([SPACING * np.arange(degree + 1.0), np.zeros(degree + 1)])
-    control += rng.normal(0.0, 0.5, control.shape)
-    detection = rng.normal(0.0, 6.0, (1, 2))
-
-    def one_detection(pose: Array, control_points: Array) -> Sequence[Array]:
-        points = to_map(detection, pose[None])
-        rows = along_from_place(points, pose[None], control_points.reshape(1, -1, 2), basis, slope)
-        return rows.residual, rows.by_pose, rows.by_control.reshape(1, -1)
-
-    assert_jacobians(one_detection, [rng.normal(0.0, 3.0, 3), control.ravel()])
-
-
-def test_it_is_the_distance_past_the_place_along_a_straight_curve() -> None:
-    """The curve runs along y; half way between its control points lies the place (2, 5)."""
-    control, basis, slope = (
-        np.array([[[2.0, 4.0], [2.0, 6.0]]]),
-        np.array([[0.5, 0.5]]),
-        np.array([[-0.5, 0.5]]),
-    )
-    pose = np.array([[1.0, 1.0, np.pi / 2.0]])
-    rows = along_from_place(np.array([[1.4, 5.7]]), pose, control, basis, slope)
-    np.testing.assert_allclose(rows.residual, [0.7])
-    np.testing.assert_allclose(rows.tangent_unit, [[0.0, 1.0]])
-    np.testing.assert_allclose(rows.by_pose, [[0.0, 1.0, 0.4]])
-    np.testing.assert_allclose(rows.by_control, [[[0.3, -0.5], [-0.3, -0.5]]])
-    np.testing.assert_allclose(rows.flat_by_control, [[0.3, -0.5, -0.3, -0.5]])

@@ -13,10 +13,8 @@ from pathspace_graph.graph.gaussian import jacobian_factor
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.landmark.landmark_map import LandmarkMap, LandmarkSmoother
-from pathspace_graph.landmark.oracle import start_oracle
-from pathspace_graph.landmark.state import LandmarkState
-from pathspace_graph.landmark.system import LandmarkSystem
+from pathspace_graph.landmark.batch import LandmarkSystem, start_oracle
+from pathspace_graph.landmark.landmark_map import LandmarkMap, LandmarkSmoother, LandmarkState
 from pathspace_graph.mapping.prediction import smoother_settings
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings

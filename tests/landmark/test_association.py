@@ -23,7 +23,7 @@ from pathspace_graph.landmark.association import (
     predict,
     squared_mahalanobis,
 )
-from pathspace_graph.landmark.state import AMBIGUOUS, UNASSOCIATED
+from pathspace_graph.landmark.landmark_map import AMBIGUOUS, UNASSOCIATED
 from pathspace_graph.settings.comparison import LandmarkSettings
 from pathspace_graph.settings.growth import GrowthSettings
 

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.landmark.closing import JointCompatibility, LoopPairs, detect_loop, optimize_loop
-from pathspace_graph.landmark.merging import merge
+from pathspace_graph.landmark.association import merge
+from pathspace_graph.landmark.fixed_lag import JointCompatibility, LoopPairs, detect_loop, optimize_loop
 
 from .scenes import driven, with_covariance
 

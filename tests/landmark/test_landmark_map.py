@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, merge_variables, normal_equations
 from pathspace_graph.graph.keys import landmark_keys, sizes
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.landmark.state import LandmarkState
+from pathspace_graph.landmark.landmark_map import LandmarkState
 
 from ..scenes.jacobians import assert_jacobians
 from .scenes import CONES, LABELS, QUADRATIC, SPEED, drive_on, driven

@@ -11,9 +11,9 @@ from pathspace_graph.graph.gaussian import normal_equations
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.landmark.merging import compatible_pairs, find_duplicates, merge, pairs_within
-from pathspace_graph.landmark.reassociation import remove_rare
-from pathspace_graph.landmark.state import LandmarkState
+from pathspace_graph.landmark.association import compatible_pairs, find_duplicates, merge, pairs_within
+from pathspace_graph.landmark.batch import remove_rare
+from pathspace_graph.landmark.landmark_map import LandmarkState
 from pathspace_graph.settings.comparison import LandmarkSettings
 from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
 

@@ -9,14 +9,14 @@ from pathspace_graph.factors.landmark import landmark_residuals
 from pathspace_graph.graph.keys import pose_key
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.landmark.reassociation import (
+from pathspace_graph.landmark.batch import (
+    LandmarkSystem,
     Reassociation,
     predicted_covariances,
     relabel,
     remove_rare,
 )
-from pathspace_graph.landmark.state import UNASSOCIATED, LandmarkState
-from pathspace_graph.landmark.system import LandmarkSystem
+from pathspace_graph.landmark.landmark_map import UNASSOCIATED, LandmarkState
 
 from .scenes import normal_equations_of, oracle_system
 

@@ -12,9 +12,8 @@ from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, UNKNOWN
-from pathspace_graph.landmark.oracle import solve_landmarks, start_oracle
-from pathspace_graph.landmark.state import UNASSOCIATED
-from pathspace_graph.landmark.system import LandmarkSystem
+from pathspace_graph.landmark.batch import LandmarkSystem, solve_landmarks, start_oracle
+from pathspace_graph.landmark.landmark_map import UNASSOCIATED
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 

@@ -227,9 +227,3 @@ def test_the_covariance_of_what_is_no_variable_is_refused(log: Log) -> None:
     for key, text in ((gone, "x0"), (beyond, "l10000")):
         with pytest.raises(SettingsError, match=f"covariance of {text}: expected keys of poses"):
             mapper.marginal_covariance([mapper.next_pose_key - 1, key])
-
-
-def test_there_is_no_graph_of_readings_held_against_their_foot_points(log: Log) -> None:
-    mapper = driven(log, 10, MapperSettings(spline=SplineSettings(residual="point")))
-    with pytest.raises(SettingsError, match=r"expected spline\.residual across, found point"):
-        mapper.graph()

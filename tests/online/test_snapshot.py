@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from pathspace_graph import FixedLagMapper, InputError, SettingsError
-from pathspace_graph.estimators import make_online
 from pathspace_graph.health import LOST
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map, SplineBoundary
@@ -94,16 +93,6 @@ def mended() -> Drive:
             "contradicted": lambda mapper, _: mapper.loop.mending.is_tried(),
             "mended": lambda mapper, result: result.notice.startswith(MENDED),
         },
-    )
-
-
-def places() -> Drive:
-    """A drive with places of the cones on the closed curves."""
-    settings = MapperSettings()
-    return Drive(
-        simulate(bean_track(), SimulationSettings(laps=2), seed=5),
-        {"places": lambda mapper, _: mapper.smoother.map.places is not None, "later": later_than(25.0)},
-        replace(settings, place=replace(settings.place, use="cones")),
     )
 
 
@@ -190,7 +179,7 @@ def assert_same_map(track: Map, expected: Map) -> None:
         np.testing.assert_array_equal(boundary.covariance, known.covariance)
 
 
-@pytest.mark.parametrize("make", [laps, lost, mended, places, recurring, standing, colours, late])
+@pytest.mark.parametrize("make", [laps, lost, mended, recurring, standing, colours, late])
 def test_a_restored_mapper_goes_on_to_the_same_result(
     make: Callable[[], Drive], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -252,13 +241,6 @@ def test_a_factor_of_the_user_is_refused_until_it_is_part_of_the_prior(tmp_path:
             assert not file.exists()
     mapper.save(file)
     assert digest(FixedLagMapper.restore(file)) == digest(mapper)
-
-
-def test_another_solver_is_refused(tmp_path: Path) -> None:
-    mapper = make_online("incremental-fixed-lag", MapperSettings(), straight())
-    assert isinstance(mapper, FixedLagMapper)
-    with pytest.raises(SettingsError, match="expected the mapper's own solver"):
-        mapper.save(tmp_path / "incremental.snap")
 
 
 # --- files -----------------------------------------------------------------------------------------------
