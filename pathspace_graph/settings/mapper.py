@@ -12,8 +12,8 @@ from .checked import Positive
 from .closing import ClosingSettings
 from .comparison import CenterlineSettings, CkfSettings, LandmarkSettings
 from .front_end import MotionSettings, SidesSettings
-from .growth import GrowthSettings, PathSettings, TentativeSettings
-from .health import FindingSettings, HealthSettings, MendingSettings
+from .growth import GrowthSettings
+from .health import HealthSettings
 from .knots import Knots
 from .limits import LimitSettings
 
@@ -238,22 +238,14 @@ class MapperSettings(Positive):
     """These settings describe the weak priors on what detections leave free."""
     gate: GateSettings = field(default_factory=GateSettings)
     """These settings describe which detections are used, and how much they weigh."""
-    path: PathSettings = field(default_factory=PathSettings)
-    """These settings describe the driven path and the predicted path ahead."""
     growth: GrowthSettings = field(default_factory=GrowthSettings)
     """These settings describe how the open end of a curve grows."""
-    tentative: TentativeSettings = field(default_factory=TentativeSettings)
-    """These settings describe the tentative stretch beyond the confirmed end of an open curve."""
     closing: ClosingSettings = field(default_factory=ClosingSettings)
     """These settings describe loop closing."""
     open_lap: OpenLapSettings = field(default_factory=OpenLapSettings)
     """These settings describe how the open lap is solved as a batch when the loop closes."""
     health: HealthSettings = field(default_factory=HealthSettings)
     """These settings describe when an estimate is good, degraded or lost."""
-    finding: FindingSettings = field(default_factory=FindingSettings)
-    """These settings describe how a vehicle that is lost on a closed map is found."""
-    mending: MendingSettings = field(default_factory=MendingSettings)
-    """These settings describe how a closed map is mended."""
     far: FarSettings = field(default_factory=FarSettings)
     """These settings describe the inactive part of the map, which is not solved for in every cycle."""
     relinearize: RelinearizeSettings = field(default_factory=RelinearizeSettings)
