@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pathspace_graph.ckf.fit import SplineMeasurement, fit_detections
-from pathspace_graph.mapping.cubature import cubature_points, square_root
+from pathspace_graph.mapping.belief import cubature_points, square_root
 from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.sim.geometry import left_normals, unit
 from pathspace_graph.spline.bspline import BSpline

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import to_map, to_vehicle
-from pathspace_graph.mapping.candidates import SIDES, in_front_row
 from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.path import SIDES, in_front_row
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.batch import ConeSettings
 from pathspace_graph.settings.growth import GrowthSettings

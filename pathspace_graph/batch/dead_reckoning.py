@@ -15,9 +15,8 @@ from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.candidates import SIDES
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.path import along_and_across
+from pathspace_graph.mapping.path import SIDES, along_and_across
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.batch import LapCorrespondenceSettings
 from pathspace_graph.settings.mapper import MapperSettings

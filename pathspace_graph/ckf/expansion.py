@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.se2 import rotated, rotation, to_map
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.candidates import SIDES, Candidates, End, chain
-from pathspace_graph.mapping.path import PathAhead
+from pathspace_graph.mapping.path import SIDES, Candidates, End, PathAhead, chain
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.settings.mapper import MapperSettings

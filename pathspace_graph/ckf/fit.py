@@ -44,7 +44,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.mapping.cubature import transform
+from pathspace_graph.mapping.belief import transform
 from pathspace_graph.settings.comparison import CkfSettings
 
 Array = NDArray[np.float64]

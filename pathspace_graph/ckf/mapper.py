@@ -12,9 +12,8 @@ from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
-from pathspace_graph.mapping.motion import MeasuredMotion
+from pathspace_graph.mapping.motion import MeasuredMotion, known_noise
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import known_noise
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.scale.door import at_scale

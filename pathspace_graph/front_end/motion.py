@@ -16,8 +16,7 @@ from pathspace_graph.factors.odometry import (
 )
 from pathspace_graph.factors.se2 import compose, relative, rotation, to_map
 from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.mapping.motion import MeasuredMotion
-from pathspace_graph.mapping.prediction import integrate_odometry
+from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry
 from pathspace_graph.settings.front_end import MotionSettings
 
 from .gate import Newest

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
-from pathspace_graph.mapping.candidates import SIDES, in_front_row
-from pathspace_graph.mapping.path import DrivenPath, PathAhead
+from pathspace_graph.mapping.path import SIDES, DrivenPath, PathAhead, in_front_row
 from pathspace_graph.settings.front_end import SidesSettings
 from pathspace_graph.settings.growth import PathSettings
 

@@ -16,14 +16,14 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import (
+from pathspace_graph.mapping.motion import (
     doubt_calibrations,
     known_noise,
     predict,
     smoother_settings,
     vehicle_state,
 )
+from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import CycleResult, Readings, Stopwatch

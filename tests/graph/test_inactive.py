@@ -15,7 +15,7 @@ from pathspace_graph.graph.variables import Layout, Variables
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.prediction import smoother_settings
+from pathspace_graph.mapping.motion import smoother_settings
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import FarSettings, MapperSettings

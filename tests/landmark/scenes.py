@@ -17,7 +17,7 @@ from pathspace_graph.landmark.landmark_map import LandmarkMap, LandmarkSmoother
 from pathspace_graph.landmark.oracle import start_oracle
 from pathspace_graph.landmark.state import LandmarkState
 from pathspace_graph.landmark.system import LandmarkSystem
-from pathspace_graph.mapping.prediction import smoother_settings
+from pathspace_graph.mapping.motion import smoother_settings
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 

@@ -17,7 +17,7 @@ from pathspace_graph.eval.figures.isolated import FIGURES, MARKER
 from pathspace_graph.eval.figures.simplification import simplification
 from pathspace_graph.eval.figures.uncertainty import UncertaintyScene, uncertainty
 from pathspace_graph.io.manifest import MANIFEST_FILE
-from pathspace_graph.mapping.cubature import cubature_points, square_root
+from pathspace_graph.mapping.belief import cubature_points, square_root
 from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit
