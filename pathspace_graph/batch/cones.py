@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import to_map, to_vehicle
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.path import SIDES, in_front_row
+from pathspace_graph.mapping.path import BESIDE, LATERAL_GAP, SIDES, in_front_row
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.batch import ConeSettings
-from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import find_anywhere
@@ -79,7 +78,7 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     others = clustered(beside & ~on_curve & _far_from(points, cones.points, radius))
     cones = cones.merged(others.where(others.count >= min_share * np.median(cones.count)))
     if boundary.periodic:
-        cones = along_drive(cones, last_lap(state, label), label, settings.growth)
+        cones = along_drive(cones, last_lap(state, label), label)
     return without_folds(cones, boundary.periodic, settings.batch.cones)
 
 
@@ -110,7 +109,7 @@ def last_lap(state: State, label: int) -> Array:
     return np.asarray(state.poses[pose_u > pose_u[-1] - state.boundaries[label].length])
 
 
-def along_drive(cones: Cones, lap: Array, label: int, settings: GrowthSettings) -> Cones:
+def along_drive(cones: Cones, lap: Array, label: int) -> Cones:
     """Return the cones of the row nearest to the poses (l, 3) of a lap, in the order in which these pass it.
 
     A cone is passed at the path length of its nearest pose, plus its distance ahead of that pose. What stands
@@ -121,7 +120,7 @@ def along_drive(cones: Cones, lap: Array, label: int, settings: GrowthSettings) 
     nearest = (offset**2).sum(axis=2).argmin(axis=1)
     ahead, left = to_vehicle(cones.points, lap[nearest]).T
     station, side = driven[nearest] + ahead, SIDES[label] * left
-    front = in_front_row(station, side, settings.beside, settings.lateral_gap)
+    front = in_front_row(station, side, BESIDE, LATERAL_GAP)
     order = np.argsort(station, kind="stable")
     return cones.where(order[front[order]])
 

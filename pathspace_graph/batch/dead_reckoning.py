@@ -16,7 +16,7 @@ from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.path import SIDES, along_and_across
+from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.batch import LapCorrespondenceSettings
 from pathspace_graph.settings.mapper import MapperSettings
@@ -190,7 +190,7 @@ def _beside_path(
     station, lateral = along_and_across(points, path, stations)
     length = recurrence.lap if recurrence.recurs else float(stations[-1]) + settings.growth.reach
     side, gate = SIDES[label] * lateral, settings.gate
-    kept = (side > settings.growth.min_lateral) & (side < settings.batch.cones.max_lateral)
+    kept = (side > MIN_LATERAL) & (side < settings.batch.cones.max_lateral)
     ahead = station - recurrence.driven[cycles]
     kept &= (ahead > -gate.view_behind) & (ahead < gate.view_ahead)
     return station, np.asarray(kept & (station >= 0.0) & (station < length)), length

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.fft import fft, ifft, next_fast_len
 
 from pathspace_graph.graph.keys import POSE
+from pathspace_graph.mapping.registration import HEADING
 from pathspace_graph.settings.batch import RecurrenceSettings
 from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.settings.mapper import MapperSettings
@@ -73,7 +74,7 @@ class Profile:
         radius = settings.radius + settings.drift * lags * self.step
         power = np.maximum(_mean_squares(curvature, lags), np.finfo(float).tiny)
         agreement = 1.0 - _mean_square_difference(curvature, lags) / power
-        back = (square < radius**2) & (along > np.cos(settings.heading))
+        back = (square < radius**2) & (along > np.cos(HEADING))
         return np.where(back, agreement, -np.inf)
 
 

@@ -12,8 +12,8 @@ from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.graph.keys import POINT, POSE, pose_keys
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.registration import Motion, register
-from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
+from pathspace_graph.mapping.registration import BEGINNING, BEGINNING_SHARE, Motion, register
+from pathspace_graph.mapping.seam import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, PeriodicCurve, make_periodic
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit
@@ -90,13 +90,12 @@ def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
 
 def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Array]:
     """Returns parameters (k,) near the end of a curve, and those (k,) of the points they are moved on."""
-    closing, spline = state.settings.closing, state.spline(label)
+    spline = state.spline(label)
     high = spline.domain[1]
-    low = max(high - closing.beginning - closing.join_margin, closing.join_share * high)
-    u = np.arange(low, high, closing.overlap_step)
+    u = np.arange(max(high - BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
     moved = motion.apply(spline.evaluate(u))
     zero = np.zeros(len(u))
-    beginning = min(closing.beginning, closing.beginning_share * high)
+    beginning = min(BEGINNING, BEGINNING_SHARE * high)
     foot = state.foot_points(label, moved, zero, zero + beginning)
     on = foot.interior & (np.abs(foot.distance) < state.settings.ckf.tie_reach)
     return u[on], foot.u[on]

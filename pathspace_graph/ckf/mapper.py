@@ -14,7 +14,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
 from pathspace_graph.mapping.motion import MeasuredMotion, known_noise
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.registration import near_start
+from pathspace_graph.mapping.registration import WINDOW, near_start
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.scale.door import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
@@ -47,7 +47,7 @@ class CkfMapper:
             Belief.at_start(self.settings.odometry, self.settings.calibration), self.settings
         )
         """This holds the pose, the curves and their joint covariance."""
-        self.path = DrivenPath(self.settings.path)
+        self.path = DrivenPath()
         """This is the path driven."""
         self.expansion = Expansion(self.settings)
         """This holds what is not on a curve yet."""
@@ -104,7 +104,7 @@ class CkfMapper:
         if self.closed:
             return
         self._recent.append((state.pose.copy(), detections))
-        self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - settings.window]
+        self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - WINDOW]
         if len(state.curves) == 0 or not near_start(self.path, state.pose, settings):
             return
         if self.path.length - self._last_check < settings.check_interval:

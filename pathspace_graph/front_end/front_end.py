@@ -77,7 +77,7 @@ class FrontEnd:
         self._begun = False
         self._calibration = settings.calibration
         self._sensor_doubted = False
-        self._sides = SideJudge(settings.sides, settings.path)
+        self._sides = SideJudge(settings.sides)
 
     def admit(self, odometry: Odometry, detections: Detections, window: Sequence[float] = ()) -> Admitted:
         """Returns a cycle that may be used, or raises a ReadingError; nothing but a count changes.

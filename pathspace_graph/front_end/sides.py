@@ -18,7 +18,6 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.path import SIDES, DrivenPath, PathAhead, in_front_row
 from pathspace_graph.settings.front_end import SidesSettings
-from pathspace_graph.settings.growth import PathSettings
 
 from .cones import NearCones
 from .rows import Row, follow_rows
@@ -30,13 +29,12 @@ IntArray = NDArray[np.intp]
 class SideJudge:
     """Gives the detections of each cycle the labels of their sides."""
 
-    def __init__(self, settings: SidesSettings, path: PathSettings) -> None:
+    def __init__(self, settings: SidesSettings) -> None:
         self.settings = settings
         self.swapped = False
         """The flag is set where the colours of the log so far are on the other sides."""
         self.colourless = False
         """The flag is set where most detections have no colour, so that the way driven tells their sides."""
-        self._path_settings = path
         self._path: DrivenPath | None = None
         self._cones = NearCones(settings)
         self._agreeing = self._opposing = 0  # cones on the side of their colour, and on the other one
@@ -54,7 +52,7 @@ class SideJudge:
         if not self.colourless and self._agreeing + self._opposing >= self.settings.enough_votes:
             self._path = None  # it begins anew, if it is needed again
             return self.relabelled(detections, labels) if self.swapped else detections
-        self._path = self._path or DrivenPath(self._path_settings)
+        self._path = self._path or DrivenPath()
         self._path.update(pose)
         self._path.steer(twists)
         path = self._path.ahead(pose, self.settings.reach)

@@ -59,7 +59,7 @@ class LandmarkFixedLag:
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), LandmarkMap(self.settings))
         """This holds the variables, the window and its prior."""
         self.smoother.window.exact = True
-        self.path = DrivenPath(self.settings.path)
+        self.path = DrivenPath()
         """This is the path driven."""
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         """These tracks by label are not landmarks yet."""

@@ -57,7 +57,7 @@ class LandmarkMap:
 
     def add_late(self, late: LateDetections) -> slice:
         """Adds late detections to those of their pose, corrected by the sensor's calibration."""
-        rows = self.detections.insert(late.detections, late.cycle, late.twist)
+        rows = self.detections.append(late.detections, late.cycle, late.twist)
         self.correct()
         return rows
 
