@@ -80,17 +80,17 @@ class Loop:
     """A closed map as the search needs it."""
 
     middle: Array
-    """(n, 2) These points lie on the middle of the track in driving order, in m, map frame."""
+    """(n, 2) Points on the middle of the track in driving order, in m, map frame."""
     stations: Array
-    """(n,) Each point has this length along the middle (m)."""
+    """(n,) Length along the middle up to each of them (m)."""
     length: float
-    """The middle is this long (m)."""
+    """Length of the middle (m)."""
     beside: Mapping[int, Array]
-    """Each boundary has its parameters (n,) beside the points of the middle (m)."""
+    """(n,) Parameters beside the points of the middle on each boundary (m)."""
     curves: Mapping[int, KDTree]
-    """Each boundary has densely sampled points."""
+    """Densely sampled points of each boundary."""
     mapped: Mapping[int, BoolArray]
-    """These say of each point whether it lies between cones that were detected (see `is_mapped`)."""
+    """Whether each of these lies between cones that were detected (see `is_mapped`)."""
 
     def at(self, stations: Array) -> Array:
         """Return the points of the middle at stations of any shape, as complex numbers x + i y."""
@@ -101,18 +101,18 @@ class Loop:
         """Return the distance (..., m) of points (..., m, 2) from their curve (m,), in m, at most `most`."""
         found = np.full(points.shape[:-1], most)
         for label, curve in self.curves.items():
-            own = labels == label
-            distance, _ = curve.query(points[..., own, :], distance_upper_bound=most)
-            found[..., own] = np.minimum(distance, most)
+            of_label = labels == label
+            distance, _ = curve.query(points[..., of_label, :], distance_upper_bound=most)
+            found[..., of_label] = np.minimum(distance, most)
         return found
 
     def beside_gaps(self, labels: IntArray, points: Array) -> BoolArray:
         """Return which points (m, 2) are nearest to a gap of their curve (m,), where no cone is mapped."""
         found = np.zeros(len(points), bool)
         for label, curve in self.curves.items():
-            own = np.flatnonzero(labels == label)
-            if len(own):
-                found[own] = ~self.mapped[label][curve.query(points[own])[1]]
+            of_label = np.flatnonzero(labels == label)
+            if len(of_label):
+                found[of_label] = ~self.mapped[label][curve.query(points[of_label])[1]]
         return found
 
 
@@ -149,15 +149,12 @@ def lay_out_loop(state: State, is_mapped_on: Callable[[int, Array], BoolArray] |
     steps = np.hypot(*np.diff(middle, axis=0, append=middle[:1]).T)
     stations = np.concatenate([[0.0], steps.cumsum()[:-1]])
     beside = {LEFT: u[LEFT][::every], RIGHT: u[RIGHT][opposite]}
-    mapped = {
-        label: is_mapped_on(label, own) if is_mapped_on else np.ones(len(own), bool)
-        for label, own in u.items()
-    }
+    mapped = {b: is_mapped_on(b, at) if is_mapped_on else np.ones(len(at), bool) for b, at in u.items()}
     return Loop(middle, stations, float(steps.sum()), beside, curves, mapped)
 
 
 class KnownLoop:
-    """Lays out the closed map when it is asked for, and again once the curves were replaced by others."""
+    """The closed map, laid out when it is asked for, and again once the curves were replaced by others."""
 
     def __init__(self, smoother: CurveSmoother) -> None:
         self._smoother = smoother
@@ -208,11 +205,10 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_
     if known.is_whole and used.sum() < settings.share_degraded * judged.sum():
         others = np.flatnonzero(judged & ~used)
         rows = tested.rows[others]
-        points = detections.points_map(rows, smoother.variables)
-        loop, own = known.get(), labels[others]
-        explained[others] = loop.distances(own, points, BESIDE) < BESIDE
-        unmapped[others] = ~explained[others] & loop.beside_gaps(own, points)
-        wrong = loop.distances(LEFT + RIGHT - own, points, BESIDE) < BESIDE
+        points, loop, label = detections.points_map(rows, smoother.variables), known.get(), labels[others]
+        explained[others] = loop.distances(label, points, BESIDE) < BESIDE
+        unmapped[others] = ~explained[others] & loop.beside_gaps(label, points)
+        wrong = loop.distances(LEFT + RIGHT - label, points, BESIDE) < BESIDE
         judged[others] &= explained[others] | ~wrong
         unmapped &= judged
     innovations, offered = tested.innovation[used], judged & ~unmapped
@@ -231,7 +227,6 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_
 
 
 def _by_boundary(labels: IntArray) -> tuple[int, int]:
-    """Return how many of the labels (m,) are of the left and of the right boundary."""
     left, right = np.bincount(labels, minlength=len(BOUNDARIES)).tolist()
     return left, right
 
@@ -256,20 +251,19 @@ class Hypothesis:
     found: RefinedMotion
     """The motion moves the window onto the place."""
     score: float
-    """This says how well the detections lie on the map there, from 0 to 1."""
+    """How well the detections lie on the map there, from 0 to 1."""
 
 
 class Search:
-    """Remembers what a lost vehicle has seen, and looks for its place on a closed map."""
+    """What a lost vehicle has seen, and the search for its place on a closed map."""
 
     def __init__(self, smoother: CurveSmoother) -> None:
-        """Begin after the newest pose."""
         self.settings: MapperSettings = smoother.map.settings
         self.loop: Loop
-        """Map as it was in the last attempt."""
+        """The map as it was in the last attempt."""
         self._smoother = smoother
         self.first_cycle = smoother.next_cycle
-        """The detections of the cycles from this one on are remembered."""
+        """Cycle from which on detections are remembered."""
         self._poses: list[Array] = []
         self._seen: list[Detections] = []
         self._tried = smoother.times[-1]
@@ -408,7 +402,7 @@ class Search:
 
 
 def start_anew(smoother: CurveSmoother, first_cycle: int, found: RefinedMotion) -> Array:
-    """Move the window onto the place that was found, and returns the jump (3,) of the newest pose.
+    """Move the window onto the place that was found, and return the jump (3,) of the newest pose.
 
     The poses before `first_cycle` leave the window. The map and its prior stay; what the prior says about the
     poses is replaced by the covariance of the registration.

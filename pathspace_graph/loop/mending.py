@@ -142,7 +142,7 @@ def in_rows(points: Array, apart: float) -> list[IntArray]:
 
 
 class Mending:
-    """Notices that a closed map is contradicted, and begins and judges the batch that mends it."""
+    """Whether a closed map is contradicted, and the batch that mends it."""
 
     def __init__(self, smoother: CurveSmoother) -> None:
         self.contradictions = Contradictions(smoother.map.settings.growth)

@@ -59,7 +59,6 @@ class TrackLoop:
         self.late_cycles = 0
         """Cycles by which the slowest batch is late in a vehicle, by its wall time."""
         self.record = DriveRecord(self.settings)
-        """Drive as it was measured."""
         self.mending = Mending(smoother)
         self._smoother = smoother
         self._path = path
@@ -115,7 +114,7 @@ class TrackLoop:
     # --- what a cycle tells ------------------------------------------------------------------------------
 
     def judge(self, tested: Gating | None, new: slice, reading: Reading) -> None:
-        """Judge the estimate by the detections that were tested, or remembers those of a lost vehicle.
+        """Judge the estimate by the detections that were tested, or remember those of a lost vehicle.
 
         The detections of the cycle are the rows `new` of the table.
         """
@@ -129,21 +128,16 @@ class TrackLoop:
             evidence = evidence_of(smoother, tested, self._known_loop, reading.seen_again)
         motion = reading.motion
         self.health = self._monitor.update(replace(evidence, odometry=motion.fault, rests=motion.rests))
-        if self.health.condition == GOOD and (caveat := self._caveat()):
-            self.health = Health(DEGRADED, caveat)
+        if self.health.condition == GOOD and self._boundaries_cross:
+            self.health = Health(DEGRADED, "the two boundaries of the map cross")
         if self._known_loop.is_whole and self.record.unsolvable is None:
             self.mending.contradictions.observe(smoother.map, self._known_loop, new, detections.t)
         self._begin_search()
 
-    def _caveat(self) -> str:
-        if self._boundaries_cross:
-            return "the two boundaries of the map cross"
-        return ""
-
     def doubt_calibrations(self, reading: Reading) -> str:
         """Widen the priors of calibrations that the drive contradicts, while the loop is open.
 
-        Returns a notice in the first cycle in which it does.
+        Return a notice in the first cycle in which it does.
         """
         if self.closed:
             return ""
@@ -155,7 +149,7 @@ class TrackLoop:
     # --- the batch of the open lap -----------------------------------------------------------------------
 
     def pause(self) -> None:
-        """Give up what is under way, and rests for `REST` metres: something has failed."""
+        """Give up what is under way, and rest for `REST` metres: something has failed."""
         self._resumes = self._path.length + REST
         if self._lap_batch is not None:
             self._lap_batch.give_up()
@@ -167,9 +161,9 @@ class TrackLoop:
         return self._path.length < self._resumes
 
     def go_on(self, closes: bool, spent: float) -> tuple[Array | None, str]:
-        """Record the open lap, has it solved when it closes, and goes on from the result when it is due.
+        """Record the open lap, have it solved when it closes, and go on from the result when it is due.
 
-        The cycle has taken the time `spent` (s) so far. Returns the jump (3,) of the newest pose if the map
+        The cycle has taken the time `spent` (s) so far. Return the jump (3,) of the newest pose if the map
         was replaced, and a notice.
         """
         if closes:
@@ -211,7 +205,7 @@ class TrackLoop:
                 self._try_loop()
 
     def _end(self, batch: LapBatch, spent: float) -> tuple[Array | None, str]:
-        """Take the result of a batch that is due, waits for the next cycle, or gives the batch up.
+        """Take the result of a batch that is due, wait for the next cycle, or give the batch up.
 
         The cycle as a whole lasts no longer than its period for that, the time since the one before it.
         """
@@ -284,7 +278,7 @@ class TrackLoop:
     def _solve_lap(self) -> str:
         """Send the lap to be solved as a batch in the cycle in which the loop has closed.
 
-        Returns a notice that says why it cannot be solved, or an empty one.
+        Return a notice that says why it cannot be solved, or an empty one.
         """
         smoother, record = self._smoother, self.record
         closed = record.closed_map(smoother)

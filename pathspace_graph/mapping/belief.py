@@ -243,7 +243,7 @@ class Belief:
         )
 
     def reorder(self, points: IntArray) -> None:
-        """Put the points into another order, or keeps some of them, by their indices (k,)."""
+        """Put the points into another order, or keep some of them, by their indices (k,)."""
         columns = np.concatenate([np.arange(HEAD), point_columns(points)])
         self.mean = self.mean[columns]
         self.covariance = self.covariance[np.ix_(columns, columns)]

@@ -26,7 +26,7 @@ MAX_TRACKS: Final = 1000
 
 
 class TentativeTracks:
-    """Cones of one label as points, merges detections within a radius, and counts them."""
+    """Cones of one label as points, each merged from the detections within a radius."""
 
     def __init__(self, settings: GrowthSettings) -> None:
         self.settings = settings

@@ -36,7 +36,7 @@ from .growth import Growth
 
 
 def careful(process: partial[CycleResult]) -> partial[CycleResult]:
-    """Return the call that processes the same cycle and leaves the loop as it is."""
+    """Return the call that processes the same cycle but leaves the loop as it is."""
     return partial(process.func, *process.args, careful=True)
 
 
@@ -240,9 +240,9 @@ class FixedLagMapper(MapperEstimate):
     # --- the steps of the paper --------------------------------------------------------------------------
 
     def _predict(self, odometry: Odometry, detections: Detections) -> Reading:
-        """Add the pose of the cycle by the calibrated odometry, and extends the driven path.
+        """Add the pose of the cycle by the calibrated odometry, and extend the driven path.
 
-        Returns the readings as the front end has judged them.
+        Return the readings as the front end has judged them.
         """
         reading = self.front_end.update(odometry, detections)
         motion, t = reading.motion, detections.t

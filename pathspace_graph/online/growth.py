@@ -160,8 +160,7 @@ class Growth:
     def _consume(self, label: int, found: Candidates, u: Array) -> None:
         """Make candidates part of the curve at u (k,), and put the window's detections of them into use."""
         detections, boundary = self._map.detections, self._state.boundaries[label]
-        boundary.observed.extend(found.points)
-        boundary.cone_parameters.extend(u.tolist())
+        boundary.add_cones(found.points, u)
         self.tentative[label].remove(found.indices)
         rows = detections.pending(label)
         points = detections.points_map(rows, self._map.variables)
