@@ -147,8 +147,7 @@ class FixedLagMapper(MapperEstimate):
         self._expand()
         self.smoother.deactivate_distant()
         watch.lap("expand")
-        for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
-            self.smoother.step(self.settings.sigma_step)
+        self._update()
         watch.lap("update")
         learned = self.loop.doubt_calibrations(reading)
         closes = self._close()
@@ -275,6 +274,11 @@ class FixedLagMapper(MapperEstimate):
         if not self.closed:
             path_ahead = self.path.ahead(self.poses[-1], self.settings.growth.reach)
             self._grown = self.growth.expand(path_ahead)
+
+    def _update(self) -> None:
+        """Take the Gauss-Newton steps of a cycle, each relinearized at the current estimate."""
+        for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
+            self.smoother.step(self.settings.sigma_step)
 
     def _close(self) -> bool:
         if not self.boundaries or not self.loop.may_close():
