@@ -224,17 +224,17 @@ def _kept(poses: Array) -> Array:
 
 
 class LapBatch:
-    """A lap is being solved in a process of its own, while the mapper goes on."""
+    """A lap that is being solved in a process of its own, while the mapper goes on."""
 
     def __init__(self, lap: OpenLap, t: float, due: int, last: int) -> None:
         self.t = t
-        """The lap was sent in the cycle of this stamp (s)."""
+        """Stamp of the cycle in which the lap was sent (s)."""
         self.due = due
-        """The marginal replaces the prior in this cycle, or in the first later one in which it is there."""
+        """Cycle in which the marginal replaces the prior, or the first later one in which it is there."""
         self.last = last
-        """It does so in this cycle at the latest."""
+        """Latest cycle in which it does so."""
         self.first_kept = lap.first_kept
-        """The window holds the poses from this cycle on until then."""
+        """Cycle from which on the window holds the poses until then."""
         self._lap = lap
         self._future: Future[LapMarginal | None] | None = None
         self.send()
@@ -256,7 +256,7 @@ class LapBatch:
             _end_worker()
 
     def marginal(self, timeout: float) -> LapMarginal | str | None:
-        """Return the solution or says why there is none; it is None if it is not there after a time (s)."""
+        """Return the solution, or why there is none, or None if it is not there after a time (s)."""
         try:
             solved = self.send().result(timeout)
         except TimeoutError:

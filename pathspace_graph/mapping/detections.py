@@ -34,10 +34,8 @@ class DetectionColumns:
     """Colour by the sensor: LEFT, RIGHT or UNKNOWN."""
     changed: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
     """Whether the association has changed since the detection's cycle was last linearized."""
-
-    def __post_init__(self) -> None:
-        self.sensor: Array = np.zeros(0)
-        """(5,) or (0,) Calibration of the sensor by which `point` is corrected."""
+    sensor: Array = field(default_factory=lambda: np.zeros(0))
+    """(5,) or (0,) Calibration of the sensor by which `point` is corrected; it is no column."""
 
     def __len__(self) -> int:
         return len(self.cycle)
@@ -71,10 +69,13 @@ class DetectionColumns:
         """
         start = int(self.cycle.searchsorted(cycle, side="right"))
         new = type(self).of([detections], cycle, None if twist is None else twist[None])
-        for column in fields(self):
-            known, added = getattr(self, column.name), getattr(new, column.name)
-            setattr(self, column.name, np.concatenate([known[:start], added, known[start:]]))
+        for column in self._columns():
+            known, added = getattr(self, column), getattr(new, column)
+            setattr(self, column, np.concatenate([known[:start], added, known[start:]]))
         return slice(start, start + len(new))
+
+    def _columns(self) -> list[str]:
+        return [column.name for column in fields(self) if column.name != "sensor"]
 
     def corrected(self, rows: IntArray | slice, sensor: Array) -> Array:
         """Return positions (m, 2), vehicle frame, corrected by the sensor's calibration: (5,) or empty."""
@@ -109,8 +110,8 @@ class DetectionColumns:
     def keep_from(self, cycle: int) -> None:
         """Remove the detections of all cycles before `cycle`."""
         first = int(self.cycle.searchsorted(cycle))
-        for column in fields(self):
-            setattr(self, column.name, getattr(self, column.name)[first:])
+        for column in self._columns():
+            setattr(self, column, getattr(self, column)[first:])
 
     def in_cycles(self, cycles: IntArray) -> BoolArray:
         """Return (m,) whether each detection was made in one of the ascending cycles (k,)."""

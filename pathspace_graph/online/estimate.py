@@ -106,16 +106,14 @@ class MapperEstimate:
 
         This is what a controller asks for in each cycle, so it is fast, and nothing of the estimate changes.
         While the loop is open, it goes on beyond the confirmed ends through the cones of `outline`, and says
-        where.
-        SettingsError is raised where a length is out of its range.
+        where. SettingsError is raised where a length is out of its range.
         """
         if not self.smoother.times:
             return track_ahead({}, np.zeros(POSE), distance, step)
         pose, state = self.poses[-1], self.smoother.map.state
         if not self.closed:
-            curves = curves_ahead(
-                self.smoother.map, self.growth.tentative, self.path, self.smoother.times[-1]
-            )
+            t = self.smoother.times[-1]
+            curves = curves_ahead(self.smoother.map, self.growth.tentative, self.path, t)
             return track_ahead(curves, pose, distance, step)
         curves = {}
         for label, boundary in self.boundaries.items():
