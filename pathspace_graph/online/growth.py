@@ -199,7 +199,7 @@ class Growth:
             beyond = np.hypot(*(found.points - end.position).T) > settings.threshold
             found = found.where(beyond & (found.stations > end.station + STATION_MARGIN))
         if len(found.points):
-            found = found.where(undisputed(self._map, label, found.points))
+            found = found.where(undisputed(self._map, label, found.points, settings.merge_radius))
         found = found.where(np.argsort(found.stations))
         found = found.where(chain(found, end))
         found = found.where(self._certain(label, path_ahead, found))
@@ -270,13 +270,13 @@ class Growth:
             self.notice = f"{self.notice}; {notice}" if self.notice else notice
 
 
-def undisputed(track: CurveMap, label: int, points: Array) -> BoolArray:
+def undisputed(track: CurveMap, label: int, points: Array, radius: float) -> BoolArray:
     """Return whether places (n, 2) have at least as many detections of `label` around them as of the other.
 
     A sensor that now and then takes a cone for one of the other boundary sees its true colour more often. All
-    coloured detections of the window within the merge radius count, in use or not.
+    coloured detections of the window within `radius` (m) count, in use or not.
     """
-    detections, radius = track.detections, track.settings.growth.merge_radius
+    detections = track.detections
     rows = np.flatnonzero(detections.label != UNKNOWN)
     offset = points[:, None] - detections.points_map(rows, track.variables)
     near = offset[:, :, 0] ** 2 + offset[:, :, 1] ** 2 < radius**2

@@ -313,7 +313,7 @@ def _tracks(track: CurveMap, label: int, tracks: TentativeTracks, t: float) -> I
         offset = tracks.points[indices, None] - mapped
         distance = np.hypot(offset[:, :, 0], offset[:, :, 1])
         indices = indices[(distance > settings.threshold).all(axis=1)]
-    return indices[undisputed(track, label, tracks.points[indices])]
+    return indices[undisputed(track, label, tracks.points[indices], settings.merge_radius)]
 
 
 def _row(track: CurveMap, label: int, candidates: Array) -> Row:

@@ -48,14 +48,14 @@ def test_a_place_is_of_the_label_that_most_readings_around_it_have(
 ) -> None:
     """Two to one, one to one, and nothing at all; those of unknown colour have no say."""
     places = np.array([[10.0, 0.0], [0.0, 8.0], [5.0, 5.0]])
-    assert undisputed(seen.smoother.map, label, places).tolist() == expected
+    assert undisputed(seen.smoother.map, label, places, 1.0).tolist() == expected
 
 
 def test_readings_farther_away_than_the_radius_have_no_say(seen: FixedLagMapper) -> None:
     """Of those about (10, 0) only the right one is within 0.25 m of (10, 0.5)."""
     place = np.array([[10.0, 0.5]])
-    assert undisputed(seen.smoother, RIGHT, place, 0.25).tolist() == [True]
-    assert undisputed(seen.smoother, LEFT, place, 0.25).tolist() == [False]
+    assert undisputed(seen.smoother.map, RIGHT, place, 0.25).tolist() == [True]
+    assert undisputed(seen.smoother.map, LEFT, place, 0.25).tolist() == [False]
 
 
 def miscoloured(log: Log, every: int) -> Log:
@@ -384,7 +384,7 @@ def uncrossed(mapper: FixedLagMapper, path: PathAhead, *points: tuple[float, flo
     places = np.array(points)
     found = Candidates(places, np.arange(len(places)), places[:, 0], places[:, 1])
     end = End(np.array([4.0, 2.0]), 4.0, 2.0)
-    return mapper.growth._uncrossed(mapper.smoother, LEFT, path, end, found).tolist()
+    return mapper.growth._uncrossed(LEFT, path, end, found).tolist()
 
 
 @pytest.fixture
