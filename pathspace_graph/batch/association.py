@@ -12,12 +12,11 @@ from pathspace_graph.factors.projection import project
 from pathspace_graph.factors.se2 import to_map, to_vehicle
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.labels import UNKNOWN
-from pathspace_graph.mapping.candidates import SIDES, in_front_row
 from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.path import BESIDE, LATERAL_GAP, SIDES, in_front_row
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import nearest_within
 from pathspace_graph.settings.batch import AssociationSettings
-from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary
 
@@ -231,7 +230,7 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     others = clustered(beside & ~on_curve & ~near)
     cones = cones.merged(others.where(others.count >= MIN_SHARE_BESIDE * np.median(cones.count)))
     if boundary.periodic:
-        cones = along_drive(cones, last_lap(state, label), label, settings.growth)
+        cones = along_drive(cones, last_lap(state, label), label)
     return without_folds(cones, boundary.periodic)
 
 
@@ -265,7 +264,7 @@ def last_lap(state: State, label: int) -> Array:
     return np.asarray(state.poses[pose_u > pose_u[-1] - state.boundaries[label].length])
 
 
-def along_drive(cones: Cones, lap: Array, label: int, settings: GrowthSettings) -> Cones:
+def along_drive(cones: Cones, lap: Array, label: int) -> Cones:
     """Return the cones of the row nearest to the poses (l, 3) of a lap, in the order in which these pass it.
 
     A cone is passed at the path length of its nearest pose, plus its distance ahead of that pose. What stands
@@ -275,7 +274,7 @@ def along_drive(cones: Cones, lap: Array, label: int, settings: GrowthSettings) 
     nearest = (offset**2).sum(axis=2).argmin(axis=1)
     ahead, left = to_vehicle(cones.points, lap[nearest]).T
     station, side = path_lengths(lap)[nearest] + ahead, SIDES[label] * left
-    front = in_front_row(station, side, settings.beside, settings.lateral_gap)
+    front = in_front_row(station, side, BESIDE, LATERAL_GAP)
     order = np.argsort(station, kind="stable")
     return cones.where(order[front[order]])
 

@@ -31,7 +31,7 @@ from pathspace_graph.graph.variables import Layout
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.registration import by_motion, sigma_of_information
-from pathspace_graph.mapping.state import State
+from pathspace_graph.mapping.state import SAMPLE, State
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.crossing import boundaries_cross, polylines_cross, sampled
@@ -286,7 +286,7 @@ def objection(found: Evidence, splines: Mapping[int, BSpline], poses: Array, set
     The boundaries of a road don't cross, the vehicle crosses neither and has driven beside all of both, and
     the detections of the lap lie on them.
     """
-    step, driven = settings.finding.sample, poses[:, :2]
+    step, driven = SAMPLE, poses[:, :2]
     if boundaries_cross(splines, step):
         return "its boundaries cross"
     for curve in (sampled(spline, step) for spline in splines.values()):

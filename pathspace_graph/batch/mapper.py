@@ -27,7 +27,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.lengths import POSE, scaled
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.prediction import doubted, known_noise
+from pathspace_graph.mapping.motion import doubted, known_noise
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import Stopwatch, settings_dict

@@ -22,9 +22,9 @@ from pathspace_graph.graph.variables import Variables
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.candidates import SIDES
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.path import along_and_across
+from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
+from pathspace_graph.mapping.registration import HEADING
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import OnlineEstimator, run_online
 from pathspace_graph.settings.closing import ClosingSettings
@@ -184,7 +184,7 @@ class Profile:
         radius = settings.radius + settings.drift * lags * PROFILE_STEP
         power = np.maximum(_mean_squares(curvature, lags), np.finfo(float).tiny)
         agreement = 1.0 - _mean_square_difference(curvature, lags) / power
-        back = (square < radius**2) & (along > np.cos(settings.heading))
+        back = (square < radius**2) & (along > np.cos(HEADING))
         return np.where(back, agreement, -np.inf)
 
 
@@ -342,7 +342,7 @@ def _begin_boundary(
     points = to_map(detections.point[rows], poses[cycles])
     station, lateral = along_and_across(points, path, stations)
     side, ahead = SIDES[label] * lateral, station - recurrence.driven[cycles]
-    kept = (side > settings.growth.min_lateral) & (side < MAX_LATERAL)
+    kept = (side > MIN_LATERAL) & (side < MAX_LATERAL)
     kept &= (ahead > -gate.view_behind) & (ahead < gate.view_ahead) & (station >= 0.0) & (station < length)
     weight = certainty(detections, rows[kept])
     cones = cluster(points[kept], station[kept], weight, length, recurrence.recurs, settings)

@@ -8,8 +8,19 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import rotated, rotation, to_map
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.candidates import SIDES, Candidates, End, chain
-from pathspace_graph.mapping.path import PathAhead
+from pathspace_graph.mapping.path import (
+    CARRIED_TO,
+    END_BEHIND,
+    MIN_CARRY,
+    MIN_LATERAL,
+    SIDES,
+    STATION_MARGIN,
+    STRANDED,
+    Candidates,
+    End,
+    PathAhead,
+    chain,
+)
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.settings.mapper import MapperSettings
@@ -88,9 +99,9 @@ class Expansion:
         found = found.where(np.argsort(found.stations))
         end = None
         if label in state.curves:
-            end = _end(state, label, path_ahead, settings.end_behind)
+            end = _end(state, label, path_ahead, END_BEHIND)
             found = found.where(self._beyond(state, label, found, end)) if len(found.points) else found
-        return found.where(chain(found, settings, end))
+        return found.where(chain(found, end))
 
     def _undisputed(self, label: int, indices: IntArray) -> IntArray:
         """Return the tracks that do not have more detections with another label around them."""
@@ -106,7 +117,7 @@ class Expansion:
         """Return which candidates (m,) meet the paper's three conditions, and lie ahead of the end."""
         foot = state.foot_points(label, found.points, *_last_stretch(state, label, len(found.points)))
         high, control_points = state.curves[label].domain[1], state.control_points(label)
-        ahead = found.stations > end.station + self.settings.growth.station_margin
+        ahead = found.stations > end.station + STATION_MARGIN
         return ahead & beyond_end(found.points, foot.u, high, control_points, self.settings.ckf)
 
     def _begin(self, state: CurveState, label: int, detections: Detections, found: Candidates) -> None:
@@ -146,13 +157,13 @@ class Expansion:
         It is carried on by at most `growth.max_unseen`. Returns whether the curve was extended.
         """
         settings = self.settings.growth
-        end = _end(state, label, path_ahead, settings.end_behind)
-        if end.station >= path_ahead.driven - settings.stranded:
+        end = _end(state, label, path_ahead, END_BEHIND)
+        if end.station >= path_ahead.driven - STRANDED:
             return False
-        side = SIDES[label] * max(end.side, settings.min_lateral)
-        point = path_ahead.beside(path_ahead.driven - settings.stranded_left * settings.stranded, side)
+        side = SIDES[label] * max(end.side, MIN_LATERAL)
+        point = path_ahead.beside(path_ahead.driven - CARRIED_TO, side)
         distance = float(np.hypot(*(point - end.position)))
-        if not settings.min_carry <= distance <= settings.max_unseen - self._carried[label]:
+        if not MIN_CARRY <= distance <= settings.max_unseen - self._carried[label]:
             return False
         self._carried[label] += distance
         point_vehicle = (point - state.pose[:2]) @ rotation(state.pose[2])

@@ -18,11 +18,17 @@ from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.motion import MeasuredMotion
+from pathspace_graph.mapping.motion import MeasuredMotion, known_noise
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import known_noise
-from pathspace_graph.mapping.registration import Motion, near_start, register
-from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
+from pathspace_graph.mapping.registration import (
+    BEGINNING,
+    BEGINNING_SHARE,
+    WINDOW,
+    Motion,
+    near_start,
+    register,
+)
+from pathspace_graph.mapping.seam import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, PeriodicCurve, make_periodic
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.scale.door import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
@@ -68,7 +74,7 @@ class CkfMapper:
         self.state = CurveState(
             Belief.at_start(self.settings.odometry, self.settings.calibration), self.settings
         )
-        self.path = DrivenPath(self.settings.path)
+        self.path = DrivenPath()
         self.expansion = Expansion(self.settings)
         self.closed = False
         self._recent: list[tuple[Array, Detections]] = []
@@ -122,7 +128,7 @@ class CkfMapper:
         if self.closed:
             return
         self._recent.append((state.pose.copy(), detections))
-        self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - settings.window]
+        self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - WINDOW]
         if len(state.curves) == 0 or not near_start(self.path, state.pose, settings):
             return
         if self.path.length - self._last_check < settings.check_interval:
@@ -226,13 +232,12 @@ def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
 
 def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Array]:
     """Return parameters (k,) near the end of a curve, and those (k,) of the points they are moved on."""
-    closing, spline = state.settings.closing, state.spline(label)
+    spline = state.spline(label)
     high = spline.domain[1]
-    low = max(high - closing.beginning - closing.join_margin, closing.join_share * high)
-    u = np.arange(low, high, closing.overlap_step)
+    u = np.arange(max(high - BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
     moved = motion.apply(spline.evaluate(u))
     zero = np.zeros(len(u))
-    beginning = min(closing.beginning, closing.beginning_share * high)
+    beginning = min(BEGINNING, BEGINNING_SHARE * high)
     foot = state.foot_points(label, moved, zero, zero + beginning)
     on = foot.interior & (np.abs(foot.distance) < TIE_REACH)
     return u[on], foot.u[on]

@@ -49,8 +49,7 @@ from pathspace_graph.factors.sensor import SENSOR_SIZE, in_vehicle
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
-from pathspace_graph.mapping.belief import SENSOR_COLUMNS, point_columns, to_vehicle_rows
-from pathspace_graph.mapping.cubature import transform
+from pathspace_graph.mapping.belief import SENSOR_COLUMNS, point_columns, to_vehicle_rows, transform
 from pathspace_graph.settings.comparison import CkfSettings
 
 from .state import CurveState

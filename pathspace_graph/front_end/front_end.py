@@ -74,7 +74,7 @@ class FrontEnd:
         self._settings = settings
         self._begun = False
         self._sensor_doubted = False
-        self._sides = SideJudge(settings.sides, settings.path)
+        self._sides = SideJudge(settings.sides)
 
     def admit(self, odometry: Odometry, detections: Detections, window: Sequence[float] = ()) -> Admitted:
         """Return a cycle that may be used, or raise a ReadingError; nothing but a count changes.

@@ -142,6 +142,10 @@ class Gate:
         self.refused, self._dropping, self._refused_at = 0, admitted.dropped > 0, None
         return admitted
 
+    def refuse(self) -> None:
+        """Count a cycle that another check has refused."""
+        self.refused += 1
+
     def _goes_on(self, detections: Detections) -> bool:
         """Return whether a cycle goes on from the one that has just been refused.
 

@@ -10,8 +10,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrated_odometry
 from pathspace_graph.factors.se2 import compose, relative, rotation, to_map
 from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
-from pathspace_graph.mapping.prediction import integrate_odometry
+from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion, integrate_odometry
 from pathspace_graph.settings.front_end import MotionSettings
 
 from .gate import Newest

@@ -18,11 +18,9 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import to_map, wrap_angle
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
-from pathspace_graph.mapping.candidates import SIDES, in_front_row
-from pathspace_graph.mapping.path import DrivenPath, PathAhead
+from pathspace_graph.mapping.path import SIDES, DrivenPath, PathAhead, in_front_row
 from pathspace_graph.mapping.tentative import nearest_within, newest_of
 from pathspace_graph.settings.front_end import SidesSettings
-from pathspace_graph.settings.growth import PathSettings
 
 REACH: Final = 8.0
 """Length of the predicted path beside which coloured cones say what the colours mean, m."""
@@ -70,13 +68,12 @@ MIN_WIDTH: Final = 1.8
 class SideJudge:
     """Gives the detections of each cycle the labels of their sides."""
 
-    def __init__(self, settings: SidesSettings, path: PathSettings) -> None:
+    def __init__(self, settings: SidesSettings) -> None:
         self.settings = settings
         self.swapped = False
         """Whether the colours of the log so far are on the other sides."""
         self.colourless = False
         """Whether most detections have no colour, so that the way driven tells their sides."""
-        self._path_settings = path
         self._path: DrivenPath | None = None
         self._cones = NearCones()
         self._agreeing = self._opposing = 0  # cones on the side of their colour, and on the other one
@@ -94,7 +91,7 @@ class SideJudge:
         if not self.colourless and self._agreeing + self._opposing >= ENOUGH_VOTES:
             self._path = None  # it begins anew, if it is needed again
             return self.relabelled(detections, labels) if self.swapped else detections
-        self._path = self._path or DrivenPath(self._path_settings)
+        self._path = self._path or DrivenPath()
         self._path.update(pose)
         self._path.steer(twists)
         path = self._path.ahead(pose, REACH)

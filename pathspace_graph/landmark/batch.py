@@ -30,7 +30,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import BatchRun, RunNoise
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from pathspace_graph.laps import LapCounter
-from pathspace_graph.mapping.prediction import known_noise
+from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import settings_dict, split_odometry
 from pathspace_graph.scale.door import log_at_scale

@@ -27,7 +27,7 @@ from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
-from pathspace_graph.mapping.prediction import known_noise
+from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.scale.door import at_scale

@@ -21,14 +21,14 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import (
+from pathspace_graph.mapping.motion import (
     doubt_calibrations,
     known_noise,
     predict,
     smoother_settings,
     vehicle_state,
 )
+from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Readings, Stopwatch
@@ -79,7 +79,7 @@ class LandmarkFixedLag:
         self.front_end = FrontEnd(self.settings, noise)
         self.smoother = FixedLagSmoother(smoother_settings(self.settings), LandmarkMap(self.settings))
         self.smoother.window.exact = True
-        self.path = DrivenPath(self.settings.path)
+        self.path = DrivenPath()
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         """Tracks by label that are not landmarks yet."""
         self.believed = self.settings

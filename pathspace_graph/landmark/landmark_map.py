@@ -145,7 +145,7 @@ class LandmarkMap:
 
     def add_late(self, late: LateDetections) -> slice:
         """Add late detections to those of their pose, corrected; return their rows."""
-        rows = self.detections.insert(late.detections, late.cycle, late.twist)
+        rows = self.detections.append(late.detections, late.cycle, late.twist)
         self.correct()
         return rows
 

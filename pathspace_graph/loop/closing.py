@@ -1,34 +1,44 @@
-"""Loop closing and simplification (paper: Simplification) of the online mapper.
+"""Loop closing and simplification (paper: Simplification), and the marginal and gauge of the closed map.
 
 `mapping.registration.register` finds the correspondences between the newest detections and the beginning of
 the curves. `apply_correspondences` moves the window there and associates the detections with the oldest
 control points, `optimize_loop` solves the whole loop, and `simplify` makes the curves periodic.
 """
 
-from __future__ import annotations
+from typing import Final
 
-from pathspace_graph.graph.keys import control_keys
-from pathspace_graph.mapping.curve_map import CurveSmoother
-from pathspace_graph.mapping.registration import Registration
+import numpy as np
+
+from pathspace_graph.batch.association import locate_poses
+from pathspace_graph.batch.lap import LapMarginal
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import compose, left_of, relative
+from pathspace_graph.graph.keys import control_keys, pose_keys
+from pathspace_graph.mapping.registration import RefinedMotion
 from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
+from pathspace_graph.mapping.smoother import CurveSmoother
+
+SIGMA_STEP: Final = 10.0
+"""Free motion of a control point in a step while the loop is optimized (m): it is hardly damped."""
 
 
-def apply_correspondences(smoother: CurveSmoother, registration: Registration) -> None:
-    """Moves the window onto the beginning, and associates its inliers with the beginning."""
+def apply_correspondences(smoother: CurveSmoother, registration: RefinedMotion) -> None:
+    """Move the window onto the beginning, and associate the inliers with it."""
     smoother.reactivate(with_prior=smoother.submaps is None)
-    registration.motion.move(smoother.map.state.poses)
-    for label, (rows, u) in registration.matches.items():
+    state = smoother.map.state
+    registration.motion.move(state.poses)
+    for label in state.boundaries:
+        rows, u = registration.matches.inliers(label)
         smoother.map.detections.take(rows, label, u)
 
 
 def optimize_loop(smoother: CurveSmoother) -> None:
-    """Solves the whole loop; each submap is relinearized in its own frame."""
-    settings = smoother.map.settings.closing
-    smoother.solve_loop(settings.iterations, settings.sigma_step)
+    """Solve the whole loop; each submap is relinearized in its own frame."""
+    smoother.solve_loop(smoother.map.settings.closing.iterations, SIGMA_STEP)
 
 
 def simplify(smoother: CurveSmoother) -> None:
-    """Replaces every open curve by a periodic one of its final size, and steps to the new optimum."""
+    """Replace every open curve by a periodic one of its final size, and step to the new optimum."""
     state, settings = smoother.map.state, smoother.map.settings
     periodic = {
         label: make_periodic(boundary, state.control_points(label), settings, settings.spline.knots)
@@ -36,19 +46,91 @@ def simplify(smoother: CurveSmoother) -> None:
     }
     substitute(smoother, periodic)
     for _ in range(settings.closing.iterations):
-        smoother.step(settings.closing.sigma_step)
+        smoother.step(SIGMA_STEP)
 
 
 def substitute(smoother: CurveSmoother, periodic: dict[int, PeriodicCurve]) -> None:
-    """Changes the variables, `C_old = E C_new`, in the graph, the detections and the poses' parameters."""
+    """Change the variables, `C_old = E C_new`, in the graph, the detections and the poses' parameters."""
     state, detections = smoother.map.state, smoother.map.detections
+    sigma = smoother.map.settings.spline.sigma_simplify
     for label, new in periodic.items():
         old_keys, rows = state.keys(label), detections.used_on(label)
         boundary = state.boundaries[label].closed(new.knots)
         new_keys = control_keys(label, boundary.numbers)
-        smoother.substitute(
-            old_keys, new_keys, new.points, new.old_from_new, smoother.map.settings.spline.sigma_simplify
-        )
-        state.boundaries[label] = boundary
+        smoother.substitute(old_keys, new_keys, new.points, new.old_from_new, sigma)
+        state.close(label, boundary)
         detections.take(rows, label, new.overlap.new_parameter(detections.u[rows]))
-        state.pose_u[label] = new.overlap.new_parameter(state.pose_u[label])
+        state.locate(label, new.overlap.new_parameter(state.pose_u[label]))
+
+
+# --- the marginal of the open lap's batch ----------------------------------------------------------------
+
+
+def go_on_from(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
+    """Replace curves and prior by the marginal of a lap, and return the jump (3,) of the newest pose.
+
+    The window keeps its own factors of the poses from `first_kept` on, the marginal has those of all poses
+    before, so nothing is counted twice. The marginal holds the curves' spacing and shape as well. Poses after
+    the last one of the lap are moved with it.
+    """
+    state, settings, first = smoother.map.state, smoother.map.settings, marginal.first_kept
+    smoother.reactivate(with_prior=False)
+    before, removed = state.poses[-1].copy(), state.map_keys
+    for label, spline in marginal.splines.items():
+        state.close(label, state.boundaries[label].closed(spline.knots))
+    added = np.concatenate([state.keys(label) for label in marginal.splines])
+    points = np.concatenate([spline.distinct_control_points for spline in marginal.splines.values()])
+    smoother.restart(first, removed, added, points)
+    smoother.map.replaced_by(marginal.scatter, marginal.cones)
+    _move_poses(state.poses, marginal.poses[first:])
+    state.variables.calibrations[:] = marginal.calibration
+    locate_poses(state, settings.batch.association)
+    keys = np.concatenate([state.variables.calibration_keys, added, pose_keys(np.array([first]))])
+    smoother.set_prior(keys, marginal.mean, marginal.information)
+    smoother.reassociate()
+    for _ in range(settings.closing.iterations):
+        smoother.step(SIGMA_STEP)
+    return np.asarray(state.poses[-1] - before)
+
+
+def _move_poses(poses: Array, solved: Array) -> None:
+    """Set the first poses of the window (P, 3) to the solved ones (k, 3), and move the others rigidly."""
+    last = len(solved) - 1
+    later = [relative(poses[last], pose) for pose in poses[last + 1 :]]
+    poses[: last + 1] = solved
+    for slot, delta in enumerate(later, start=last + 1):
+        poses[slot] = compose(poses[last], delta)
+
+
+# --- the gauge -------------------------------------------------------------------------------------------
+
+
+def hold_gauge(smoother: CurveSmoother) -> None:
+    """Hold where the closed map as a whole is, across its curves.
+
+    Only the beginning of the drive is known in the map frame, and every later detection is relative. So what
+    later laps tell of the gauge comes through the shape of the map alone: the better the curves beside the
+    start are known, the better is the heading of all the rest. This is true of the noise of detections, which
+    is new in every lap. But cones lie off a curve with few control points by the same distance in each lap.
+    The detections of many laps bend the curve to it, and a bend of centimetres beside the start turns the
+    whole map. So the gauge is held after a few laps, and the shape goes on to be estimated. What cones share
+    between laps is not averaged out, so no more is claimed of the map than was known then.
+    """
+    state = smoother.map.state
+    tangents = [state.spline(label).tangent_unit(b.abscissae) for label, b in state.boundaries.items()]
+    keys, normals = state.map_keys, left_of(np.concatenate(tangents))
+    order = np.argsort(keys)
+    smoother.hold_gauge(keys[order], motion_across(state.map_points[order], normals[order]))
+
+
+def motion_across(points: Array, normals: Array) -> Array:
+    """Return the rows C (3, 2k) by which `C dx` is the rigid motion that fits small moves dx (2k,) best.
+
+    Points (k, 2) of a curve may slide along it, so their moves count along the normals (k, 2) only. With the
+    rows N (k, 2k) of the normals and the rigid motions G it is the least squares solution `(N G)^+ N`.
+    """
+    count = len(points)
+    across = np.zeros((count, count, 2))
+    across[np.arange(count), np.arange(count)] = normals
+    turn = (normals * left_of(points)).sum(axis=1)
+    return np.asarray(np.linalg.pinv(np.column_stack([normals, turn])) @ across.reshape(count, -1))

@@ -1,54 +1,114 @@
-"""The drive as it was measured, and its batch: when the loop closes, and where the closed map is mended."""
+"""The drive as it was measured, its poses along the curves, and its batch when the loop closes."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 from functools import cache
-from typing import Any, cast
+from typing import Any, Final, cast
 
 import numpy as np
 from joblib.externals import loky
-from numpy.typing import NDArray
 
 from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, is_worth_trying, solve_lap
 from pathspace_graph.batch.start import Recurrence, find_recurrence, unwrap
 from pathspace_graph.errors import SingularSystemError
-from pathspace_graph.factors.se2 import compose
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import compose, to_map, wrap_angle
 from pathspace_graph.front_end.log_odometry import chained
 from pathspace_graph.io.log import Detections
-from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import MeasuredMotion
+from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary
 
-from .places import Place, curve_poses, in_final_map
 from .recognition import RecognizedPlace
 
-Array = NDArray[np.float64]
 
-WORKER_IDLE = 600
-"""The process that solves laps ends when it has had nothing to do for this time (s)."""
+@dataclass(frozen=True, eq=False)
+class Place:
+    """The point of a curve beside the vehicle, as the curve was in one cycle."""
 
-LATE = "the batch of the lap was late"
-"""This says why a batch was given up that the process has not solved in time."""
+    cycle: int
+    u: float
+    """Parameter of the point, which goes on from lap to lap."""
+    pose: Array
+    """(3,) Position x, y (m) and direction theta of the curve there (rad)."""
 
-SOLVED = 3.0
+
+def curve_poses(boundary: Boundary, control_points: Array, u: Array) -> Array:
+    """Return the position of a curve at parameters u (m,) and its direction there, (m, 3): x, y, theta."""
+    values, span = boundary.tables.evaluate(u, 1)
+    position, tangent = np.einsum("omj,mjd->omd", values, control_points[boundary.columns(span)])
+    return np.column_stack([position, np.arctan2(tangent[:, 1], tangent[:, 0])])
+
+
+def in_final_map(
+    poses: Array,
+    closed_at: int,
+    places: Mapping[int, Sequence[Place]],
+    state: State,
+    settings: MapperSettings,
+) -> Array:
+    """Return the poses (P, 3), those before the loop closed moved with the curves beside them.
+
+    A loop closure bends the map, but an online estimator keeps its earlier poses as they were. Each of them
+    is put beside the final curves as it was beside the curves of its own cycle: the place on the curve is
+    moved rigidly to the same parameter of the final curve. The result is the mean over both boundaries. A
+    pose that was beside no curve is corrected as much as its neighbours are.
+    """
+    total, count = np.zeros_like(poses), np.zeros((len(poses), 1))
+    for label, boundary in state.boundaries.items():
+        beside = [place for place in places[label] if place.cycle < closed_at]
+        beside = [place for place in beside if _is_beside(place, poses[place.cycle], settings)]
+        if not beside:
+            continue
+        cycles = np.array([place.cycle for place in beside], np.intp)
+        before = np.array([place.pose for place in beside])
+        after = curve_poses(boundary, state.control_points(label), np.array([place.u for place in beside]))
+        after[:, 2] = wrap_angle(after[:, 2] - before[:, 2])
+        total[cycles, :2] += to_map(poses[cycles, :2] - before[:, :2], after)
+        total[cycles, 2] += poses[cycles, 2] + after[:, 2]
+        count[cycles] += 1
+    known = np.flatnonzero(count[:, 0])
+    if len(known) == 0:
+        return poses
+    correction = total[known] / count[known] - poses[known]
+    earlier, poses = np.arange(closed_at), poses.copy()
+    for k in range(poses.shape[1]):
+        poses[earlier, k] += np.interp(earlier, known, correction[:, k])
+    return poses
+
+
+def _is_beside(place: Place, pose: Array, settings: MapperSettings) -> bool:
+    """Return whether the vehicle at a pose (3,) drove along the curve at a place."""
+    distance = float(np.hypot(*(pose[:2] - place.pose[:2])))
+    same_direction = np.cos(place.pose[2] - pose[2]) > SAME_DIRECTION
+    return bool(distance < settings.growth.max_lateral and same_direction)
+
+
+# --- the record -----------------------------------------------------------------------------------------
+
+WORKER_IDLE: Final = 600
+"""Time with nothing to do after which the process that solves laps ends (s)."""
+LATE: Final = "the batch of the lap was late"
+"""Why a batch was given up that the process has not solved in time."""
+SOLVED: Final = 3.0
 """A batch counts as solved within this distance (joint sigmas) of its optimum: its marginal has the rest."""
 
 
 class DriveRecord:
-    """Keeps the odometry, the detections and the poses of every cycle, as long as a batch can solve them."""
+    """The odometry, the detections and the poses of every cycle, kept as long as a batch can solve them."""
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
         self.unsolvable: str | None = None
-        """This says why the drive cannot be solved as a batch; it is None if it can be."""
+        """Why the drive cannot be solved as a batch; None if it can be."""
         self.poses: list[Array] = []
-        """Each cycle had this pose (3,), map frame, as it was estimated then or by the newest batch."""
+        """Pose (3,) of each cycle, map frame, as it was estimated then or by the newest batch."""
         self._stamps: list[float] = []
         self._motions: list[MeasuredMotion] = []
         self._detections: list[Detections] = []
@@ -57,13 +117,13 @@ class DriveRecord:
         self._prepared = False
 
     def give_up(self, reason: str) -> None:
-        """Drops the measurements, since the lap cannot be solved for this reason."""
+        """Drop the measurements, since the lap cannot be solved for this reason."""
         if self.unsolvable is None:
             self.unsolvable = reason
         self._stamps, self._motions, self._detections = [], [], []
 
     def measured(self, t: float, motion: MeasuredMotion, detections: Detections) -> None:
-        """Adds the motion that leads to the pose at t (s), and the detections there."""
+        """Add the motion that leads to the pose at t (s), and the detections there."""
         if self.unsolvable is not None:
             return
         self._stamps.append(t)
@@ -75,7 +135,7 @@ class DriveRecord:
             self.give_up("the lap is too long for a batch")
 
     def measured_late(self, cycle: int, detections: Detections) -> None:
-        """Adds detections to those of an earlier cycle, as they would be seen from its pose."""
+        """Add detections to those of an earlier cycle, as they would be seen from its pose."""
         if self.unsolvable is None:
             known = self._detections[cycle]
             self._detections[cycle] = Detections(
@@ -86,7 +146,7 @@ class DriveRecord:
             )
 
     def estimated(self, state: State) -> None:
-        """Adds the newest pose, and its place along each of the curves."""
+        """Add the newest pose, and its place along each of the curves."""
         cycle = len(self.poses)
         self.poses.append(_kept(state.poses[-1].copy()))
         for label, boundary in state.boundaries.items():
@@ -95,21 +155,21 @@ class DriveRecord:
             self._places.setdefault(label, []).append(Place(cycle, float(u[0]), pose))
 
     def followed(self, newest: Array) -> None:
-        """Adds the newest pose (3,) on a closed map."""
+        """Add the newest pose (3,) on a closed map."""
         if self.unsolvable is None:
             self.poses.append(_kept(newest.copy()))
 
     def replaced(self, earlier: Array, window: Array) -> None:
-        """Replaces all poses by those (k, 3) before the window and those (P, 3) in it, after a swap."""
+        """Replace all poses by those (k, 3) before the window and those (P, 3) in it, after a swap."""
         self.poses = [*_kept(unwrap(np.concatenate([earlier, window])))]
 
     def recurrence(self) -> Recurrence | None:
-        """Returns the recurrence of the path driven, if odometry alone says that the lap is over."""
+        """Return the recurrence of the path driven, if odometry alone says that the lap is over."""
         found = find_recurrence(np.array(self._reckoned), self.settings)
         return found if is_worth_trying(found, self.settings) else None
 
     def recurrence_since(self, place: RecognizedPlace) -> Recurrence:
-        """Returns the recurrence of the path driven since the vehicle was at a place before."""
+        """Return the recurrence of the path driven since the vehicle was at a place before."""
         poses, (label, u) = np.array(self._reckoned), next(iter(place.beside.items()))
         places = self._places[label]
         before = places[int(np.argmin([abs(at.u - u) for at in places]))].cycle
@@ -118,7 +178,7 @@ class DriveRecord:
         return Recurrence(driven, float(driven[-1] - driven[before]), turn, 1.0)
 
     def prepare(self) -> None:
-        """Starts the process that solves laps, once, so that it is ready when the loop closes.
+        """Start the process that solves laps, once, so that it is ready when the loop closes.
 
         This does not wait for it.
         """
@@ -127,23 +187,23 @@ class DriveRecord:
             _submit(_nothing)
 
     def resume(self) -> None:
-        """Starts the process again where it was ready when a snapshot was taken."""
+        """Start the process again where it was ready when a snapshot was taken."""
         if self._prepared and self.unsolvable is None:
             _submit(_nothing)
 
     def corrected(self, smoother: CurveSmoother) -> Array:
-        """Returns the poses (P, 3) of all cycles in the frame of the map that has just been closed."""
+        """Return the poses (P, 3) of all cycles in the frame of the map that has just been closed."""
         window = smoother.first_cycle
         poses = unwrap(np.array([*self.poses[:window], *smoother.variables.poses]))
         return in_final_map(poses, window, self._places, smoother.map.state, self.settings)
 
     def closed_map(self, smoother: CurveSmoother) -> ClosedMap:
-        """Returns the map that has just been closed, with the poses of all cycles beside it."""
+        """Return the map that has just been closed, with the poses of all cycles beside it."""
         state = smoother.map.state
         return ClosedMap(state.splines, self.corrected(smoother), state.variables.calibrations.copy())
 
     def lap(self, first_kept: int, start: ClosedMap | Recurrence, settings: MapperSettings) -> OpenLap:
-        """Returns the lap, whose search begins at a map that has just been closed, or at odometry.
+        """Return the lap, whose search begins at a map that has just been closed, or at odometry.
 
         The priors of the calibrations are those of the settings, which may have become wide.
         """
@@ -158,45 +218,44 @@ class DriveRecord:
 
 
 def _kept(poses: Array) -> Array:
-    """Returns poses that nobody can change any more, so that copies of the record share them."""
     poses.flags.writeable = False
     return poses
 
 
 class LapBatch:
-    """A lap is being solved in a process of its own, while the mapper goes on."""
+    """A lap that is being solved in a process of its own, while the mapper goes on."""
 
     def __init__(self, lap: OpenLap, t: float, due: int, last: int) -> None:
         self.t = t
-        """The lap was sent in the cycle of this stamp (s)."""
+        """Stamp of the cycle in which the lap was sent (s)."""
         self.due = due
-        """The marginal replaces the prior in this cycle, or in the first later one in which it is there."""
+        """Cycle in which the marginal replaces the prior, or the first later one in which it is there."""
         self.last = last
-        """It does so in this cycle at the latest."""
+        """Latest cycle in which it does so."""
         self.first_kept = lap.first_kept
-        """The window holds the poses from this cycle on until then."""
+        """Cycle from which on the window holds the poses until then."""
         self._lap = lap
         self._future: Future[LapMarginal | None] | None = None
         self.send()
 
     def send(self) -> Future[LapMarginal | None]:
-        """Hands the lap to the process, unless it has it already; a snapshot holds the lap alone."""
+        """Hand the lap to the process, unless it has it already; a snapshot holds the lap alone."""
         if self._future is None:
             self._future = _submit(solve_lap, self._lap)
         return self._future
 
     def wait(self) -> None:
-        """Waits for the process, however long it takes."""
+        """Wait for the process, however long it takes."""
         wait([self.send()])
 
     def give_up(self) -> None:
-        """Takes the lap from the process, which is ended if it is at it; the next lap has a new one then."""
+        """Take the lap from the process, which is ended if it is at it; the next lap has a new one then."""
         future = self.send()
         if not future.done() and not future.cancel():
             _end_worker()
 
     def marginal(self, timeout: float) -> LapMarginal | str | None:
-        """Returns the solution or says why there is none; it is None if it is not there after a time (s)."""
+        """Return the solution, or why there is none, or None if it is not there after a time (s)."""
         try:
             solved = self.send().result(timeout)
         except TimeoutError:
@@ -215,7 +274,7 @@ class LapBatch:
 
 
 def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
-    """Hands work to the process that solves laps; a new process takes the place of one that has died.
+    """Hand work to the process that solves laps; a new process takes the place of one that has died.
 
     Where none can be begun, the work has failed.
     """
@@ -232,15 +291,13 @@ def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
 
 @cache
 def _worker() -> Any:
-    """Returns the executor of this program, which has one process and imports no module of the program's."""
     return loky.ProcessPoolExecutor(max_workers=1, timeout=WORKER_IDLE)
 
 
 def _end_worker() -> None:
-    """Ends the process that solves laps, whatever it is doing, without waiting for its end."""
     _worker().shutdown(wait=False, kill_workers=True)
     _worker.cache_clear()
 
 
 def _nothing() -> None:
-    """Does nothing: the process has imported what it needs by then."""
+    """Do nothing: the process has imported what it needs by then."""

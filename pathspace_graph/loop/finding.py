@@ -6,86 +6,118 @@ loop, and the best places are refined by the registration. The farther the vehic
 agree. Once one is clearly better than all others, and twice in a row, the window starts anew there.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from pathspace_graph.batch.association import locate_poses
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import to_map, wrap_angle
 from pathspace_graph.graph.gaussian import half_solve
 from pathspace_graph.graph.keys import POSE
 from pathspace_graph.health import Evidence
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.mapping.curve_map import CurveSmoother
 from pathspace_graph.mapping.registration import Motion, RefinedMotion, Sightings, refine, worst_sigma
-from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.health import FindingSettings
+from pathspace_graph.mapping.smoother import CurveSmoother, Gating
+from pathspace_graph.mapping.state import SAMPLE, State
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
-
-from .association import Gating, reassociate
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
 _POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])
 """These unit vectors choose the position of a pose."""
 FOUND: Final = "the vehicle was lost, and is found again"
-"""This begins the notice of a cycle in which the window starts anew at the place that was found."""
+"""Begin of the notice of a cycle in which the window starts anew at the place that was found."""
+BESIDE: Final = 1.0
+"""Distance from the closed curve of its colour within which an unused detection is explained (m)."""
+GAP: Final = 3.0
+"""Neighbouring cones farther apart than this number of times the median have a gap between them."""
+INTERVAL: Final = 0.5
+"""Least time between two attempts (s)."""
+MEMORY: Final = 60.0
+"""Length of the newest path whose detections are compared with the map (m)."""
+MOST_DETECTIONS: Final = 200
+"""Detections, evenly chosen, that are compared with the map at most ..."""
+MIN_DETECTIONS: Final = 40
+"""... and at least."""
+STEP: Final = 2.0
+"""Distance of the places along the loop (m)."""
+LEAD: Final = 4.0
+"""The vehicle heads for the middle of the track this far ahead (m)."""
+MISFIT: Final = 3.0
+"""Rms distance of the path driven from the middle within which a place is compared (m)."""
+REACH: Final = 3.0
+"""A detection that is farther from its curve counts as if it were this far (m)."""
+STARTS: Final = 12
+"""Largest number of places that are refined."""
+APART: Final = 4.0
+"""Two places that are less than this apart are one (m)."""
+SIGMAS_PLACE: Final = (3.0, 3.0, 0.2)
+"""Standard deviations of the pose about a place, before it is refined (m, m, rad)."""
+SIGMA_FIT: Final = 0.3
+"""A detection at a distance d from a curve of its colour scores `exp(-d^2 / (2 SIGMA_FIT^2))` (m)."""
+MIN_SCORE: Final = 0.6
+"""Least score of the place that is accepted; the true one has about 0.85 ..."""
+MARGIN: Final = 0.1
+"""... and that of every other place is smaller by this."""
+SIGMA_MAX: Final = 0.5
+"""Largest standard deviation of the position there in its worst direction (m)."""
+CONFIRMATIONS: Final = 2
+"""Attempts, one after the other, that must find the same place."""
+WIDENING: Final = 3.0
+"""Factor of the registration's standard deviations in the prior of the found pose: its detections are used
+again."""
+STEPS: Final = 2
+"""Gauss-Newton steps at the place that was found."""
 
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Holds a closed map as the search needs it."""
+    """A closed map as the search needs it."""
 
     middle: Array
-    """(n, 2) These points lie on the middle of the track in driving order, in m, map frame."""
+    """(n, 2) Points on the middle of the track in driving order, in m, map frame."""
     stations: Array
-    """(n,) Each point has this length along the middle (m)."""
+    """(n,) Length along the middle up to each of them (m)."""
     length: float
-    """The middle is this long (m)."""
+    """Length of the middle (m)."""
     beside: Mapping[int, Array]
-    """Each boundary has its parameters (n,) beside the points of the middle (m)."""
+    """(n,) Parameters beside the points of the middle on each boundary (m)."""
     curves: Mapping[int, KDTree]
-    """Each boundary has densely sampled points."""
+    """Densely sampled points of each boundary."""
     mapped: Mapping[int, BoolArray]
-    """These say of each point whether it lies between cones that were detected (see `is_mapped`)."""
+    """Whether each of these lies between cones that were detected (see `is_mapped`)."""
 
     def at(self, stations: Array) -> Array:
-        """Returns the points of the middle at stations of any shape, as complex numbers x + i y."""
+        """Return the points of the middle at stations of any shape, as complex numbers x + i y."""
         x, y = (np.interp(stations, self.stations, axis, period=self.length) for axis in self.middle.T)
         return np.asarray(x + 1j * y)
 
     def distances(self, labels: IntArray, points: Array, most: float) -> Array:
-        """Returns the distance (..., m) of points (..., m, 2) from their curve (m,), in m, at most `most`."""
+        """Return the distance (..., m) of points (..., m, 2) from their curve (m,), in m, at most `most`."""
         found = np.full(points.shape[:-1], most)
         for label, curve in self.curves.items():
-            own = labels == label
-            distance, _ = curve.query(points[..., own, :], distance_upper_bound=most)
-            found[..., own] = np.minimum(distance, most)
+            of_label = labels == label
+            distance, _ = curve.query(points[..., of_label, :], distance_upper_bound=most)
+            found[..., of_label] = np.minimum(distance, most)
         return found
 
     def beside_gaps(self, labels: IntArray, points: Array) -> BoolArray:
-        """Returns which points (m, 2) are nearest to a gap of their curve (m,), where no cone is mapped."""
+        """Return which points (m, 2) are nearest to a gap of their curve (m,), where no cone is mapped."""
         found = np.zeros(len(points), bool)
         for label, curve in self.curves.items():
-            own = np.flatnonzero(labels == label)
-            if len(own):
-                found[own] = ~self.mapped[label][curve.query(points[own])[1]]
+            of_label = np.flatnonzero(labels == label)
+            if len(of_label):
+                found[of_label] = ~self.mapped[label][curve.query(points[of_label])[1]]
         return found
 
 
 def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) -> BoolArray:
-    """Returns which parameters (m,) of a closed curve lie between cones (k,) that are neighbours (m).
+    """Return which parameters (m,) of a closed curve lie between cones (k,) that are neighbours (m).
 
     The others lie in a gap, which is longer than `gap` times the median distance of neighbours, and farther
     than the margin (m) from its ends. Where the cones are not known, all of the curve counts as mapped.
@@ -100,70 +132,64 @@ def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) 
     return np.asarray(near_end | (steps <= gap * np.median(steps))[before])
 
 
-def lay_out_loop(
-    state: State, settings: FindingSettings, is_mapped_on: Callable[[int, Array], BoolArray] | None = None
-) -> Loop:
-    """Returns the loop between the two closed curves of a state.
+def lay_out_loop(state: State, is_mapped_on: Callable[[int, Array], BoolArray] | None = None) -> Loop:
+    """Return the loop between the two closed curves of a state.
 
     `is_mapped_on` says which parameters (m,) of a boundary lie between cones; without it, all of them do.
     """
     u, points = {}, {}
     for label, boundary in state.boundaries.items():
-        u[label] = np.arange(boundary.tables.low, boundary.tables.high, settings.sample)
+        u[label] = np.arange(boundary.tables.low, boundary.tables.high, SAMPLE)
         points[label] = boundary.evaluate(state.control_points(label), u[label])
-    curves = {label: KDTree(own) for label, own in points.items()}
-    every = max(int(settings.step / settings.sample), 1)
+    curves = {label: KDTree(curve) for label, curve in points.items()}
+    every = max(int(STEP / SAMPLE), 1)
     left = points[LEFT][::every]
     opposite = curves[RIGHT].query(left)[1]
     middle = 0.5 * (left + points[RIGHT][opposite])
     steps = np.hypot(*np.diff(middle, axis=0, append=middle[:1]).T)
     stations = np.concatenate([[0.0], steps.cumsum()[:-1]])
     beside = {LEFT: u[LEFT][::every], RIGHT: u[RIGHT][opposite]}
-    mapped = {
-        label: is_mapped_on(label, own) if is_mapped_on else np.ones(len(own), bool)
-        for label, own in u.items()
-    }
+    mapped = {b: is_mapped_on(b, at) if is_mapped_on else np.ones(len(at), bool) for b, at in u.items()}
     return Loop(middle, stations, float(steps.sum()), beside, curves, mapped)
 
 
 class KnownLoop:
-    """Lays out the closed map when it is asked for, and again once the curves were replaced by others."""
+    """The closed map, laid out when it is asked for, and again once the curves were replaced by others."""
 
     def __init__(self, smoother: CurveSmoother) -> None:
         self._smoother = smoother
         self._laid_out: tuple[list[Boundary], Loop] | None = None
 
     def get(self) -> Loop:
-        """Returns the loop as it was when it was laid out, which changes no variable."""
+        """Return the loop as it was when it was laid out, which changes no variable."""
         state = self._smoother.map.state
         boundaries = [*state.boundaries.values()]
         if self._laid_out is None or self._laid_out[0] != boundaries:
             values = state.variables.values.copy()
             self._smoother.refresh()
-            settings = self._smoother.map.settings.finding
-            self._laid_out = boundaries, lay_out_loop(state, settings, self.is_mapped)
+            self._laid_out = boundaries, lay_out_loop(state, self.is_mapped)
             state.variables.values[:] = values
         return self._laid_out[1]
 
     @property
     def is_whole(self) -> bool:
-        """Returns whether the loop has closed, with both boundaries."""
+        """Return whether the loop has closed, with both boundaries."""
         state = self._smoother.map.state
         return state.closed and set(state.boundaries) == set(BOUNDARIES)
 
     def with_gaps(self) -> list[int]:
-        """Returns the boundaries whose curves have gaps."""
+        """Return the boundaries whose curves have gaps."""
         return [label for label, mapped in self.get().mapped.items() if not mapped.all()]
 
     def is_mapped(self, label: int, u: Array) -> BoolArray:
-        """Returns which parameters (m,) of a boundary lie between cones that were detected."""
+        """Return which parameters (m,) of a boundary lie between cones that were detected."""
         track, settings = self._smoother.map, self._smoother.map.settings
         cones, length = track.cones.get(label, np.zeros(0)), track.state.boundaries[label].length
-        return is_mapped(u, cones, length, settings.health.gap, settings.growth.merge_radius)
+        return is_mapped(u, cones, length, GAP, settings.growth.merge_radius)
 
 
 def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_again: BoolArray) -> Evidence:
-    """Returns what the tested detections say about the newest pose, before the update.
+    """Return what the tested detections say about the newest pose, before the update.
 
     On a closed map every coloured detection should lie on a curve. If many are not in use, these are looked
     for on the whole of their curve: they may be of a stretch across the infield. Three kinds of them say
@@ -179,11 +205,10 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_
     if known.is_whole and used.sum() < settings.share_degraded * judged.sum():
         others = np.flatnonzero(judged & ~used)
         rows = tested.rows[others]
-        points = to_map(detections.point[rows], smoother.map.variables.poses_at(detections.cycle[rows]))
-        loop, own = known.get(), labels[others]
-        explained[others] = loop.distances(own, points, settings.beside) < settings.beside
-        unmapped[others] = ~explained[others] & loop.beside_gaps(own, points)
-        wrong = loop.distances(LEFT + RIGHT - own, points, settings.beside) < settings.beside
+        points, loop, label = detections.points_map(rows, smoother.variables), known.get(), labels[others]
+        explained[others] = loop.distances(label, points, BESIDE) < BESIDE
+        unmapped[others] = ~explained[others] & loop.beside_gaps(label, points)
+        wrong = loop.distances(LEFT + RIGHT - label, points, BESIDE) < BESIDE
         judged[others] &= explained[others] | ~wrong
         unmapped &= judged
     innovations, offered = tested.innovation[used], judged & ~unmapped
@@ -202,13 +227,12 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_
 
 
 def _by_boundary(labels: IntArray) -> tuple[int, int]:
-    """Returns how many of the labels (m,) are of the left and of the right boundary."""
     left, right = np.bincount(labels, minlength=len(BOUNDARIES)).tolist()
     return left, right
 
 
 def _sigma_of_position(smoother: CurveSmoother) -> float:
-    """Returns the standard deviation (m) of the last solved position in its worst direction.
+    """Return the standard deviation (m) of the last solved position in its worst direction.
 
     The newest pose has the last columns of the system, so that the last block of its factor tells it.
     """
@@ -222,25 +246,24 @@ def _sigma_of_position(smoother: CurveSmoother) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Holds a place where the vehicle may be."""
+    """A place where the vehicle may be."""
 
     found: RefinedMotion
     """The motion moves the window onto the place."""
     score: float
-    """This says how well the detections lie on the map there, from 0 to 1."""
+    """How well the detections lie on the map there, from 0 to 1."""
 
 
 class Search:
-    """Remembers what a lost vehicle has seen, and looks for its place on a closed map."""
+    """What a lost vehicle has seen, and the search for its place on a closed map."""
 
     def __init__(self, smoother: CurveSmoother) -> None:
-        """Begins after the newest pose."""
         self.settings: MapperSettings = smoother.map.settings
         self.loop: Loop
-        """This is the map as it was in the last attempt."""
+        """The map as it was in the last attempt."""
         self._smoother = smoother
         self.first_cycle = smoother.next_cycle
-        """The detections of the cycles from this one on are remembered."""
+        """Cycle from which on detections are remembered."""
         self._poses: list[Array] = []
         self._seen: list[Detections] = []
         self._tried = smoother.times[-1]
@@ -248,19 +271,18 @@ class Search:
         self._agreed = 0
 
     def observe(self, pose: Array, detections: Detections) -> None:
-        """Remembers a cycle: its pose (3,) by odometry, and its detections."""
+        """Remember a cycle: its pose (3,) by odometry, and its detections."""
         self._poses.append(pose.copy())
         self._seen.append(detections)
         poses = np.array(self._poses)
         driven = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-        while len(driven) and driven.sum() > self.settings.finding.memory:
+        while len(driven) and driven.sum() > MEMORY:
             driven = driven[1:]
             del self._poses[0], self._seen[0]
 
     def find(self) -> RefinedMotion | None:
-        """Returns the motion onto the only place that agrees, once it was found several times in a row."""
-        settings = self.settings.finding
-        if not self._seen or self._seen[-1].t - self._tried < settings.interval:
+        """Return the motion onto the only place that agrees, once it was found several times in a row."""
+        if not self._seen or self._seen[-1].t - self._tried < INTERVAL:
             return None
         self._tried, best = self._seen[-1].t, self._best()
         if best is None:
@@ -268,61 +290,57 @@ class Search:
             return None
         self._agreed = self._agreed + 1 if self._confirms(best.motion) else 1
         self._last = best.motion
-        return best if self._agreed >= settings.confirmations else None
+        return best if self._agreed >= CONFIRMATIONS else None
 
     def _confirms(self, motion: Motion) -> bool:
-        """Returns whether a motion leads to the same place as the last one that was found."""
         newest = self._poses[-1][None, :2]
         if self._last is None:
             return False
         apart = motion.apply(newest) - self._last.apply(newest)
-        return bool(np.hypot(*apart[0]) < self.settings.finding.apart)
+        return bool(np.hypot(*apart[0]) < APART)
 
     def _best(self) -> RefinedMotion | None:
-        """Returns the motion onto the place that is clearly better than all others, if there is one.
+        """Return the motion onto the place that is clearly better than all others, if there is one.
 
         The loop is laid out each time: the map goes on to relax from the detections that were taken out of
         use.
         """
-        settings, seen = self.settings.finding, self._sightings()
-        if len(seen.rows) < settings.min_readings:
+        seen = self._sightings()
+        if len(seen.rows) < MIN_DETECTIONS:
             return None
         self._smoother.refresh()
         state = self._smoother.map.state
-        self.loop = lay_out_loop(state, settings)
+        self.loop = lay_out_loop(state)
         centre = self._poses[-1][:2]
         places = [self._refined(state, seen, Motion(centre, vector), i) for vector, i in self._starts(seen)]
         places = sorted(places, key=lambda place: -place.score)
-        if not places or places[0].score < settings.min_score:
+        if not places or places[0].score < MIN_SCORE:
             return None
         best = places[0].found
         rivals = [place.score for place in places[1:] if not self._same(place.found, best)]
-        if rivals and rivals[0] > places[0].score - settings.margin:
+        if rivals and rivals[0] > places[0].score - MARGIN:
             return None
-        return best if worst_sigma(best.covariance) < settings.sigma_max else None
+        return best if worst_sigma(best.covariance) < SIGMA_MAX else None
 
     def _same(self, a: RefinedMotion, b: RefinedMotion) -> bool:
-        """Returns whether two motions lead to one place."""
         apart = np.hypot(*(a.motion.vector - b.motion.vector)[:2])
-        return bool(apart < self.settings.finding.apart)
+        return bool(apart < APART)
 
     def _sightings(self) -> Sightings:
-        """Returns the remembered coloured detections, or evenly chosen ones if there are too many."""
         labels = np.concatenate([one.labels for one in self._seen])
         cycles = np.repeat(np.arange(len(self._seen)), [len(one.labels) for one in self._seen])
         points = np.concatenate([one.points_vehicle for one in self._seen])
         rows = np.flatnonzero(np.isin(labels, BOUNDARIES))
-        rows = rows[:: max(-(-len(rows) // self.settings.finding.readings), 1)]
+        rows = rows[:: max(-(-len(rows) // MOST_DETECTIONS), 1)]
         placed = to_map(points[rows], np.array(self._poses)[cycles[rows]])
         return Sightings.of_points(rows, labels[rows], placed)
 
     # --- hypotheses --------------------------------------------------------------------------------------
 
     def _starts(self, seen: Sightings) -> list[tuple[Array, int]]:
-        """Returns motions (3,) onto the likeliest places, each with the index of its point of the middle."""
-        settings = self.settings.finding
+        """Return motions (3,) onto the likeliest places, each with the index of its point of the middle."""
         motions, misfit = self._beside_the_loop()
-        possible = np.flatnonzero(misfit < settings.misfit)
+        possible = np.flatnonzero(misfit < MISFIT)
         if len(possible) == 0:
             return []
         turn = np.exp(1j * motions[possible, 2])[:, None]
@@ -330,32 +348,32 @@ class Search:
         arms = (seen.points - centre) @ np.array([1.0, 1j])
         moved = turn * arms + (centre + motions[possible, :2]) @ np.array([[1.0], [1j]])
         points = np.stack([moved.real, moved.imag], axis=2)
-        cost = np.square(self.loop.distances(seen.labels, points, settings.reach)).mean(axis=1)
+        cost = np.square(self.loop.distances(seen.labels, points, REACH)).mean(axis=1)
         return [(motions[i], int(i)) for i in self._spread(possible, cost)]
 
     def _spread(self, places: IntArray, cost: Array) -> list[int]:
-        """Returns the places of least cost that are no nearer to each other than `apart`."""
-        settings, chosen = self.settings.finding, list[int]()
+        """Return the places of least cost that are no nearer to each other than `APART`."""
+        chosen = list[int]()
         for i in places[np.argsort(cost)].tolist():
             away = np.abs(self.loop.stations[chosen] - self.loop.stations[i])
-            if (np.minimum(away, self.loop.length - away) >= settings.apart).all():
+            if (np.minimum(away, self.loop.length - away) >= APART).all():
                 chosen.append(i)
-            if len(chosen) == settings.starts:
+            if len(chosen) == STARTS:
                 break
         return chosen
 
     def _beside_the_loop(self) -> tuple[Array, Array]:
-        """Returns motions (n, 3) that lay the path onto the middle before each of its points.
+        """Return motions (n, 3) that lay the path onto the middle before each of its points.
 
         They are of least squares; the rms distances (n,) of the path from the middle are returned, too.
         """
-        settings, poses = self.settings.finding, np.array(self._poses)
+        poses = np.array(self._poses)
         behind = np.hypot(*np.diff(poses[:, :2], axis=0).T)[::-1].cumsum()[::-1]
         behind = np.append(behind, 0.0)
-        _, first = np.unique(behind // settings.step, return_index=True)
-        ahead = poses[-1, :2] + settings.lead * np.array([np.cos(poses[-1, 2]), np.sin(poses[-1, 2])])
+        _, first = np.unique(behind // STEP, return_index=True)
+        ahead = poses[-1, :2] + LEAD * np.array([np.cos(poses[-1, 2]), np.sin(poses[-1, 2])])
         own = np.concatenate([poses[first, :2], ahead[None]]) @ np.array([1.0, 1j])
-        target = self.loop.at(self.loop.stations[:, None] - np.append(behind[first], -settings.lead))
+        target = self.loop.at(self.loop.stations[:, None] - np.append(behind[first], -LEAD))
         mean, means = own.mean(), target.mean(axis=1)
         turn = ((own - mean).conj() * (target - means[:, None])).sum(axis=1)
         turn /= np.maximum(np.abs(turn), np.finfo(float).tiny)
@@ -365,27 +383,26 @@ class Search:
         return np.column_stack([shift.real, shift.imag, np.angle(turn)]), np.sqrt((misfit**2).mean(axis=1))
 
     def _refined(self, state: State, seen: Sightings, start: Motion, i: int) -> Hypothesis:
-        """Returns the hypothesis that registration makes of a motion onto point `i` of the middle."""
-        settings, closing = self.settings.finding, self.settings.closing
+        """Return the hypothesis that registration makes of a motion onto point `i` of the middle."""
         poses = np.array(self._poses)
         driven = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
         stretches = {
             label: self._stretch(state, label, float(u[i]), driven) for label, u in self.loop.beside.items()
         }
-        sigmas = np.array([settings.sigma_position, settings.sigma_position, settings.sigma_heading])
-        found = refine(state, seen, start, stretches, (start.vector, np.diag(sigmas**-2)), closing)
-        distance = self.loop.distances(seen.labels, found.motion.apply(seen.points), settings.reach)
-        return Hypothesis(found, float(np.exp(-0.5 * (distance / settings.sigma_fit) ** 2).mean()))
+        prior = start.vector, np.diag(np.array(SIGMAS_PLACE) ** -2)
+        found = refine(state, seen, start, stretches, prior, self.settings.closing)
+        distance = self.loop.distances(seen.labels, found.motion.apply(seen.points), REACH)
+        return Hypothesis(found, float(np.exp(-0.5 * (distance / SIGMA_FIT) ** 2).mean()))
 
     def _stretch(self, state: State, label: int, u: float, driven: float) -> tuple[float, float]:
-        """Returns the stretch of a curve that the vehicle has seen on a path that ends beside u (m)."""
+        """Return the stretch of a curve that the vehicle has seen on a path that ends beside u (m)."""
         gate, tables = self.settings.gate, state.boundaries[label].tables
         low, high = u - driven - gate.station_room, u + gate.view_ahead + gate.station_room
         return (low, high) if high - low < tables.high - tables.low else (tables.low, tables.high)
 
 
 def start_anew(smoother: CurveSmoother, first_cycle: int, found: RefinedMotion) -> Array:
-    """Moves the window onto the place that was found, and returns the jump (3,) of the newest pose.
+    """Move the window onto the place that was found, and return the jump (3,) of the newest pose.
 
     The poses before `first_cycle` leave the window. The map and its prior stay; what the prior says about the
     poses is replaced by the covariance of the registration.
@@ -394,10 +411,10 @@ def start_anew(smoother: CurveSmoother, first_cycle: int, found: RefinedMotion) 
     smoother.forget_poses(first_cycle)
     before = state.poses[-1].copy()
     found.motion.move(state.poses)
-    smoother.add_pose_prior(smoother.next_cycle - 1, found.covariance * settings.finding.widening**2)
+    smoother.add_pose_prior(smoother.next_cycle - 1, found.covariance * WIDENING**2)
     locate_poses(state, settings.batch.association)
-    reassociate(smoother)
-    for _ in range(settings.finding.steps):
+    smoother.reassociate()
+    for _ in range(STEPS):
         smoother.step(settings.sigma_step)
     jump = state.poses[-1] - before
     jump[2] = wrap_angle(jump[2])

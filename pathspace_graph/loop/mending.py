@@ -1,42 +1,151 @@
 """Mending: the curves of a closed map are led through cones that contradict them, and the drive solved again.
 
-The poses are right: the vehicle is held by the other boundary and by the stretches before and after. So the
-batch of the whole drive begins at these poses, with curves that lead through the cones that were seen.
+A contradiction is a cone that is seen again and again where the closed map has none of its colour. The poses
+are right: the vehicle is held by the other boundary and by the stretches before and after. So the batch of
+the whole drive begins at these poses, with curves that lead through the cones that were seen.
 """
 
-from __future__ import annotations
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.simplification import fit_through
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import to_map, to_vehicle
-from pathspace_graph.labels import NAMES
-from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
+from pathspace_graph.labels import BOUNDARIES, NAMES
+from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import along_and_across
+from pathspace_graph.mapping.smoother import CurveSmoother
+from pathspace_graph.mapping.state import SAMPLE
+from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label
+from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.crossing import sampled
 
-from .contradictions import Contradictions, Stretch
-from .finding import KnownLoop
+from .finding import KnownLoop, Loop
 
-Array = NDArray[np.float64]
+MENDED: Final = "the map was mended"
+"""Begin of the notice of a cycle in which mended curves take the place of the old ones."""
+SIGHTINGS: Final = 6
+"""Detections after which a cone contradicts the map: one that the vehicle passes is detected about twenty
+times, and a place in clutter hardly more than once."""
+MEMORY: Final = 30.0
+"""Time after its last detection at which a contradiction is forgotten (s)."""
+CONES: Final = 3
+"""Least number of contradictions in a row that is mended."""
+BESIDE: Final = 0.5
+"""Distance from a curve within which a cone does not contradict it (m)."""
+ROW: Final = 11.0
+"""Largest distance of neighbours in a row (m): two regular gaps, since a cone may never be detected."""
+SETTLE: Final = 1.5
+"""Time without detections of its cones after which the vehicle has passed a stretch (s) ..."""
+MOST: Final = 20
+"""... or enough of it, where it has passed this number of contradictions."""
+INTERVAL: Final = 0.5
+"""Time after which contradictions are looked for again (s)."""
+ATTEMPTS: Final = 8
+"""Largest number of attempts to mend a map."""
+EXPLAINED: Final = 0.5
+"""Least share of the contradictions that a mended map explains; otherwise the old one stays for a lap."""
 
-MENDED = "the map was mended"
-"""This begins the notice of a cycle in which curves that were led anew take the place of the old ones."""
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Cones of a boundary's colour that stand in a row beside its curve."""
+
+    label: int
+    cones: Array
+    """(k, 2) Positions in m, map frame, in no order."""
+
+
+class Contradictions:
+    """The detections that no curve of a closed map explains, by label."""
+
+    def __init__(self, settings: GrowthSettings) -> None:
+        merging = replace(settings, sightings=SIGHTINGS, forget_after=MEMORY)
+        self._tracks = {label: TentativeTracks(merging) for label in BOUNDARIES}
+
+    def observe(self, track: CurveMap, known: KnownLoop, new: slice, t: float) -> None:
+        """Add the new coloured detections, seen at t (s), that are not in use, or are used beside a gap."""
+        detections, rows = track.detections, np.arange(new.start, new.stop)
+        unexplained = ~detections.used[new]
+        for label in known.with_gaps():
+            on = rows[detections.boundary[new] == label]
+            unexplained[on - new.start] |= ~known.is_mapped(label, detections.u[on])
+        rows = rows[unexplained]
+        if len(rows):
+            points = detections.points_map(rows, track.variables)
+            covariances = detections.covariances_map(rows, track.variables)
+            add_by_label(self._tracks, detections.label[rows], points, covariances, t)
+
+    def clear(self) -> None:
+        """Forget everything, because the map or the pose was replaced."""
+        for tracks in self._tracks.values():
+            tracks.clear()
+
+    def stretches(self, loop: Loop, t: float) -> list[Stretch]:
+        """Return the stretches whose cones contradict the curves of the loop, or stand in a gap.
+
+        There are none until the vehicle has passed all of them at t (s), and has not seen their cones for a
+        while. It does not pass a very long one as a whole.
+        """
+        found = list[Stretch]()
+        for label, tracks in self._tracks.items():
+            chosen = tracks.confirmed()
+            if len(chosen) < CONES:
+                continue
+            chosen = chosen[_is_new(loop, label, tracks.points[chosen])]
+            chosen = chosen[self._undisputed(label, chosen)]
+            points, passed = tracks.points[chosen], tracks.last_t[chosen] < t - SETTLE
+            for row in in_rows(points, ROW):
+                if len(row) < CONES:
+                    continue
+                if not passed[row].all() and passed[row].sum() < MOST:
+                    return []
+                found.append(Stretch(label, points[row[passed[row]]]))
+        return found
+
+    def _undisputed(self, label: int, chosen: IntArray) -> BoolArray:
+        """Return which tracks (k,) were seen more often than those of the other colour at the same place."""
+        own, (other,) = self._tracks[label], (self._tracks[b] for b in BOUNDARIES if b != label)
+        apart = np.hypot(*(own.points[chosen, None] - other.points).transpose(2, 0, 1))
+        rival = np.where(apart < other.settings.merge_radius, other.counts, 0).max(axis=1, initial=0)
+        return np.asarray(own.counts[chosen] > rival)
+
+
+def _is_new(loop: Loop, label: int, points: Array) -> BoolArray:
+    """Return which points (k, 2) of a colour are farther than `BESIDE` from all curves, or in a gap."""
+    new = loop.beside_gaps(np.full(len(points), label), points)
+    new |= loop.curves[label].query(points)[0] > BESIDE
+    for number, curve in loop.curves.items():
+        if number != label:
+            new &= curve.query(points)[0] > BESIDE
+    return new
+
+
+def in_rows(points: Array, apart: float) -> list[IntArray]:
+    """Return the groups (k,) of points (n, 2), by index, whose neighbours are at most this far apart (m)."""
+    if len(points) == 0:
+        return []
+    pairs = KDTree(points).sparse_distance_matrix(KDTree(points), apart)
+    count, group = connected_components(pairs, directed=False)
+    return [np.flatnonzero(group == number) for number in range(count)]
+
+
+# --- the batch that mends the map ------------------------------------------------------------------------
 
 
 class Mending:
-    """Notices that a closed map is contradicted, and begins and judges the batch that mends it."""
+    """Whether a closed map is contradicted, and the batch that mends it."""
 
     def __init__(self, smoother: CurveSmoother) -> None:
-        self.settings = smoother.map.settings.mending
-        self.contradictions = Contradictions(smoother.map.settings)
-        """These are the detections that no curve explains."""
+        self.contradictions = Contradictions(smoother.map.settings.growth)
         self._smoother = smoother
         self._stretches: list[Stretch] = []
         self._lap: Array = np.zeros((0, 3))  # the poses of the newest lap as the attempt began
@@ -45,12 +154,12 @@ class Mending:
         self._attempts = 0
 
     def is_due(self, known: KnownLoop, driven: float) -> bool:
-        """Returns whether the closed map is contradicted, after a path of this length (m)."""
+        """Return whether the closed map is contradicted, after a path of this length (m)."""
         t = self._smoother.times[-1]
-        if t < self._asked + self.settings.interval or driven < self._wait_until:
+        if t < self._asked + INTERVAL or driven < self._wait_until:
             return False
         self._asked = t
-        if self._attempts >= self.settings.attempts:
+        if self._attempts >= ATTEMPTS:
             return False
         loop = known.get()
         self._stretches = self.contradictions.stretches(loop, t)
@@ -59,7 +168,7 @@ class Mending:
         return bool(self._stretches)
 
     def begin(self, poses: Array) -> ClosedMap:
-        """Returns the map that the batch of the drive begins with, whose curves are led anew.
+        """Return the map that the batch of the drive begins with, whose curves are led anew.
 
         The poses (P, 3) are those of all cycles, in the map frame.
         """
@@ -74,11 +183,11 @@ class Mending:
         return ClosedMap(splines, poses, state.variables.calibrations.copy())
 
     def is_tried(self) -> bool:
-        """Returns whether the batch that is under way mends a map, rather than closing it."""
+        """Return whether the batch that is under way mends a map, rather than closing it."""
         return bool(self._stretches)
 
     def end(self, marginal: LapMarginal | str) -> str:
-        """Ends an attempt; returns the notice of a map that explains the contradictions, or an empty one."""
+        """End an attempt; returns the notice of a map that explains the contradictions, or an empty one."""
         stretches, self._stretches = self._stretches, []
         if isinstance(marginal, str):
             return ""
@@ -87,10 +196,10 @@ class Mending:
         cones = carried(cones, self._lap, marginal.poses[end - len(self._lap) :])
         distance = np.full(len(cones), np.inf)
         for own, spline in marginal.splines.items():
-            curve = KDTree(sampled(spline, self.settings.sample))
+            curve = KDTree(sampled(spline, SAMPLE))
             distance[label == own] = curve.query(cones[label == own])[0]
-        explained = distance < self.settings.beside
-        if explained.mean() < self.settings.explained:
+        explained = distance < BESIDE
+        if explained.mean() < EXPLAINED:
             return ""
         self._wait_until = 0.0
         self.contradictions.clear()
@@ -98,20 +207,20 @@ class Mending:
         return f"{MENDED}: {int(explained.sum())} more cones on the {' and on the '.join(names)} lie on it"
 
 
-def _cones(stretches: list[Stretch]) -> tuple[NDArray[np.intp], Array]:
-    """Returns the label (k,) and the place (k, 2) of each cone of stretches."""
+def _cones(stretches: list[Stretch]) -> tuple[IntArray, Array]:
+    """Return the label (k,) and the place (k, 2) of each cone of stretches."""
     labels = np.repeat([one.label for one in stretches], [len(one.cones) for one in stretches])
     return labels, np.concatenate([one.cones for one in stretches])
 
 
 def carried(points: Array, before: Array, after: Array) -> Array:
-    """Returns points (k, 2), each moved as the pose next to it has moved, from `before` to `after` (n, 3)."""
+    """Return points (k, 2), each moved as the pose next to it has moved, from `before` to `after` (n, 3)."""
     nearest = KDTree(before[:, :2]).query(points)[1]
     return to_map(to_vehicle(points, before[nearest]), after[nearest])
 
 
 def led_through(track: CurveMap, label: int, stretches: list[Stretch], poses: Array) -> BSpline:
-    """Returns the closed curve of a boundary, led through the cones of its stretches.
+    """Return the closed curve of a boundary, led through the cones of its stretches.
 
     The cones of the curve are in the order in which the newest lap of the poses (P, 3) passes them. Those
     that lie beside a row of the stretches' cones, or are one of them, are removed.
@@ -135,7 +244,7 @@ def led_through(track: CurveMap, label: int, stretches: list[Stretch], poses: Ar
 
 
 def newest_lap(poses: Array, length: float) -> tuple[Array, Array]:
-    """Returns the positions (n, 2) on the newest lap of poses (P, 3), the first one again at the end.
+    """Return the positions (n, 2) on the newest lap of poses (P, 3), the first one again at the end.
 
     It begins at the place nearest to the newest pose about a lap of this length (m) before. The stations (n,)
     of the positions along it are returned, too.
@@ -146,18 +255,16 @@ def newest_lap(poses: Array, length: float) -> tuple[Array, Array]:
 
 
 def lap_begin(poses: Array, length: float) -> int:
-    """Returns the index of the pose (P, 3) nearest to the newest one, about a lap of a length (m) before."""
+    """Return the index of the pose (P, 3) nearest to the newest one, about a lap of a length (m) before."""
     driven = path_lengths(poses)
     before = np.flatnonzero(np.abs(driven[-1] - driven - length) < 0.5 * length)
     away = np.hypot(*(poses[before, :2] - poses[-1, :2]).T)
     return int(before[away.argmin()]) if len(before) else 0
 
 
-def _is_replaced(
-    cones: Array, at: Array, row: Array, row_at: Array, settings: MapperSettings
-) -> NDArray[np.bool_]:
-    """Returns which cones (k, 2) at stations (k,) are those of a row (r, 2), or lie beside it."""
-    order, beside = np.argsort(row_at), settings.mending.beside
+def _is_replaced(cones: Array, at: Array, row: Array, row_at: Array, settings: MapperSettings) -> BoolArray:
+    """Return which cones (k, 2) at stations (k,) are those of a row (r, 2), or lie beside it."""
+    order, beside = np.argsort(row_at), BESIDE
     away = np.abs(along_and_across(cones, row[order], row_at[order])[1])
     within = (at > row_at.min() - beside) & (at < row_at.max() + beside)
     same = KDTree(row).query(cones)[0] < settings.growth.merge_radius

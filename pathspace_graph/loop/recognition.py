@@ -5,17 +5,18 @@ seconds agree with any place along a straight there. The open curves hold more: 
 bends of the track in it, and these are where they were a lap before.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import left_of, wrap_angle
-from pathspace_graph.graph.keys import pose_keys
-from pathspace_graph.mapping.curve_map import CurveMap, CurveSmoother
+from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.registration import (
+    BEGINNING_SHARE,
+    START_CHI2,
+    START_STEP,
     Motion,
     Sightings,
     by_motion,
@@ -23,12 +24,18 @@ from pathspace_graph.mapping.registration import (
     refine,
     sigma_of_information,
 )
+from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.spline.boundary import Boundary
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+STRETCH: Final = 150.0
+"""Length at the end of the curves that is registered with an earlier stretch (m): it holds the bends that
+tell the place along the track."""
+STRETCH_ROOM: Final = 10.0
+"""Room beyond the ends of the earlier stretch in which foot points are searched (m)."""
+STARTS: Final = 6
+"""Largest number of earlier stretches, which turn as the newest does, that it is registered with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,17 +50,15 @@ class RecognizedPlace:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Holds the cones of the newest stretch of both curves."""
+    """The cones of the newest stretch of both curves."""
 
-    length: float
-    """This is the length of the stretch (m)."""
     cones: dict[int, Array]
     """Each boundary has cones (k, 2) at these points in m, map frame."""
     normals: dict[int, Array]
     """Each of these cones has the unit normal (k, 2) of its curve."""
 
     def tells_place(self, centre: Array, settings: ClosingSettings) -> bool:
-        """Returns whether the stretch, laid on itself, holds the vehicle at `centre` (2,) in every direction.
+        """Return whether the stretch, laid on itself, holds the vehicle at `centre` (2,) in every direction.
 
         A straight does not: it could as well lie farther along.
         """
@@ -63,14 +68,14 @@ class Stretch:
 
     @property
     def sightings(self) -> Sightings:
-        """Returns the cones as the registration takes them."""
+        """Return the cones as the registration takes them."""
         labels = np.repeat(list(self.cones), [len(cones) for cones in self.cones.values()])
         points = np.concatenate(list(self.cones.values()))
         return Sightings.of_points(np.arange(len(points)), labels, points)
 
 
 def recognize(smoother: CurveSmoother) -> RecognizedPlace | None:
-    """Returns the place at which the newest stretch of the curves has been before.
+    """Return the place at which the newest stretch of the curves has been before.
 
     The result is None where the vehicle is not lost, or its place is not found.
     """
@@ -79,19 +84,19 @@ def recognize(smoother: CurveSmoother) -> RecognizedPlace | None:
         return None
     smoother.carry()
     smoother.refresh()
-    covariance = smoother.covariance(pose_keys(np.array([smoother.next_cycle - 1])))
+    covariance = smoother.newest_covariance()
     return find_place(track, covariance, settings) if is_lost(covariance, settings) else None
 
 
 def may_tell_place(state: State, settings: ClosingSettings) -> bool:
-    """Returns whether it is worth asking for the place: the curves are long enough, and not straight."""
+    """Return whether it is worth asking for the place: the curves are long enough, and not straight."""
     if not is_long_enough(state, settings):
         return False
-    return newest_stretch(state, settings.recognition.stretch).tells_place(state.poses[-1, :2], settings)
+    return newest_stretch(state).tells_place(state.poses[-1, :2], settings)
 
 
 def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) -> RecognizedPlace | None:
-    """Returns the only place at which the newest stretch of the curves agrees with an earlier stretch.
+    """Return the only place at which the newest stretch of the curves agrees with an earlier stretch.
 
     The `covariance` (3, 3) of the newest pose says how far the place may be from where the vehicle believes
     to be. The result is None if no place agrees, if several do, or if the place along the track is uncertain.
@@ -99,7 +104,7 @@ def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) ->
     state = track.state
     if not is_long_enough(state, settings):
         return None
-    newest = newest_stretch(state, settings.recognition.stretch)
+    newest = newest_stretch(state)
     centre = state.poses[-1, :2].copy()
     prior = np.asarray(np.linalg.inv(_wide(covariance) * settings.prior_scale**2), np.float64)
     found: list[RecognizedPlace] = []
@@ -111,7 +116,7 @@ def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) ->
 
 
 def _wide(covariance: Array) -> Array:
-    """Returns the covariance (3, 3) of a pose without correlations, as wide as its worst direction.
+    """Return the covariance (3, 3) of a pose without correlations, as wide as its worst direction.
 
     A lap away the heading turns the position on an arc, which the correlations follow only for small angles.
     """
@@ -120,40 +125,39 @@ def _wide(covariance: Array) -> Array:
 
 
 def is_long_enough(state: State, settings: ClosingSettings) -> bool:
-    """Returns whether the curves hold a whole lap between an earlier stretch and the newest one."""
+    """Return whether the curves hold a whole lap between an earlier stretch and the newest one."""
     end = min(boundary.confirmed_end for boundary in state.boundaries.values())
-    early = settings.beginning_share * end
-    return bool(settings.recognition.stretch < early < end - settings.recognition.stretch - settings.min_path)
+    early = BEGINNING_SHARE * end
+    return bool(STRETCH < early < end - STRETCH - settings.min_path)
 
 
-def newest_stretch(state: State, length: float) -> Stretch:
-    """Returns the confirmed cones on the last `length` metres of each curve."""
+def newest_stretch(state: State) -> Stretch:
+    """Return the confirmed cones on the last `STRETCH` metres of each curve."""
     cones, normals = {}, {}
     for label, boundary in state.boundaries.items():
         u, points = np.array(boundary.cone_parameters), state.control_points(label)
-        chosen = u[(u > boundary.confirmed_end - length) & (u <= boundary.confirmed_end)]
+        chosen = u[(u > boundary.confirmed_end - STRETCH) & (u <= boundary.confirmed_end)]
         cones[label], tangents = boundary.evaluate(points, chosen), boundary.evaluate(points, chosen, 1)
         tangents /= np.hypot(tangents[:, :1], tangents[:, 1:])
         normals[label] = left_of(tangents)
-    return Stretch(length, cones, normals)
+    return Stretch(cones, normals)
 
 
 def _same(a: RecognizedPlace, b: RecognizedPlace, settings: ClosingSettings) -> bool:
-    """Returns whether two places are one."""
     return bool(np.hypot(*(a.motion.vector - b.motion.vector)[:2]) < settings.overlap)
 
 
 def _starts(state: State, prior: Array, settings: ClosingSettings) -> list[tuple[Array, float]]:
-    """Returns motions (3,) onto earlier stretches that turn as the newest one does, the likest first.
+    """Return motions (3,) onto earlier stretches that turn as the newest one does, the likest first.
 
     Each goes with the parameter at which the earlier stretch of the first boundary begins. The headings along
     both stretches are compared, after a common turn.
     """
     label = next(iter(state.boundaries))
-    boundary, step = state.boundaries[label], settings.start_step
+    boundary, step = state.boundaries[label], START_STEP
     points, headings = _samples(boundary, state.control_points(label), step)
-    count = int(settings.recognition.stretch / step)
-    last = int(settings.beginning_share * len(points))
+    count = int(STRETCH / step)
+    last = int(BEGINNING_SHARE * len(points))
     turns = np.lib.stride_tricks.sliding_window_view(headings[:last], count) - headings[-count:]
     places = np.lib.stride_tricks.sliding_window_view(points[:last], count, axis=0).mean(axis=2)
     turn, unlike = turns.mean(axis=1), turns.std(axis=1)
@@ -161,21 +165,21 @@ def _starts(state: State, prior: Array, settings: ClosingSettings) -> list[tuple
     arm, c, s = middle - centre, np.cos(turn), np.sin(turn)
     turned = np.column_stack([c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]]) + centre
     motions = np.column_stack([places - turned, wrap_angle(turn)])
-    possible = np.einsum("ij,jk,ik->i", motions, prior, motions) < settings.start_chi2
+    possible = np.einsum("ij,jk,ik->i", motions, prior, motions) < START_CHI2
     unlike = np.where(possible, unlike, np.inf)
-    best = _minima(unlike, int(settings.overlap / step))[: settings.recognition.starts]
+    best = _minima(unlike, int(settings.overlap / step))[:STARTS]
     return [(motions[i], float(step * i)) for i in best]
 
 
 def _samples(boundary: Boundary, control_points: Array, step: float) -> tuple[Array, Array]:
-    """Returns points (n, 2) a step apart up to the end of a curve, and the headings (n,), not wrapped."""
+    """Return points (n, 2) a step apart up to the end of a curve, and the headings (n,), not wrapped."""
     u = np.arange(boundary.confirmed_end % step, boundary.confirmed_end, step)
     tangents = boundary.evaluate(control_points, u, 1)
     return boundary.evaluate(control_points, u), np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
 
 
 def _minima(values: Array, apart: int) -> list[int]:
-    """Returns the indices of finite values that are the least of all that are as near as `apart`."""
+    """Return the indices of finite values that are the least of all that are as near as `apart`."""
     padded = np.pad(values, apart, constant_values=np.inf)
     least = np.lib.stride_tricks.sliding_window_view(padded, 2 * apart + 1).min(axis=1)
     found = np.flatnonzero(np.isfinite(values) & (values == least))
@@ -185,9 +189,8 @@ def _minima(values: Array, apart: int) -> list[int]:
 def _register(
     state: State, newest: Stretch, start: Motion, low: float, prior: Array, settings: ClosingSettings
 ) -> RecognizedPlace | None:
-    """Registers the newest stretch with the earlier one; returns None if they disagree."""
     first = next(iter(state.boundaries))
-    ends = np.array([low, low + newest.length])
+    ends = np.array([low, low + STRETCH])
     corners = state.boundaries[first].evaluate(state.control_points(first), ends)
     stretches = {label: _beside(state, label, corners, settings) for label in state.boundaries}
     found = refine(state, newest.sightings, start, stretches, (np.zeros(3), prior), settings)
@@ -201,7 +204,7 @@ def _register(
 def _beside_newest(
     state: State, motion: Motion, stretches: dict[int, tuple[float, float]]
 ) -> dict[int, float]:
-    """Returns the parameter of each boundary's earlier stretch that the moved newest pose is beside (m)."""
+    """Return the parameter of each boundary's earlier stretch that the moved newest pose is beside (m)."""
     place, beside = motion.apply(state.poses[-1:, :2]), {}
     for label, (low, high) in stretches.items():
         foot = state.boundaries[label].find(
@@ -212,9 +215,9 @@ def _beside_newest(
 
 
 def _beside(state: State, label: int, corners: Array, settings: ClosingSettings) -> tuple[float, float]:
-    """Returns the parameters of the stretch of a boundary between two points (2, 2), and some room."""
-    boundary, room = state.boundaries[label], settings.recognition.stretch_room
+    """Return the parameters of the stretch of a boundary between two points (2, 2), and some room."""
+    boundary, room = state.boundaries[label], STRETCH_ROOM
     zero = np.zeros(len(corners))
-    high = zero + settings.beginning_share * boundary.confirmed_end
+    high = zero + BEGINNING_SHARE * boundary.confirmed_end
     u = boundary.find(state.control_points(label), corners, zero, high).u
     return max(float(u[0]) - room, 0.0), float(u[1]) + room

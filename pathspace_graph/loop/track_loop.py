@@ -1,47 +1,41 @@
 """The loop of the track: when it closes, what is done once, and what is done afterwards."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from math import ceil
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.start import Recurrence
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Evidence, Health, HealthMonitor
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.curve_map import CurveSmoother
+from pathspace_graph.mapping.motion import doubt_calibrations
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import doubt_calibrations
 from pathspace_graph.mapping.registration import near_start
+from pathspace_graph.mapping.smoother import CurveSmoother, Gating
+from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.crossing import boundaries_cross
 
-from .association import Gating
+from .closing import go_on_from, hold_gauge
 from .drive_record import LATE, DriveRecord, LapBatch
 from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
-from .gauge import hold_gauge
 from .mending import Mending
 from .recognition import recognize
-from .swap import go_on_from
 
-Array = NDArray[np.float64]
-
-OWN_PRIOR = "the map goes on from the window's own prior"
-"""This begins the notice of a cycle in which the batch of the lap does not replace the prior."""
-
-LONGEST_WAIT = 1.0
-"""A cycle waits for a batch no longer than this (s), however long ago the cycle before it was."""
-
-
-REST = 10.0
-"""After a failure the loop is left as it is for this distance (m)."""
-
-LEARNED = "the drive contradicts the calibration, which is learned"
+OWN_PRIOR: Final = "the map goes on from the window's own prior"
+"""Begin of the notice of a cycle in which the batch of the lap does not replace the prior."""
+LONGEST_WAIT: Final = 1.0
+"""Longest time that a cycle waits for a batch (s), however long ago the cycle before it was."""
+REST: Final = 10.0
+"""Distance for which the loop is left as it is after a failure (m)."""
+RECOGNITION_INTERVAL: Final = 10.0
+"""Least distance of two attempts to recognize the place (m along the path)."""
+LEARNED: Final = "the drive contradicts the calibration, which is learned"
 """Notice of the cycle in which the priors of the calibrations are first doubted."""
 
 
@@ -50,24 +44,22 @@ class LoopRefusedError(Exception):
 
 
 class TrackLoop:
-    """Looks after the loop: the batch of the open lap when it closes, and a vehicle that is lost on it."""
+    """What is done about the loop: the batch of the open lap when it closes, and a vehicle that is lost."""
 
     def __init__(self, smoother: CurveSmoother, path: DrivenPath) -> None:
         self.settings = smoother.map.settings
         self.closed = False
-        """The flag is set when the loop has closed: the map has its final size."""
+        """Whether the loop has closed: the map has its final size."""
         self.health = Health()
-        """This says how far the newest estimate can be trusted."""
+        """How far the newest estimate can be trusted."""
         self.corrected_poses: Array = np.zeros((0, 3))
-        """(k, 3) These are the poses of the first k cycles as the closing of the loop has corrected them."""
+        """(k, 3) Poses of the first k cycles as the closing of the loop has corrected them."""
         self.lap_seconds = float("nan")
-        """The batch of the lap took this wall time (s) in its own process, once it has replaced the prior."""
+        """Wall time (s) of the batch of the lap in its own process, once it has replaced the prior."""
         self.late_cycles = 0
-        """By its wall time, the slowest batch is this number of cycles late in a vehicle."""
+        """Cycles by which the slowest batch is late in a vehicle, by its wall time."""
         self.record = DriveRecord(self.settings)
-        """This is the drive as it was measured."""
         self.mending = Mending(smoother)
-        """This mends the closed map where detections contradict it."""
         self._smoother = smoother
         self._path = path
         self._monitor = HealthMonitor(self.settings.health)
@@ -84,22 +76,22 @@ class TrackLoop:
 
     @property
     def is_hypothesis(self) -> bool:
-        """Returns whether the loop has closed, and the batch of its lap has not confirmed that yet."""
+        """Return whether the loop has closed, and the batch of its lap has not confirmed that yet."""
         return self.closed and self._lap_batch is not None and self._settled is None
 
     @property
     def is_searching(self) -> bool:
-        """Returns whether the vehicle is lost on a closed map, and is looked for."""
+        """Return whether the vehicle is lost on a closed map, and is looked for."""
         return self._search is not None
 
     @property
     def first_kept(self) -> int | None:
-        """Returns the cycle whose pose must stay in the window until the lap is solved, if there is one."""
+        """Return the cycle whose pose must stay in the window until the lap is solved, if there is one."""
         return self._lap_batch.first_kept if self._lap_batch else None
 
     @property
     def batch_ends(self) -> tuple[int, ...]:
-        """Returns the cycles in which batches ended: their result was taken, or they were given up.
+        """Return the cycles in which batches ended: their result was taken, or they were given up.
 
         A late one that is under way is going to be given up.
         """
@@ -109,7 +101,7 @@ class TrackLoop:
         return (*ends, batch.last + 1)
 
     def may_close(self) -> bool:
-        """Returns whether it is time to register the newest detections with the beginning of an open loop."""
+        """Return whether it is time to register the newest detections with the beginning of an open loop."""
         settings, length = self.settings.closing, self._path.length
         newest = self._smoother.variables.poses[-1]
         if self.closed or self._rests or not near_start(self._path, newest, settings):
@@ -122,13 +114,13 @@ class TrackLoop:
     # --- what a cycle tells ------------------------------------------------------------------------------
 
     def judge(self, tested: Gating | None, new: slice, reading: Reading) -> None:
-        """Judges the estimate by the detections that were tested, or remembers those of a lost vehicle.
+        """Judge the estimate by the detections that were tested, or remember those of a lost vehicle.
 
         The detections of the cycle are the rows `new` of the table.
         """
         smoother, detections = self._smoother, reading.detections
         if self._search is not None:
-            corrected = smoother.map.detections.point[new].copy()
+            corrected = smoother.map.detections.corrected(new, smoother.variables.sensor).copy()
             self._search.observe(smoother.variables.poses[-1], replace(detections, points_vehicle=corrected))
             return
         evidence = Evidence(detections.t)
@@ -136,22 +128,16 @@ class TrackLoop:
             evidence = evidence_of(smoother, tested, self._known_loop, reading.seen_again)
         motion = reading.motion
         self.health = self._monitor.update(replace(evidence, odometry=motion.fault, rests=motion.rests))
-        if self.health.condition == GOOD and (caveat := self._caveat()):
-            self.health = Health(DEGRADED, caveat)
+        if self.health.condition == GOOD and self._boundaries_cross:
+            self.health = Health(DEGRADED, "the two boundaries of the map cross")
         if self._known_loop.is_whole and self.record.unsolvable is None:
-            self.mending.contradictions.observe(smoother, self._known_loop, new, detections.t)
+            self.mending.contradictions.observe(smoother.map, self._known_loop, new, detections.t)
         self._begin_search()
 
-    def _caveat(self) -> str:
-        """Returns why an estimate is not good though the detections agree with it, or an empty string."""
-        if self._boundaries_cross:
-            return "the two boundaries of the map cross"
-        return ""
-
     def doubt_calibrations(self, reading: Reading) -> str:
-        """Widens the priors of calibrations that the drive contradicts, while the loop is open.
+        """Widen the priors of calibrations that the drive contradicts, while the loop is open.
 
-        Returns a notice in the first cycle in which it does.
+        Return a notice in the first cycle in which it does.
         """
         if self.closed:
             return ""
@@ -163,7 +149,7 @@ class TrackLoop:
     # --- the batch of the open lap -----------------------------------------------------------------------
 
     def pause(self) -> None:
-        """Gives up what is under way, and rests for `REST` metres: something has failed."""
+        """Give up what is under way, and rest for `REST` metres: something has failed."""
         self._resumes = self._path.length + REST
         if self._lap_batch is not None:
             self._lap_batch.give_up()
@@ -175,9 +161,9 @@ class TrackLoop:
         return self._path.length < self._resumes
 
     def go_on(self, closes: bool, spent: float) -> tuple[Array | None, str]:
-        """Records the open lap, has it solved when it closes, and goes on from the result when it is due.
+        """Record the open lap, have it solved when it closes, and go on from the result when it is due.
 
-        The cycle has taken the time `spent` (s) so far. Returns the jump (3,) of the newest pose if the map
+        The cycle has taken the time `spent` (s) so far. Return the jump (3,) of the newest pose if the map
         was replaced, and a notice.
         """
         if closes:
@@ -199,20 +185,19 @@ class TrackLoop:
         return None, ""
 
     def wait(self) -> None:
-        """Waits for the batch whose result the next cycle may take, however long that takes."""
+        """Wait for the batch whose result the next cycle may take, however long that takes."""
         batch = self._lap_batch
         if batch is not None and batch.due <= self._smoother.next_cycle <= batch.last:
             batch.wait()
 
     def resume(self) -> None:
-        """Sends the lap that was being solved when a snapshot was taken, which the process has not seen."""
+        """Send the lap that was being solved when a snapshot was taken, which the process has not seen."""
         if self._lap_batch is not None:
             self._lap_batch.send()
         elif not self.closed:
             self.record.resume()
 
     def _record_open_lap(self) -> None:
-        """Records the estimate of an open lap, and tries to close it where the drive says that it is over."""
         self.record.estimated(self._smoother.map.state)
         if self._path.length > self.settings.closing.min_path and not self._rests:
             self.record.prepare()
@@ -220,28 +205,27 @@ class TrackLoop:
                 self._try_loop()
 
     def _end(self, batch: LapBatch, spent: float) -> tuple[Array | None, str]:
-        """Takes the result of a batch that is due, waits for the next cycle, or gives the batch up.
+        """Take the result of a batch that is due, wait for the next cycle, or give the batch up.
 
         The cycle as a whole lasts no longer than its period for that, the time since the one before it.
         """
         cycle, times = self._smoother.next_cycle - 1, self._smoother.times
         period = float(np.ptp(times[-2:]))
-        found: LapMarginal | str | None = LATE
+        outcome: LapMarginal | str | None = LATE
         if cycle <= batch.last:
-            found = batch.marginal(max(min(period, LONGEST_WAIT) - spent, 0.0))
+            outcome = batch.marginal(max(min(period, LONGEST_WAIT) - spent, 0.0))
         else:
             batch.give_up()
-        if found is None:
+        if outcome is None:
             return None, ""
-        if isinstance(found, LapMarginal) and period > 0.0:
+        if isinstance(outcome, LapMarginal) and period > 0.0:
             given = times[batch.due - self._smoother.first_cycle] - batch.t
-            self.late_cycles = max(self.late_cycles, ceil((found.seconds - given) / period))
+            self.late_cycles = max(self.late_cycles, ceil((outcome.seconds - given) / period))
         self._lap_batch = None
         self._batch_ends.append(cycle)
-        return self._take(found)
+        return self._take(outcome)
 
     def _take(self, marginal: LapMarginal | str) -> tuple[Array | None, str]:
-        """Goes on from the result of a batch, unless the present map is better."""
         mends, smoother = self.mending.is_tried(), self._smoother
         notice = self.mending.end(marginal) if mends else ""
         if isinstance(marginal, str):
@@ -261,14 +245,12 @@ class TrackLoop:
         return jump, notice
 
     def _crosses(self, splines: Mapping[int, BSpline] | None = None) -> bool:
-        """Returns whether two boundaries cross, by default those of the present map."""
         if splines is None:
             self._smoother.refresh()
             splines = self._smoother.map.state.splines
-        return set(splines) == set(BOUNDARIES) and boundaries_cross(splines, self.settings.finding.sample)
+        return set(splines) == set(BOUNDARIES) and boundaries_cross(splines, SAMPLE)
 
     def _try_mending(self) -> None:
-        """Sends the drive to a batch that begins with other curves, where the closed map is contradicted."""
         record = self.record
         if not self._known_loop.is_whole or self._search is not None or record.unsolvable is not None:
             return
@@ -276,7 +258,7 @@ class TrackLoop:
             self._begin_batch(self.mending.begin(np.array(record.poses)))
 
     def _hold_gauge(self) -> None:
-        """Holds the position and heading of the closed map as a whole, once enough laps were driven on it.
+        """Hold the position and heading of the closed map as a whole, once enough laps were driven on it.
 
         They are not held where the user has given factors, since these may tell them.
         """
@@ -290,13 +272,13 @@ class TrackLoop:
             hold_gauge(smoother)
 
     def _closes(self) -> None:
-        """Notes that the loop has closed; hardly anything moves from now on."""
-        self.closed, self._smoother.window.exact = True, False
+        self.closed = True
+        self._smoother.settle()
 
     def _solve_lap(self) -> str:
-        """Sends the lap to be solved as a batch in the cycle in which the loop has closed.
+        """Send the lap to be solved as a batch in the cycle in which the loop has closed.
 
-        Returns a notice that says why it cannot be solved, or an empty one.
+        Return a notice that says why it cannot be solved, or an empty one.
         """
         smoother, record = self._smoother, self.record
         closed = record.closed_map(smoother)
@@ -311,24 +293,28 @@ class TrackLoop:
         return ""
 
     def _begin_batch(self, start: ClosedMap | Recurrence) -> None:
-        """Sends the lap to its batch, which begins at a map that has just been closed, or at odometry.
+        """Send the lap to its batch, which begins at a map that has just been closed, or at odometry.
 
         Where a drive is replayed, the batch ends in the cycle that was recorded. One that is under way is
         given up, since its process would not begin this one.
         """
         if self._lap_batch is not None:
             self._lap_batch.give_up()
-        own, first, cycle = self.settings.open_lap, self._smoother.first_cycle, self._smoother.next_cycle - 1
-        wait = max(min(own.cycles, cycle - first), int(own.cycles_share * cycle))
+        open_lap, first, cycle = (
+            self.settings.open_lap,
+            self._smoother.first_cycle,
+            self._smoother.next_cycle - 1,
+        )
+        wait = max(min(open_lap.cycles, cycle - first), int(open_lap.cycles_share * cycle))
         first_kept, due = min(first + wait, cycle), cycle + wait
-        last = max(due, min(due + own.late, first_kept + self.settings.max_poses - 1))
-        recorded = own.ends[len(self._batch_ends) :][:1]
+        last = max(due, min(due + open_lap.late, first_kept + self.settings.max_poses - 1))
+        recorded = open_lap.ends[len(self._batch_ends) :][:1]
         lap = self.record.lap(first_kept, start, self._believed)
         due = min(max([due, *recorded]), last + 1)
         self._lap_batch = LapBatch(lap, self._smoother.times[-1], due, last)
 
     def _try_loop(self) -> None:
-        """Sends the lap to a batch from odometry where the drive says that it is over.
+        """Send the lap to a batch from odometry where the drive says that it is over.
 
         That happens where the registration keeps refusing to close the loop.
         """
@@ -342,12 +328,11 @@ class TrackLoop:
             self._begin_batch(recurrence)
 
     def _recurrence(self) -> Recurrence | None:
-        """Returns after which length the drive recurs, by its odometry or by the shape of the curves."""
-        record, settings = self.record, self.settings.closing.recognition
+        record = self.record
         if record.unsolvable is not None:
             return None
         found = record.recurrence()
-        if found is not None or self._path.length < self._recognition_tried + settings.interval:
+        if found is not None or self._path.length < self._recognition_tried + RECOGNITION_INTERVAL:
             return found
         self._recognition_tried = self._path.length
         place = recognize(self._smoother)
@@ -356,20 +341,19 @@ class TrackLoop:
     # --- a vehicle that is lost --------------------------------------------------------------------------
 
     def _begin_search(self) -> None:
-        """Takes all detections of the window out of use, if the vehicle is lost on a map that is complete.
+        """Take all detections of the window out of use, if the vehicle is lost on a map that is complete.
 
         So the map stays as it was before. Nothing is done before the batch of the lap has replaced it.
         """
         ready = self._known_loop.is_whole and self._lap_batch is None
         if self.health.condition == LOST and ready:
-            detections = self._smoother.map.detections
-            detections.release(np.arange(len(detections)))
+            self._smoother.map.detections.release_all()
             self._search = Search(self._smoother)
             self.mending.contradictions.clear()
             self.record.give_up("the vehicle was lost")
 
     def find_back(self) -> tuple[Array | None, str]:
-        """Starts the window anew where a lost vehicle is found; returns its jump (3,) and a notice."""
+        """Start the window anew where a lost vehicle is found; returns its jump (3,) and a notice."""
         if self._search is None or self._rests:
             return None, ""
         found = self._search.find()

@@ -1,15 +1,16 @@
-"""The state of the paper's filters: the vehicle's pose and points of the map, with a joint covariance."""
+"""The state of the paper's filters: a joint Gaussian over pose and map, moved by the cubature rule.
 
-from __future__ import annotations
+The third-degree spherical-radial rule (Arasaratnam and Haykin 2009) is the paper's transform.
+"""
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, lapack
 
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor, corrected
@@ -18,11 +19,58 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
 
-from .cubature import Transformed, square_root, transform
 from .motion import MeasuredMotion
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+_LEAST_VARIANCE: Final = 1e-12
+"""Eigenvalues are raised to this share of the largest one where a covariance has no Cholesky factor."""
+
+
+@dataclass(frozen=True, eq=False)
+class Transformed:
+    """The moments of a function of a Gaussian, by the cubature rule."""
+
+    mean: Array
+    """(q,) Mean of the function."""
+    covariance: Array
+    """(q, q) Covariance of the function."""
+    slope: Array
+    """(q, d) Statistical linearization `C_yx C_xx^-1`. The covariance of the function with a
+    variable z that it does not depend on is `slope @ C_xz`, which is exact for Gaussians."""
+
+
+def square_root(covariance: Array) -> Array:
+    """Return the lower L with `L L' = covariance` (d, d). Small eigenvalues are raised if it is singular."""
+    factor, info = lapack.dpotrf(covariance, lower=1, clean=1)
+    if info == 0:
+        return np.asarray(factor)
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    lifted = np.maximum(values, _LEAST_VARIANCE * max(float(values[-1]), _LEAST_VARIANCE))
+    return np.asarray(np.linalg.qr((vectors * np.sqrt(lifted)).T)[1].T)
+
+
+def cubature_points(mean: Array, root: Array) -> Array:
+    """Return `mean +- sqrt(d) L e_i` (2 d, d), the positive ones first; each has the weight 1 / (2 d)."""
+    offsets = np.sqrt(len(mean)) * root.T
+    return np.concatenate([mean + offsets, mean - offsets])
+
+
+def transform(function: Callable[[Array], Array], mean: Array, covariance: Array) -> Transformed:
+    """Return mean, covariance and slope of `function`, which maps points (k, d) row by row to (k, q).
+
+    All are exact for a linear function, and the mean is exact for a polynomial of the third degree.
+    """
+    root = square_root(covariance)
+    d = len(mean)
+    values = function(cubature_points(mean, root))
+    centre = values.mean(axis=0)
+    spread = (values - centre) / np.sqrt(2.0 * d)
+    half = (values[:d] - values[d:]) / (2.0 * np.sqrt(d))
+    slope, _ = lapack.dtrtrs(root, half, lower=1, trans=1)
+    return Transformed(centre, spread.T @ spread, np.asarray(slope).T)
+
+
+# === The state of the paper's filters: the vehicle's pose and points of the map, with a joint covariance.
+
 
 _ODOMETRY: Final = slice(POSE, POSE + CALIBRATION_SIZE)
 HEAD: Final = POSE + CALIBRATION_SIZE + SENSOR_SIZE
@@ -46,15 +94,15 @@ class Belief:
         sigma, known = np.zeros(HEAD - POSE), () if calibration_sigma is None else calibration_sigma
         sigma[: len(known)] = known
         self.mean: Array = np.concatenate([pose, np.zeros(HEAD - POSE)])
-        """(n,) This is the mean of x."""
+        """(n,) Mean of x."""
         self.covariance: Array = block_diag(covariance, np.diag(sigma**2))
-        """(n, n) This is the covariance of x."""
+        """(n, n) Covariance of x."""
         self.twist: Array = np.zeros(POSE)
         """(3,) The vehicle moves with this twist, in m/s, m/s and rad/s."""
 
     @classmethod
-    def at_start(cls, settings: OdometrySettings, sensor: CalibrationSettings) -> Belief:
-        """Returns the belief at the first odometry stamp, with an empty map.
+    def at_start(cls, settings: OdometrySettings, sensor: CalibrationSettings) -> Self:
+        """Return the belief at the first odometry stamp, with an empty map.
 
         The priors of the sensor are the wide ones: a filter that has explained its errors by something else
         cannot take that back, as a window can.
@@ -67,43 +115,43 @@ class Belief:
 
     @property
     def pose(self) -> Array:
-        """This is the mean pose (3,), a view of the mean; theta is not wrapped."""
+        """Mean pose (3,), a view of the mean; theta is not wrapped."""
         return self.mean[:POSE]
 
     @property
     def points(self) -> Array:
-        """Returns a view of the mean points (m, 2)."""
+        """Return a view of the mean points (m, 2)."""
         return self.mean[HEAD:].reshape(-1, POINT)
 
     @property
     def sensor(self) -> Array:
-        """Returns a view of the mean calibration of the sensor (5,)."""
+        """Return a view of the mean calibration of the sensor (5,)."""
         return self.mean[POSE + CALIBRATION_SIZE : HEAD]
 
     def corrected(self, detections: Detections) -> Detections:
-        """Returns the newest detections, corrected by the mean calibration of the sensor."""
+        """Return the newest detections, corrected by the mean calibration of the sensor."""
         points = detections.points_vehicle
         twists = np.tile(self.twist, (len(points), 1))
         return replace(detections, points_vehicle=corrected(points, twists, self.sensor))
 
     def by_sensor(self, points_vehicle: Array) -> Array:
-        """Returns the derivatives (m, 2, 5) of the newest detections (m, 2) by the sensor's calibration."""
+        """Return the derivatives (m, 2, 5) of the newest detections (m, 2) by the sensor's calibration."""
         return by_sensor(points_vehicle, np.tile(self.twist, (len(points_vehicle), 1)))
 
     def vehicle_state(self) -> VehicleState:
-        """Returns a copy of the pose and the calibration, with their joint covariance."""
+        """Return a copy of the pose and the calibration, with their joint covariance."""
         covariance = self.covariance[:HEAD, :HEAD].copy()
         return VehicleState.split(self.pose, self.mean[POSE:HEAD], covariance)
 
     def follow(self, motion: MeasuredMotion) -> None:
-        """Predicts the pose after a motion, and updates by a bias that was measured at rest."""
+        """Predict the pose after a motion, and updates by a bias that was measured at rest."""
         self.predict(motion.odometry)
         if motion.bias is not None:
             measured, noise = np.array([motion.bias.value]), np.array([[motion.bias.sigma**2]])
             self.update(np.array([POSE + 1]), lambda x: x, measured, noise)
 
     def predict(self, odometry: IntegratedOdometry) -> None:
-        """Predicts `pose <- pose * delta * (error - J calibration)`; the error is that of the odometry."""
+        """Predict `pose <- pose * delta * (error - J calibration)`; the error is that of the odometry."""
         drift, size, self.twist = odometry.calibration_jacobian, HEAD + POSE, odometry.twist
         augmented = np.zeros((size, size))
         augmented[:HEAD, :HEAD] = self.covariance[:HEAD, :HEAD]
@@ -123,7 +171,7 @@ class Belief:
     def update(
         self, columns: IntArray, function: Callable[[Array], Array], measured: Array, noise: Array
     ) -> None:
-        """Makes one Kalman update: `measured` (q,) is `function(x[columns])` plus noise of covariance (q, q).
+        """Make one Kalman update: `measured` (q,) is `function(x[columns])` plus noise of covariance (q, q).
 
         The function maps points (k, d) to (k, q), row by row.
         """
@@ -136,7 +184,7 @@ class Belief:
         self.covariance = 0.5 * (self.covariance + self.covariance.T)
 
     def predict_detections(self, points: IntArray) -> Transformed:
-        """Predicts the corrected detections of points (k,): mean (2 k,) and covariance (2 k, 2 k).
+        """Predict the corrected detections of points (k,): mean (2 k,) and covariance (2 k, 2 k).
 
         They are in the vehicle frame. An error of the sensor's calibration moves them, too.
         """
@@ -145,11 +193,11 @@ class Belief:
         return transform(self.measuring(points), self.mean[columns], covariance)
 
     def measuring_columns(self, others: IntArray) -> IntArray:
-        """Returns the entries of x that detections depend on: the pose, the sensor, and others (k,)."""
+        """Return the entries of x that detections depend on: the pose, the sensor, and others (k,)."""
         return np.concatenate([np.arange(POSE), SENSOR_COLUMNS, others])
 
     def measuring(self, points: IntArray) -> Callable[[Array], Array]:
-        """Returns the function from [pose | sensor | points] (k, d) to corrected detections of points (k,).
+        """Return the function from [pose | sensor | points] (k, d) to corrected detections of points (k,).
 
         It is `R' (p - t) - C (b - b0)`, where b0 is the mean calibration by which they are corrected.
         """
@@ -163,7 +211,7 @@ class Belief:
         return detect
 
     def add_points(self, detections: Array, covariances: Array) -> None:
-        """Adds points at the end of x, at detections (k, 2) with covariances (k, 2, 2), vehicle frame."""
+        """Add points at the end of x, at detections (k, 2) with covariances (k, 2, 2), vehicle frame."""
         own = block_diag(self.covariance[:POSE, :POSE], *covariances)
         mean = np.concatenate([self.pose, detections.ravel()])
         placed = transform(lambda x: to_map_rows(x[:, :POSE], x[:, POSE:]), mean, own)
@@ -172,7 +220,7 @@ class Belief:
         self.covariance = np.block([[self.covariance, cross.T], [cross, placed.covariance]])
 
     def transform_points(self, start: int, stop: int, matrix: Array, sigma: Array) -> None:
-        """Replaces the points [start, stop) by `matrix` (k, stop - start) times them, for both coordinates.
+        """Replace the points [start, stop) by `matrix` (k, stop - start) times them, for both coordinates.
 
         Independent noise with standard deviations sigma (k,) in m is added to them. The change is linear, so
         this is what the cubature rule gives.
@@ -193,19 +241,19 @@ class Belief:
         )
 
     def reorder(self, points: IntArray) -> None:
-        """Puts the points into another order, or keeps some of them, by their indices (k,)."""
+        """Put the points into another order, or keep some of them, by their indices (k,)."""
         columns = np.concatenate([np.arange(HEAD), point_columns(points)])
         self.mean = self.mean[columns]
         self.covariance = self.covariance[np.ix_(columns, columns)]
 
 
 def point_columns(points: IntArray) -> IntArray:
-    """Returns the entries (2 k,) of points (k,) in x."""
+    """Return the entries (2 k,) of points (k,) in x."""
     return (HEAD + POINT * points[:, None] + np.arange(POINT)).ravel()
 
 
 def to_map_rows(poses: Array, detections: Array) -> Array:
-    """Returns `R z + t` (k, 2 r), map frame, of r detections (k, 2 r) from each of k poses (k, 3)."""
+    """Return `R z + t` (k, 2 r), map frame, of r detections (k, 2 r) from each of k poses (k, 3)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x, y = detections[:, 0::2], detections[:, 1::2]
     placed = np.stack([c * x - s * y + poses[:, :1], s * x + c * y + poses[:, 1:2]], axis=2)
@@ -213,7 +261,7 @@ def to_map_rows(poses: Array, detections: Array) -> Array:
 
 
 def to_vehicle_rows(poses: Array, points: Array) -> Array:
-    """Returns `R' (p - t)` (k, 2 r), vehicle frame, of r map points (k, 2 r) from each of k poses (k, 3)."""
+    """Return `R' (p - t)` (k, 2 r), vehicle frame, of r map points (k, 2 r) from each of k poses (k, 3)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x, y = points[:, 0::2] - poses[:, :1], points[:, 1::2] - poses[:, 1:2]
     return np.stack([c * x + s * y, c * y - s * x], axis=2).reshape(len(poses), -1)

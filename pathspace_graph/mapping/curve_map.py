@@ -1,64 +1,56 @@
 """The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
-from typing import TypeAlias
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.gauge import pair_residuals
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.projection import project
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.projection import ProjectionRows, project
+from pathspace_graph.factors.sensor import SensorRows
 from pathspace_graph.graph.keys import CONTROL_LETTERS, SENSOR_KEY, control_keys, pose_keys
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Gauge
 
 from .detections import DetectionTable
 from .state import State
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-
-POINTS_PER_FACTOR = 6
-"""The weak priors of this number of consecutive control points are one factor, so that there are few factors
-and each of them is small."""
+POINTS_PER_FACTOR: Final = 6
+"""Consecutive control points whose weak priors are one factor: there are few factors, and each is small."""
 
 
 class CurveMap:
-    """Holds both boundaries and the detections of the window's poses, and builds their rows."""
+    """Both boundaries with the detections of the window's poses, and the rows of both."""
 
     def __init__(self, settings: MapperSettings, state: State | None = None) -> None:
         self.settings = settings
         self.state = state or State()
-        """The state holds the curves and all variables."""
+        """Curves and all variables."""
         self.variables = self.state.variables
         self.detections = DetectionTable()
-        """The table holds the detections of the poses in the window."""
+        """Detections of the poses in the window."""
         self.held_by_prior = False
-        """The prior holds the spacing and the shape of the curves, which the window then does not."""
+        """Whether the prior holds the spacing and shape of the curves, so that the window does not."""
         self.scatter: dict[int, Array] = {}
-        """Cones scatter about a boundary's curve by this sigma (m,) at each control point (m), where it is
-        known."""
+        """(m,) Standard deviation of cones about a boundary's curve at each control point (m), if known."""
         self.cones: dict[int, Array] = {}
-        """The cones of a closed boundary were detected at these parameters (k,) (m), where they are known."""
+        """(k,) Parameters of the cones of a closed boundary (m), where they are known."""
         self.reached_inactive = False
-        """The flag is set when a foot point of the latest `rows` has slid to an inactive part of a curve."""
-        self._found: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
+        """Whether a foot point of the latest `rows` has slid to an inactive part of a curve."""
+        self._refined: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
 
     # --- detections --------------------------------------------------------------------------------------
 
     def changed(self) -> IntArray:
-        """Returns the cycles (k,) whose associations have changed since they were last linearized."""
+        """Return the cycles (k,) whose associations have changed since they were last linearized."""
         return self.detections.cycle[self.detections.changed]
 
     def rows(self, cycles: IntArray) -> list[Rows]:
-        """Returns `w_i n_i . (R z_i + t - S(u_i)) / sigma_i` for the detections in use of ascending cycles.
+        """Return `w_i n_i . (R z_i + t - S(u_i)) / sigma_i` for the detections in use of ascending cycles.
 
         The keys are [pose | control points of the span]; w is the root of the Huber weight, and zero if the
         foot point is not interior. The refined parameters u are stored in the table only by `linearized`.
@@ -69,16 +61,20 @@ class CurveMap:
         rows = np.flatnonzero(detections.used & detections.in_cycles(cycles))
         curves, cycle = state.curves, detections.cycle[rows]
         curve = curves.number(detections.boundary[rows])
-        poses = self.variables.poses_at(cycle)
-        points = to_map(detections.corrected(rows, self.variables.sensor), poses)
+        points = detections.points_map(rows, self.variables)
         foot = curves.refine(state.map_points, points, curve, detections.u[rows])
-        self._found, self.reached_inactive = (rows, foot.u), curves.reaches_inactive(curve, foot)
-        jacobian, residual = self._across(rows, points, poses, foot)
+        self._refined, self.reached_inactive = (rows, foot.u), curves.reaches_inactive(curve, foot)
+        projected, by = self.project(rows, points, foot)
+        factor, residual = by.factor[:, None], by.factor * projected.residual
+        weight = np.sqrt(huber_weights(residual / projected.sigma, self.settings.gate.huber))
+        weight *= foot.interior / projected.sigma
+        by_control = factor * projected.by_control.reshape(len(rows), 2 * foot.basis.shape[1])
+        jacobian = np.concatenate([factor * projected.by_pose, by.by_sensor, by_control], axis=1)
         keys = np.concatenate([self.measuring_keys(cycle), curves.keys[foot.columns]], axis=1)
-        return [Rows(keys, jacobian, residual, cycle)]
+        return [Rows(keys, jacobian * weight[:, None], residual * weight, cycle)]
 
     def measuring_keys(self, cycles: IntArray) -> IntArray:
-        """Returns the keys (m, k) that the detections of cycles (m,) depend on beside the curves.
+        """Return the keys (m, k) that the detections of cycles (m,) depend on beside the curves.
 
         These are the pose, and the calibration of the sensor where it is estimated.
         """
@@ -87,69 +83,66 @@ class CurveMap:
             return poses
         return np.concatenate([poses, np.full_like(poses, SENSOR_KEY)], axis=1)
 
-    def correct(self) -> None:
-        """Corrects the detections by the present calibration of the sensor."""
-        self.detections.correct(self.variables.sensor)
+    def project(self, rows: IntArray, points: Array, foot: FootPoints) -> tuple[ProjectionRows, SensorRows]:
+        """Return the distances of detections (m,) at points (m, 2) from their foot points, not whitened.
 
-    def _across(self, rows: IntArray, points: Array, poses: Array, foot: FootPoints) -> tuple[Array, Array]:
-        """Returns the weighted Jacobian (m, 3 + q + 2 (degree + 1)) and residual (m,) of signed distances.
-
-        The detections (m,) are at points (m, 2), map frame, from poses (m, 3). Their q derivatives by the
-        sensor's calibration are 5 or none.
+        The second result says how they depend on the sensor's calibration.
         """
-        settings, detections = self.settings, self.detections
-        projected = project(points, detections.covariance[rows], poses, foot, settings.spline.sigma_model)
-        by = detections.sensor_rows(rows, foot.normal_unit, projected.residual, poses, self.variables.sensor)
-        residual = by.factor * projected.residual
-        weight = np.sqrt(huber_weights(residual / projected.sigma, settings.gate.huber))
-        weight *= foot.interior / projected.sigma
-        by_control = projected.by_control.reshape(len(rows), 2 * foot.basis.shape[1])
-        factor = by.factor[:, None]
-        jacobian = np.concatenate([factor * projected.by_pose, by.by_sensor, factor * by_control], axis=1)
-        return jacobian * weight[:, None], residual * weight
+        detections, variables = self.detections, self.variables
+        poses, sigma_model = variables.poses_at(detections.cycle[rows]), self.settings.spline.sigma_model
+        projected = project(points, detections.covariance[rows], poses, foot, sigma_model)
+        residual, normals = projected.residual, foot.normal_unit
+        return projected, detections.sensor_rows(rows, normals, residual, poses, variables.sensor)
+
+    def correct(self) -> None:
+        """Do nothing: detections are corrected when their points are asked for."""
 
     def linearized(self, cycles: IntArray) -> None:
-        """Accepts the latest `rows`, of these cycles: the graph holds them from now on."""
+        """Accept the latest `rows`, of these cycles: the graph holds them from now on."""
         if len(cycles) and self.state.boundaries:
-            self.detections.refine(*self._found)
+            self.detections.refine(*self._refined)
             self.detections.mark_linearized()
 
     def activate(self, keys: IntArray) -> None:
-        """Makes control points active, which lie next to the active ones."""
-        for label, indices in self.state.active_stretch.items():
-            numbers = self.state.keys(label)[:1] + np.arange(indices[0])
-            back = np.flatnonzero(np.isin(numbers, keys))
-            self.state.active_stretch[label] = np.append(back, indices)
+        """Make control points active, which lie next to the active ones."""
+        self.state.activate(keys)
 
     def move(self, motion: Array) -> None:
-        """Moves the cones that the curves were grown through by a rigid motion (3,) of the map frame."""
+        """Move the cones that the curves were grown through by a rigid motion (3,) of the map frame."""
         for boundary in self.state.boundaries.values():
             boundary.move(motion)
 
     def activate_all(self) -> None:
-        """Makes every control point active."""
-        self.state.active_stretch = {}
+        """Make every control point active."""
+        self.state.activate_only({})
 
     def drop_cycle(self, cycle: int) -> None:
-        """Removes the detections of a cycle whose pose, the oldest one, has left the window."""
+        """Remove the detections of a cycle whose pose, the oldest one, has left the window."""
         self.detections.keep_from(cycle + 1)
         self.state.drop_oldest_pose_u()
+
+    def replaced_by(self, scatter: dict[int, Array], cones: dict[int, Array]) -> None:
+        """Note that curves of a batch have taken the place of the ones before, with the prior that has them.
+
+        Cones scatter about them by sigmas (m,), and were detected at parameters (k,), by label.
+        """
+        self.held_by_prior, self.scatter, self.cones = True, scatter, cones
 
     # --- weak priors -------------------------------------------------------------------------------------
 
     @property
     def structure(self) -> object:
-        """Returns an object that is replaced when the weak priors hold other control points than before."""
+        """Return an object that is replaced when the weak priors hold other control points than before."""
         return self.state.curves if self.state.boundaries else None
 
     def gauge(self, whole: bool) -> list[Rows]:
-        """Returns the spacing `(|c_{j+1} - c_j| - nominal_j) / (sigma_spacing nominal_j)`.
+        """Return the spacing `(|c_{j+1} - c_j| - nominal_j) / (sigma_spacing nominal_j)`.
 
         The rows hold the active control points, or all of them if `whole`.
         """
         if not self.state.boundaries or self.held_by_prior:
             return []
-        found = []
+        spacing = []
         for label, gauge in self._gauges(whole):
             points, sigma = (
                 self.state.control_points(label),
@@ -158,11 +151,11 @@ class CurveMap:
             first, second = points[gauge.pairs[:, 0]], points[gauge.pairs[:, 1]]
             off, direction = pair_residuals(first, second, gauge.nominal)
             jacobian = np.concatenate([-direction, direction], axis=1) / sigma[:, None]
-            found.append(self._rows(label, gauge.pairs, jacobian, off / sigma))
-        return [_stacked(found)]
+            spacing.append(self._rows(label, gauge.pairs, jacobian, off / sigma))
+        return [_stacked(spacing)]
 
     def linear_gauge(self, whole: bool) -> list[Rows]:
-        """Returns the linear priors: smoothness `D c / (sigma_smoothness spacing)`, and anchors.
+        """Return the linear priors: smoothness `D c / (sigma_smoothness spacing)`, and anchors.
 
         An anchor holds each control point where it is, so weakly that it only keeps the system regular. The
         rows hold the active control points, or all of them if `whole`.
@@ -183,7 +176,7 @@ class CurveMap:
             yield label, boundary.gauge_on(boundary.everything if whole else self.state.active(label))
 
     def _rows(self, label: int, points: IntArray, jacobian: Array, residual: Array) -> Rows:
-        """Returns rows, equally many for each row of `points` (m, k); neighbouring points share an owner."""
+        """Return rows, equally many for each row of `points` (m, k); neighbouring points share an owner."""
         repeated = np.repeat(points, len(residual) // max(len(points), 1), axis=0)
         owner = len(CONTROL_LETTERS) * (repeated[:, 0] // POINTS_PER_FACTOR) + label
         return Rows(
@@ -192,7 +185,6 @@ class CurveMap:
 
 
 def _stacked(groups: Sequence[Rows]) -> Rows:
-    """Concatenates groups of rows that have equally many keys."""
     return Rows(
         keys=np.concatenate([rows.keys for rows in groups]),
         jacobian=np.concatenate([rows.jacobian for rows in groups]),
@@ -202,11 +194,7 @@ def _stacked(groups: Sequence[Rows]) -> Rows:
 
 
 def _by_axis(coefficients: Array) -> Array:
-    """Returns (2 m, 2 k) the coefficients (m, k) of k points, once for x and once for y."""
+    """Return (2 m, 2 k) the coefficients (m, k) of k points, once for x and once for y."""
     both = np.zeros((len(coefficients), 2, coefficients.shape[1], 2))
     both[:, 0, :, 0] = both[:, 1, :, 1] = coefficients
     return both.reshape(2 * len(coefficients), 2 * coefficients.shape[1])
-
-
-CurveSmoother: TypeAlias = FixedLagSmoother[CurveMap]
-"""This is the fixed-lag engine on both boundaries' curves."""

@@ -1,52 +1,190 @@
-"""The motion between two perception cycles, as the estimators are given it."""
+"""The motion between two perception cycles, the prediction by it (paper: Predict), and its calibration."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pathspace_graph.factors.odometry import IntegratedOdometry
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.measured_noise import KnownNoise
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrate_twists
+from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, SENSOR_KEY, pose_key
+from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.system import SmootherSettings
+from pathspace_graph.graph.window import MapRows
+from pathspace_graph.io.log import Odometry
+from pathspace_graph.io.results import VehicleState
+from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
-Array = NDArray[np.float64]
+from .path import DrivenPath
+
+DOUBT_CYCLES: Final = 10
+"""Cycles from one judgement of all calibrations to the next."""
+KEYFRAME_INTERVAL: Final = 12.0
+"""Distance of the keyframes in whose frames the drive is kept until the loop closes (m along the path)."""
 
 
 @dataclass(frozen=True)
 class BiasMeasurement:
-    """Holds a measured bias of the yaw rate: what a vehicle at rest measures."""
+    """A measured bias of the yaw rate: what a vehicle at rest measures."""
 
     value: float
-    """This is the mean yaw rate (rad/s)."""
+    """Mean yaw rate (rad/s)."""
     sigma: float
-    """This is its standard deviation (rad/s)."""
+    """Its standard deviation (rad/s)."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMotion:
-    """Holds the motion that leads to a cycle, and what was found out about the odometry."""
+    """The motion that leads to a cycle, and what was found out about the odometry."""
 
     odometry: IntegratedOdometry
-    """This is the relative pose, with its covariance."""
+    """Relative pose, with its covariance."""
     twists: Array
-    """(k, 3) The vehicle moved with these twists since the last cycle, in m/s, m/s and rad/s."""
+    """(k, 3) Twists since the last cycle, in m/s, m/s and rad/s."""
     doubted: bool = False
-    """The flag is set where the detections contradict the odometry, and their own motion replaces it."""
+    """Whether the detections contradict the odometry, and their own motion replaces it."""
     missing: bool = False
-    """The flag is set where no twist was measured for long."""
+    """Whether no twist was measured for long."""
     stuck: bool = False
-    """The flag is set where the twist stays the same to the last digit."""
+    """Whether the twist stays the same to the last digit."""
     bias: BiasMeasurement | None = None
-    """This is what the vehicle has measured at rest, where it has just done so."""
+    """What the vehicle has measured at rest, where it has just done so."""
 
     @property
     def rests(self) -> bool:
-        """Return whether no twist says that the vehicle moves."""
         return not self.twists.any()
 
     @property
     def fault(self) -> str:
-        """Returns what is wrong with the odometry in plain words; it is empty where nothing is."""
+        """Return what is wrong with the odometry in plain words; it is empty where nothing is."""
         if self.missing:
             return "there is no odometry"
         return "the detections contradict the odometry" if self.doubted else ""
+
+
+# --- prediction ---------------------------------------------------------------------------------------
+
+
+def known_noise(sigma: Array | KnownNoise | None) -> KnownNoise:
+    """Return what is known of the noise before a drive.
+
+    An array (3,) states the standard deviations of a twist (m/s, m/s, rad/s). Without any, those of the
+    simulator are assumed until others are measured. Anything but three positive numbers is a SettingsError.
+    """
+    if isinstance(sigma, KnownNoise):
+        return replace(sigma, odometry=_checked(sigma.odometry))
+    if sigma is None:
+        return KnownNoise(np.array(ODOMETRY_SIGMA), odometry_stated=False)
+    return KnownNoise(_checked(sigma))
+
+
+def _checked(sigma: Array) -> Array:
+    noise = np.array(sigma, float)
+    if noise.shape != (POSE,) or not ((noise > 0.0) & (noise < np.inf)).all():
+        raise SettingsError(f"odometry_sigma: expected {POSE} positive numbers, found {noise.tolist()}")
+    return noise
+
+
+def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:
+    """Integrate twists, each held until the next and the last one until a stamp (s).
+
+    sigma, (3,) or (k, 3), is the standard deviation of one measured twist (m/s, m/s, rad/s).
+    """
+    return integrate_twists(np.diff(np.append(odometry.t, until)), odometry.twist, sigma)
+
+
+def predict(
+    smoother: FixedLagSmoother[MapRows],
+    path: DrivenPath,
+    motion: MeasuredMotion,
+    t: float,
+    settings: MapperSettings,
+) -> None:
+    """Add the pose at t (s) by the calibrated motion since the newest one, and extend the driven path."""
+    path.update(smoother.predict(t, motion.odometry, settings.odometry.sigmas_start))
+    path.steer(motion.twists)
+    if motion.bias is not None:
+        smoother.measure_bias(motion.bias.value, motion.bias.sigma)
+
+
+def doubted(mean: Array, variance: Array, settings: MapperSettings) -> MapperSettings:
+    """Return the settings, with wide priors of the calibrations if the drive contradicts one of them.
+
+    mean m and variance v, (2,) or (7,), are those of the calibrations. If a prior with mean p and standard
+    deviation sigma is right, then m - p had the variance `sigma^2 - v` before the drive. The priors that are
+    contradicted most become wide, those of the odometry or those of the sensor. So a prior has a heavy tail,
+    as that of a mixture of two Gaussians.
+    """
+    sigma = np.array(settings.sigmas_calibrations)
+    limits = np.full(len(sigma), settings.calibration.doubt)
+    limits[:CALIBRATION_SIZE] = settings.odometry.doubt
+    if settings.odometry.hold_scale:
+        limits[0] = np.inf
+    spread = sigma**2 - variance
+    shown = spread > np.finfo(np.float32).eps * sigma**2  # the drive says something at all
+    off = mean - settings.calibrations
+    square = np.where(shown, off**2 / np.where(shown, spread, 1.0), 0.0) / limits**2
+    most = int(np.argmax(square))
+    if square[most] <= 1.0:
+        return settings
+    if most < CALIBRATION_SIZE:
+        return replace(settings, odometry=settings.odometry.widened())
+    return replace(settings, calibration=settings.calibration.widened())
+
+
+def doubt_calibrations(
+    smoother: FixedLagSmoother[MapRows],
+    settings: MapperSettings,
+    sensor_doubted: bool,
+    measured: MapperSettings | None = None,
+) -> MapperSettings:
+    """Widen the priors of calibrations where the drive so far contradicts them.
+
+    Where the front end says that the prior of the sensor is doubted, it becomes wide at once, before other
+    variables have taken the sensor's errors over. Where it has measured the sensor's errors, the priors are
+    those of the settings `measured`.
+    It returns the settings with the priors as they are then. It is for an open loop: the prior of a closed
+    one is linearized where the calibration was then, and is surer of it than it may be.
+    """
+    if measured is not None:
+        settings = replace(settings, odometry=measured.odometry, calibration=measured.calibration)
+        _believe(smoother, settings)
+    if sensor_doubted and settings.calibration.doubt < inf:
+        settings = replace(settings, calibration=settings.calibration.widened())
+        _believe(smoother, settings)
+    if smoother.last_step is None or smoother.next_cycle % DOUBT_CYCLES:
+        return settings
+    variables = smoother.variables
+    variance = np.diag(smoother.last_covariance(variables.calibration_keys))
+    found = doubted(variables.calibrations, variance, settings)
+    _believe(smoother, found)
+    return found
+
+
+def _believe(smoother: FixedLagSmoother[MapRows], settings: MapperSettings) -> None:
+    smoother.believe_calibrations(np.array(settings.calibrations), np.array(settings.sigmas_calibrations))
+
+
+def vehicle_state(smoother: FixedLagSmoother[MapRows]) -> VehicleState:
+    """Return the newest pose and the calibration of a smoother, with their joint covariance."""
+    variables, keys = smoother.variables, [pose_key(smoother.next_cycle - 1), CALIBRATION_KEY]
+    if len(variables.sensor):
+        keys.append(SENSOR_KEY)
+    covariance = smoother.covariance(np.array(keys, np.intp))
+    return VehicleState.split(variables.poses[-1], variables.calibrations, covariance)
+
+
+def smoother_settings(settings: MapperSettings) -> SmootherSettings:
+    """Return the engine's part of an estimator's settings."""
+    return SmootherSettings(
+        lag=settings.lag,
+        max_poses=settings.max_poses,
+        tolerances=(settings.relinearize.point, settings.relinearize.heading),
+        keyframe_interval=KEYFRAME_INTERVAL,
+        sigmas_calibrations=settings.sigmas_calibrations,
+        calibrations=settings.calibrations,
+        relative=True,
+    )

@@ -1,40 +1,52 @@
-"""The driven path, and the path ahead as the current turn predicts it: curves grow along both."""
-
-from __future__ import annotations
+"""The driven path and the path ahead, along which curves grow, and the cones that come next beside it."""
 
 from dataclasses import dataclass
+from typing import Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import move_points
-from pathspace_graph.settings.growth import PathSettings
+from pathspace_graph.labels import LEFT, RIGHT
 
-Array = NDArray[np.float64]
+STEP: Final = 0.3
+"""Least distance of neighbouring positions of the stored path (m)."""
+MEMORY: Final = 60.0
+"""Length of the stored path behind the vehicle, and of the first stretch, which closing needs (m)."""
+BEGINNING_STEP: Final = 1.0
+"""Least distance of neighbouring poses of the stored first stretch (m)."""
+MAX_CURVATURE: Final = 0.3
+"""Largest curvature of the predicted path (1/m): that of a tight hairpin."""
+CURVATURE_GAIN: Final = 0.4
+"""Share of a cycle's measured curvature in the smoothed one."""
+MIN_SPEED: Final = 1.0
+"""Speed (m/s) below which yaw rate over speed is too uncertain to be a curvature."""
+SIDES: Final = {LEFT: 1.0, RIGHT: -1.0}
+"""Sign of the signed distance from the path (left positive) at which each boundary lies."""
 
 
 @dataclass(frozen=True, eq=False)
 class PathAhead:
-    """Holds the driven path and an arc ahead of the vehicle as one polyline."""
+    """The driven path and an arc ahead of the vehicle as one polyline."""
 
     points: Array
-    """(n, 2) Each row holds a position (x, y) in m, map frame."""
+    """(n, 2) Positions (x, y) in m, map frame."""
     stations: Array
-    """(n,) Each position has this station: the path length up to it (m)."""
+    """(n,) Path length up to each position (m)."""
     driven: float
-    """The vehicle is at this station (m)."""
+    """Station of the vehicle (m)."""
 
     def locate(self, points: Array) -> tuple[Array, Array]:
-        """Returns the stations (m,) and the signed distances (m,), left positive, of points (m, 2)."""
+        """Return the stations (m,) and the signed distances (m,), left positive, of points (m, 2)."""
         return along_and_across(points, self.points, self.stations)
 
-    def since(self, station: float) -> PathAhead:
-        """Returns the path from the last position before a station (m) on."""
+    def since(self, station: float) -> Self:
+        """Return the path from the last position before a station (m) on."""
         first = max(int(self.stations.searchsorted(station)) - 1, 0)
-        return PathAhead(self.points[first:], self.stations[first:], self.driven)
+        return type(self)(self.points[first:], self.stations[first:], self.driven)
 
     def beside(self, station: float, lateral: float) -> Array:
-        """Returns the point (2,) near a station (m), at a signed distance (m) to the left of the path."""
+        """Return the point (2,) near a station (m), at a signed distance (m) to the left of the path."""
         i = int(np.clip(np.searchsorted(self.stations, station), 1, len(self.stations) - 1))
         direction = self.points[i] - self.points[i - 1]
         direction /= max(np.hypot(*direction), np.finfo(float).tiny)
@@ -42,24 +54,23 @@ class PathAhead:
 
 
 class DrivenPath:
-    """The driven path is a polyline that grows with the vehicle; it also tracks the present curvature."""
+    """A polyline that grows with the vehicle, and the curvature of its present turn."""
 
-    def __init__(self, settings: PathSettings | None = None) -> None:
-        self.settings = settings or PathSettings()
+    def __init__(self) -> None:
         self.points: Array = np.zeros((0, 2))
-        """(n, 2) Each row holds a kept position (x, y) in m, map frame; they are at least a step apart."""
+        """(n, 2) Kept positions (x, y) in m, map frame, at least `STEP` apart."""
         self.stations: Array = np.zeros(0)
-        """(n,) Each kept position has this station: the path length up to it (m)."""
+        """(n,) Path length up to each of them (m)."""
         self.beginning: Array = np.zeros((0, 3))
-        """(k, 3) These are poses (x, y, theta) on the first stretch, which is as long as the memory."""
+        """(k, 3) Poses (x, y, theta) on the first stretch, which is as long as the memory."""
         self.length = 0.0
-        """The vehicle is at this station: the length of the driven path (m)."""
+        """Length of the driven path: the station of the vehicle (m)."""
         self.curvature = 0.0
-        """This is the smoothed curvature of the present turn (1/m), left positive."""
+        """Smoothed curvature of the present turn (1/m), left positive."""
         self._last: Array = np.zeros(2)
 
     def update(self, pose: Array) -> None:
-        """Extends the path to `pose` (3,), map frame."""
+        """Extend the path to `pose` (3,), map frame."""
         self._keep_beginning(pose)
         position = pose[:2]
         if len(self.points) == 0:
@@ -69,23 +80,23 @@ class DrivenPath:
         self._take_back(pose)
         distance = float(np.hypot(*(position - self.points[-1])))
         self.length = float(self.stations[-1]) + distance
-        if distance >= self.settings.step:
+        if distance >= STEP:
             self.points = np.concatenate([self.points, position[None]])
             self.stations = np.append(self.stations, self.length)
-            keep = self.stations >= self.length - self.settings.memory
+            keep = self.stations >= self.length - MEMORY
             self.points, self.stations = self.points[keep], self.stations[keep]
 
     def move(self, motion: Array) -> None:
-        """Moves the path behind the vehicle by a rigid motion (3,) of the map frame; its beginning stays."""
+        """Move the path behind the vehicle by a rigid motion (3,) of the map frame; its beginning stays."""
         self.points = move_points(motion, self.points)
         self._last = move_points(motion, self._last[None])[0]
 
     def _take_back(self, pose: Array) -> None:
-        """Shortens the path if the vehicle drove backwards to `pose` (3,)."""
+        """Shorten the path if the vehicle drove backwards to `pose` (3,)."""
         heading = np.array([np.cos(pose[2]), np.sin(pose[2])])
         moved = pose[:2] - self._last
         self._last = pose[:2].copy()
-        reach = float(np.hypot(*moved)) + self.settings.step
+        reach = float(np.hypot(*moved)) + STEP
         while moved @ heading < 0.0 and len(self.points) > 1:
             ahead = self.points[-1] - pose[:2]
             if ahead @ heading <= 0.0 or np.hypot(*ahead) > reach:
@@ -93,37 +104,34 @@ class DrivenPath:
             self.points, self.stations = self.points[:-1], self.stations[:-1]
 
     def _keep_beginning(self, pose: Array) -> None:
-        """Adds a pose to the beginning while the path is shorter than the memory."""
-        if self.length > self.settings.memory:
+        if self.length > MEMORY:
             return
         first = len(self.beginning) == 0
-        if first or np.hypot(*(pose[:2] - self.beginning[-1, :2])) >= self.settings.beginning_step:
+        if first or np.hypot(*(pose[:2] - self.beginning[-1, :2])) >= BEGINNING_STEP:
             self.beginning = np.concatenate([self.beginning, pose[None]])
 
     def steer(self, twists: Array) -> None:
-        """Updates the curvature by `w / v` of body twists (k, 3), if the vehicle is fast enough."""
+        """Update the curvature by `w / v` of body twists (k, 3), if the vehicle is fast enough."""
         if len(twists) == 0:
             return
         speed, _, rate = twists.mean(axis=0)
-        if speed > self.settings.min_speed:
-            limit = self.settings.max_curvature
-            now = float(np.clip(rate / speed, -limit, limit))
-            self.curvature += self.settings.curvature_gain * (now - self.curvature)
+        if speed > MIN_SPEED:
+            now = float(np.clip(rate / speed, -MAX_CURVATURE, MAX_CURVATURE))
+            self.curvature += CURVATURE_GAIN * (now - self.curvature)
 
     def ahead(self, pose: Array, reach: float) -> PathAhead:
-        """Returns the driven path, continued from `pose` (3,) by an arc of `reach` metres."""
-        step = self.settings.step
-        s = np.arange(0.0, reach + step, step)
+        """Return the driven path, continued from `pose` (3,) by an arc of `reach` metres."""
+        s = np.arange(0.0, reach + STEP, STEP)
         angle = 0.5 * self.curvature * s
         chord = s * np.sinc(angle / np.pi)
         direction = np.column_stack([np.cos(pose[2] + angle), np.sin(pose[2] + angle)])
-        behind = self.stations < self.length - 0.5 * step
+        behind = self.stations < self.length - 0.5 * STEP
         points = np.concatenate([self.points[behind], pose[:2] + chord[:, None] * direction])
         return PathAhead(points, np.concatenate([self.stations[behind], self.length + s]), self.length)
 
 
 def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array, Array]:
-    """Returns the station (m,) and signed distance (m,), left positive, of points (m, 2) beside a polyline.
+    """Return the station (m,) and signed distance (m,), left positive, of points (m, 2) beside a polyline.
 
     The polyline has at least two positions (n, 2) with stations (n,). Beyond the last position the station
     continues along the last segment.
@@ -142,3 +150,100 @@ def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array
     nearest = np.sign(cross) * np.sqrt(distance2[rows, best])
     lateral = np.where(overshoot > 0.0, cross / np.sqrt(length2[best]), nearest)
     return stations[best] + along * (stations[best + 1] - stations[best]), lateral
+
+
+def crosses(begin: Array, ends: Array, line: Array) -> BoolArray:
+    """Return whether each segment from `begin` (2,) to one of `ends` (k, 2) crosses a polyline (n, 2)."""
+    step, relative = ends - begin, line - begin
+    beside = step[:, :1] * relative[:, 1] - step[:, 1:] * relative[:, 0]
+    edge = np.diff(line, axis=0)
+    at_begin = edge[:, 1] * relative[:-1, 0] - edge[:, 0] * relative[:-1, 1]
+    at_end = at_begin + edge[:, 0] * step[:, 1:] - edge[:, 1] * step[:, :1]
+    parts = (beside[:, :-1] * beside[:, 1:] < 0.0) & (at_begin * at_end < 0.0)
+    return np.asarray(parts.any(axis=1))
+
+
+# --- cones that come next --------------------------------------------------------------------------------
+
+LATERAL_CHANGE: Final = 1.5
+"""How much farther from the path the next cone may be than the newest ones of the curve (m) ..."""
+LATERAL_RATE: Final = 0.2
+"""... and how much more of it for each metre along the path (m/m)."""
+BESIDE: Final = 2.0
+"""Cones less than this apart along the path stand beside each other (m)."""
+LATERAL_GAP: Final = 0.8
+"""A cone is behind the row if one beside it is nearer to the path by more than this (m)."""
+STATION_MARGIN: Final = 0.3
+"""Least distance past the end of a curve of what extends it (m along the path)."""
+END_BEHIND: Final = 5.0
+"""Farthest that the end of a curve is behind the vehicle (m along the path): a stranded end is carried on,
+and an older stretch of the path across the infield may be nearer to it, which means nothing."""
+STRANDED: Final = 2.0
+"""An end farther behind the vehicle than this, with nothing that extends it, is carried on (m) ..."""
+CARRIED_TO: Final = 1.0
+"""... to this distance behind the vehicle (m) ..."""
+MIN_LATERAL: Final = 0.5
+"""... at least at this distance from the path (m) ..."""
+MIN_CARRY: Final = 0.5
+"""... by at least this length (m), or not at all."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Points that a boundary may be extended through."""
+
+    points: Array
+    """(n, 2) Positions (x, y) in m, map frame."""
+    indices: IntArray
+    """(n,) Index of each among the tentative tracks, or among a cycle's detections."""
+    stations: Array
+    """(n,) Station of each along the path (m)."""
+    sides: Array
+    """(n,) Distance of each from the path (m), positive on the boundary's own side."""
+
+    def where(self, chosen: IntArray | BoolArray) -> Self:
+        """Return the chosen candidates, in the given order if they are chosen by index."""
+        return type(self)(
+            self.points[chosen], self.indices[chosen], self.stations[chosen], self.sides[chosen]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class End:
+    """Where the confirmed part of a curve ends."""
+
+    position: Array
+    """(2,) Position (x, y) in m, map frame."""
+    station: float
+    """Station along the path (m)."""
+    side: float
+    """Distance from the path (m), positive on the boundary's own side."""
+
+
+def chain(candidates: Candidates, end: End | None) -> IntArray:
+    """Return the indices of the candidates, sorted by station, that may follow one another.
+
+    A candidate i may follow the end of the curve if `side_i <= side_end + LATERAL_CHANGE + LATERAL_RATE
+    (s_i - s_end)`; without a curve the first candidate takes the place of the end. No candidate allows the
+    next one more than that, or a row would be left for the next lane's, step by step. Of candidates at about
+    the same station only those nearest to the path remain: a second row behind the first belongs to another
+    stretch of the track.
+    """
+    stations, sides = candidates.stations, candidates.sides
+    in_front = np.flatnonzero(in_front_row(stations, sides, BESIDE, LATERAL_GAP))
+    if len(in_front) == 0:
+        return in_front
+    first = in_front[0]
+    station, side = (stations[first], sides[first]) if end is None else (end.station, end.side)
+    room = LATERAL_CHANGE + LATERAL_RATE * (stations[in_front] - station)
+    return np.asarray(in_front[sides[in_front] <= side + room])
+
+
+def in_front_row(stations: Array, sides: Array, beside: float, gap: float) -> BoolArray:
+    """Return which points are in the row nearest to the path, from their stations and sides (n,), in m.
+
+    A point is behind that row if another one is less than `beside` (m) from it along the path, and nearer to
+    the path by more than `gap` (m).
+    """
+    near = np.abs(stations - stations[:, None]) < beside
+    return np.asarray(~(near & (sides < sides[:, None] - gap)).any(axis=1))

@@ -1,137 +1,147 @@
 """Registration of detections with a stretch of the curves: it finds the loop closure, and a lost vehicle."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import rotated, rotation, to_map, wrap_angle
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.se2 import rotation, wrap_angle
 from pathspace_graph.settings.closing import ClosingSettings
-from pathspace_graph.spline.boundary import Boundary
 
 from .curve_map import CurveMap
 from .path import DrivenPath
 from .state import State
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
+HEADING: Final = 0.8
+"""Largest angle between the heading and that of the beginning where the loop may close (rad)."""
+START_LATERAL: Final = 5.0
+"""Largest distance from the place of the start at which the vehicle crosses its line again (m) ..."""
+START_HEADING: Final = 0.5
+"""... and largest angle between both directions there (rad). The loop closes only after that."""
+WINDOW: Final = 2.0
+"""Age of the oldest detections that are registered (s)."""
+BEGINNING: Final = 60.0
+"""Length of the curves that counts as their beginning (m) ..."""
+BEGINNING_SHARE: Final = 0.6
+"""... and its largest share of a short curve."""
+REACH: Final = 3.0
+"""Distance from the curves of detections that the first iteration uses (m) ..."""
+SHRINK: Final = 0.7
+"""... and its factor for each further iteration, down to `closing.inlier_distance`."""
+ITERATIONS: Final = 7
+START_STEP: Final = 2.0
+"""Distance of the poses of the beginning from which the registration starts where the vehicle is lost (m)."""
+START_CHI2: Final = 16.3
+"""Their largest squared Mahalanobis distance under its uncertainty: 99.9 % of chi-square with 3 degrees."""
+MIN_DETECTIONS: Final = 25
+"""Least number of matched detections ..."""
+MIN_INLIERS: Final = 5
+"""... and of inliers on each boundary."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion is a rigid correction of the newest poses and their detections."""
+    """A rigid correction of the newest poses and their detections."""
 
     centre: Array
-    """(2,) The motion rotates about this point, the newest position, in m, map frame."""
+    """(2,) Centre of the rotation, the newest position, in m, map frame."""
     vector: Array
-    """(3,) The motion translates by (x, y) in m after the rotation by the third entry (rad)."""
+    """(3,) Translation (x, y) in m after the rotation by the third entry (rad)."""
 
     def apply(self, points: Array) -> Array:
-        """Returns the moved points (m, 2)."""
+        """Return the moved points (m, 2)."""
         c, s = np.cos(self.vector[2]), np.sin(self.vector[2])
         turned = (points - self.centre) @ np.array([[c, s], [-s, c]])
         return np.asarray(turned + self.centre + self.vector[:2])
 
     def move(self, poses: Array) -> None:
-        """Moves poses (m, 3) in place."""
+        """Move poses (m, 3) in place."""
         poses[:, :2] = self.apply(poses[:, :2])
         poses[:, 2] += self.vector[2]
 
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Holds coloured detections, where the vehicle believes that they are."""
+    """Coloured detections, where the vehicle believes that they are."""
 
     rows: IntArray
-    """(m,) These are the detections, by row of the table that they are from."""
+    """(m,) Rows of the detections in their table."""
     labels: IntArray
-    """(m,) Each detection has this label."""
     points: Array
-    """(m, 2) Each detection is at this point in m, map frame."""
+    """(m, 2) Positions in m, map frame."""
     covariances: Array
-    """(m, 2, 2) Each detection has this covariance in m^2, map frame."""
+    """(m, 2, 2) Covariances in m^2, map frame."""
     explained: BoolArray
     """(m,) Whether the newest curves explain the detection: only these can contradict a place."""
 
-    def where(self, chosen: IntArray) -> Sightings:
-        """Returns some of the detections, by index."""
-        return Sightings(
-            self.rows[chosen],
-            self.labels[chosen],
-            self.points[chosen],
-            self.covariances[chosen],
-            self.explained[chosen],
-        )
-
     @classmethod
-    def of_points(cls, rows: IntArray, labels: IntArray, points: Array) -> Sightings:
+    def of_points(cls, rows: IntArray, labels: IntArray, points: Array) -> Self:
         """Return sightings that all count the same, by the least deviation of the registration."""
         return cls(rows, labels, points, np.zeros((len(rows), 2, 2)), np.ones(len(rows), bool))
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Holds the detections whose foot points are inside a stretch of their curve, for one motion."""
+    """The detections whose foot points are inside a stretch of their curve, for one motion."""
 
     rows: IntArray
-    """(m,) These are the detections, by row of the table."""
+    """(m,) Rows of the detections in their table."""
     labels: IntArray
-    """(m,) Each detection has this label."""
     u: Array
-    """(m,) Each detection has its foot point at this parameter."""
+    """(m,) Parameters of the foot points (m)."""
     inlier: BoolArray
-    """(m,) The flag is set when the detection is within `inlier_distance` of the curve."""
+    """(m,) Whether the detection is within `inlier_distance` of the curve."""
     explained: BoolArray
     """(m,) Whether the newest curves explain the detection."""
     hessian: Array
-    """(3, 3) This is the information about the motion, from the detections within reach."""
+    """(3, 3) Information about the motion, from the detections within reach."""
     negative_gradient: Array
-    """(3,) This is the negative gradient of the cost by the motion, from the same detections."""
+    """(3,) Negative gradient of the cost by the motion, from the same detections."""
 
     def inliers(self, label: int) -> tuple[IntArray, Array]:
-        """Returns the rows (k,) and the parameters (k,) of one boundary's inliers."""
+        """Return the rows (k,) and the parameters (k,) of one boundary's inliers."""
         chosen = self.inlier & (self.labels == label)
         return self.rows[chosen], self.u[chosen]
 
 
 @dataclass(frozen=True, eq=False)
-class Registration:
-    """Holds the correspondences between the newest detections and the beginning of the curves."""
+class RefinedMotion:
+    """A motion that the registration has ended with."""
 
     motion: Motion
-    """The motion moves the window onto the beginning."""
-    matches: dict[int, tuple[IntArray, Array]]
-    """Each boundary has the rows of its inliers and their parameters on the beginning."""
+    """The motion moves the detections onto their curves."""
+    matches: Matches
+    """Detections at the last iteration."""
+    covariance: Array
+    """(3, 3) Covariance of the motion (m, m, rad)."""
 
 
 def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool:
-    """Returns whether a pose (3,) may be on the beginning again: after a long path, near it, and along it."""
+    """Return whether a pose (3,) may be on the beginning again: after a long path, near it, and along it."""
     if path.length < settings.min_path:
         return False
     drift = settings.radius + settings.drift * path.length
     away = np.hypot(*(path.beginning[:, :2] - pose[:2]).T)
-    same_direction = np.cos(path.beginning[:, 2] - pose[2]) > np.cos(settings.heading)
+    same_direction = np.cos(path.beginning[:, 2] - pose[2]) > np.cos(HEADING)
     return bool((same_direction & (away < drift)).any())
 
 
-def passes_start(state: State, path: DrivenPath, motion: Motion, settings: ClosingSettings) -> bool:
-    """Returns whether the newest path, moved, crosses the line at which the drive began, on its road.
+def passes_start(state: State, path: DrivenPath, motion: Motion) -> bool:
+    """Return whether the newest path, moved, crosses the line at which the drive began, on its road.
 
     A vehicle that comes back to a later place of its beginning has not closed a lap: on a skidpad it does so
     in each round.
     """
     start, turn = path.beginning[0, :2], rotation(path.beginning[0, 2])
-    newest = motion.apply(path.points[path.stations > path.length - settings.beginning])
+    newest = motion.apply(path.points[path.stations > path.length - BEGINNING])
     ahead, left = ((newest - start) @ turn).T
     steps, forward = np.hypot(np.diff(ahead), np.diff(left)), np.diff(ahead)
-    crosses = (ahead[:-1] <= 0.0) & (ahead[1:] > 0.0) & (np.abs(left[1:]) < settings.start_lateral)
-    crosses &= forward > np.cos(settings.start_heading) * steps
+    crosses = (ahead[:-1] <= 0.0) & (ahead[1:] > 0.0) & (np.abs(left[1:]) < START_LATERAL)
+    crosses &= forward > np.cos(START_HEADING) * steps
     for label, boundary in state.boundaries.items():
-        u = np.arange(0.0, min(settings.beginning, boundary.confirmed_end), boundary.settings.search_step)
+        u = np.arange(0.0, min(BEGINNING, boundary.confirmed_end), boundary.settings.search_step)
         curve = boundary.evaluate(state.control_points(label), u) - start
         _, beside = curve[np.hypot(*curve.T).argmin()] @ turn
         crosses &= (left[1:] - beside) * beside < 0.0  # on the same side of it as the start
@@ -140,50 +150,33 @@ def passes_start(state: State, path: DrivenPath, motion: Motion, settings: Closi
 
 def register(
     track: CurveMap, times: Sequence[float], covariance: Array, beginning: Array, settings: ClosingSettings
-) -> Registration | None:
-    """Registers the newest detections with the beginning of the curves; returns None if they disagree.
+) -> RefinedMotion | None:
+    """Register the newest detections with the beginning of the curves; return None if they disagree.
 
     Iterated closest points on the curves minimize `sum (n . (M p - S(u)))^2 / sigma^2 + m' P^-1 m`. The
     `covariance` P (3, 3) of the newest pose is the prior, because detections along a straight or an arc leave
     the motion free. If P is larger than what the iteration can bridge, the iteration starts from the best
     pose of the `beginning` (k, 3), the first stretch of the drive. `times` are the stamps of the poses (s).
     """
-    recent, state = _recent(track, times, settings.window), track.state
+    recent, state = _recent(track, times), track.state
     prior = np.asarray(np.linalg.inv(covariance * settings.prior_scale**2), np.float64)
-    stretches = {label: _beginning(boundary, settings) for label, boundary in state.boundaries.items()}
+    stretches = {
+        label: (0.0, min(BEGINNING, BEGINNING_SHARE * boundary.confirmed_end))
+        for label, boundary in state.boundaries.items()
+    }
     centre = state.poses[-1, :2].copy()
     vector = np.zeros(3)
     lost = is_lost(covariance, settings)
     if lost:
-        motions = _motions(state.poses[-1], beginning, settings)
-        starts = [v for v in motions if v @ prior @ v < settings.start_chi2]
+        starts = [v for v in _motions(state.poses[-1], beginning) if v @ prior @ v < START_CHI2]
         inliers = [
-            _match(state, settings, recent, Motion(centre, v), stretches, settings.icp_reach).inlier.sum()
+            _match(state, settings, recent, Motion(centre, v), stretches, REACH).inlier.sum()
             for v in [vector, *starts]
         ]
         vector = [vector, *starts][int(np.argmax(inliers))]
     found = refine(state, recent, Motion(centre, vector), stretches, (np.zeros(3), prior), settings)
-    if not found.agrees(list(state.boundaries), settings, lost):
-        return None
-    return Registration(found.motion, {label: found.matches.inliers(label) for label in state.boundaries})
-
-
-@dataclass(frozen=True, eq=False)
-class RefinedMotion:
-    """Holds a motion that the registration has ended with."""
-
-    motion: Motion
-    """The motion moves the detections onto their curves."""
-    matches: Matches
-    """These are the detections at the last iteration."""
-    covariance: Array
-    """(3, 3) This is the covariance of the motion (m, m, rad)."""
-
-    def agrees(self, labels: list[int], settings: ClosingSettings, lost: bool) -> bool:
-        """Returns whether the detections agree with the curves, and hold the motion in every direction."""
-        return agrees(self.matches, labels, settings) and is_certain(
-            self.matches, self.covariance, settings, lost
-        )
+    agree = agrees(found.matches, list(state.boundaries), settings)
+    return found if agree and is_certain(found.matches, found.covariance, settings, lost) else None
 
 
 def refine(
@@ -194,12 +187,13 @@ def refine(
     prior: tuple[Array, Array],
     settings: ClosingSettings,
 ) -> RefinedMotion:
-    """Refines a motion by iterated closest points on a stretch (low, high) of each curve, by label.
+    """Refine a motion by iterated closest points on a stretch (low, high) of each curve, by label.
 
     The prior of the motion has the mean (3,) and the information (3, 3).
     """
     (mean, information), vector = prior, start.vector
-    for reach in _reaches(settings):
+    for iteration in range(ITERATIONS):
+        reach = max(settings.inlier_distance, REACH * SHRINK**iteration)
         matches = _match(state, settings, seen, Motion(start.centre, vector), stretches, reach)
         negative_gradient = matches.negative_gradient - information @ (vector - mean)
         vector = vector + np.linalg.solve(matches.hessian + information, negative_gradient)
@@ -207,41 +201,31 @@ def refine(
     return RefinedMotion(Motion(start.centre, vector), matches, covariance)
 
 
-def _beginning(boundary: Boundary, settings: ClosingSettings) -> tuple[float, float]:
-    """Returns the stretch of a curve that counts as its beginning."""
-    return 0.0, min(settings.beginning, settings.beginning_share * boundary.confirmed_end)
-
-
 def is_lost(covariance: Array, settings: ClosingSettings) -> bool:
-    """Returns whether a pose with this covariance (3, 3) is less certain than the registration can bridge."""
+    """Return whether a pose with this covariance (3, 3) is less certain than the registration can bridge."""
     prior = np.linalg.inv(covariance * settings.prior_scale**2)
-    return bool(np.linalg.eigvalsh(prior[:2, :2])[0] < settings.icp_reach**-2)
+    return bool(np.linalg.eigvalsh(prior[:2, :2])[0] < REACH**-2)
 
 
-def _motions(pose: Array, beginning: Array, settings: ClosingSettings) -> list[Array]:
-    """Returns motions (3,) from a pose (3,) to poses of the beginning (k, 3) that are `start_step` apart."""
+def _motions(pose: Array, beginning: Array) -> list[Array]:
+    """Return motions (3,) from a pose (3,) to poses of the beginning (k, 3) that are `START_STEP` apart."""
     along = np.hypot(*np.diff(beginning[:, :2], axis=0, prepend=beginning[:1, :2]).T).cumsum()
-    _, first = np.unique(along // settings.start_step, return_index=True)
+    _, first = np.unique(along // START_STEP, return_index=True)
     motions = beginning[first] - pose
     motions[:, 2] = wrap_angle(motions[:, 2])
     return list(motions)
 
 
-def _recent(track: CurveMap, times: Sequence[float], seconds: float) -> Sightings:
-    """Returns the coloured detections of the newest poses."""
+def _recent(track: CurveMap, times: Sequence[float]) -> Sightings:
+    """Return the coloured detections of the newest poses."""
     detections, variables, stamps = track.detections, track.variables, np.asarray(times)
-    rows = np.flatnonzero(stamps[detections.cycle - variables.first_cycle] > stamps[-1] - seconds)
+    rows = np.flatnonzero(stamps[detections.cycle - variables.first_cycle] > stamps[-1] - WINDOW)
     rows = rows[np.isin(detections.label[rows], list(track.state.boundaries))]
-    poses = variables.poses_at(detections.cycle[rows])
-    covariances = rotated(detections.covariance[rows], poses[:, 2])
-    points, used = to_map(detections.point[rows], poses), detections.used[rows]
-    return Sightings(rows, detections.label[rows], points, covariances, used)
-
-
-def _reaches(settings: ClosingSettings) -> Iterator[float]:
-    """Yields the decreasing distance (m) within which detections are used in each iteration."""
-    for iteration in range(settings.icp_iterations):
-        yield max(settings.inlier_distance, settings.icp_reach * settings.icp_shrink**iteration)
+    points, covariances = (
+        detections.points_map(rows, variables),
+        detections.covariances_map(rows, variables),
+    )
+    return Sightings(rows, detections.label[rows], points, covariances, detections.used[rows])
 
 
 def _match(
@@ -252,7 +236,7 @@ def _match(
     stretches: Mapping[int, tuple[float, float]],
     reach: float,
 ) -> Matches:
-    """Matches moved detections with a stretch of each curve, and linearizes those within `reach` (m)."""
+    """Match moved detections with a stretch of each curve, and linearizes those within `reach` (m)."""
     moved = motion.apply(seen.points)
     hessian, negative_gradient = np.zeros((3, 3)), np.zeros(3)
     matched, u, inlier = [np.zeros(0, np.intp)], [np.zeros(0)], [np.zeros(0, bool)]
@@ -277,7 +261,7 @@ def _match(
 
 
 def by_motion(normals: Array, arms: Array) -> Array:
-    """Returns the derivatives (m, 3) of distances across curves by a motion about the arms' origin.
+    """Return the derivatives (m, 3) of distances across curves by a motion about the arms' origin.
 
     The normals (m, 2) are unit vectors, and the arms (m, 2) lead to the points (m), both in the map frame.
     """
@@ -286,33 +270,33 @@ def by_motion(normals: Array, arms: Array) -> Array:
 
 
 def worst_sigma(covariance: Array) -> float:
-    """Returns the standard deviation (m) of a position in its worst direction, by covariance (3, 3)."""
+    """Return the standard deviation (m) of a position in its worst direction, by covariance (3, 3)."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
 
 
 def sigma_of_information(information: Array) -> float:
-    """Returns `worst_sigma` of an information (3, 3); it is infinite where a direction is not held."""
+    """Return `worst_sigma` of an information (3, 3); it is infinite where a direction is not held."""
     if np.linalg.matrix_rank(information) < len(information):
         return np.inf
     return worst_sigma(np.asarray(np.linalg.inv(information), np.float64))
 
 
 def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bool:
-    """Returns whether nearly all of enough detections are inliers, on a long stretch of every boundary.
+    """Return whether nearly all of enough detections are inliers, on a long stretch of every boundary.
 
     Detections that the newest curves do not explain are clutter, of another stretch of the road, or ahead of
     all that was mapped yet: where they are no inliers, they say nothing.
     """
     asked = matches.explained
     count, inliers = int(asked.sum()), int(matches.inlier[asked].sum())
-    if count < settings.min_readings or inliers < settings.inlier_share * count:
+    if count < MIN_DETECTIONS or inliers < settings.inlier_share * count:
         return False
     on_each = [matches.inliers(label)[1] for label in labels]
-    return all(len(u) >= settings.min_boundary_readings and np.ptp(u) >= settings.overlap for u in on_each)
+    return all(len(u) >= MIN_INLIERS and np.ptp(u) >= settings.overlap for u in on_each)
 
 
 def is_certain(matches: Matches, posterior: Array, settings: ClosingSettings, lost: bool = False) -> bool:
-    """Returns whether the motion is certain in every direction.
+    """Return whether the motion is certain in every direction.
 
     The limit is wider after a long stretch of the beginning has been driven again, because more detections
     would add little. It is not wider if the vehicle is `lost`: then one place along a straight agrees as well

@@ -1,13 +1,11 @@
 """The change of an open curve whose end overlaps its beginning to a periodic one (paper: Simplification)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pathspace_graph.settings.closing import ClosingSettings
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.settings.knots import BreakSettings, FitSettings, Knots
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
@@ -15,39 +13,47 @@ from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.cone_knots import thin
 from pathspace_graph.spline.knots import curvature_weighted_breaks, refit
 
-Array = NDArray[np.float64]
+from .registration import BEGINNING
 
-
-EXTRAPOLATED = 2
-"""Parameters up to this number of knot intervals past the confirmed end are mapped to the closed curve."""
+EXTRAPOLATED: Final = 2
+"""Knot intervals past the confirmed end whose parameters are mapped to the closed curve."""
+JOIN_MARGIN: Final = 10.0
+"""The seam lies within the last `BEGINNING` plus this length of a curve (m) ..."""
+JOIN_SHARE: Final = 0.5
+"""... and past this share of a short one."""
+OVERLAP_STEP: Final = 1.0
+"""Step at which points of the overlap are placed on the beginning (m)."""
+OVERLAP_ROOM: Final = 4.0
+"""Room about its expected place in which a point of the overlap is searched for (m along the curve)."""
+SEAM_MARGIN: Final = 0.5
+"""A cone nearer to the seam than this (m) was also detected at the beginning, and is not counted twice."""
 
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """Holds the correspondence between a curve's end and its beginning."""
+    """The correspondence between a curve's end and its beginning."""
 
     period: float
-    """The closed curve has this length in the open curve's parameter (m)."""
+    """Length of the closed curve in the open curve's parameter (m)."""
     u: Array
-    """(k,) These are increasing parameters of the open curve's end, from the seam on."""
+    """(k,) Increasing parameters of the open curve's end, from the seam on."""
     w: Array
-    """(k,) These are the parameters of the same places on the beginning, from 0 on."""
+    """(k,) Parameters of the same places on the beginning, from 0 on."""
 
     def new_parameter(self, u: Array) -> Array:
-        """Maps parameters of the open curve to those of the closed one, which are not wrapped."""
+        """Map parameters of the open curve to those of the closed one, which are not wrapped."""
         return np.where(u < self.u[0], u, self.period + np.interp(u, self.u, self.w))
 
 
 @dataclass(frozen=True, eq=False)
 class PeriodicCurve:
-    """Holds the periodic curve that replaces an open one."""
+    """The periodic curve that replaces an open one."""
 
     overlap: Overlap
-    """The overlap maps the open curve's parameters to the closed curve's."""
     knots: Array
-    """(m + 2 p + 1,) These are the periodic knots."""
+    """(m + 2 p + 1,) Periodic knots."""
     points: Array
-    """(m, 2) These are the control points in m, map frame."""
+    """(m, 2) Control points in m, map frame."""
     old_from_new: Array
     """(n, m) The matrix E changes the variables: `C_old = E C_new`."""
 
@@ -55,9 +61,9 @@ class PeriodicCurve:
 def make_periodic(
     boundary: Boundary, control_points: Array, settings: MapperSettings, knots: Knots
 ) -> PeriodicCurve:
-    """Returns the periodic curve that is nearest to an open one with control points (n, 2)."""
+    """Return the periodic curve that is nearest to an open one with control points (n, 2)."""
     spline = boundary.spline(control_points)
-    overlap = find_overlap(boundary, control_points, settings.closing)
+    overlap = find_overlap(boundary, control_points)
     breaks = _breaks(boundary, control_points, overlap.period, settings, knots)
     frame = BSpline.periodic_from(breaks, np.zeros((len(breaks) - 1, 2)), boundary.degree)
     change = refit(spline, frame, overlap.new_parameter)
@@ -67,12 +73,12 @@ def make_periodic(
 def _breaks(
     boundary: Boundary, control_points: Array, period: float, settings: MapperSettings, knots: Knots
 ) -> Array:
-    """Returns the closed curve's breaks (m + 1,), where m is a share of the number of its cones.
+    """Return the closed curve's breaks (m + 1,), where m is a share of the number of its cones.
 
     The place of a cone is its parameter on the present curve.
     """
     u = np.array(boundary.cone_parameters)
-    u = _apart(u[u < period - settings.closing.seam_margin], settings.growth.merge_radius)
+    u = _apart(u[u < period - SEAM_MARGIN], settings.growth.merge_radius)
     size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
     if knots == "curvature" or size >= len(u):
         baseline = BreakSettings(settings.spline.linear_baseline)
@@ -83,7 +89,7 @@ def _breaks(
 
 
 def _apart(values: Array, distance: float) -> Array:
-    """Returns those of the sorted values (k,) that exceed the last returned one by more than `distance`."""
+    """Return those of the sorted values (k,) that exceed the last returned one by more than `distance`."""
     kept: list[float] = []
     for value in values.tolist():
         if not kept or value - kept[-1] > distance:
@@ -91,31 +97,30 @@ def _apart(values: Array, distance: float) -> Array:
     return np.array(kept)
 
 
-def find_overlap(boundary: Boundary, control_points: Array, settings: ClosingSettings) -> Overlap:
-    """Finds the overlap of a curve's end and beginning; the seam is the beginning's foot point on the end.
+def find_overlap(boundary: Boundary, control_points: Array) -> Overlap:
+    """Find the overlap of a curve's end and beginning; the seam is the beginning's foot point on the end.
 
     If the end does not reach the beginning, the gap between them counts as straight.
     """
     confirmed_end = boundary.confirmed_end
-    late = confirmed_end - settings.beginning - settings.join_margin
-    late = max(late, settings.join_share * confirmed_end)
+    late = max(confirmed_end - BEGINNING - JOIN_MARGIN, JOIN_SHARE * confirmed_end)
     ends = boundary.evaluate(control_points, np.array([0.0, confirmed_end]))
     foot = boundary.find(control_points, ends[:1], np.array([late]), np.array([confirmed_end]))
     if not foot.interior[0]:
         period = confirmed_end + float(np.hypot(*(ends[0] - ends[1])))
         return Overlap(period, np.array([period, period + 1.0]), np.array([0.0, 1.0]))
     seam = float(foot.u[0])
-    u = np.linspace(seam, confirmed_end, max(int((confirmed_end - seam) / settings.overlap_step), 1) + 1)
-    w = _on_beginning(boundary, control_points, u, settings.overlap_room)
+    u = np.linspace(seam, confirmed_end, max(int((confirmed_end - seam) / OVERLAP_STEP), 1) + 1)
+    w = _on_beginning(boundary, control_points, u)
     beyond = EXTRAPOLATED * boundary.nominal[0]
     return Overlap(seam, np.append(u, u[-1] + beyond), np.append(w, w[-1] + beyond))
 
 
-def _on_beginning(boundary: Boundary, control_points: Array, u: Array, room: float) -> Array:
-    """Returns parameters (k,) on the beginning of the end's points at u (k,), from 0 and never decreasing."""
+def _on_beginning(boundary: Boundary, control_points: Array, u: Array) -> Array:
+    """Return parameters (k,) on the beginning of the end's points at u (k,), from 0 and never decreasing."""
     guess = u - u[0]
     points = boundary.evaluate(control_points, u)
-    w = boundary.find(control_points, points, np.maximum(guess - room, 0.0), guess + room).u
+    w = boundary.find(control_points, points, np.maximum(guess - OVERLAP_ROOM, 0.0), guess + OVERLAP_ROOM).u
     w = np.maximum.accumulate(w)
     w[0] = 0.0
     return w

@@ -1,126 +1,230 @@
-"""The state of the spline estimators: the curves, and the variables of their control points and poses."""
+"""The state of the spline estimators: curves, and the variables of their control points and poses."""
 
-from __future__ import annotations
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_joint_foot_points
+from pathspace_graph.factors.spans import SpanPolynomials, Spans, lay_out
 from pathspace_graph.graph.keys import CONTROL_LETTERS, control_keys
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
-from .curves import Curves, lay_out_curves
+SAMPLE: Final = 0.25
+"""Step at which curves are sampled where they are compared with each other and with cones (m)."""
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """The active part of every curve: curves 0 to k - 1 in the order of their labels.
+
+    So detections of both boundaries are projected in one pass. The control points of all curves are rows of
+    one array, as `State.map_points` has them.
+    """
+
+    boundaries: tuple[Boundary, ...]
+    labels: IntArray
+    """(k,) Labels of the curves, ascending."""
+    active: tuple[IntArray, ...]
+    """Active control points of each curve, by index."""
+    tables: tuple[SpanPolynomials, ...]
+    """Tables of each whole curve."""
+    spans: Spans
+    """All spans of closed curves; an open curve begins at its first active control point."""
+    active_from: Array
+    """(k,) Parameter before which an open curve is inactive; minus infinity if all is active."""
+    keys: IntArray
+    """(m,) Keys of all control points."""
+
+    @classmethod
+    def of(cls, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> Self:
+        """Lay out boundaries, at least one, with the active control points (k,) of each."""
+        curves, active_of = tuple(boundaries.values()), tuple(active[label] for label in boundaries)
+        sizes = [boundary.size for boundary in curves]
+        offsets = np.cumsum([0, *sizes[:-1]]).tolist()
+        first = [0 if b.periodic else int(indices[0]) for b, indices in zip(curves, active_of, strict=True)]
+        tables = [b.tables.tail(start) if start else b.tables for b, start in zip(curves, first, strict=True)]
+        begins = [t.low if start else -np.inf for t, start in zip(tables, first, strict=True)]
+        return cls(
+            boundaries=curves,
+            labels=np.array(list(boundaries), np.intp),
+            active=active_of,
+            tables=tuple(boundary.tables for boundary in curves),
+            spans=lay_out(tables, [o + f for o, f in zip(offsets, first, strict=True)], sizes),
+            active_from=np.array(begins),
+            keys=np.concatenate([control_keys(label, b.numbers) for label, b in boundaries.items()]),
+        )
+
+    def number(self, labels: IntArray) -> IntArray:
+        """Return the index (m,) of the curve that has each label (m,)."""
+        return self.labels.searchsorted(labels)
+
+    def believed(self, curve: IntArray, high: Array) -> Array:
+        """Return upper limits (m,) of stretches, clipped so that they exclude extrapolated ends."""
+        trusted = np.array([boundary.trusted for boundary in self.boundaries])
+        return np.asarray(np.minimum(high, trusted[curve]))
+
+    def find(
+        self, control_points: Array, points: Array, curve: IntArray, low: Array, high: Array
+    ) -> FootPoints:
+        """Search the foot point of each point (m, 2) on its own curve (m,) and stretch [low, high]."""
+        s, high = self.boundaries[0].settings, self.believed(curve, high)
+        search = (s.search_step, s.search_iterations)
+        return joint_foot_points(self.spans, control_points, points, curve, low, high, *search)
+
+    def refine(self, control_points: Array, points: Array, curve: IntArray, u: Array) -> FootPoints:
+        """Refine the foot point of each point (m, 2) on its own curve (m,), starting at u (m,)."""
+        s = self.boundaries[0].settings
+        low, high = u - s.refine_room, self.believed(curve, u + s.refine_room)
+        return refine_joint_foot_points(
+            self.spans, control_points, points, curve, u, low, high, s.refine_iterations
+        )
+
+    def reaches_inactive(self, curve: IntArray, foot: FootPoints) -> bool:
+        """Return whether any foot point, each on its own curve (m,), is on an inactive part."""
+        return not self.spans.periodic and bool((foot.u <= self.active_from[curve]).any())
 
 
 class State:
-    """Holds the boundaries and the variables: control points (m) and poses (m, m, rad), map frame."""
+    """The boundaries and the variables: control points (m) and poses (m, m, rad), map frame."""
 
     def __init__(self, variables: Variables | None = None) -> None:
         self.variables = variables or Variables()
-        """The control points, the calibration and the poses are stored here by key."""
+        """Control points, calibration and poses by key."""
         self.boundaries: dict[int, Boundary] = {}
-        """The curves are sorted by label, as their control points are."""
+        """Curves, sorted by label as their control points are."""
         self.active_stretch: dict[int, IntArray] = {}
-        """A boundary that is partly inactive has its active control points (k,) here: one stretch in driving
-        order, by index from the boundary's first control point."""
+        """Active control points (k,) of a boundary that is partly inactive: one stretch in driving order, by
+        index from the boundary's first control point."""
         self.pose_u: dict[int, Array] = {}
-        """(P,) Each pose has its foot point at this parameter of each boundary; the parameter increases from
-        lap to lap."""
+        """(P,) Parameter of each pose's foot point on each boundary, which increases from lap to lap."""
         self._curves: Curves | None = None
 
-    def copy(self) -> State:
-        """Returns a state whose boundaries, values and pose parameters can change independently."""
-        other = State(self.variables.copy())
+    def copy(self) -> Self:
+        """Return a state whose boundaries, values and pose parameters can change independently."""
+        other = type(self)(self.variables.copy())
         other.boundaries, other.pose_u = dict(self.boundaries), dict(self.pose_u)
         return other
 
     # --- by key ------------------------------------------------------------------------------------------
 
     def keys(self, label: int) -> IntArray:
-        """Returns the keys (m,) of a boundary's control points."""
+        """Return the keys (m,) of a boundary's control points."""
         return control_keys(label, self.boundaries[label].numbers)
 
     @property
     def map_keys(self) -> IntArray:
-        """Returns the keys (m,) of all boundaries' control points, in the order of `map_points`."""
+        """Return the keys (m,) of all boundaries' control points, in the order of `map_points`."""
         return np.concatenate([np.zeros(0, np.intp), *(self.keys(label) for label in self.boundaries)])
 
     @property
     def map_points(self) -> Array:
-        """Returns a view of all boundaries' control points (m, 2) in m, map frame."""
+        """Return a view of all boundaries' control points (m, 2) in m, map frame."""
         layout, (left, right) = self.variables.layout, CONTROL_LETTERS
         both = slice(layout.block(left).start, layout.block(right).stop)
         return self.variables.values[both].reshape(-1, 2)
 
     def control_points(self, label: int) -> Array:
-        """Returns a view of a boundary's control points (m, 2) in m, map frame."""
+        """Return a view of a boundary's control points (m, 2) in m, map frame."""
         return self.variables.block(CONTROL_LETTERS[label]).reshape(-1, 2)
 
     @property
     def poses(self) -> Array:
-        """Returns a view of the poses (P, 3), the oldest first."""
+        """Return a view of the poses (P, 3), the oldest first."""
         return self.variables.poses
 
     @property
     def calibration(self) -> Array:
-        """Returns a view of the calibration: (scale error [-], yaw-rate bias [rad/s])."""
+        """Return a view of the calibration: (scale error [-], yaw-rate bias [rad/s])."""
         return self.variables.calibration
 
     # --- the curves --------------------------------------------------------------------------------------
 
-    def active(self, label: int) -> IntArray:
-        """Returns the indices (k,) of a boundary's active control points, in driving order."""
-        return self.active_stretch.get(label, self.boundaries[label].everything)
-
-    @property
-    def whole(self) -> bool:
-        """Returns whether every control point is active."""
-        return not self.active_stretch
-
     @property
     def closed(self) -> bool:
-        """Returns whether a curve is closed; both are closed together."""
+        """Return whether a curve is closed; both are closed together."""
         return any(boundary.periodic for boundary in self.boundaries.values())
 
     def spline(self, label: int) -> BSpline:
-        """Returns a boundary as a spline of its own, which later changes of the state leave alone."""
+        """Return a boundary as a spline of its own, which later changes of the state leave alone."""
         return self.boundaries[label].spline(self.control_points(label).copy())
 
     @property
     def splines(self) -> dict[int, BSpline]:
-        """Returns all boundaries as splines of their own, by label."""
+        """Return all boundaries as splines of their own, by label."""
         return {label: self.spline(label) for label in self.boundaries}
 
     @property
     def curves(self) -> Curves:
-        """Returns the boundaries, at least one, side by side; the result is cached."""
-        known = self._curves
-        if known is None or not known.is_current(self.boundaries, self.active):
-            active = {label: self.active(label) for label in self.boundaries}
-            known = self._curves = lay_out_curves(self.boundaries, active)
+        """Return the boundaries, at least one, side by side; the result is cached."""
+        known, active = self._curves, {label: self.active(label) for label in self.boundaries}
+        tables = [boundary.tables for boundary in self.boundaries.values()]
+        if known is None or [*map(id, (*known.tables, *known.active))] != [
+            *map(id, (*tables, *active.values()))
+        ]:
+            known = self._curves = Curves.of(self.boundaries, active)
         return known
 
     def add_boundary(self, label: int, boundary: Boundary, control_points: Array) -> None:
-        """Adds a boundary with control points (m, 2)."""
+        """Add a boundary with control points (m, 2)."""
         self.boundaries = dict(sorted({**self.boundaries, label: boundary}.items()))
         self.variables.insert(self.keys(label), control_points.ravel())
 
     def extend(self, label: int, points: Array) -> None:
-        """Adds the variables of control points (k, 2) by which a boundary has grown; they are active."""
+        """Add the variables of control points (k, 2) by which a boundary has grown; they are active."""
         size, count = self.boundaries[label].size, len(points)
         self.variables.insert(self.keys(label)[size - count :], points.ravel())
         if label in self.active_stretch:
             self.active_stretch[label] = np.append(self.active_stretch[label], np.arange(size - count, size))
 
     def replace_boundary(self, label: int, boundary: Boundary, control_points: Array) -> None:
-        """Replaces a boundary by another one with control points (m, 2)."""
+        """Replace a boundary by another one with control points (m, 2)."""
         self.variables.remove(self.keys(label))
         self.add_boundary(label, boundary, control_points)
 
+    def close(self, label: int, boundary: Boundary) -> None:
+        """Replace an open boundary by a periodic one, whose control points are inserted by the smoother."""
+        self.boundaries[label] = boundary
+
+    # --- active control points ---------------------------------------------------------------------------
+
+    def active(self, label: int) -> IntArray:
+        """Return the indices (k,) of a boundary's active control points, in driving order."""
+        return self.active_stretch.get(label, self.boundaries[label].everything)
+
+    @property
+    def whole(self) -> bool:
+        """Return whether every control point is active."""
+        return not self.active_stretch
+
+    def activate(self, keys: IntArray) -> None:
+        """Make control points active, which lie next to the active ones."""
+        for label, indices in self.active_stretch.items():
+            numbers = self.keys(label)[:1] + np.arange(indices[0])
+            back = np.flatnonzero(np.isin(numbers, keys))
+            self.active_stretch[label] = np.append(back, indices)
+
+    def activate_only(self, active: dict[int, IntArray]) -> None:
+        """Make the given control points active and no others; by default, or where it is empty, all are."""
+        self.active_stretch = active
+
+    # --- poses beside the curves -------------------------------------------------------------------------
+
+    def locate(self, label: int, pose_u: Array) -> None:
+        """Set the parameters (P,) of all poses on a boundary."""
+        self.pose_u[label] = pose_u
+
+    def locate_newest(self, label: int, u: float) -> None:
+        """Add the newest pose's parameter; on a closed curve it goes on from lap to lap."""
+        boundary, known = self.boundaries[label], self.pose_u[label]
+        if boundary.periodic:
+            u += boundary.length * np.round((known[-1] - u) / boundary.length)
+        self.pose_u[label] = np.append(known, u)
+
     def drop_oldest_pose_u(self) -> None:
-        """Removes the parameters of the oldest pose, which has left the window."""
+        """Remove the parameters of the oldest pose, which has left the window."""
         self.pose_u = {label: u[1:] for label, u in self.pose_u.items()}

@@ -1,24 +1,19 @@
 """Cones that no curve explains: tentative tracks, which one may explain later, and orange cones."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import compose, move_points, rotated, to_map
-from pathspace_graph.factors.sensor import by_sensor
+from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.settings.growth import GrowthSettings
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-
 
 MERGE_CHI: Final = 2.5
 """Gate of a smeared detection about a track, in sigmas of both together."""
@@ -26,24 +21,26 @@ MERGE_MOST: Final = 2.0
 """Its limit in merge radii: the next cone of the row is farther away."""
 RESTORED: Final = 0.3
 """Standard deviation of a cone that is taken back from a curve (m)."""
+MAX_TRACKS: Final = 1000
+"""Tracks of each label that are kept, the ones that were seen last."""
 
 
 class TentativeTracks:
-    """Holds cones of one label as points, merges detections within a radius, and counts them."""
+    """Cones of one label as points, each merged from the detections within a radius."""
 
     def __init__(self, settings: GrowthSettings) -> None:
         self.settings = settings
         self.points: Array = np.zeros((0, 2))
-        """(n, 2) Each row is the weighted mean of a track's detections in m, map frame."""
+        """(n, 2) Weighted mean of each track's detections in m, map frame."""
         self.information: Array = np.zeros((0, 2, 2))
         """(n, 2, 2) Information of each track (1/m^2): the sum of its detections' inverse covariances."""
         self.counts: IntArray = np.zeros(0, np.intp)
-        """(n,) Each track has this number of detections."""
+        """(n,) Number of detections."""
         self.last_t: Array = np.zeros(0)
-        """(n,) Each track was last seen at this stamp (s)."""
+        """(n,) Stamp of the newest detection (s)."""
 
     def add(self, points: Array, covariances: Array, t: float) -> None:
-        """Adds detections (m, 2) with covariances (m, 2, 2), seen at t (s), to their tracks or to new ones.
+        """Add detections (m, 2) with covariances (m, 2, 2), seen at t (s), to their tracks or to new ones.
 
         A detection is of the track to which it is nearest, in `merge_radius` or in sigmas, whichever says
         less: far sightings of one cone are smeared along their rays. Tracks that were not seen for
@@ -55,9 +52,9 @@ class TentativeTracks:
         information = np.linalg.inv(covariances)
         nearest, near = self._nearest(points, covariances)
         for row in np.flatnonzero(near):
-            i, own = nearest[row], information[row]
-            self.information[i] += own
-            self.points[i] += np.linalg.solve(self.information[i], own @ (points[row] - self.points[i]))
+            i, weight = nearest[row], information[row]
+            self.information[i] += weight
+            self.points[i] += np.linalg.solve(self.information[i], weight @ (points[row] - self.points[i]))
             self.counts[i] += 1
             self.last_t[i] = max(self.last_t[i], t)  # a late detection makes no track older
         new = ~near
@@ -65,10 +62,10 @@ class TentativeTracks:
         self.information = np.concatenate([self.information, information[new]])
         self.counts = np.concatenate([self.counts, np.ones(int(new.sum()), np.intp)])
         self.last_t = np.concatenate([self.last_t, np.full(int(new.sum()), t)])
-        self._keep(newest_of(self.last_t, self.settings.max_tracks))
+        self._keep(newest_of(self.last_t, MAX_TRACKS))
 
-    def _nearest(self, points: Array, covariances: Array) -> tuple[IntArray, NDArray[np.bool_]]:
-        """Returns the track of each detection (m, 2), by index, and whether it has one."""
+    def _nearest(self, points: Array, covariances: Array) -> tuple[IntArray, BoolArray]:
+        """Return the track of each detection (m, 2), by index, and whether it has one."""
         radius = self.settings.merge_radius
         nearest, near = nearest_within(points, self.points, radius)
         rest = np.flatnonzero(~near)
@@ -88,25 +85,25 @@ class TentativeTracks:
         return nearest, near
 
     def confirmed(self) -> IntArray:
-        """Returns the indices of the tracks with enough detections."""
+        """Return the indices of the tracks with enough detections."""
         return np.flatnonzero(self.counts >= self.settings.sightings)
 
     def variances(self, indices: IntArray) -> Array:
-        """Returns the variance (k,) of tracks in any direction (m^2): half the trace of their covariance."""
+        """Return the variance (k,) of tracks in any direction (m^2): half the trace of their covariance."""
         return np.asarray(0.5 * np.trace(np.linalg.inv(self.information[indices]), axis1=1, axis2=2))
 
     def sigmas(self, indices: IntArray) -> Array:
-        """Returns the standard deviation (k,) of tracks in their worst direction (m)."""
+        """Return the standard deviation (k,) of tracks in their worst direction (m)."""
         return np.asarray(np.linalg.eigvalsh(self.information[indices])[:, 0] ** -0.5)
 
     def remove(self, indices: IntArray) -> None:
-        """Removes tracks by index."""
+        """Remove tracks by index."""
         keep = np.ones(len(self.counts), bool)
         keep[indices] = False
         self._keep(keep)
 
     def restore(self, points: Array, t: float) -> None:
-        """Adds confirmed tracks at points (k, 2), last seen at t (s)."""
+        """Add confirmed tracks at points (k, 2), last seen at t (s)."""
         self.points = np.concatenate([self.points, points])
         known = np.tile(np.eye(2) / RESTORED**2, (len(points), 1, 1))
         self.information = np.concatenate([self.information, known])
@@ -114,30 +111,39 @@ class TentativeTracks:
         self.last_t = np.append(self.last_t, np.full(len(points), t))
 
     def move(self, motion: Array) -> None:
-        """Moves all tracks by a rigid motion (3,) of the map frame."""
+        """Move all tracks by a rigid motion (3,) of the map frame."""
         self.points = move_points(motion, self.points)
         self.information = rotated(self.information, np.full(len(self.points), motion[2]))
 
     def clear(self) -> None:
-        """Removes all tracks."""
+        """Remove all tracks."""
         self._keep(np.zeros(len(self.counts), bool))
 
-    def _keep(self, keep: NDArray[np.bool_]) -> None:
+    def _keep(self, keep: BoolArray) -> None:
         if not keep.all():
             self.points, self.information = self.points[keep], self.information[keep]
             self.counts, self.last_t = self.counts[keep], self.last_t[keep]
 
 
-def newest_of(stamps: Array, most: int) -> NDArray[np.bool_]:
-    """Returns which (n,) of the stamps (n,) are among the newest ones, of which there are at most `most`."""
+def add_by_label(
+    tracks: Mapping[int, TentativeTracks], labels: IntArray, points: Array, covariances: Array, t: float
+) -> None:
+    """Add detections (m, 2), map frame, with labels (m,) and covariances (m, 2, 2), seen at t (s)."""
+    for label, of_label in tracks.items():
+        chosen = labels == label
+        of_label.add(points[chosen], covariances[chosen], t)
+
+
+def newest_of(stamps: Array, most: int) -> BoolArray:
+    """Return which (n,) of the stamps (n,) are among the newest ones, of which there are at most `most`."""
     keep = np.ones(len(stamps), bool)
     if len(stamps) > most:
         keep[np.argsort(stamps, kind="stable")[:-most]] = False
     return keep
 
 
-def nearest_within(points: Array, known: Array, radius: float) -> tuple[IntArray, NDArray[np.bool_]]:
-    """Returns the nearest of the known points (n, 2) to each point (m, 2), and whether it is within a radius.
+def nearest_within(points: Array, known: Array, radius: float) -> tuple[IntArray, BoolArray]:
+    """Return the nearest of the known points (n, 2) to each point (m, 2), and whether it is within a radius.
 
     The first result (m,) is an index, which means nothing where no point is known.
     """
@@ -218,13 +224,9 @@ class OrangeCones:
         return found
 
     def _place(self, sighting: Sighting, sensor: Array) -> None:
-        seen, pose = sighting.detections, sighting.pose
-        points = seen.points_vehicle
-        if len(sensor):
-            points = points + by_sensor(points, np.tile(sighting.twist, (len(points), 1))) @ sensor
-        in_map = to_map(points, pose[None])
-        covariances = rotated(seen.covariances, np.full(len(points), pose[2]))
-        for label in np.unique(seen.labels).tolist():
-            tracks = self._tracks.setdefault(label, TentativeTracks(self._settings))
-            own = seen.labels == label
-            tracks.add(in_map[own], covariances[own], seen.t)
+        seen, pose, count = sighting.detections, sighting.pose, len(sighting.detections.labels)
+        points = corrected(seen.points_vehicle, np.tile(sighting.twist, (count, 1)), sensor)
+        covariances = rotated(seen.covariances, np.full(count, pose[2]))
+        labels = np.unique(seen.labels).tolist()
+        tracks = {label: self._tracks.setdefault(label, TentativeTracks(self._settings)) for label in labels}
+        add_by_label(tracks, seen.labels, to_map(points, pose[None]), covariances, seen.t)

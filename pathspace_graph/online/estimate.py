@@ -1,44 +1,46 @@
 """What the fixed-lag mapper gives: the map, what is ahead, the vehicle's state, and the graph itself."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.graph.keys import POINT, POSE, name, pose_key, pose_keys
-from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.gtsam_factors import (
+    smoothness_factors,
+    spacing_factors,
+    spline_projection_factors,
+)
+from pathspace_graph.graph.gaussian import factors_of
+from pathspace_graph.graph.keys import POINT, POSE, control_keys, name, pose_key, pose_keys
+from pathspace_graph.graph.odometry import odometry_factor
+from pathspace_graph.graph.user_factors import as_nonlinear
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import LapBatches, VehicleState
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.motion import vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import vehicle_state
+from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.tentative import OrangeCones
 from pathspace_graph.run import Readings
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import GaugeSettings, MapperSettings
 from pathspace_graph.spline.ahead import CurveAhead, TrackAhead, track_ahead
 from pathspace_graph.spline.boundary import Boundary
 
 from .growth import Growth
-from .nonlinear_graph import window_graph
 from .outlook import Outlook, confirmed, curves_ahead, joint_covariance_of, look_ahead
-from .readings import newest_readings
-
-Array = NDArray[np.float64]
 
 
 class MapperEstimate:
-    """Answers what a fixed-lag mapper can be asked; to ask changes nothing of the estimate."""
+    """What a fixed-lag mapper can be asked; to ask changes nothing of the estimate."""
 
     settings: MapperSettings
-    smoother: FixedLagSmoother[CurveMap]
+    smoother: CurveSmoother
     path: DrivenPath
     growth: Growth
     orange: OrangeCones
@@ -47,7 +49,7 @@ class MapperEstimate:
     # --- the map -----------------------------------------------------------------------------------------
 
     def map(self) -> Map:
-        """Returns a copy of the present map, with the joint covariance of each boundary's control points.
+        """Return a copy of the present map, with the joint covariance of each boundary's control points.
 
         An open curve goes on beyond its confirmed end, as `outline` says.
         """
@@ -62,9 +64,7 @@ class MapperEstimate:
         joint = self.smoother.covariance(np.concatenate([state.map_keys, newest]))
         if self.closed:
             return self._closed_map(joint[:-POSE, :-POSE])
-        joint, blocks = joint_covariance_of(
-            list(outlooks.values()), joint, self.poses[-1], self.settings.tentative.sigma_bend
-        )
+        joint, blocks = joint_covariance_of(list(outlooks.values()), joint, self.poses[-1])
         boundaries = {
             label: SplineBoundary(outlook.spline, joint[block, block].copy(), outlook.confirmed_until)
             for (label, outlook), block in zip(outlooks.items(), blocks, strict=True)
@@ -72,7 +72,7 @@ class MapperEstimate:
         return Map(False, boundaries, joint)
 
     def _closed_map(self, joint: Array) -> Map:
-        """Returns the closed map, whose control points have a covariance (2m, 2m) from the graph.
+        """Return the closed map, whose control points have a covariance (2m, 2m) from the graph.
 
         What a curve with few control points cannot follow is added: no number of detections averages it out.
         """
@@ -87,7 +87,7 @@ class MapperEstimate:
         return Map(True, boundaries, joint_covariance(joint, boundaries))
 
     def outline(self) -> Map:
-        """Returns a copy of the present map without covariances, which takes a hundredth of the time.
+        """Return a copy of the present map without covariances, which takes a hundredth of the time.
 
         An open curve is confirmed up to `confirmed_until`. From there on it is tentative: it leads through
         cones that were seen less often, and is fitted anew in each call. A curve that has not begun may
@@ -102,18 +102,19 @@ class MapperEstimate:
         return Map(self.closed, boundaries, points=self.orange.points())
 
     def ahead(self, distance: float, step: float = 1.0) -> TrackAhead:
-        """Returns the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.
+        """Return the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.
 
         This is what a controller asks for in each cycle, so it is fast, and nothing of the estimate changes.
         While the loop is open, it goes on beyond the confirmed ends through the cones of `outline`, and says
-        where.
-        SettingsError is raised where a length is out of its range.
+        where. SettingsError is raised where a length is out of its range.
         """
         if not self.smoother.times:
             return track_ahead({}, np.zeros(POSE), distance, step)
         pose, state = self.poses[-1], self.smoother.map.state
         if not self.closed:
-            return track_ahead(curves_ahead(self.smoother, self.growth, self.path), pose, distance, step)
+            t = self.smoother.times[-1]
+            curves = curves_ahead(self.smoother.map, self.growth.tentative, self.path, t)
+            return track_ahead(curves, pose, distance, step)
         curves = {}
         for label, boundary in self.boundaries.items():
             points, beside = boundary.extended(state.control_points(label)), float(state.pose_u[label][-1])
@@ -121,7 +122,7 @@ class MapperEstimate:
         return track_ahead(curves, pose, distance, step)
 
     def looked_at(self) -> AbstractContextManager[None]:
-        """Returns a context in which the mapper may be asked for anything, and its estimate stays as it is.
+        """Return a context in which the mapper may be asked for anything, and its estimate stays as it is.
 
         Without it, `control_points` leaves the inactive part of an open map up to date, which may move later
         estimates by millimetres.
@@ -129,25 +130,36 @@ class MapperEstimate:
         return self.smoother.variables.looked_at()
 
     def readings(self) -> Readings:
-        """Returns the detections of the newest cycle as they were used or gated, with their foot points."""
-        return newest_readings(self.smoother)
+        """Return the detections of the newest cycle as they were used or gated, with their foot points.
+
+        A foot point is that of the last linearization, on the curve as it is now.
+        """
+        track, table = self.smoother.map, self.smoother.map.detections
+        newest = slice(int(table.cycle.searchsorted(self.smoother.next_cycle - 1)), None)
+        used, boundary = table.used[newest].copy(), table.boundary[newest].copy()
+        points = table.points_map(newest, track.variables)
+        feet = np.full(points.shape, np.nan)
+        for label, curve in self.boundaries.items():
+            on = np.flatnonzero(used & (boundary == label))
+            if len(on):
+                feet[on] = curve.evaluate(track.state.control_points(label), table.u[newest][on])
+        return Readings(points, boundary, used, feet)
 
     def vehicle_state(self) -> VehicleState:
-        """Returns the newest pose and the calibration, with their joint covariance."""
+        """Return the newest pose and the calibration, with their joint covariance."""
         with self.smoother.variables.looked_at():
             return vehicle_state(self.smoother)
 
     def _outlooks(self) -> dict[int, Outlook]:
-        """Returns the curves; open ones have a tentative stretch."""
         self.smoother.refresh()
         if self.closed or self.smoother.next_cycle == 0:
-            return confirmed(self.smoother)
-        return look_ahead(self.smoother, self.growth, self.path)
+            return confirmed(self.smoother.map)
+        return look_ahead(self.smoother.map, self.growth.tentative, self.path, self.smoother.times[-1])
 
     # --- the graph ---------------------------------------------------------------------------------------
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Returns the window as GTSAM factors: projection, spacing, smoothness, odometry, your own and prior.
+        """Return the window as GTSAM factors: projection, spacing, smoothness, odometry, your own and prior.
 
         The factors hold the active variables, which `values` returns. The graph shares nothing with the
         mapper: optimize it, print its errors, or compute its marginals with GTSAM's own classes.
@@ -155,11 +167,11 @@ class MapperEstimate:
         return window_graph(self.smoother)
 
     def values(self) -> gtsam.Values:
-        """Returns the active variables: poses as `Pose2`, control points and the calibration as points."""
+        """Return the active variables: poses as `Pose2`, control points and the calibration as points."""
         return self.smoother.variables.gtsam_values(self.smoother.layout.keys)
 
     def marginal_covariance(self, keys: Sequence[int]) -> Array:
-        """Returns the joint covariance (q, q) of any variables (k,), in the order of their keys.
+        """Return the joint covariance (q, q) of any variables (k,), in the order of their keys.
 
         Control points are in m, poses (x, y, theta) in m and rad, both in the map frame; the calibration is
         (-, rad/s). SettingsError is raised for a key that is not a variable: its pose has left the window, or
@@ -177,16 +189,16 @@ class MapperEstimate:
 
     @staticmethod
     def pose_key(cycle: int) -> int:
-        """Returns GTSAM's key of the pose at a perception cycle, counted from 0."""
+        """Return GTSAM's key of the pose at a perception cycle, counted from 0."""
         return pose_key(cycle)
 
     @property
     def next_pose_key(self) -> int:
-        """Returns the key of the pose that the next update adds."""
+        """Return the key of the pose that the next update adds."""
         return pose_key(self.smoother.next_cycle)
 
     def control_keys(self, label: int) -> list[int]:
-        """Returns the keys of a boundary's control points, which change only when the loop closes."""
+        """Return the keys of a boundary's control points, which change only when the loop closes."""
         keys: list[int] = self.smoother.map.state.keys(label).tolist()
         return keys
 
@@ -194,21 +206,21 @@ class MapperEstimate:
 
     @property
     def closed(self) -> bool:
-        """Returns whether the loop has closed: the map has its final size."""
+        """Return whether the loop has closed: the map has its final size."""
         return self.loop.closed
 
     @property
     def corrected_poses(self) -> Array:
-        """Returns the poses (k, 3) of the first k cycles as the closing of the loop has corrected them."""
+        """Return the poses (k, 3) of the first k cycles as the closing of the loop has corrected them."""
         return self.loop.corrected_poses
 
     @property
     def lap_seconds(self) -> float:
-        """Returns the wall time (s) of the batch of the lap, once it has replaced the prior."""
+        """Return the wall time (s) of the batch of the lap, once it has replaced the prior."""
         return self.loop.lap_seconds
 
     def wait(self) -> None:
-        """Waits for the batch whose result the next update may take, however long that takes.
+        """Wait for the batch whose result the next update may take, however long that takes.
 
         A replay calls this before each update, so that the same log always gives the same map. A vehicle does
         not: there an update waits for no batch longer than the time since the cycle before.
@@ -216,40 +228,122 @@ class MapperEstimate:
         self.loop.wait()
 
     def batches(self) -> LapBatches:
-        """Returns the cycles in which batches of the lap have ended, and how late they would have been."""
+        """Return the cycles in which batches of the lap have ended, and how late they would have been."""
         return LapBatches(self.loop.batch_ends, self.loop.late_cycles)
 
     # --- the estimate ------------------------------------------------------------------------------------
 
     @property
     def boundaries(self) -> dict[int, Boundary]:
-        """Returns the curves by label; their control points are in `control_points`."""
+        """Return the curves by label; their control points are in `control_points`."""
         return self.smoother.map.state.boundaries
 
     def control_points(self, label: int) -> Array:
-        """Returns a view of a boundary's control points (m, 2) in m, map frame."""
+        """Return a view of a boundary's control points (m, 2) in m, map frame."""
         self.smoother.refresh()
         return self.smoother.map.state.control_points(label)
 
     def pose_parameter(self, label: int) -> float:
-        """Returns the parameter (m) of the newest pose's foot point; it increases from lap to lap."""
+        """Return the parameter (m) of the newest pose's foot point; it increases from lap to lap."""
         return float(self.smoother.map.state.pose_u[label][-1])
 
     @property
     def poses(self) -> Array:
-        """Returns a view of the poses (P, 3) in the window, the oldest first, map frame."""
+        """Return a view of the poses (P, 3) in the window, the oldest first, map frame."""
         return self.smoother.variables.poses
 
     def window_poses(self) -> Array:
-        """Returns a copy of the poses (P, 3) in the window, the oldest first, map frame."""
+        """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
         return self.poses.copy()
 
     @property
     def calibration(self) -> Array:
-        """Returns a view of the odometry's calibration: (scale error [-], yaw-rate bias [rad/s])."""
+        """Return a view of the odometry's calibration: (scale error [-], yaw-rate bias [rad/s])."""
         return self.smoother.variables.calibration
 
     @property
     def calibrations(self) -> Array:
-        """Returns a view of the calibrations of the odometry and, where it is estimated, of the sensor."""
+        """Return a view of the calibrations of the odometry and, where it is estimated, of the sensor."""
         return self.smoother.variables.calibrations
+
+
+# --- the window as nonlinear factors ---------------------------------------------------------------------
+
+
+def window_graph(smoother: CurveSmoother) -> gtsam.NonlinearFactorGraph:
+    """Return projection, spacing, smoothness, odometry, user and prior factors on the active variables.
+
+    Linearized at the estimate, the graph is the mapper's own system in GTSAM's tangents of the poses.
+    """
+    track, state, settings = smoother.map, smoother.map.state, smoother.map.settings
+    factors: list[gtsam.NonlinearFactor] = []
+    anchor = gtsam.noiseModel.Isotropic.Sigma(2, settings.gauge.sigma_anchor)
+    for label, boundary in state.boundaries.items():
+        active = state.active(label)
+        factors += _detection_factors(track, label, active)
+        if not track.held_by_prior:
+            factors += _gauge_factors(label, boundary, active, settings.gauge)
+        keys = control_keys(label, boundary.first + active).tolist()
+        points = state.control_points(label)[active]
+        factors += [gtsam.PriorFactorPoint2(*pair, anchor) for pair in zip(keys, points, strict=True)]
+    intervals = enumerate(smoother.window.odometry.intervals, start=smoother.first_cycle)
+    factors += [odometry_factor(cycle, interval) for cycle, interval in intervals]
+    factors += smoother.user_factors.factors
+    prior = factors_of(smoother.absolute_prior())
+    factors += [as_nonlinear(factor, smoother.variables) for factor in prior]
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.add(factor)
+    return graph
+
+
+def _detection_factors(track: CurveMap, label: int, active: IntArray) -> list[gtsam.CustomFactor]:
+    """Return a spline-projection factor for each cycle of the detections in use on a boundary.
+
+    Their foot points may move as far as a step refines them, where the curve is active. They are corrected
+    by the sensor's calibration where it is estimated.
+    """
+    detections, settings = track.detections, track.settings
+    boundary, rows = track.state.boundaries[label], detections.used_on(label)
+    u = detections.u[rows]
+    before, past = _room(boundary, active, u, settings.spline.refine_room)
+    return spline_projection_factors(
+        pose_keys(detections.cycle[rows]),
+        control_keys(label, boundary.numbers).tolist(),
+        boundary.tables,
+        points_vehicle=detections.measured[rows],
+        covariances=detections.covariance[rows],
+        low=u - before,
+        high=boundary.believed(u + past),
+        sigma_model=settings.spline.sigma_model,
+        huber=settings.gate.huber,
+        sensor_key=track.variables.sensor_key,
+        twists=detections.twist[rows],
+    )
+
+
+def _room(boundary: Boundary, active: IntArray, u: Array, room: float) -> tuple[Array, Array]:
+    """Return how far before and past parameters (m,) the curve is active, at most `room`."""
+    if len(active) == boundary.size:
+        return np.full(len(u), room), np.full(len(u), room)
+    p, begin = boundary.degree, boundary.knots[active[0] + boundary.degree]
+    span = active[0] + np.arange(p, len(active))
+    span = np.where(span >= boundary.size + p, span - boundary.size, span) if boundary.periodic else span
+    widths = np.diff(boundary.knots)[span]
+    after = np.mod(u - begin, boundary.length) if boundary.periodic else u - begin
+    return np.minimum(after, room), np.minimum(widths.sum() - after, room)
+
+
+def _gauge_factors(
+    label: int, boundary: Boundary, active: IntArray, settings: GaugeSettings
+) -> list[gtsam.NonlinearFactor]:
+    """Return spacing and smoothness factors between the active control points of a boundary."""
+    gauge = boundary.gauge_on(active)
+    keys = control_keys(label, boundary.first + np.arange(boundary.size)).tolist()
+    factors: list[gtsam.NonlinearFactor] = []
+    for (first, second), nominal in zip(gauge.pairs.tolist(), gauge.nominal, strict=True):
+        sigma = np.array([settings.sigma_spacing * nominal])
+        factors += spacing_factors([keys[first], keys[second]], np.array([nominal]), sigma, False)
+    for triple, bending in zip(gauge.triples.tolist(), gauge.bending, strict=True):
+        factors += smoothness_factors([keys[j] for j in triple], bending[None], 1.0)
+    return factors

@@ -1,58 +1,47 @@
 """Fixed-lag online mapping, in the paper's order: predict, classify, expand, update, close, simplify."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Self
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.checkpoint import Recovery
 from pathspace_graph.errors import ReadingError, SettingsError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.measured_noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd, Reading, at_nearest_pose
 from pathspace_graph.front_end.gate import Admitted
-from pathspace_graph.graph.keys import pose_keys
-from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.association import associate, associate_late
 from pathspace_graph.loop.closing import apply_correspondences, optimize_loop, simplify
 from pathspace_graph.loop.track_loop import LoopRefusedError, TrackLoop
-from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.motion import known_noise, predict
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import (
-    known_noise,
-    predict,
-    smoother_settings,
-)
 from pathspace_graph.mapping.registration import passes_start, register
+from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.scale.door import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.snapshot import restore, save
 
-from .activation import deactivate_distant
 from .estimate import MapperEstimate
 from .growth import Growth
 
-Array = NDArray[np.float64]
-
 
 def careful(process: partial[CycleResult]) -> partial[CycleResult]:
-    """Returns the call that processes the same cycle and leaves the loop as it is."""
+    """Return the call that processes the same cycle but leaves the loop as it is."""
     return partial(process.func, *process.args, careful=True)
 
 
 @at_scale
 class FixedLagMapper(MapperEstimate):
-    """Maps a track's two boundaries cycle by cycle, as splines in one factor graph with the vehicle's poses.
+    """Both boundaries of a track, mapped cycle by cycle as splines in one factor graph with the poses.
 
     Each cycle solves for the poses of the last `settings.lag` seconds and for every control point; all
     earlier information is a Gaussian prior. `odometry_sigma` (3,) is the standard deviation of one measured
@@ -68,23 +57,18 @@ class FixedLagMapper(MapperEstimate):
         noise = known_noise(odometry_sigma)
         self.odometry_sigma = noise.odometry
         self.front_end = FrontEnd(self.settings, noise)
-        """It judges the readings of each cycle."""
-        self.smoother = FixedLagSmoother(smoother_settings(self.settings), CurveMap(self.settings))
-        """The smoother holds the variables, the factors of the window, and the prior."""
-        self.smoother.window.exact = True
-        self.path = DrivenPath(self.settings.path)
-        """This is the path that the vehicle has driven."""
-        self.growth = Growth(self.settings.growth)
-        """The open curves grow through the tentative tracks that are collected here."""
+        self.smoother = CurveSmoother(self.settings)
+        """Variables, factors of the window, and the prior."""
+        self.path = DrivenPath()
+        self.growth = Growth(self.smoother)
+        """Tentative tracks, through which the open curves grow."""
         self.orange = OrangeCones(self.settings.growth, self.settings.spline.sigma_shape)
-        """Orange cones are points of the map."""
-        self.smoother.followers = [self.smoother.map, self.path, self.growth, self.orange]
+        """Orange cones, which are points of the map."""
+        self.smoother.add_followers(self.path, self.growth, self.orange)
         self.loop = TrackLoop(self.smoother, self.path)
-        """This closes the loop of the track, and looks after the closed map."""
         if self.settings.open_lap.prior == "window":
             self.loop.record.give_up("no batch of the lap was asked for")
         self.recovery = Recovery()
-        """It takes the mapper back where an update fails."""
         self._unused: Odometry | None = None  # twists of a cycle that was left out
         self._grown: frozenset[int] = frozenset()
 
@@ -94,7 +78,7 @@ class FixedLagMapper(MapperEstimate):
         detections: Detections,
         factors: Sequence[gtsam.NonlinearFactor] = (),
     ) -> CycleResult:
-        """Processes one perception cycle: the twists since the last cycle, and its detections.
+        """Process one perception cycle: the twists since the last cycle, and its detections.
 
         The call is refused as a ReadingError, and nothing has changed, where it holds anything that cannot be
         used (`front_end.gate`, `settings.front_end`). Impossible detections are dropped and counted in the
@@ -146,7 +130,7 @@ class FixedLagMapper(MapperEstimate):
     def _process(
         self, cycle: Admitted, factors: Sequence[gtsam.NonlinearFactor], *, careful: bool = False
     ) -> CycleResult:
-        """Takes the steps of the paper; a `careful` cycle leaves the loop as it is for some metres."""
+        """Take the steps of the paper; a `careful` cycle leaves the loop as it is for some metres."""
         watch = Stopwatch()
         if cycle.late:
             return self._use_late(cycle.detections, watch)
@@ -160,10 +144,9 @@ class FixedLagMapper(MapperEstimate):
         self._classify(reading)  # detections that no curve explains may expand one
         watch.lap("classify")
         self._expand()
-        deactivate_distant(self.smoother)
+        self.smoother.deactivate_distant()
         watch.lap("expand")
-        for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
-            self.smoother.step(self.settings.sigma_step)
+        self._update()
         watch.lap("update")
         learned = self.loop.doubt_calibrations(reading)
         closes = self._close()
@@ -188,7 +171,7 @@ class FixedLagMapper(MapperEstimate):
     def _without(
         self, cycle: Admitted, factors: Sequence[gtsam.NonlinearFactor], error: Exception
     ) -> CycleResult:
-        """Goes on where a cycle has failed: without the loop, or without detections, or without the cycle.
+        """Go on where a cycle has failed: without the loop, or without detections, or without the cycle.
 
         The mapper is as it was before the cycle each time. The notice says what has failed.
         """
@@ -215,7 +198,6 @@ class FixedLagMapper(MapperEstimate):
         return replace(result, notice=self._failed(error, "the cycle is not used"))
 
     def _failed(self, error: Exception, consequence: str, notice: str = "") -> str:
-        """Returns the notice of a cycle that has failed, in full for the first one."""
         number = self.recovery.failures
         why = f": {type(error).__name__}: {error}" if number == 1 else f" (failure {number})"
         return "; ".join(
@@ -225,43 +207,40 @@ class FixedLagMapper(MapperEstimate):
     def _admit(
         self, odometry: Odometry, detections: Detections, factors: Sequence[gtsam.NonlinearFactor]
     ) -> Admitted:
-        """Returns a cycle that may be used, or raises; nothing but a count changes."""
         try:
             self.smoother.check_factors(factors)
         except SettingsError:
-            self.front_end.gate.refused += 1
+            self.front_end.gate.refuse()
             raise
         cycle = self.front_end.admit(odometry, detections, self.smoother.times)
         if cycle.late and factors:
-            self.front_end.gate.refused += 1
+            self.front_end.gate.refuse()
             raise ReadingError("factors", "none with a late cycle", len(factors), t=cycle.detections.t)
         return cycle
 
     def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
-        """Uses the detections of a late cycle at its time, without a pose of their own."""
         detections = self.front_end.use_late(detections, self.smoother.times)
         late = at_nearest_pose(self.smoother, detections, self.settings.motion)
-        track = self.smoother.map
-        new = track.detections.insert(late.detections, late.cycle, late.twist)
-        track.correct()
+        table = self.smoother.map.detections
+        new = table.append(late.detections, late.cycle, late.twist)
         self.loop.record.measured_late(late.cycle, late.detections)
         if self.boundaries and not self.loop.is_searching:
-            associate_late(self.smoother, new)
+            self.smoother.associate_late(new)
         if not self.closed:
-            self.growth.observe(self.smoother, new, detections.t)
+            self.growth.observe(new, detections.t)
         watch.lap("classify")
         for _ in range(self.settings.steps):
             self.smoother.step(self.settings.sigma_step)
         watch.lap("update")
-        used = int(track.detections.used[new].sum())
+        used = int(table.used[new].sum())
         return replace(self._result(detections.t, watch.laps, None, ""), readings=used)
 
     # --- the steps of the paper --------------------------------------------------------------------------
 
     def _predict(self, odometry: Odometry, detections: Detections) -> Reading:
-        """Adds the pose of the cycle by the calibrated odometry, and extends the driven path.
+        """Add the pose of the cycle by the calibrated odometry, and extend the driven path.
 
-        Returns the readings as the front end has judged them.
+        Return the readings as the front end has judged them.
         """
         reading = self.front_end.update(odometry, detections)
         motion, t = reading.motion, detections.t
@@ -276,50 +255,51 @@ class FixedLagMapper(MapperEstimate):
         return self.smoother.variables.sensor
 
     def _place_orange_again(self) -> None:
-        """Places orange cones by the poses that the batch of the lap has corrected, and by the window's."""
         window = self.smoother.first_cycle, self.poses
         self.orange.place_again(self._sensor, (0, self.corrected_poses), window)
 
     def _classify(self, reading: Reading) -> None:
-        """Associates detections with the curves; those that no curve uses become tentative tracks."""
         detections, motion, cycle = reading.detections, reading.motion, self.smoother.next_cycle - 1
         new = self.smoother.map.detections.append(detections, cycle, motion.odometry.twist)
-        self.smoother.map.correct()
         tested = None
         if self.boundaries:
-            tested = associate(self.smoother, self._grown, use=not self.loop.is_searching)
+            tested = self.smoother.associate(self._grown, use=not self.loop.is_searching)
         self.loop.judge(tested, new, reading)
         if not self.closed:
-            self.growth.observe(self.smoother, new, detections.t)
+            self.growth.observe(new, detections.t)
 
     def _expand(self) -> None:
-        """Extends each open curve through the confirmed tracks that come next along the path."""
         self._grown = frozenset()
         if not self.closed:
             path_ahead = self.path.ahead(self.poses[-1], self.settings.growth.reach)
-            self._grown = self.growth.expand(self.smoother, path_ahead)
+            self._grown = self.growth.expand(path_ahead)
+
+    def _update(self) -> None:
+        """Take the Gauss-Newton steps of a cycle, each relinearized at the current estimate."""
+        for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
+            self.smoother.step(self.settings.sigma_step)
 
     def _close(self) -> bool:
-        """Closes the loop if the newest detections are registered with the beginning; True if it closes."""
         if not self.boundaries or not self.loop.may_close():
             return False
         self.smoother.carry()
         self.smoother.refresh()
-        covariance = self.smoother.covariance(pose_keys(np.array([self.smoother.next_cycle - 1])))
-        track, beginning, settings = self.smoother.map, self.path.beginning, self.settings.closing
-        registration = register(track, self.smoother.times, covariance, beginning, settings)
-        if registration is None or not passes_start(track.state, self.path, registration.motion, settings):
+        track, covariance, settings = (
+            self.smoother.map,
+            self.smoother.newest_covariance(),
+            self.settings.closing,
+        )
+        found = register(track, self.smoother.times, covariance, self.path.beginning, settings)
+        if found is None or not passes_start(track.state, self.path, found.motion):
             return False
-        apply_correspondences(self.smoother, registration)
+        apply_correspondences(self.smoother, found)
         optimize_loop(self.smoother)
         return True
 
     def _simplify(self) -> None:
-        """Makes both curves periodic; they have their final size then."""
         simplify(self.smoother)
 
     def _result(self, t: float, stages: dict[str, float], jump: Array | None, notice: str) -> CycleResult:
-        """Returns the newest pose, the sizes of the boundaries, and the cycle's detections in use."""
         detections = self.smoother.map.detections
         used = int(detections.used[detections.cycle.searchsorted(self.smoother.next_cycle - 1) :].sum())
         left, right = (self.boundaries[b].size if b in self.boundaries else 0 for b in (LEFT, RIGHT))
@@ -329,11 +309,11 @@ class FixedLagMapper(MapperEstimate):
     # --- the snapshot ------------------------------------------------------------------------------------
 
     def noise_used(self) -> RunNoise:
-        """Returns the noise that is used now, and what was measured so far."""
+        """Return the noise that is used now, and what was measured so far."""
         return self.front_end.noise_used
 
     def save(self, path: Path | str) -> None:
-        """Writes the whole mapper to one file, from which `restore` makes one that goes on to the same map.
+        """Write the whole mapper to one file, from which `restore` makes one that goes on to the same map.
 
         Nothing of the mapper changes. An earlier file is kept as a numbered backup, and at each moment the
         old or the new file is there. SettingsError is raised while a factor of your own is in the window.
@@ -344,8 +324,8 @@ class FixedLagMapper(MapperEstimate):
         save(self, path)
 
     @classmethod
-    def restore(cls, path: Path | str) -> FixedLagMapper:
-        """Returns the mapper that `save` has written, with its settings; an InputError if the file is not so.
+    def restore(cls, path: Path | str) -> Self:
+        """Return the mapper that `save` has written, with its settings; an InputError if the file is not so.
 
         A lap that was being solved when it was saved is solved again.
         """
@@ -354,7 +334,6 @@ class FixedLagMapper(MapperEstimate):
         return mapper
 
     def _look(self) -> None:
-        """Looks at all that the mapper gives; a damaged one raises something."""
         self.outline()
         if self.smoother.times:
             self.vehicle_state()

@@ -4,71 +4,191 @@ The tentative stretch is no part of the graph. It is fitted to the tracks whenev
 can't harm the estimate, and it is taken back as soon as the tracks contradict it.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.graph.keys import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.mapping.candidates import SIDES
-from pathspace_graph.mapping.curve_map import CurveSmoother
-from pathspace_graph.mapping.path import DrivenPath
+from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.path import SIDES, DrivenPath, along_and_across, crosses
+from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.ahead import CurveAhead
 from pathspace_graph.spline.boundary import Boundary, Placement, open_boundary
 from pathspace_graph.spline.bspline import BSpline
 
-from .corridor import Row, lead_on
-from .growth import Growth, undisputed
+from .growth import undisputed
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+REACH: Final = 12.5
+"""Farthest track from the vehicle that the stretch leads through (m)."""
+MEMORY: Final = 0.35
+"""Time for which a track that is not confirmed counts (s): a detection of nothing is not repeated."""
+GAP: Final = 11.0
+"""Largest distance of neighbouring tracks of a row (m): two regular gaps, as a cone may never be detected."""
+TURN: Final = 2.0
+"""Largest turn of a row from one track to the next (rad) ..."""
+TURN_RATE: Final = 0.1
+"""... less this for each metre to it (rad/m)."""
+TURN_COST: Final = 1.0
+"""The next track of a row has the least `distance (1 + TURN_COST turn^2)` (rad^-2)."""
+MIN_WIDTH: Final = 1.5
+"""Least distance of a row from the other boundary (m)."""
+WIDTH_RATIO: Final = 1.8
+"""The next track is at most this number of times as far from the other boundary as the one before ..."""
+WIDTH_SLACK: Final = 1.0
+"""... and this (m)."""
+TAIL: Final = 20.0
+"""Length at the end of the confirmed curves that tells where the track leads and how wide it is (m) ..."""
+TAIL_STEP: Final = 1.0
+"""... and its step (m)."""
+BEGIN_LATERAL: Final = 1.5
+"""Distance beside the vehicle from which the row of a boundary that has not begun is searched (m)."""
+SIGMA_CONE: Final = 0.1
+"""Standard deviation of a cone's distance from a smooth curve (m), added to a track's own."""
+SIGMA_BEND: Final = 1.0
+"""Standard deviation of the second difference of control points about that of a straight line (m). It widens
+the band between tracks that are far apart, and beyond the last one."""
+MIN_TRACKS: Final = 2
+"""Least number of tracks for a tentative curve of a boundary that has not begun."""
 
-MIN_TRACKS = 2
-"""A boundary that has not begun needs at least this many tracks for a tentative curve."""
+
+# --- rows of tracks --------------------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class Row:
+    """One boundary as far as it is known, and the tracks that may continue it."""
+
+    side: float
+    """Sign of the signed distance from the other row (left positive)."""
+    line: Array
+    """(n, 2) At least two points of the row in driving order (m, map frame)."""
+    direction: Array
+    """(2,) Unit vector in which the row leads on from its last point."""
+    candidates: Array
+    """(k, 2) Tracks that may continue the row (m, map frame)."""
+    chosen: list[int] = field(default_factory=list)
+    """Candidates that the row continues through, by index in driving order."""
+    ended: bool = False
+    """Whether no candidate continues the row, wherever the other one leads."""
+
+    @property
+    def end(self) -> Array:
+        """Return the last point (2,) of the row."""
+        end: Array = self.line[-1]
+        return end
+
+    @property
+    def tracks(self) -> Array:
+        """Return the candidates (c, 2) that the row continues through."""
+        return self.candidates[self.chosen]
+
+    @property
+    def lengths(self) -> Array:
+        """Return the lengths (c,) in m along the row from the known end to the tracks that continue it."""
+        new = self.line[-len(self.chosen) - 1 :]
+        return np.asarray(np.cumsum(np.hypot(*np.diff(new, axis=0).T)))
+
+    def choose(self, index: int) -> None:
+        """Continue the row through a candidate."""
+        step = self.candidates[index] - self.end
+        self.direction = step / np.hypot(*step)
+        self.line = np.concatenate([self.line, self.candidates[index, None]])
+        self.chosen.append(index)
+
+
+def extend_rows(left: Row, right: Row, driven: Array, threshold: float) -> None:
+    """Continue both rows through their candidates, each time the one that lags behind.
+
+    Each row bounds where the other may lead: it stays on its own side, at about the width that the track has.
+    No row crosses the driven path (n, 2). A track nearer to a row's end than `threshold` (m) is passed over.
+    """
+    waiting = [left, right]
+    while waiting:
+        ahead = left.direction + right.direction
+        row = min(waiting, key=lambda row: float(row.end @ ahead))
+        index = _next(row, right if row is left else left, driven, threshold)
+        if index is None:
+            waiting = [other for other in waiting if other is not row]
+        else:
+            row.choose(index)
+            waiting = [other for other in (left, right) if not other.ended]
+
+
+def _next(row: Row, other: Row, driven: Array, threshold: float) -> int | None:
+    """Return the index of the candidate that continues a row, or None."""
+    step = row.candidates - row.end
+    distance = np.hypot(step[:, 0], step[:, 1])
+    near = (distance > threshold) & (distance < GAP)
+    near[row.chosen] = False
+    indices = np.flatnonzero(near)
+    (cos, sin), step, distance = row.direction, step[indices], distance[indices]
+    turn = np.abs(np.arctan2(cos * step[:, 1] - sin * step[:, 0], step @ row.direction))
+    allowed = turn < TURN - TURN_RATE * distance
+    cost = distance * (1.0 + TURN_COST * turn**2)
+    indices = indices[allowed][np.argsort(cost[allowed])]
+    if len(indices) == 0:
+        row.ended = True
+        return None
+    points = row.candidates[indices]
+    possible = _has_width(row, other, points)
+    possible &= ~crosses(row.end, points, driven) & ~crosses(row.end, points, other.line)
+    return int(indices[possible.argmax()]) if possible.any() else None
+
+
+def _has_width(row: Row, other: Row, points: Array) -> BoolArray:
+    """Return whether points (k, 2) are about as far from the other row as the end of their own row."""
+    stations = np.append(0.0, np.cumsum(np.hypot(*np.diff(other.line, axis=0).T)))
+    station, width = along_and_across(np.concatenate([row.end[None], points]), other.line, stations)
+    width, beyond = row.side * width, station[1:] > stations[-1]
+    widest = WIDTH_RATIO * abs(width[0]) + WIDTH_SLACK
+    return np.asarray((width[1:] > MIN_WIDTH) & (beyond | (width[1:] < widest)))
+
+
+# --- curves through them ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """Holds a boundary with its tentative stretch."""
+    """A boundary with its tentative stretch."""
 
     boundary: Boundary
-    """The knots hold the tentative stretch, too."""
+    """Knots, those of the tentative stretch too."""
     known: Array
-    """(n, 2) These are the control points of the confirmed curve (m, map frame)."""
+    """(n, 2) Control points of the confirmed curve (m, map frame)."""
     confirmed_until: float
-    """The curve is confirmed up to this parameter (m)."""
+    """Parameter up to which the curve is confirmed (m)."""
     tracks: Array
-    """(k, 2) The tentative stretch leads through these tracks (m, map frame)."""
+    """(k, 2) Tracks that the tentative stretch leads through (m, map frame)."""
     variances: Array
-    """(k,) Each track has this variance in any direction (m^2), seen from the vehicle."""
+    """(k,) Variance of each in any direction (m^2), seen from the vehicle."""
     placement: Placement | None
-    """Control points were placed so for the tentative stretch; None where there is none."""
+    """How control points were placed for the tentative stretch; None where there is none."""
 
     @property
     def control_points(self) -> Array:
-        """Returns the control points (m, 2) in m, map frame."""
+        """Return the control points (m, 2) in m, map frame."""
         if self.placement is None:
             return self.known.copy()
         return self.placement.place(self.known, self.tracks)
 
     @property
     def spline(self) -> BSpline:
-        """Returns the curve."""
+        """Return the curve."""
         return self.boundary.spline(self.control_points)
 
-    def linear(self, vehicle: Array, sigma_bend: float) -> tuple[Array, Array]:
-        """Returns A (2m, 2n + 3) and N (2m, 2m): the control points have the covariance `A Sigma A' + N`.
+    def linear(self, vehicle: Array) -> tuple[Array, Array]:
+        """Return A (2m, 2n + 3) and N (2m, 2m): the control points have the covariance `A Sigma A' + N`.
 
         Sigma is the joint covariance of the known control points and of the newest pose `vehicle` (3,), from
         which the tracks were seen. The placement is linear in both, in the tracks' own errors, and in the
-        second differences, which have the standard deviation `sigma_bend` (m).
+        second differences, which have the standard deviation `SIGMA_BEND`.
         """
         placement, eye, size = self.placement, np.eye(POINT), self.known.size
         if placement is None:
@@ -78,23 +198,23 @@ class Outlook:
         A[:kept, :kept] = np.eye(kept)
         A[kept:, POINT * placement.first : size] = np.kron(placement.by_known, eye)
         A[kept:, size:] = by_track @ _by_pose(self.tracks, vehicle)
-        own = (placement.by_target * self.variances) @ placement.by_target.T
-        own += sigma_bend**2 * placement.by_bend @ placement.by_bend.T
+        noise = (placement.by_target * self.variances) @ placement.by_target.T
+        noise += SIGMA_BEND**2 * placement.by_bend @ placement.by_bend.T
         N = np.zeros((len(A), len(A)))
-        N[kept:, kept:] = np.kron(own, eye)
+        N[kept:, kept:] = np.kron(noise, eye)
         return A, N
 
 
 def joint_covariance_of(
-    outlooks: Sequence[Outlook], joint: Array, vehicle: Array, sigma_bend: float
+    outlooks: Sequence[Outlook], joint: Array, vehicle: Array
 ) -> tuple[Array, list[slice]]:
-    """Returns the joint covariance of the control points of all curves, and the block of each curve.
+    """Return the joint covariance of the control points of all curves, and the block of each curve.
 
     `joint` is the covariance of the known control points of all curves and, last, of the pose `vehicle` (3,).
     """
     changes, noises, blocks, begin, end = [], [], [], 0, 0
     for outlook in outlooks:
-        A, N = outlook.linear(vehicle, sigma_bend)
+        A, N = outlook.linear(vehicle)
         size = outlook.known.size
         change = np.zeros((len(A), len(joint)))
         change[:, begin : begin + size], change[:, -POSE:] = A[:, :size], A[:, size:]
@@ -107,131 +227,113 @@ def joint_covariance_of(
     return np.asarray(0.5 * (covariance + covariance.T)), blocks
 
 
-def led_rows(
-    smoother: CurveSmoother, growth: Growth, path: DrivenPath
-) -> tuple[dict[int, Row], dict[int, IntArray]]:
-    """Returns the row of each boundary, led on through its tentative tracks, and the indices of these."""
-    settings = smoother.map.settings
-    tracks = {label: _tracks(smoother, growth, label) for label in BOUNDARIES}
-    rows = {label: _row(smoother, growth, label, tracks[label]) for label in BOUNDARIES}
-    lead_on(rows[LEFT], rows[RIGHT], path.points, settings.growth.threshold, settings.tentative)
-    return rows, tracks
+def _by_pose(points: Array, vehicle: Array) -> Array:
+    """Return the derivative (2k, 3) of points (k, 2), fixed to the vehicle, by its pose (x, y, theta)."""
+    offset = points - vehicle[:2]
+    jacobian = np.zeros((len(points), POINT, POSE))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
+    jacobian[:, 0, 2], jacobian[:, 1, 2] = -offset[:, 1], offset[:, 0]
+    return jacobian.reshape(-1, POSE)
 
 
-def curves_ahead(smoother: CurveSmoother, growth: Growth, path: DrivenPath) -> dict[int, CurveAhead]:
-    """Returns each open curve from beside the vehicle on, with the tracks that lead on, for `track_ahead`.
+# --- what is ahead ---------------------------------------------------------------------------------------
+
+
+def curves_ahead(
+    track: CurveMap, tentative: Mapping[int, TentativeTracks], path: DrivenPath, t: float
+) -> dict[int, CurveAhead]:
+    """Return each open curve from beside the vehicle on, with the tracks that lead on, for `track_ahead`.
 
     These are the tracks of `look_ahead`, but no curve is fitted to them, which would take most of the time.
     """
-    state, settings = smoother.map.state, smoother.map.settings
-    rows, tracks = led_rows(smoother, growth, path)
-    curves = {}
-    for label, row in rows.items():
+    state, curves = track.state, {}
+    for label, (row, chosen) in extended_rows(track, tentative, path, t).items():
         if label in state.boundaries:
             boundary = state.boundaries[label]
             points, beside = state.control_points(label), float(state.pose_u[label][-1])
-            on = row.candidates[row.chosen]
-            curves[label] = CurveAhead(boundary.tables, points, beside, boundary.confirmed_end, on)
-        elif len(row.chosen) >= MIN_TRACKS:
-            variances = growth.tentative[label].variances(tracks[label][row.chosen])
-            outlook = _begun(settings, row, variances)
-            boundary = outlook.boundary
-            points = outlook.control_points
-            curves[label] = CurveAhead(boundary.tables, points, 0.0, boundary.tables.high, confirmed=False)
+            end = boundary.confirmed_end
+            curves[label] = CurveAhead(boundary.tables, points, beside, end, row.tracks)
+        elif len(chosen) >= MIN_TRACKS:
+            outlook = _begun(track.settings, row, tentative[label].variances(chosen))
+            tables, points = outlook.boundary.tables, outlook.control_points
+            curves[label] = CurveAhead(tables, points, 0.0, tables.high, confirmed=False)
     return curves
 
 
-def look_ahead(smoother: CurveSmoother, growth: Growth, path: DrivenPath) -> dict[int, Outlook]:
-    """Returns each open curve with its tentative stretch, and curves that have not begun but may."""
-    state, settings = smoother.map.state, smoother.map.settings
-    rows, tracks = led_rows(smoother, growth, path)
-    outlooks = {}
-    for label, row in rows.items():
-        chosen = tracks[label][row.chosen]
-        variances = growth.tentative[label].variances(chosen) + settings.tentative.sigma_cone**2
+def look_ahead(
+    track: CurveMap, tentative: Mapping[int, TentativeTracks], path: DrivenPath, t: float
+) -> dict[int, Outlook]:
+    """Return each open curve with its tentative stretch at t (s), and curves that have not begun but may."""
+    state, outlooks = track.state, {}
+    for label, (row, chosen) in extended_rows(track, tentative, path, t).items():
+        variances = tentative[label].variances(chosen) + SIGMA_CONE**2
         if label in state.boundaries:
-            known = state.control_points(label)
-            outlooks[label] = _extended(state.boundaries[label], known, row, variances)
+            known, longer = state.control_points(label), copy(state.boundaries[label])
+            end, placement = longer.confirmed_end, None
+            if len(chosen):
+                placement = longer.extend(len(known), end + row.lengths)
+            outlooks[label] = Outlook(longer, known, end, row.tracks, variances, placement)
         elif len(chosen) >= MIN_TRACKS:
-            outlooks[label] = _begun(settings, row, variances)
+            outlooks[label] = _begun(track.settings, row, variances)
     return outlooks
 
 
-def confirmed(smoother: CurveSmoother) -> dict[int, Outlook]:
-    """Returns the curves as they are, without a tentative stretch."""
-    state, none = smoother.map.state, np.zeros((0, POINT))
+def confirmed(track: CurveMap) -> dict[int, Outlook]:
+    """Return the curves as they are, without a tentative stretch."""
+    state, none = track.state, np.zeros((0, POINT))
     return {
         label: Outlook(boundary, state.control_points(label), boundary.confirmed_end, none, np.zeros(0), None)
         for label, boundary in state.boundaries.items()
     }
 
 
-def _tracks(smoother: CurveSmoother, growth: Growth, label: int) -> IntArray:
-    """Returns the indices of the tracks near the vehicle that are confirmed or were seen just now.
+def extended_rows(
+    track: CurveMap, tentative: Mapping[int, TentativeTracks], path: DrivenPath, t: float
+) -> dict[int, tuple[Row, IntArray]]:
+    """Return the row of each boundary, extended through its tentative tracks, and the indices of these."""
+    tracks = {label: _tracks(track, label, tentative[label], t) for label in BOUNDARIES}
+    rows = {label: _row(track, label, tentative[label].points[tracks[label]]) for label in BOUNDARIES}
+    extend_rows(rows[LEFT], rows[RIGHT], path.points, track.settings.growth.threshold)
+    return {label: (row, tracks[label][row.chosen]) for label, row in rows.items()}
+
+
+def _tracks(track: CurveMap, label: int, tracks: TentativeTracks, t: float) -> IntArray:
+    """Return the indices of the tracks near the vehicle that are confirmed or were seen just now.
 
     A track at a cone that the curve has already is left out: across an infield, the sensor sees the row of an
     earlier stretch again.
     """
-    settings, tracks, t = smoother.map.settings, growth.tentative[label], smoother.times[-1]
-    offset = tracks.points - smoother.variables.poses[-1, :2]
-    near = np.hypot(offset[:, 0], offset[:, 1]) < settings.tentative.reach
-    believed = tracks.counts >= settings.growth.sightings
-    believed |= tracks.last_t > t - settings.tentative.memory
+    settings, state = track.settings.growth, track.state
+    offset = tracks.points - state.poses[-1, :2]
+    near = np.hypot(offset[:, 0], offset[:, 1]) < REACH
+    believed = (tracks.counts >= settings.sightings) | (tracks.last_t > t - MEMORY)
     indices = np.flatnonzero(near & believed)
-    if label in smoother.map.state.boundaries:
-        mapped = np.array(smoother.map.state.boundaries[label].observed).reshape(-1, POINT)
+    if label in state.boundaries:
+        mapped = np.array(state.boundaries[label].observed).reshape(-1, POINT)
         offset = tracks.points[indices, None] - mapped
         distance = np.hypot(offset[:, :, 0], offset[:, :, 1])
-        indices = indices[(distance > settings.growth.threshold).all(axis=1)]
-    radius = settings.growth.merge_radius
-    return indices[undisputed(smoother, label, tracks.points[indices], radius)]
+        indices = indices[(distance > settings.threshold).all(axis=1)]
+    return indices[undisputed(track, label, tracks.points[indices], settings.merge_radius)]
 
 
-def _row(smoother: CurveSmoother, growth: Growth, label: int, tracks: IntArray) -> Row:
-    """Returns a boundary's row with its candidates; it begins beside the vehicle if there is no curve yet."""
-    state, settings = smoother.map.state, smoother.map.settings.tentative
-    candidates, side = growth.tentative[label].points[tracks], SIDES[label]
+def _row(track: CurveMap, label: int, candidates: Array) -> Row:
+    """Return a boundary's row with its candidates; it begins beside the vehicle if there is no curve yet."""
+    state, side = track.state, SIDES[label]
     if label not in state.boundaries:
         x, y, theta = state.poses[-1]
         ahead = np.array([np.cos(theta), np.sin(theta)])
-        beside = np.array([x, y]) + side * settings.begin_lateral * np.array([-ahead[1], ahead[0]])
-        return Row(side, np.array([beside - settings.tail * ahead, beside]), ahead, candidates)
+        beside = np.array([x, y]) + side * BEGIN_LATERAL * np.array([-ahead[1], ahead[0]])
+        return Row(side, np.array([beside - TAIL * ahead, beside]), ahead, candidates)
     boundary, known = state.boundaries[label], state.control_points(label)
     end = boundary.confirmed_end
-    steps = int(np.ceil(min(settings.tail, end) / settings.tail_step)) + 1
-    u = np.linspace(max(end - settings.tail, 0.0), end, max(steps, 2))
+    steps = int(np.ceil(min(TAIL, end) / TAIL_STEP)) + 1
+    u = np.linspace(max(end - TAIL, 0.0), end, max(steps, 2))
     direction = boundary.evaluate(known, u[-1:], 1)[0]
     return Row(side, boundary.evaluate(known, u), direction / np.hypot(*direction), candidates)
 
 
-def _extended(boundary: Boundary, known: Array, row: Row, variances: Array) -> Outlook:
-    """Returns a curve that is extended through the tracks that its row continues through."""
-    tracks, longer = row.candidates[row.chosen], copy(boundary)
-    placement = None
-    if len(tracks):
-        u = boundary.confirmed_end + _lengths(row)
-        placement = longer.extend(len(known), u)
-    return Outlook(longer, known, boundary.confirmed_end, tracks, variances, placement)
-
-
 def _begun(settings: MapperSettings, row: Row, variances: Array) -> Outlook:
-    """Returns a curve through the tracks of a row; none of it is confirmed."""
-    tracks, boundary = row.candidates[row.chosen], open_boundary(settings.spline, settings.gauge)
-    u = _lengths(row)
+    """Return a curve through the tracks of a row; none of it is confirmed."""
+    boundary, u = open_boundary(settings.spline, settings.gauge), row.lengths
     placement = boundary.extend(0, u - u[0])
-    return Outlook(boundary, np.zeros((0, POINT)), 0.0, tracks, variances, placement)
-
-
-def _lengths(row: Row) -> Array:
-    """Returns the lengths (k,) in m along a row from the curve's end to the tracks that continue it."""
-    new = row.line[-len(row.chosen) - 1 :]
-    return np.asarray(np.cumsum(np.hypot(*np.diff(new, axis=0).T)))
-
-
-def _by_pose(points: Array, vehicle: Array) -> Array:
-    """Returns the derivative (2k, 3) of points (k, 2), fixed to the vehicle, by its pose (x, y, theta)."""
-    offset = points - vehicle[:2]
-    jacobian = np.zeros((len(points), POINT, POSE))
-    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
-    jacobian[:, 0, 2], jacobian[:, 1, 2] = -offset[:, 1], offset[:, 0]
-    return jacobian.reshape(-1, POSE)
+    return Outlook(boundary, np.zeros((0, POINT)), 0.0, row.tracks, variances, placement)

@@ -15,8 +15,8 @@ from .checked import Positive
 from .closing import ClosingSettings
 from .comparison import CenterlineSettings, CkfSettings, LandmarkSettings
 from .front_end import LimitSettings, MotionSettings, SidesSettings
-from .growth import GrowthSettings, PathSettings, TentativeSettings
-from .health import FindingSettings, HealthSettings, MendingSettings
+from .growth import GrowthSettings
+from .health import HealthSettings
 from .knots import Knots
 
 
@@ -120,7 +120,6 @@ class GateSettings(Positive):
 
 
 @dataclass(frozen=True)
-@dataclass(frozen=True)
 class FarSettings(Positive):
     """The inactive part of the map, which is not solved for in every cycle: it changes speed, not results."""
 
@@ -171,22 +170,14 @@ class MapperSettings(Positive):
     """The weak priors on what detections leave free."""
     gate: GateSettings = field(default_factory=GateSettings)
     """Which detections are used, and how much they weigh."""
-    path: PathSettings = field(default_factory=PathSettings)
-    """The driven path and the predicted path ahead."""
     growth: GrowthSettings = field(default_factory=GrowthSettings)
     """Growth at the open end of a curve."""
-    tentative: TentativeSettings = field(default_factory=TentativeSettings)
-    """The tentative stretch beyond the confirmed end of an open curve."""
     closing: ClosingSettings = field(default_factory=ClosingSettings)
     """Loop closing."""
     open_lap: OpenLapSettings = field(default_factory=OpenLapSettings)
     """The batch over the open lap when the loop closes."""
     health: HealthSettings = field(default_factory=HealthSettings)
     """When an estimate is good, degraded or lost."""
-    finding: FindingSettings = field(default_factory=FindingSettings)
-    """How a vehicle that is lost on a closed map is found."""
-    mending: MendingSettings = field(default_factory=MendingSettings)
-    """How a closed map is mended."""
     far: FarSettings = field(default_factory=FarSettings)
     """The inactive part of the map."""
     relinearize: RelinearizeSettings = field(default_factory=RelinearizeSettings)

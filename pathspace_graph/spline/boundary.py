@@ -247,6 +247,11 @@ class Boundary:
         if self.observed:
             self.observed = [*move_points(motion, np.array(self.observed))]
 
+    def add_cones(self, points: Array, u: Array) -> None:
+        """Add observed cones (k, 2) that the curve has grown through, at parameters (k,) in m."""
+        self.observed.extend(points)
+        self.cone_parameters.extend(u.tolist())
+
     def take_back(self, kept: int) -> None:
         """Removes all observed cones but the first `kept`; the curve is confirmed up to the last of these."""
         self.confirmed_end = self.cone_parameters[kept - 1]

@@ -87,7 +87,7 @@ def test_cones_are_passed_in_the_order_of_the_drive() -> None:
     )
     wrong = np.array([0, 1, 4, 3, 2, 5, 6])
     cones = Cones(true[wrong], np.arange(7.0), wrong)
-    passed = along_drive(cones, lap, LEFT, SETTINGS.growth)
+    passed = along_drive(cones, lap, LEFT)
     np.testing.assert_array_equal(passed.points, true)
     np.testing.assert_array_equal(passed.count, np.arange(7))
 
@@ -98,4 +98,4 @@ def test_a_cone_behind_the_row_is_none_of_it() -> None:
     lap = np.column_stack([x, np.zeros(20), np.zeros(20)])
     row = np.column_stack([np.arange(1.0, 18.0, 4.0), [-2.0, -2.6, -3.2, -2.6, -2.0]])
     cones = Cones(np.concatenate([row, [[10.0, -4.4]]]), np.arange(6.0), np.full(6, 9))
-    np.testing.assert_array_equal(along_drive(cones, lap, RIGHT, SETTINGS.growth).points, row)
+    np.testing.assert_array_equal(along_drive(cones, lap, RIGHT).points, row)

@@ -33,7 +33,7 @@ def small_system() -> tuple[BatchSystem, State]:
     chain = judge_log(log, log.noise, settings).chain
     detections = DetectionTable.of(log.cycles)
     noise = np.random.default_rng(1).normal(0.0, 0.1, detections.measured.shape)
-    detections.measured = detections.point = detections.measured + noise
+    detections.measured = detections.measured + noise
     state = start_odometry(chain, detections, settings)
     system = BatchSystem(detections, chain, settings, Biweight(settings.batch.gate))
     system.begin(state)

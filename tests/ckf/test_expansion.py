@@ -14,7 +14,7 @@ from pathspace_graph.ckf.mapper import REACH
 from pathspace_graph.ckf.state import CurveState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
-from pathspace_graph.mapping.path import DrivenPath, PathAhead
+from pathspace_graph.mapping.path import CARRIED_TO, DrivenPath, PathAhead
 from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -28,7 +28,7 @@ END = np.array([12.0, 2.0])
 
 def path_along_x(x: float, settings: MapperSettings) -> PathAhead:
     """Returns the path of a vehicle that has driven from 0 to `x` (m) along the x axis."""
-    path = DrivenPath(settings.path)
+    path = DrivenPath()
     for at in np.arange(0.0, x + 0.25, 0.5):
         path.update(np.array([at, 0.0, 0.0]))
     return path.ahead(np.array([x, 0.0, 0.0]), REACH)
@@ -127,9 +127,8 @@ def test_a_stranded_end_is_extended_beside_the_path() -> None:
     """The vehicle has passed the end without any detection."""
     state = straight_rows()
     extended, _ = expanded(state, np.zeros((0, 2)), x=16.0)
-    growth = state.settings.growth
     assert extended == {LEFT, RIGHT}
-    np.testing.assert_allclose(end_of(state), [16.0 - growth.stranded_left * growth.stranded, 2.0], atol=0.1)
+    np.testing.assert_allclose(end_of(state), [16.0 - CARRIED_TO, 2.0], atol=0.1)
 
 
 def test_two_confirmed_tracks_begin_a_curve_and_one_does_not() -> None:

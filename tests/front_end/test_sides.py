@@ -14,7 +14,6 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, ORANGE, RIGHT, UNKNOWN
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.front_end import SidesSettings
-from pathspace_graph.settings.growth import PathSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.faults import Faults, SensorFaults, VehicleFaults
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -68,14 +67,14 @@ def is_swapped(judge: SideJudge, lap: int, agreeing: int, opposing: int) -> bool
 )
 def test_colours_are_swapped_by_a_clear_majority(agreeing: int, opposing: int, swapped: bool) -> None:
     """Three cones at least, and more than 2.5 times as many as on the side of their own colour."""
-    judge = SideJudge(SidesSettings(), PathSettings())
+    judge = SideJudge(SidesSettings())
     assert is_swapped(judge, 0, agreeing, opposing) is swapped
 
 
 @pytest.mark.parametrize(("agreeing", "swapped"), [(7, True), (8, False)])
 def test_colours_are_swapped_back_by_as_clear_a_majority(agreeing: int, swapped: bool) -> None:
     """Three cones were on the other side."""
-    judge = SideJudge(SidesSettings(), PathSettings())
+    judge = SideJudge(SidesSettings())
     assert is_swapped(judge, 0, 0, 3)
     assert is_swapped(judge, 1, agreeing, 0) is swapped
 

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from pathspace_graph.graph.gaussian import graph_of, keys_of, normal_equations
 from pathspace_graph.graph.inactive import InactiveMap
 from pathspace_graph.graph.keys import CALIBRATION_KEY, CONTROL_LETTERS, control_keys, pose_keys
-from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import Layout, Variables
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.loop.track_loop import TrackLoop
-from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.prediction import smoother_settings
+from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.online.growth import Growth
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import FarSettings, MapperSettings
 
@@ -184,7 +183,7 @@ EAGER = MapperSettings(far=FarSettings(stretch=5.0, room=3.0))
 """With these settings control points are deactivated early and often."""
 
 
-class Checked(FixedLagSmoother[CurveMap]):
+class Checked(CurveSmoother):
     """A smoother that compares every step on a closed map with a dense solution of the whole system."""
 
     worst = 0.0
@@ -219,8 +218,9 @@ def test_steps_of_the_active_variables_are_steps_of_the_whole_system() -> None:
     """The log has two laps: the curves grow, and are closed."""
     log = lap_log(bean_track(), overrun=100.0)
     mapper = FixedLagMapper(EAGER, log.odometry_sigma)
-    mapper.smoother = smoother = Checked(smoother_settings(EAGER), CurveMap(EAGER))
-    smoother.followers = [smoother.map, mapper.path, mapper.growth]
+    mapper.smoother = smoother = Checked(EAGER)
+    mapper.growth = Growth(smoother)
+    smoother.add_followers(mapper.path, mapper.growth)
     mapper.loop = TrackLoop(smoother, mapper.path)
     map_log(log, mapper)
     assert mapper.closed

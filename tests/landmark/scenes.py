@@ -15,7 +15,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.landmark.batch import LandmarkSystem, start_oracle
 from pathspace_graph.landmark.landmark_map import LandmarkMap, LandmarkSmoother, LandmarkState
-from pathspace_graph.mapping.prediction import smoother_settings
+from pathspace_graph.mapping.motion import smoother_settings
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 

@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.loop.association import associate
-from pathspace_graph.mapping.motion import MeasuredMotion
-from pathspace_graph.mapping.prediction import integrate_odometry, predict
+from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry, predict
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import GateSettings
 
@@ -145,11 +143,11 @@ def test_older_detections_are_tested_again_only_where_a_curve_has_grown() -> Non
     odometry, cycle = next_cycle(mapper, at([]), [])
     motion = MeasuredMotion(integrate_odometry(odometry, cycle.t, ODOMETRY_SIGMA), odometry.twist)
     predict(smoother, mapper.path, motion, cycle.t, mapper.settings)
-    associate(smoother, frozenset())
+    smoother.associate(frozenset())
     assert not table.used[released].any()
     for label in (LEFT, RIGHT):  # the newest pose's parameter was appended; it is found anew
         smoother.map.state.pose_u[label] = smoother.map.state.pose_u[label][:-1]
-    associate(smoother, frozenset({LEFT}))
+    smoother.associate(frozenset({LEFT}))
     np.testing.assert_array_equal(table.used[released], labels == LEFT)
     assert table.changed[released].all()
 

@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.accuracy import cone_distances
-from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.gaussian import keys_of, normal_equations
 from pathspace_graph.graph.keys import control_keys
 from pathspace_graph.graph.variables import Layout
@@ -17,7 +16,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
 from pathspace_graph.loop.closing import substitute
-from pathspace_graph.mapping.registration import Registration, near_start, register
+from pathspace_graph.mapping.registration import RefinedMotion, near_start, register
 from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
@@ -133,7 +132,7 @@ def test_readings_in_use_lie_on_the_closed_curve(when: str, request: pytest.Fixt
     for label, boundary in mapper.boundaries.items():
         rows = detections.used_on(label)
         assert len(rows) > 20
-        points = to_map(detections.point[rows], mapper.smoother.variables.poses_at(detections.cycle[rows]))
+        points = detections.points_map(rows, mapper.smoother.variables)
         on_curve = boundary.evaluate(mapper.control_points(label), detections.u[rows])
         distances = np.hypot(*(points - on_curve).T)
         assert np.median(distances) < 0.15
@@ -149,7 +148,7 @@ def covariance_of(mapper: FixedLagMapper) -> Array:
     return mapper.marginal_covariance([mapper.pose_key(mapper.smoother.next_cycle - 1)])
 
 
-def registered(mapper: FixedLagMapper, theta: float, shift: Array) -> Registration:
+def registered(mapper: FixedLagMapper, theta: float, shift: Array) -> RefinedMotion:
     """The window of a mapper drifts by a rigid motion about the vehicle; how it is found back.
 
     How certain the position along the track is doesn't matter here.
@@ -182,10 +181,10 @@ def test_a_drifted_window_is_registered_back(
     moved = registration.motion.apply(mapper.poses[:, :2])
     np.testing.assert_allclose(moved, poses_before[:, :2], atol=0.3)
     detections = mapper.smoother.map.detections
-    for label, (rows, u) in registration.matches.items():
+    for label in mapper.boundaries:
+        rows, u = registration.matches.inliers(label)
         assert (detections.label[rows] == label).all()
-        poses = mapper.smoother.variables.poses_at(detections.cycle[rows])
-        points = registration.motion.apply(to_map(detections.point[rows], poses))
+        points = registration.motion.apply(detections.points_map(rows, mapper.smoother.variables))
         on_curve = mapper.boundaries[label].evaluate(mapper.control_points(label), u)
         distances = np.hypot(*(points - on_curve).T)
         assert np.median(distances) < 0.1

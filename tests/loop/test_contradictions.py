@@ -12,8 +12,8 @@ from scipy.spatial import KDTree
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.contradictions import Contradictions, in_rows
 from pathspace_graph.loop.finding import KnownLoop, Loop, is_mapped
+from pathspace_graph.loop.mending import SETTLE, SIGHTINGS, Contradictions, in_rows
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -22,7 +22,6 @@ from ..scenes.drives import detections
 Array = NDArray[np.float64]
 
 SETTINGS = MapperSettings()
-OWN = SETTINGS.mending
 LATER = 100.0
 """The vehicle has passed everything at this stamp (s)."""
 
@@ -46,12 +45,12 @@ class WithoutGaps(KnownLoop):
 def seen(
     cones: Sequence[Sequence[float]],
     label: int = LEFT,
-    times: int = OWN.sightings,
+    times: int = SIGHTINGS,
     found: Contradictions | None = None,
 ) -> Contradictions:
     """Contradictions after cones were detected from a vehicle that stands at the origin; it has no map."""
     mapper = FixedLagMapper()
-    found = found or Contradictions(SETTINGS)
+    found = found or Contradictions(SETTINGS.growth)
     smoother, points = mapper.smoother, np.array(cones, float)
     smoother.variables.insert(pose_keys(np.arange(1)), np.zeros(3))
     smoother.times.append(0.0)
@@ -59,7 +58,7 @@ def seen(
     for number in range(times):
         cycle = detections(0.1 * number, own, np.full(len(points), label))
         new = smoother.map.detections.append(cycle, 0)
-        found.observe(smoother, WithoutGaps(smoother), new, cycle.t)
+        found.observe(smoother.map, WithoutGaps(smoother), new, cycle.t)
     return found
 
 
@@ -87,17 +86,17 @@ def test_other_cones_are_not(cones: list[list[float]], why: str) -> None:
 
 
 def test_a_cone_that_is_seen_less_often_does_not_count() -> None:
-    assert seen(ROW, times=OWN.sightings - 1).stretches(lane(), LATER) == []
+    assert seen(ROW, times=SIGHTINGS - 1).stretches(lane(), LATER) == []
 
 
 def test_there_are_none_until_the_vehicle_has_passed_all_of_them() -> None:
-    found, last = seen(ROW), 0.1 * (OWN.sightings - 1)
-    assert found.stretches(lane(), last + 0.9 * OWN.settle) == []
-    assert len(found.stretches(lane(), last + 1.1 * OWN.settle)) == 1
+    found, last = seen(ROW), 0.1 * (SIGHTINGS - 1)
+    assert found.stretches(lane(), last + 0.9 * SETTLE) == []
+    assert len(found.stretches(lane(), last + 1.1 * SETTLE)) == 1
 
 
 def test_the_colour_that_was_seen_more_often_at_a_place_counts() -> None:
-    both = seen(ROW, RIGHT, 2 * OWN.sightings, found=seen(ROW, LEFT))
+    both = seen(ROW, RIGHT, 2 * SIGHTINGS, found=seen(ROW, LEFT))
     assert [stretch.label for stretch in both.stretches(lane(), LATER)] == [RIGHT]
 
 

@@ -11,8 +11,7 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.drive_record import DriveRecord
 from pathspace_graph.loop.recognition import RecognizedPlace
-from pathspace_graph.mapping.motion import MeasuredMotion
-from pathspace_graph.mapping.prediction import integrate_odometry
+from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry
 from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.calibration import OdometrySettings

@@ -17,11 +17,10 @@ from pathspace_graph.graph.variables import Layout
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.association import Gating
-from pathspace_graph.loop.finding import FOUND, KnownLoop, Search, evidence_of, lay_out_loop
+from pathspace_graph.loop.finding import FOUND, MEMORY, KnownLoop, Search, evidence_of, lay_out_loop
+from pathspace_graph.mapping.smoother import Gating
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.health import FindingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import detections, map_log, replay, true_poses
@@ -149,7 +148,7 @@ def test_a_wrong_colour_says_nothing_about_the_vehicle() -> None:
 def test_the_middle_of_the_loop_lies_between_the_curves() -> None:
     _, mapper, _ = clean()
     state = mapper.smoother.map.state
-    loop = lay_out_loop(state, FindingSettings())
+    loop = lay_out_loop(state)
     for label, u in loop.beside.items():
         points = state.boundaries[label].evaluate(mapper.control_points(label), u)
         across = np.hypot(*(points - loop.middle).T)
@@ -188,7 +187,7 @@ def test_the_remembered_path_has_a_bound() -> None:
     for pose, cycle in zip(true_poses(log), log.cycles, strict=True):
         search.observe(pose, cycle)
     poses = np.array(search._poses)
-    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() <= FindingSettings().memory
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() <= MEMORY
 
 
 def test_forgetting_the_poses_keeps_all_that_the_prior_knows_of_the_map() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pathspace_graph.io.log import Log
-from pathspace_graph.loop.gauge import hold_gauge, motion_across
+from pathspace_graph.loop.closing import hold_gauge, motion_across
 from pathspace_graph.mapping.state import State
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import split_odometry

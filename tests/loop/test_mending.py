@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,14 +12,12 @@ from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.contradictions import Stretch
+from pathspace_graph.loop import mending
 from pathspace_graph.loop.finding import KnownLoop
-from pathspace_graph.loop.mending import MENDED, carried, led_through, newest_lap
+from pathspace_graph.loop.mending import MENDED, Stretch, carried, led_through, newest_lap
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online
-from pathspace_graph.settings.health import MendingSettings
-from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.faults import Faults, SensorFaults
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
@@ -107,10 +104,12 @@ def test_the_record_has_the_pose_of_every_cycle_in_the_frame_of_the_mended_map()
     assert np.hypot(*(poses - true_poses(clean()))[:, :2].T).max() < 0.3
 
 
-def test_a_map_that_does_not_explain_the_contradictions_is_refused() -> None:
+def test_a_map_that_does_not_explain_the_contradictions_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """It is asked for more of them than there are."""
-    settings = replace(MapperSettings(), mending=MendingSettings(explained=2.0))
-    mapper, results = map_log(unseen(clean(), [LEFT], *HOLE), FixedLagMapper(settings))
+    monkeypatch.setattr(mending, "EXPLAINED", 2.0)
+    mapper, results = map_log(unseen(clean(), [LEFT], *HOLE), FixedLagMapper())
     jumps = [result.t for result in results if result.jump is not None]
     assert len(jumps) == 1  # the swap of the open lap
     assert mapper.closed and not any(result.notice for result in results)

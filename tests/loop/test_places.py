@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.start import unwrap
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.places import Place, curve_poses, in_final_map
+from pathspace_graph.loop.drive_record import Place, curve_poses, in_final_map
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 

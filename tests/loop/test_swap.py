@@ -20,9 +20,9 @@ from pathspace_graph.graph.keys import pose_keys
 from pathspace_graph.graph.variables import Layout, Variables
 from pathspace_graph.io.log import Log
 from pathspace_graph.loop import drive_record, track_loop
+from pathspace_graph.loop.closing import _move_poses
 from pathspace_graph.loop.drive_record import DriveRecord
-from pathspace_graph.loop.swap import _move_poses
-from pathspace_graph.mapping.curve_map import CurveSmoother
+from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings

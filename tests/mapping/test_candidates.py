@@ -7,10 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pathspace_graph.mapping.candidates import Candidates, End, chain
-from pathspace_graph.settings.growth import GrowthSettings
-
-SETTINGS = GrowthSettings(lateral_change=1.5, lateral_rate=0.2, beside=2.0, lateral_gap=0.8)
+from pathspace_graph.mapping.path import Candidates, End, chain
 
 
 def candidates(*places: tuple[float, float]) -> Candidates:
@@ -24,7 +21,7 @@ def end(station: float, side: float) -> End:
 
 
 def test_a_row_at_one_distance_is_a_chain() -> None:
-    assert chain(candidates((0.0, 2.0), (4.0, 2.0), (8.0, 2.0)), SETTINGS, None).tolist() == [0, 1, 2]
+    assert chain(candidates((0.0, 2.0), (4.0, 2.0), (8.0, 2.0)), None).tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize(("side", "follows"), [(1.0, True), (4.29, True), (4.31, False)])
@@ -34,43 +31,43 @@ def test_the_next_may_be_farther_from_the_path_by_a_step_and_a_rate(side: float,
         (candidates((0.0, 2.0), (4.0, side)), None),
         (candidates((4.0, side)), end(0.0, 2.0)),
     ):
-        assert (len(found.points) - 1 in chain(found, SETTINGS, begin)) == follows
+        assert (len(found.points) - 1 in chain(found, begin)) == follows
 
 
 def test_one_that_is_left_out_does_not_lead_on_to_the_next() -> None:
     """The far row stands 6 m from the path: each of its cones is measured from the last near one."""
     found = candidates((0.0, 2.0), (4.0, 6.0), (8.0, 6.0), (12.0, 2.0))
-    assert chain(found, SETTINGS, None).tolist() == [0, 3]
+    assert chain(found, None).tolist() == [0, 3]
 
 
 @pytest.mark.parametrize(("begin", "count"), [(None, 4), (end(-4.0, 2.0), 6)], ids=["no curve", "a curve"])
 def test_no_candidate_allows_the_next_one_more(begin: End | None, count: int) -> None:
     """A row leads away by 1.2 m from cone to cone, and only 0.8 m of them are the rate."""
     found = candidates(*((4.0 * k, 2.0 + 1.2 * k) for k in range(8)))
-    assert chain(found, SETTINGS, begin).tolist() == list(range(count))
+    assert chain(found, begin).tolist() == list(range(count))
 
 
 def test_a_candidate_farther_out_does_not_end_the_chain() -> None:
     """One that may not follow is left out, and the next one near the path is measured from the same end."""
     found = candidates((4.0, 2.0), (8.0, 6.0), (12.0, 2.0), (16.0, 5.5))
-    assert chain(found, SETTINGS, end(0.0, 2.0)).tolist() == [0, 2, 3]
+    assert chain(found, end(0.0, 2.0)).tolist() == [0, 2, 3]
 
 
 @pytest.mark.parametrize(("gap", "chosen"), [(0.7, [0, 1]), (0.9, [0])])
 def test_of_those_beside_each_other_the_nearest_to_the_path_stay(gap: float, chosen: list[int]) -> None:
-    assert chain(candidates((0.0, 2.0), (1.9, 2.0 + gap)), SETTINGS, None).tolist() == chosen
+    assert chain(candidates((0.0, 2.0), (1.9, 2.0 + gap)), None).tolist() == chosen
     apart = candidates((0.0, 2.0), (2.1, 2.0 + gap))
-    assert chain(apart, SETTINGS, None).tolist() == [0, 1]
+    assert chain(apart, None).tolist() == [0, 1]
 
 
 def test_no_candidates_are_an_empty_chain() -> None:
-    assert chain(candidates(), SETTINGS, end(0.0, 2.0)).tolist() == []
+    assert chain(candidates(), end(0.0, 2.0)).tolist() == []
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 30.0), st.floats(0.0, 9.0)), max_size=12), st.floats(0.0, 5.0))
 def test_every_candidate_of_a_chain_keeps_the_rule(places: list[tuple[float, float]], side: float) -> None:
     found = candidates(*sorted(places))
-    chosen = found.where(chain(found, SETTINGS, end(-1.0, side)))
+    chosen = found.where(chain(found, end(-1.0, side)))
     assert (chosen.sides <= side + 1.5 + 0.2 * (chosen.stations + 1.0) + 1e-9).all()
 
 

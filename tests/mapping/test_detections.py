@@ -85,7 +85,7 @@ def test_an_association_is_taken_refined_and_released() -> None:
 def test_which_rows_a_boundary_may_have() -> None:
     """Row 2 has no colour; where RIGHT uses it, LEFT is still tested for it, since both may accept it."""
     table = DetectionTable.of(CYCLES)
-    assert table.pending(LEFT).tolist() == [0, 2, 4, 5]
+    assert table.pending(LEFT).tolist() == [0, 4, 5]
     table.take(np.array([2, 4]), np.array([RIGHT, LEFT]), np.zeros(2))
     assert table.pending(LEFT).tolist() == [0, 5]
     assert table.open_to(LEFT, 0).tolist() == [0, 2, 5]
@@ -106,8 +106,8 @@ def test_landmarks_that_are_merged_give_their_detections() -> None:
 def test_late_detections_stand_behind_those_of_their_cycle(kind: type[DetectionColumns]) -> None:
     """The table is that of the log in which the cycle had them from the first."""
     table = kind.of(CYCLES)
-    assert table.insert(cycle(UNKNOWN, LEFT), 2) == slice(4, 6)
+    assert table.append(cycle(UNKNOWN, LEFT), 2) == slice(4, 6)
     assert table.cycle.tolist() == [0, 0, 0, 2, 2, 2, 3, 3]
     assert table.label.tolist() == [LEFT, RIGHT, UNKNOWN, RIGHT, UNKNOWN, LEFT, LEFT, LEFT]
-    assert table.insert(cycle(RIGHT), 1) == slice(3, 4)
+    assert table.append(cycle(RIGHT), 1) == slice(3, 4)
     assert table.cycle.tolist() == [0, 0, 0, 1, 2, 2, 2, 3, 3]

@@ -8,22 +8,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from pathspace_graph.mapping import path as path_module
 from pathspace_graph.mapping.path import DrivenPath, PathAhead, along_and_across
-from pathspace_graph.settings.growth import PathSettings
 
 Array = NDArray[np.float64]
 
 
-def driven(xs: list[float], **settings: float) -> DrivenPath:
+def driven(xs: list[float]) -> DrivenPath:
     """A path along x."""
-    path = DrivenPath(PathSettings(**settings))
+    path = DrivenPath()
     for x in xs:
         path.update(np.array([x, 0.0, 0.0]))
     return path
 
 
 def test_positions_are_kept_a_step_apart() -> None:
-    path = driven([0.0, 0.1, 0.2, 0.4, 0.5], step=0.3)
+    path = driven([0.0, 0.1, 0.2, 0.4, 0.5])
     np.testing.assert_allclose(path.points, [[0.0, 0.0], [0.4, 0.0]])
     np.testing.assert_allclose(path.stations, [0.0, 0.4])
     assert path.length == pytest.approx(0.5)
@@ -35,31 +35,32 @@ def test_standing_still_adds_nothing() -> None:
     assert path.length == 1.0
 
 
-def test_only_the_last_stretch_is_kept() -> None:
-    path = driven(np.arange(0.0, 21.0).tolist(), memory=5.0)
+def test_only_the_last_stretch_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(path_module, "MEMORY", 5.0)
+    path = driven(np.arange(0.0, 21.0).tolist())
     np.testing.assert_allclose(path.stations, np.arange(15.0, 21.0))
     np.testing.assert_allclose(path.points[:, 0], np.arange(15.0, 21.0))
 
 
 def test_the_curvature_is_smoothed_clipped_and_not_taken_from_a_creeping_vehicle() -> None:
-    path = driven([0.0], curvature_gain=0.5, max_curvature=0.3)
+    path = driven([0.0])
     path.steer(np.array([[5.0, 0.0, 1.0]]))
-    assert path.curvature == pytest.approx(0.1)
+    assert path.curvature == pytest.approx(0.08)
     path.steer(np.array([[5.0, 0.0, 9.0], [5.0, 0.0, 11.0]]))
-    assert path.curvature == pytest.approx(0.2)
+    assert path.curvature == pytest.approx(0.08 + 0.4 * (0.3 - 0.08))
     path.steer(np.array([[0.5, 0.0, 1.0]]))
     path.steer(np.zeros((0, 3)))
-    assert path.curvature == pytest.approx(0.2)
+    assert path.curvature == pytest.approx(0.08 + 0.4 * (0.3 - 0.08))
 
 
 def test_the_prediction_of_a_straight_goes_on_straight() -> None:
-    path = driven([0.0, 1.0, 2.0, 3.0], step=0.5)
-    path_ahead = path.ahead(np.array([3.0, 0.0, 0.0]), 2.0)
-    np.testing.assert_allclose(path_ahead.points[:, 0], [0.0, 1.0, 2.0, 3.0, 3.5, 4.0, 4.5, 5.0])
+    path = driven([0.0, 1.0, 2.0, 3.0])
+    path_ahead = path.ahead(np.array([3.0, 0.0, 0.0]), 0.9)
+    np.testing.assert_allclose(path_ahead.points[:, 0], [0.0, 1.0, 2.0, 3.0, 3.3, 3.6, 3.9])
     np.testing.assert_allclose(path_ahead.stations, path_ahead.points[:, 0])
     np.testing.assert_array_equal(path_ahead.points[:, 1], 0.0)
     assert path_ahead.driven == 3.0
-    np.testing.assert_allclose(path_ahead.beside(3.4, -2.0), [3.5, -2.0])
+    np.testing.assert_allclose(path_ahead.beside(3.4, -2.0), [3.6, -2.0])
 
 
 @pytest.mark.parametrize(("station", "first"), [(-1.0, 0), (0.5, 0), (1.0, 0), (1.5, 1), (2.0, 1), (9.0, 3)])
@@ -126,7 +127,7 @@ def test_stations_move_with_the_frame(angle: float, x: float, y: float) -> None:
 
 
 def test_driving_backwards_takes_the_path_back() -> None:
-    path = DrivenPath(PathSettings(step=0.3))
+    path = DrivenPath()
     for x in [*np.arange(0.0, 6.01, 0.5), *np.arange(5.8, 1.99, -0.2)]:
         path.update(np.array([x, 0.0, 0.0]))
     assert path.length == pytest.approx(2.0)
@@ -134,7 +135,7 @@ def test_driving_backwards_takes_the_path_back() -> None:
 
 
 def test_turning_on_the_spot_keeps_the_path() -> None:
-    path = DrivenPath(PathSettings(step=0.3))
+    path = DrivenPath()
     for x in np.arange(0.0, 6.01, 0.5):
         path.update(np.array([x, 0.0, 0.0]))
     for theta in np.linspace(0.0, np.pi, 20):

@@ -12,9 +12,14 @@ from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.motion import MeasuredMotion
+from pathspace_graph.mapping.motion import (
+    MeasuredMotion,
+    doubted,
+    integrate_odometry,
+    predict,
+    smoother_settings,
+)
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.prediction import doubted, integrate_odometry, predict, smoother_settings
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.calibration import OdometrySettings
 from pathspace_graph.settings.mapper import MapperSettings

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_keys
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.mapping import path as path_module
+from pathspace_graph.mapping import registration
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import (
     Matches,
     Motion,
-    Registration,
+    RefinedMotion,
     Sightings,
     _match,
     agrees,
@@ -26,7 +27,6 @@ from pathspace_graph.mapping.registration import (
 )
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.closing import ClosingSettings
-from pathspace_graph.settings.growth import PathSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import detections
@@ -65,7 +65,7 @@ class Window:
         self.poses[:, :2] = by.apply(self.poses[:, :2])
         self.poses[:, 2] += by.vector[2]
 
-    def register(self, covariance: Array = PRIOR, **settings: float) -> Registration | None:
+    def register(self, covariance: Array = PRIOR, **settings: float) -> RefinedMotion | None:
         closing = ClosingSettings(**settings)  # type: ignore[arg-type]
         beginning = self.truth[:1] if np.trace(covariance[:2, :2]) < 9.0 else drive(0.0, 1.4, 40, self.dent)
         return register(self.track, self.times, covariance, beginning, closing)
@@ -137,9 +137,10 @@ def test_matches_are_coloured_detections_beside_their_own_curve() -> None:
     found = scene.register()
     assert found is not None
     table = scene.track.detections
-    for label, (rows, u) in found.matches.items():
+    for label in SIDES:
+        rows, u = found.matches.inliers(label)
         assert len(rows) == 3 * POSES and (table.label[rows] == label).all()
-        points = found.motion.apply(to_map(table.point[rows], scene.poses[table.cycle[rows]]))
+        points = found.motion.apply(table.points_map(rows, scene.track.variables))
         boundary, control_points = (
             scene.track.state.boundaries[label],
             scene.track.state.control_points(label),
@@ -148,11 +149,14 @@ def test_matches_are_coloured_detections_beside_their_own_curve() -> None:
         assert u.max() < 60.0
 
 
-def test_only_the_newest_seconds_are_registered() -> None:
+def test_only_the_newest_seconds_are_registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registration, "WINDOW", 1.0)
     scene = window()
-    found = scene.register(window=1.0, sigma_max=1.0)
+    found = scene.register(sigma_max=1.0)
     assert found is not None
-    cycles = scene.track.detections.cycle[np.concatenate([rows for rows, _ in found.matches.values()])]
+    cycles = scene.track.detections.cycle[
+        np.concatenate([found.matches.inliers(label)[0] for label in SIDES])
+    ]
     assert set(cycles.tolist()) == set(range(10, POSES))
 
 
@@ -180,8 +184,8 @@ def test_detections_beside_the_curves_are_refused() -> None:
     """A track of the same shape, but a metre wider to either side."""
     scene = window()
     table = scene.track.detections
-    table.point[table.label == LEFT, 1] += 1.0
-    table.point[table.label == RIGHT, 1] -= 1.0
+    table.measured[table.label == LEFT, 1] += 1.0
+    table.measured[table.label == RIGHT, 1] -= 1.0
     assert scene.register() is None
 
 
@@ -283,7 +287,7 @@ def test_a_far_uncertain_detection_weighs_less() -> None:
 def _seen_points(scene: Window) -> Array:
     """Returns the coloured detections (6, 2) of the first cycle, map frame."""
     table = scene.track.detections
-    return np.asarray(to_map(table.point[:6], scene.poses[table.cycle[:6]]))
+    return table.points_map(slice(6), scene.track.variables)
 
 
 def _match_at(scene: Window, seen: Sightings) -> Array:
@@ -326,9 +330,12 @@ def test_a_place_must_be_certain_and_less_so_after_a_long_stretch(
         ((10.0, 0.0, 2.0 * np.pi), True),
     ],
 )
-def test_near_the_start_is_a_matter_of_place_and_direction(pose: tuple[float, ...], near: bool) -> None:
+def test_near_the_start_is_a_matter_of_place_and_direction(
+    pose: tuple[float, ...], near: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """After 80 m along x, on the first 20 m: within 8 m + 3 % of 80 m, and 0.8 rad."""
-    path = DrivenPath(PathSettings(memory=20.0))
+    monkeypatch.setattr(path_module, "MEMORY", 20.0)
+    path = DrivenPath()
     for x in np.arange(0.0, 80.1, 0.5):
         path.update(np.array([x, 0.0, 0.0]))
     assert near_start(path, np.array(pose), ClosingSettings()) is near

@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.mapping.seam import Overlap, find_overlap, make_periodic
-from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.settings.knots import Knots
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
@@ -38,7 +37,7 @@ def radii(points: Array) -> Array:
 def test_the_seam_is_where_the_end_meets_the_beginning(turns: float) -> None:
     """The parameter is the length of the chords between the cones, of which a lap has 36."""
     boundary, points = circle(turns)
-    overlap = find_overlap(boundary, points, ClosingSettings())
+    overlap = find_overlap(boundary, points)
     lap = 36 * 2.0 * RADIUS * np.sin(np.pi / 36)
     assert overlap.period == pytest.approx(lap, abs=0.1)
     assert (np.diff(overlap.u) > 0.0).all() and (np.diff(overlap.w) >= 0.0).all()
@@ -47,7 +46,7 @@ def test_the_seam_is_where_the_end_meets_the_beginning(turns: float) -> None:
 
 def test_places_of_the_overlap_are_the_same_places_of_the_beginning() -> None:
     boundary, points = circle(1.3)
-    overlap = find_overlap(boundary, points, ClosingSettings())
+    overlap = find_overlap(boundary, points)
     u = np.linspace(overlap.period + 2.0, boundary.confirmed_end - 1.0, 20)
     again = overlap.new_parameter(u) - overlap.period
     np.testing.assert_allclose(boundary.evaluate(points, again), boundary.evaluate(points, u), atol=0.15)
@@ -56,7 +55,7 @@ def test_places_of_the_overlap_are_the_same_places_of_the_beginning() -> None:
 def test_a_gap_between_end_and_beginning_counts_as_straight() -> None:
     """A tenth of the circle is missing: its chord is 2 R sin(pi / 10)."""
     boundary, points = circle(0.9)
-    overlap = find_overlap(boundary, points, ClosingSettings())
+    overlap = find_overlap(boundary, points)
     gap = 2.0 * RADIUS * np.sin(0.1 * np.pi)
     assert overlap.period == pytest.approx(boundary.confirmed_end + gap, abs=0.1)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BIG_ORANGE, ORANGE
+from pathspace_graph.mapping import tentative as tentative_module
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting, TentativeTracks
 from pathspace_graph.settings.growth import GrowthSettings
 
@@ -97,8 +98,9 @@ def test_a_rigid_motion_moves_every_track() -> None:
     assert found.counts.tolist() == [1, 1]
 
 
-def test_of_too_many_tracks_those_stay_that_were_seen_last() -> None:
-    found = TentativeTracks(GrowthSettings(max_tracks=3))
+def test_of_too_many_tracks_those_stay_that_were_seen_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tentative_module, "MAX_TRACKS", 3)
+    found = TentativeTracks(GrowthSettings())
     for k, t in enumerate([0.4, 0.1, 0.3, 0.2, 0.5]):
         found.add(np.array([[3.0 * k, 0.0]]), round_covariances(1.0), t)
     assert found.points[:, 0].tolist() == [0.0, 6.0, 12.0]

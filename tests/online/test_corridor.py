@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.online.corridor import Row, crosses, lead_on
-from pathspace_graph.settings.growth import TentativeSettings
+from pathspace_graph.mapping.path import crosses
+from pathspace_graph.online.outlook import Row, extend_rows
 
-SETTINGS = TentativeSettings(gap=9.0, turn=2.0, turn_rate=0.1, min_width=1.5)
 THRESHOLD = 0.7
 PATH = np.array([[-10.0, 0.0], [0.0, 0.0]])
 
@@ -20,7 +19,7 @@ def row(side: float, *candidates: tuple[float, float], end: float = 0.0) -> Row:
 
 
 def chosen(left: Row, right: Row, driven: np.ndarray = PATH) -> tuple[list[int], list[int]]:
-    lead_on(left, right, driven, THRESHOLD, SETTINGS)
+    extend_rows(left, right, driven, THRESHOLD)
     return left.chosen, right.chosen
 
 
@@ -30,7 +29,7 @@ def test_a_segment_crosses_a_line_or_not() -> None:
     assert crosses(np.zeros(2), ends, line).tolist() == [True, False, False, False, True]
 
 
-def test_rows_lead_on_in_the_order_of_the_track() -> None:
+def test_rows_extend_rows_in_the_order_of_the_track() -> None:
     left, right = row(1.0, (8.0, 2.0), (4.0, 2.0), (12.0, 2.0)), row(-1.0, (4.5, -2.0), (9.0, -2.0))
     assert chosen(left, right) == ([1, 0, 2], [0, 1])
     np.testing.assert_allclose(left.line[-1], [12.0, 2.0])
@@ -42,8 +41,8 @@ def test_rows_lead_on_in_the_order_of_the_track() -> None:
     [
         ((4.0, 2.0), True),
         ((0.5, 2.0), False),
-        ((8.9, 2.0), True),
-        ((9.1, 2.0), False),
+        ((10.9, 2.0), True),
+        ((11.1, 2.0), False),
         ((-0.3, 4.0), True),
         ((-2.0, 3.0), False),
         ((4.0, -0.6), False),

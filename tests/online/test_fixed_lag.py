@@ -12,7 +12,6 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.accuracy import cone_distances, lap_metrics
 from pathspace_graph.eval.metrics.trajectory import ate
-from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
@@ -248,7 +247,7 @@ def test_unknown_readings_on_a_curve_are_used() -> None:
     detections = mapper.smoother.map.detections
     used = detections.used & (detections.label == UNKNOWN)
     assert used.sum() > 10
-    y = to_map(detections.point[used], mapper.smoother.variables.poses_at(detections.cycle[used]))[:, 1]
+    y = detections.points_map(used, mapper.smoother.variables)[:, 1]
     np.testing.assert_array_equal(detections.boundary[used], np.where(y > 0.0, LEFT, RIGHT))
     for label, line in ((LEFT, 2.0), (RIGHT, -2.0)):
         assert straightness(mapper.map(), label, line, 60.0) < 0.02

@@ -12,10 +12,10 @@ from scipy.spatial import KDTree
 from pathspace_graph.eval.metrics.accuracy import mapped_points, true_curve
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.mapping.candidates import Candidates, End
-from pathspace_graph.mapping.path import PathAhead
+from pathspace_graph.mapping.path import END_BEHIND, Candidates, End, PathAhead
+from pathspace_graph.online import growth
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.online.growth import _end, count_in_order, undisputed
+from pathspace_graph.online.growth import count_in_order, undisputed
 from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -48,14 +48,14 @@ def test_a_place_is_of_the_label_that_most_readings_around_it_have(
 ) -> None:
     """Two to one, one to one, and nothing at all; those of unknown colour have no say."""
     places = np.array([[10.0, 0.0], [0.0, 8.0], [5.0, 5.0]])
-    assert undisputed(seen.smoother, label, places, 1.0).tolist() == expected
+    assert undisputed(seen.smoother.map, label, places, 1.0).tolist() == expected
 
 
 def test_readings_farther_away_than_the_radius_have_no_say(seen: FixedLagMapper) -> None:
     """Of those about (10, 0) only the right one is within 0.25 m of (10, 0.5)."""
     place = np.array([[10.0, 0.5]])
-    assert undisputed(seen.smoother, RIGHT, place, 0.25).tolist() == [True]
-    assert undisputed(seen.smoother, LEFT, place, 0.25).tolist() == [False]
+    assert undisputed(seen.smoother.map, RIGHT, place, 0.25).tolist() == [True]
+    assert undisputed(seen.smoother.map, LEFT, place, 0.25).tolist() == [False]
 
 
 def miscoloured(log: Log, every: int) -> Log:
@@ -113,7 +113,7 @@ def test_an_end_nearer_to_an_older_stretch_of_the_path_does_not_follow_that() ->
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
     stations = np.union1d(np.arange(0.0, along[-1], 0.3), along)  # the path is stored in such steps
     points = np.column_stack([np.interp(stations, along, corners[:, k]) for k in range(2)])
-    assert mapper.growth.expand(mapper.smoother, PathAhead(points, stations, float(along[3]))) == frozenset()
+    assert mapper.growth.expand(PathAhead(points, stations, float(along[3]))) == frozenset()
     assert (boundary.confirmed_end, boundary.size) == (confirmed, size)
 
 
@@ -141,7 +141,7 @@ def track(mapper: FixedLagMapper, *points: tuple[float, float], label: int = LEF
 
 def grow(mapper: FixedLagMapper, path: PathAhead) -> list[tuple[float, float]]:
     """Expands the curves along a path; returns the cones of the left one, to a centimetre."""
-    mapper.growth.expand(mapper.smoother, path)
+    mapper.growth.expand(path)
     observed = mapper.boundaries[LEFT].observed if LEFT in mapper.boundaries else []
     return [(round(float(x), 2), round(float(y), 2)) for x, y in observed]
 
@@ -210,11 +210,10 @@ def test_an_end_that_the_vehicle_has_passed_follows_the_path(alone: FixedLagMapp
 def test_cones_that_were_passed_in_another_order_are_counted(alone: FixedLagMapper) -> None:
     """The curve went (0, 2), (4, 2), (12, 2), (8, 2): after 9 m the third has not been passed yet."""
     boundary, _ = boundary_through(np.array([[0.0, 2.0], [4.0, 2.0], [12.0, 2.0], [8.0, 2.0]]))
-    settings = MapperSettings().growth
-    counts = [count_in_order(boundary, along_x(x), settings) for x in (3.0, 7.0, 9.0, 13.0)]
+    counts = [count_in_order(boundary, along_x(x)) for x in (3.0, 7.0, 9.0, 13.0)]
     assert counts == [4, 4, 2, 2]
     in_order, _ = boundary_through(np.array([[0.0, 2.0], [4.0, 2.0], [8.0, 2.0], [12.0, 2.0]]))
-    assert count_in_order(in_order, along_x(13.0), settings) == 4
+    assert count_in_order(in_order, along_x(13.0)) == 4
 
 
 def test_a_curve_that_is_taken_back_goes_through_its_cones_in_the_right_order(alone: FixedLagMapper) -> None:
@@ -276,24 +275,28 @@ def backwards(mapper: FixedLagMapper, log: Log) -> float:
     return float(np.max(-np.diff(nearest), initial=0.0))
 
 
-def test_an_end_led_on_in_the_wrong_order_is_taken_back() -> None:
+def test_an_end_led_on_in_the_wrong_order_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
     log = hairpin()
     mapper, _ = map_log(log)
     assert backwards(mapper, log) < 0.5
-    settings = MapperSettings()
-    never = replace(settings, growth=replace(settings.growth, recall=0.1))
-    assert backwards(map_log(log, FixedLagMapper(never, log.odometry_sigma))[0], log) > 2.0
+    monkeypatch.setattr(growth, "RECALL", 0.1)
+    assert backwards(map_log(log, FixedLagMapper(None, log.odometry_sigma))[0], log) > 2.0
 
 
 # --- the bound -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    "bound",
-    [GrowthSettings(max_size=10.0), GrowthSettings(length_driven=0.01, length_free=25.0)],
+    ("size", "constants"),
+    [(10.0, {}), (5000.0, {"LENGTH_DRIVEN": 0.01, "LENGTH_FREE": 25.0})],
     ids=["size", "length"],
 )
-def test_an_open_curve_has_a_bound_and_it_is_said_once_for_each_boundary(bound: GrowthSettings) -> None:
+def test_an_open_curve_has_a_bound_and_it_is_said_once_for_each_boundary(
+    size: float, constants: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in constants.items():
+        monkeypatch.setattr(growth, name, value)
+    bound = GrowthSettings(max_size=size)
     cones, labels = corridor(100.0)
     log = exact_log(ahead(6.0, 12.0), cones, labels)
     mapper, results = map_log(log, FixedLagMapper(replace(MapperSettings(), growth=bound)))
@@ -381,7 +384,7 @@ def uncrossed(mapper: FixedLagMapper, path: PathAhead, *points: tuple[float, flo
     places = np.array(points)
     found = Candidates(places, np.arange(len(places)), places[:, 0], places[:, 1])
     end = End(np.array([4.0, 2.0]), 4.0, 2.0)
-    return mapper.growth._uncrossed(mapper.smoother, LEFT, path, end, found).tolist()
+    return mapper.growth._uncrossed(LEFT, path, end, found).tolist()
 
 
 @pytest.fixture
@@ -432,7 +435,7 @@ def test_one_wrong_cone_at_the_end_leads_no_farther(alone: FixedLagMapper) -> No
     """The newest cones are 2, 2 and 3.4 m beside the path: the next may be 2.7 m and a step away."""
     track(alone, (-4.0, 2.0), (0.0, 2.0), (4.0, 3.4))
     assert len(grow(alone, along_x())) == 3
-    end = _end(alone.smoother, LEFT, along_x(), 5.0)
+    end = alone.growth.end(LEFT, along_x(), 5.0)
     assert end.side == pytest.approx(2.7, abs=0.05)  # of the cones and the end, four values
     assert end.position == pytest.approx([4.0, 3.4], abs=0.05)
 
@@ -453,4 +456,4 @@ def test_an_end_that_was_carried_on_around_a_bend_has_the_side_that_it_has(alone
     boundary, control_points = boundary_through(inner)
     alone.smoother.map.state.add_boundary(LEFT, boundary, control_points)
     boundary.observed[:] = [np.array([x, 2.0]) for x in (0.0, 4.0, 8.0, 12.0)]
-    assert _end(alone.smoother, LEFT, path, GrowthSettings().end_behind).side == pytest.approx(2.0, abs=0.1)
+    assert alone.growth.end(LEFT, path, END_BEHIND).side == pytest.approx(2.0, abs=0.1)

@@ -13,7 +13,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.online.outlook import Outlook, joint_covariance_of, look_ahead
+from pathspace_graph.online.outlook import SIGMA_BEND, Outlook, joint_covariance_of, look_ahead
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -35,7 +35,9 @@ def mapper(log: Log) -> FixedLagMapper:
 
 
 def outlook(mapper: FixedLagMapper, label: int = LEFT) -> Outlook:
-    return look_ahead(mapper.smoother, mapper.growth, mapper.path)[label]
+    return look_ahead(mapper.smoother.map, mapper.growth.tentative, mapper.path, mapper.smoother.times[-1])[
+        label
+    ]
 
 
 def test_an_open_map_leads_on_through_all_cones_in_sight(mapper: FixedLagMapper) -> None:
@@ -80,7 +82,9 @@ def test_a_detection_that_is_not_repeated_is_taken_back() -> None:
     mapper, ends = FixedLagMapper(odometry_sigma=log.odometry_sigma), []
     for odometry, detected in split_odometry(log):
         mapper.update(odometry, detected)
-        found = look_ahead(mapper.smoother, mapper.growth, mapper.path).get(LEFT)
+        found = look_ahead(
+            mapper.smoother.map, mapper.growth.tentative, mapper.path, mapper.smoother.times[-1]
+        ).get(LEFT)
         ends.append(found.tracks[-1, 0] if found is not None and len(found.tracks) else 0.0)
     assert max(ends[:at]) < 25.0
     assert [end > 27.0 for end in ends[at : at + 6]] == [True] * 4 + [False] * 2
@@ -132,7 +136,7 @@ def test_the_covariance_is_that_of_the_fit_by_differences(mapper: FixedLagMapper
     newest = pose_keys(np.array([mapper.smoother.next_cycle - 1]))
     joint = mapper.smoother.covariance(np.concatenate([state.keys(LEFT), newest]))
     assert found.placement is not None
-    vehicle, tracks, bend = mapper.poses[-1], found.tracks, 0.7
+    vehicle, tracks, bend = mapper.poses[-1], found.tracks, SIGMA_BEND
 
     def placed(offset: Array) -> Array:
         dx, dy, turned = offset[-3:]
@@ -149,7 +153,7 @@ def test_the_covariance_is_that_of_the_fit_by_differences(mapper: FixedLagMapper
     by_track, by_bend = found.placement.by_target, found.placement.by_bend
     own = by_track @ np.diag(found.variances) @ by_track.T + bend**2 * by_bend @ by_bend.T
     expected[kept:, kept:] += np.kron(own, np.eye(2))
-    covariance, (block,) = joint_covariance_of([found], joint, vehicle, bend)
+    covariance, (block,) = joint_covariance_of([found], joint, vehicle)
     assert block == slice(0, len(covariance))
     np.testing.assert_allclose(covariance, expected, atol=1e-8)
 

@@ -22,8 +22,7 @@ def boundary_through(points: Array, settings: SplineSettings | None = None) -> t
     boundary = open_boundary(settings or SplineSettings(), GaugeSettings())
     u = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
     control_points = boundary.grow(np.zeros((0, 2)), u, points)
-    boundary.observed.extend(points)
-    boundary.cone_parameters.extend(u.tolist())
+    boundary.add_cones(points, u)
     return boundary, control_points
 
 

@@ -17,7 +17,6 @@ UNLIMITED = {
     "gate.huber",
     "growth.forget_after",
     "growth.max_size",
-    "growth.length_driven",
     "open_lap.max_cycles",
     "open_lap.max_cones",
     "odometry.doubt",
