@@ -26,7 +26,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import fields, is_dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from hashlib import sha256
 from inspect import unwrap
 from io import BytesIO
@@ -167,16 +167,11 @@ def _factors(graph: Any) -> list[Any]:
     return [graph.at(i) for i in range(graph.size())]
 
 
-def _graph(kind: Callable[[], Any]) -> Callable[..., Any]:
-    """Return how a graph or a net is made of its factors."""
-
-    def make(*factors: Any) -> Any:
-        graph = kind()
-        for factor in factors:
-            graph.push_back(factor)
-        return graph
-
-    return make
+def _graph(kind: Callable[[], Any], *factors: Any) -> Any:
+    graph = kind()
+    for factor in factors:
+        graph.push_back(factor)
+    return graph
 
 
 def _jacobian(factor: gtsam.JacobianFactor) -> tuple[Any, ...]:
@@ -202,8 +197,8 @@ TYPES: Final[dict[type, tuple[Callable[[Any], Iterable[Any]], Callable[..., Any]
     KDTree: (lambda tree: (np.array(tree.data),), KDTree),
     Recovery: (lambda recovery: (recovery.failures,), Recovery),
     Future: (lambda _: (), lambda: None),  # what a process is about to give is asked for again
-    gtsam.GaussianFactorGraph: (_factors, _graph(gtsam.GaussianFactorGraph)),
-    gtsam.GaussianBayesNet: (_factors, _graph(gtsam.GaussianBayesNet)),
+    gtsam.GaussianFactorGraph: (_factors, partial(_graph, gtsam.GaussianFactorGraph)),
+    gtsam.GaussianBayesNet: (_factors, partial(_graph, gtsam.GaussianBayesNet)),
     gtsam.GaussianConditional: (
         _conditional,
         lambda keys, matrix, frontals: linear_arrays.conditional_of(keys, sizes(keys), frontals, matrix),
@@ -272,10 +267,8 @@ class Encoder:
             return ["object", number, *map(self._value, held.values())]
         if kind in TYPES:
             return [kind.__name__, *map(self._value, TYPES[kind][0](value))]
-        found = f"{kind.__module__}.{kind.__qualname__} {getattr(value, 'dtype', '')}"
-        raise SettingsError(
-            f"snapshot: expected what can be saved in {self._holder}, found a {found.rstrip()}"
-        )
+        found = f"{kind.__module__}.{kind.__qualname__} {getattr(value, 'dtype', '')}".rstrip()
+        raise SettingsError(f"snapshot: expected what can be saved in {self._holder}, found a {found}")
 
 
 def _lay_out(arrays: list[tuple[NDArray[Any], list[Any]]]) -> Bytes:
