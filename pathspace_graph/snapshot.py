@@ -267,10 +267,8 @@ class Encoder:
             return ["object", number, *map(self._value, held.values())]
         if kind in TYPES:
             return [kind.__name__, *map(self._value, TYPES[kind][0](value))]
-        found = f"{kind.__module__}.{kind.__qualname__} {getattr(value, 'dtype', '')}"
-        raise SettingsError(
-            f"snapshot: expected what can be saved in {self._holder}, found a {found.rstrip()}"
-        )
+        found = f"{kind.__module__}.{kind.__qualname__} {getattr(value, 'dtype', '')}".rstrip()
+        raise SettingsError(f"snapshot: expected what can be saved in {self._holder}, found a {found}")
 
 
 def _lay_out(arrays: list[tuple[NDArray[Any], list[Any]]]) -> Bytes:

@@ -45,7 +45,7 @@ class SplineBoundary:
     """The curve is in the map frame, in the direction of travel."""
 
     covariance: Array
-    """Joint covariance (2m, 2m) in m^2 of the m distinct control points, in the order x0, y0, x1 and so on."""
+    """Joint covariance (2m, 2m) in m^2 of the distinct control points, in the order x0, y0, x1 and so on."""
 
     confirmed_until: float = math.inf
     """Parameter up to which the curve is confirmed; beyond, it is tentative, and may be taken back."""
