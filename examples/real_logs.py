@@ -27,7 +27,7 @@ from pathspace_graph.estimators import DEFAULT, DEFAULT_BATCH, make_batch, make_
 from pathspace_graph.eval.metrics.accuracy import crossings
 from pathspace_graph.eval.metrics.reference import aligned_distance
 from pathspace_graph.eval.metrics.summary import summarize
-from pathspace_graph.factors.measured_noise import MeasuredNoise
+from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.se2 import compose, move_points, to_map, to_vehicle, wrap_angle
 from pathspace_graph.factors.sensor import SENSOR, by_sensor
 from pathspace_graph.front_end.front_end import seen_cycles

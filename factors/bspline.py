@@ -1,4 +1,4 @@
-"""B-spline basis functions on plain arrays: their values and derivatives by the Cox-de Boor recurrence.
+"""B-spline bases on plain arrays: the Cox-de Boor recurrence, and polynomials on each span, which are faster.
 
 A spline of degree p over n control points has n + p + 1 non-decreasing knots and the domain
 [knots[p], knots[n]]. On the span knots[i] <= u < knots[i + 1] only the control points i - p to i matter.
@@ -8,20 +8,24 @@ last p repeat the first, over one period of knots and p more on either side.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import factorial
+from typing import Final
+
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
+from .arrays import Array, IntArray
 
 
-def domain(knots: Floats, degree: int) -> tuple[float, float]:
-    """Returns the limits knots[p] and knots[n] of the domain, where all p + 1 basis functions exist."""
+def domain(knots: Array, degree: int) -> tuple[float, float]:
+    """Return the limits knots[p] and knots[n] of the domain, where all p + 1 basis functions exist."""
     return float(knots[degree]), float(knots[len(knots) - degree - 1])
 
 
-def wrap(knots: Floats, degree: int, u: Floats) -> Floats:
-    """Returns u modulo the period, inside the domain of a periodic spline.
+def wrap(knots: Array, degree: int, u: Array) -> Array:
+    """Return u modulo the period, inside the domain of a periodic spline.
 
     The right end of the domain is reached by round-off only.
     """
@@ -31,8 +35,8 @@ def wrap(knots: Floats, degree: int, u: Floats) -> Floats:
     return np.minimum(np.maximum(wrapped, low), high)
 
 
-def find_span(knots: Floats, degree: int, u: Floats) -> Ints:
-    """Returns the span i (m,), in [p, n - 1], of each u (m,), so that knots[i] <= u < knots[i + 1].
+def find_span(knots: Array, degree: int, u: Array) -> IntArray:
+    """Return the span i (m,), in [p, n - 1], of each u (m,), so that knots[i] <= u < knots[i + 1].
 
     Values of u outside the domain are treated as if they were clipped to it. The right end of the domain
     belongs to the last non-empty span. knots has shape (n + p + 1,).
@@ -43,8 +47,8 @@ def find_span(knots: Floats, degree: int, u: Floats) -> Ints:
     return np.searchsorted(inner, u, side="right") + degree
 
 
-def basis(knots: Floats, degree: int, u: Floats, derivatives: int = 0) -> tuple[Floats, Ints]:
-    """Returns basis values and derivatives (derivatives + 1, m, p + 1) at u (m,), and the spans (m,) of u.
+def basis(knots: Array, degree: int, u: Array, derivatives: int = 0) -> tuple[Array, IntArray]:
+    """Return basis values and derivatives (derivatives + 1, m, p + 1) at u (m,), and the spans (m,) of u.
 
         N_i^p = (u - t_i) / (t_{i+p} - t_i) N_i^{p-1} + (t_{i+p+1} - u) / (t_{i+p+1} - t_{i+1}) N_{i+1}^{p-1}
 
@@ -68,8 +72,8 @@ def basis(knots: Floats, degree: int, u: Floats, derivatives: int = 0) -> tuple[
     return values.transpose(0, 2, 1), span
 
 
-def _levels(window: Floats, degree: int, u: Floats) -> list[Floats]:
-    """Returns the basis values (q + 1, m) of each degree q <= p, from the knots (2 p, m) around each u."""
+def _levels(window: Array, degree: int, u: Array) -> list[Array]:
+    """Return the basis values (q + 1, m) of each degree q <= p, from the knots (2 p, m) around each u."""
     levels = [np.ones((1, len(u)))]
     for q in range(1, degree + 1):
         lower, upper = window[degree - q : degree], window[degree : degree + q]
@@ -82,8 +86,8 @@ def _levels(window: Floats, degree: int, u: Floats) -> list[Floats]:
     return levels
 
 
-def _differentiate(window: Floats, degree: int, q: int, level: Floats) -> Floats:
-    """Returns q (N_i^{q-1} / (t_{i+q} - t_i) - N_{i+1}^{q-1} / (t_{i+q+1} - t_{i+1})) (q + 1, m).
+def _differentiate(window: Array, degree: int, q: int, level: Array) -> Array:
+    """Return q (N_i^{q-1} / (t_{i+q} - t_i) - N_{i+1}^{q-1} / (t_{i+q+1} - t_{i+1})) (q + 1, m).
 
     level (q, m) holds the functions, or derivatives, of degree q - 1.
     """
@@ -94,13 +98,13 @@ def _differentiate(window: Floats, degree: int, q: int, level: Floats) -> Floats
     return raised
 
 
-def divisors(width: Floats) -> Floats:
-    """Returns each width, or infinity where it is zero, so that 0 / 0 is taken as 0."""
+def divisors(width: Array) -> Array:
+    """Return each width, or infinity where it is zero, so that 0 / 0 is taken as 0."""
     return np.where(width > 0.0, width, np.inf)
 
 
-def scatter(values: Floats, first: Ints, size: int, periodic: bool = False) -> Floats:
-    """Returns dense rows (m, size) of local values (m, p + 1), whose first columns belong to `first` (m,).
+def scatter(values: Array, first: IntArray, size: int, periodic: bool = False) -> Array:
+    """Return dense rows (m, size) of local values (m, p + 1), whose first columns belong to `first` (m,).
 
     Columns of a periodic spline are taken modulo `size`, and values that fall on the same column are added.
     """
@@ -112,33 +116,24 @@ def scatter(values: Floats, first: Ints, size: int, periodic: bool = False) -> F
     return matrix
 
 
-def basis_matrix(knots: Floats, degree: int, u: Floats, n: int, derivative: int = 0) -> Floats:
-    """Returns B (m, n) with B[k, i] = d^r/du^r N_i^p(u_k), so that d^r S/du^r = B c for n control points."""
+def basis_matrix(knots: Array, degree: int, u: Array, n: int, derivative: int = 0) -> Array:
+    """Return B (m, n) with B[k, i] = d^r/du^r N_i^p(u_k), so that d^r S/du^r = B c for n control points."""
     values, span = basis(knots, degree, u, derivative)
     return scatter(values[derivative], span - degree, n)
 
 
-def periodic_basis_matrix(knots: Floats, degree: int, u: Floats, m: int, derivative: int = 0) -> Floats:
-    """Returns B (k, m) as `basis_matrix`, for the m distinct control points of a periodic spline.
-
-    Parameters u (k,) are taken modulo the period.
-    """
-    values, span = basis(knots, degree, wrap(knots, degree, u), derivative)
-    return scatter(values[derivative], span - degree, m, periodic=True)
-
-
-def uniform_knots(count: int, degree: int, interval: float = 1.0, start: float = 0.0) -> Floats:
-    """Returns unclamped, equally spaced knots of `count` control points; the domain begins at `start`."""
+def uniform_knots(count: int, degree: int, interval: float = 1.0, start: float = 0.0) -> Array:
+    """Return unclamped, equally spaced knots of `count` control points; the domain begins at `start`."""
     return start + interval * np.arange(-degree, count + 1, dtype=np.float64)
 
 
-def clamped_knots(breaks: Floats, degree: int) -> Floats:
-    """Returns the breaks (k + 1,) with both ends repeated p times more, as knots of k + p control points."""
+def clamped_knots(breaks: Array, degree: int) -> Array:
+    """Return the breaks (k + 1,) with both ends repeated p times more, as knots of k + p control points."""
     return np.concatenate([np.full(degree, breaks[0]), breaks, np.full(degree, breaks[-1])])
 
 
-def periodic_knots(breaks: Floats, degree: int) -> Floats:
-    """Returns one period of m + 1 > p breaks with p more knots on either side.
+def periodic_knots(breaks: Array, degree: int) -> Array:
+    """Return one period of m + 1 > p breaks with p more knots on either side.
 
     They are the knots of m + p unwrapped control points.
     """
@@ -148,33 +143,272 @@ def periodic_knots(breaks: Floats, degree: int) -> Floats:
     return np.concatenate([before, breaks, after])
 
 
-def end_change_matrix(knots: Floats, degree: int, new_knots: Floats) -> Floats:
-    """Returns M (n, n) with C_new = M C, which keeps the curve where only knots outside the domain change.
+_PERIODS_LAID_OUT: Final = (-1.0, 0.0, 1.0)
+"""A periodic curve lies on the axis of `Spans` once for each of these shifts, in periods."""
+_GAP_OF_CURVES: Final = 1.0
+"""Curves on the axis of `Spans` are at least this far apart, in units of the parameter."""
 
-    The control point c_j is the blossom, at the knots t_{j+1} to t_{j+p}, of the polynomial of any span that
-    it acts on (Ramshaw 1989). So clamping, unclamping and the extension of Hu et al. (2002) are one formula.
-    The first and the last span of the domain must not be empty. Knots beyond index n + p - 1 are not read.
+
+@dataclass(frozen=True, eq=False)
+class SpanPolynomials:
+    """Basis functions on each span as polynomials of s = (u - t_i) / (t_{i+1} - t_i).
+
+    It gives the same values as `basis`, but faster.
     """
-    count = len(knots) - degree - 1
-    matrix = np.eye(count)
-    for j in range(count):
-        arguments = new_knots[j + 1 : j + degree + 1]
-        if not np.array_equal(arguments, knots[j + 1 : j + degree + 1]):
-            span = degree if j < degree else count - 1
-            matrix[j] = 0.0
-            matrix[j, span - degree : span + 1] = _blossom(knots, degree, span, arguments)
-    return matrix
+
+    knots: Array
+    """The knots (n + p + 1,) do not decrease; they are unwrapped where the curve is periodic."""
+    degree: int
+    periodic: bool = False
+    """If true, parameters are taken modulo the length of the domain instead of being clipped to it."""
+    known: Array | None = field(default=None, repr=False)
+    """Coefficients of the first spans, which are taken over instead of being computed again."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "knots", np.ascontiguousarray(self.knots, dtype=np.float64))
+
+    @cached_property
+    def low(self) -> float:
+        """Left end of the domain."""
+        return domain(self.knots, self.degree)[0]
+
+    @cached_property
+    def high(self) -> float:
+        """Right end of the domain."""
+        return domain(self.knots, self.degree)[1]
+
+    @cached_property
+    def starts(self) -> Array:
+        """Left knots of the spans (n - p,)."""
+        return self.knots[self.degree : -self.degree - 1]
+
+    @cached_property
+    def inverse_widths(self) -> Array:
+        """`1 / (t_{i+1} - t_i)` of each span (n - p,), and zero for an empty span."""
+        widths = np.diff(self.knots[self.degree : len(self.knots) - self.degree])
+        return np.where(widths > 0.0, 1.0 / divisors(widths), 0.0)
+
+    @cached_property
+    def windows(self) -> IntArray:
+        """Indices (n - p, p + 1) of the control points that matter on each span."""
+        return np.arange(len(self.starts))[:, None] + np.arange(self.degree + 1)
+
+    @cached_property
+    def coefficients(self) -> Array:
+        """N_{i-p+j}(u) is sum_k coefficients[k, i - p, j] s^k; the shape is (p + 1, n - p spans, p + 1)."""
+        if self.known is None:
+            return _span_coefficients(self.knots, self.degree)
+        count = self.known.shape[1]
+        if count == len(self.starts):
+            return self.known
+        return np.concatenate([self.known, _span_coefficients(self.knots[count:], self.degree)], axis=1)
+
+    @cached_property
+    def alone(self) -> Spans:
+        """Spans of this curve alone, on its unwrapped control points."""
+        return lay_out([self], [0])
+
+    @cached_property
+    def _breaks(self) -> Array:
+        last = int(np.searchsorted(self.starts, self.high, side="left")) - 1
+        return self.knots[self.degree + 1 : self.degree + 1 + max(last, 0)]
+
+    @cached_property
+    def _stacks(self) -> dict[int, Array]:
+        return {0: self.coefficients}
+
+    def extended(self, knots: Array) -> SpanPolynomials:
+        """Return an open curve's polynomials on knots that begin with these; only new spans are computed."""
+        return SpanPolynomials(knots, self.degree, False, self.coefficients)
+
+    def tail(self, first: int) -> SpanPolynomials:
+        """Return an open curve's polynomials without its first control points; other spans stay the same."""
+        return SpanPolynomials(self.knots[first:], self.degree, False, self.coefficients[:, first:])
+
+    @property
+    def length(self) -> float:
+        return self.high - self.low
+
+    @property
+    def occupied(self) -> int:
+        """Return the number of spans up to the last one that is not empty."""
+        return len(self._breaks) + 1
+
+    def inside(self, u: Array) -> Array:
+        """Return u wrapped into the domain of a periodic curve, or clipped to the domain of an open one."""
+        if self.periodic:
+            return wrap(self.knots, self.degree, u)
+        return np.minimum(np.maximum(u, self.low), self.high)
+
+    def locate(self, u: Array) -> tuple[IntArray, Array]:
+        """Return the span number span - p (m,), in [0, n - p), and s (m,), in [0, 1], of each u (m,).
+
+        u is wrapped or clipped first.
+        """
+        inside = self.inside(u)
+        number = self._breaks.searchsorted(inside, side="right")
+        return number, (inside - self.starts.take(number)) * self.inverse_widths.take(number)
+
+    def evaluate(self, u: Array, derivatives: int = 0) -> tuple[Array, IntArray]:
+        """Return values (derivatives + 1, m, p + 1) and spans (m,) as `basis` does, by Horner's rule.
+
+        u is wrapped or clipped first.
+        """
+        number, s = self.locate(u)
+        values = horner(self._stack(derivatives).take(number, axis=1), s[:, None])
+        by_order = values.reshape(len(s), derivatives + 1, self.degree + 1).transpose(1, 0, 2)
+        return by_order, number + self.degree
+
+    @cached_property
+    def polynomials(self) -> Array:
+        """Polynomials of the basis and of two derivatives by span: (n - p, 3 (p + 1), p + 1)."""
+        return self._stack(2).transpose(1, 0, 2).reshape(len(self.starts), -1, self.degree + 1)
+
+    def _stack(self, derivatives: int) -> Array:
+        """Return the polynomials of all orders side by side: (p + 1, n - p, (derivatives + 1) (p + 1))."""
+        if derivatives not in self._stacks:
+            orders = [_derivative(self.coefficients, r, self.inverse_widths) for r in range(derivatives + 1)]
+            self._stacks[derivatives] = np.ascontiguousarray(np.concatenate(orders, axis=2))
+        return self._stacks[derivatives]
 
 
-def _blossom(knots: Floats, degree: int, span: int, arguments: Floats) -> Floats:
-    """Returns the weights (p + 1,) of a span's control points in the blossom of its polynomial.
+@dataclass(frozen=True, eq=False)
+class Spans:
+    """Spans of several curves of one degree, laid out one curve after the other on an axis v.
 
-    They follow from de Boor's recurrence, with another argument at each level.
+    Rows on any of the curves are then located and evaluated in one call. Parameter u of curve k lies at
+    `v = u + shift[k]`. A periodic curve is laid out for three periods, so that a stretch across the seam need
+    not be wrapped.
     """
-    weights = np.eye(degree + 1)
-    for r, x in enumerate(arguments, start=1):
-        lower = knots[span - degree + r : span + 1]
-        upper = knots[span + 1 : span + degree - r + 2]
-        share = ((x - lower) / (upper - lower))[:, None]
-        weights = (1.0 - share) * weights[:-1] + share * weights[1:]
-    return np.asarray(weights[0])
+
+    degree: int
+    periodic: bool
+    """If true, all curves are closed; otherwise none is."""
+    low: Array
+    high: Array
+    """Limits (k,) of the curves' domains on the axis."""
+    shift: Array
+    """Each shift (k,) leads from a curve's own parameter to the axis; it is zero for the first curve."""
+    interval: Array
+    """Mean knot intervals (k,) of the curves."""
+    first: int
+    """The control points of the first curve begin at this place of the common array."""
+    columns: IntArray
+    """Each row (n, p + 1) holds the control points that matter on a span."""
+    starts: Array
+    """Left ends (l,) of the spans, in order: l is n, or 3 n for periodic curves."""
+    inverse_widths: Array
+    """Each entry (l,) is one over the width of a span."""
+    number: IntArray
+    """Each entry (l,) is the number of the span, in [0, n)."""
+    by_span: Array
+    """The array (n, 3 (p + 1), p + 1) holds the polynomials of the basis and of two derivatives."""
+    values: Array
+    """The array (p + 1, n, p + 1) holds the polynomials of the basis, power after power."""
+
+    def locate(self, v: Array) -> tuple[IntArray, Array]:
+        """Return the span number in [0, n), and s in [0, 1], of each place v (m,) on the axis."""
+        laid = self.starts[1:].searchsorted(v, side="right")
+        s = (v - self.starts.take(laid)) * self.inverse_widths.take(laid)
+        return self.number.take(laid) if self.periodic else laid, s
+
+    def basis(self, number: IntArray, s: Array) -> Array:
+        """Return basis values (m, p + 1) at the result of `locate`, by Horner's rule."""
+        return horner(self.values.take(number, axis=1), s[:, None])
+
+    def curve_coefficients(self, control_points: Array) -> Array:
+        """Return C (p + 1, 3, 2, n): on span i, d^r S / du^r = sum_k C[k, r, :, i] s^k, r <= 2."""
+        by_span = np.matmul(self.by_span, control_points.take(self.columns, axis=0))
+        shape = (len(by_span), self.degree + 1, 3, 2)
+        return np.ascontiguousarray(by_span.reshape(shape).transpose(1, 2, 3, 0))
+
+
+def horner(terms: Array, s: Array) -> Array:
+    """Return sum_k terms[k] s^k for terms (p + 1, m, ...) and s, which broadcasts to the shape of a term."""
+    total: Array = terms[-1] * s
+    total += terms[-2]
+    for term in terms[-3::-1]:
+        total *= s
+        total += term
+    return total
+
+
+def lay_out(
+    curves: Sequence[SpanPolynomials], offsets: Sequence[int], sizes: Sequence[int] | None = None
+) -> Spans:
+    """Return the spans of curves, all periodic or none, laid out on one axis.
+
+    The control points of each curve begin at its entry of `offsets` in a common array. Where `sizes` is
+    given, the array holds this many distinct control points of each periodic curve; otherwise it holds
+    unwrapped ones.
+    """
+    periodic, counts = curves[0].periodic, [curve.occupied for curve in curves]
+    periods = np.array(_PERIODS_LAID_OUT) if periodic else np.zeros(1)
+    shift = np.array(_shifts(curves, periods))
+    columns = [curve.windows[:n] for curve, n in zip(curves, counts, strict=True)]
+    if periodic and sizes is not None:
+        columns = [window % size for window, size in zip(columns, sizes, strict=True)]
+    starts = [
+        (curve.starts[:n] + curve.length * periods[:, None]).ravel() + moved
+        for curve, n, moved in zip(curves, counts, shift, strict=True)
+    ]
+    first = np.cumsum([0, *counts[:-1]])
+    number = [np.tile(k + np.arange(n), len(periods)) for k, n in zip(first, counts, strict=True)]
+    inverse_widths = np.concatenate([c.inverse_widths[:n] for c, n in zip(curves, counts, strict=True)])
+    laid = np.concatenate(number)
+    return Spans(
+        degree=curves[0].degree,
+        periodic=periodic,
+        low=np.array([curve.low for curve in curves]) + shift,
+        high=np.array([curve.high for curve in curves]) + shift,
+        shift=shift,
+        interval=np.array([curve.length / len(curve.starts) for curve in curves]),
+        first=offsets[0],
+        columns=np.concatenate([k + window for k, window in zip(offsets, columns, strict=True)]),
+        starts=np.concatenate(starts),
+        inverse_widths=inverse_widths[laid],
+        number=laid,
+        by_span=np.concatenate([c.polynomials[:n] for c, n in zip(curves, counts, strict=True)]),
+        values=np.concatenate([c.coefficients[:, :n] for c, n in zip(curves, counts, strict=True)], axis=1),
+    )
+
+
+def _shifts(curves: Sequence[SpanPolynomials], periods: Array) -> list[float]:
+    """Return the shift of each curve at which no two overlap; the first curve is not shifted.
+
+    Shifts are whole numbers, which add the least round-off.
+    """
+    shifts, end = [0.0], curves[0].high + curves[0].length * periods[-1]
+    for curve in curves[1:]:
+        shifts.append(float(np.ceil(end - (curve.low + curve.length * periods[0]) + _GAP_OF_CURVES)))
+        end = curve.high + curve.length * periods[-1] + shifts[-1]
+    return shifts
+
+
+def _span_coefficients(knots: Array, degree: int) -> Array:
+    """Return the coefficients (p + 1 powers, n - p spans, p + 1) by Cox-de Boor on polynomials of s."""
+    spans = np.arange(degree, len(knots) - degree - 1)
+    start = knots[spans]
+    width = knots[spans + 1] - start
+    window = knots[spans + np.arange(1 - degree, degree + 1)[:, None]]
+    level = np.zeros((degree + 1, 1, len(spans)))
+    level[0] = 1.0
+    for q in range(1, degree + 1):
+        lower, upper = window[degree - q : degree], window[degree : degree + q]
+        ratio = level / divisors(upper - lower)
+        raised = np.zeros((degree + 1, q + 1, len(spans)))
+        raised[:, :-1] = (upper - start) * ratio
+        raised[:, 1:] += (start - lower) * ratio
+        raised[1:, :-1] -= width * ratio[:-1]
+        raised[1:, 1:] += width * ratio[:-1]
+        level = raised
+    return np.ascontiguousarray(level.transpose(0, 2, 1))
+
+
+def _derivative(coefficients: Array, order: int, inverse_widths: Array) -> Array:
+    """Return d^r/du^r of polynomials of s = (u - start) / width, in the same shape."""
+    derived = np.zeros_like(coefficients)
+    for power in range(order, len(coefficients)):
+        derived[power - order] = coefficients[power] * (factorial(power) // factorial(power - order))
+    derived *= (inverse_widths**order)[:, None]
+    return derived

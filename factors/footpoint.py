@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .bspline import Floats, Ints
-from .spans import SpanPolynomials, Spans, Stretch, horner, stretch_of
-
-Bools = NDArray[np.bool_]
+from .arrays import Array, BoolArray, IntArray
+from .bspline import SpanPolynomials, Spans, horner
 
 _STEP_TOLERANCE: Final = 1e-9
 """A row takes its last step where |step| <= tolerance * length of the domain; the error is its square."""
@@ -26,7 +23,7 @@ _NO_TANGENT: Final = 1e-12
 _SAFEGUARDED_STEPS: Final = 4
 """A Newton step that leads farther away is replaced by this number of bracketed steps."""
 _TINY: Final = 1e-300
-"""This is the smallest divisor of a step; the numerator vanishes before it does."""
+"""Smallest divisor of a step; the numerator vanishes before it does."""
 _CHUNK: Final = 1 << 20
 """At most this number of point-to-grid distances are held in memory at once."""
 SEARCH_ITERATIONS: Final = 50
@@ -36,84 +33,152 @@ REFINE_ITERATIONS: Final = 2
 
 
 @dataclass(frozen=True, eq=False)
+class Stretch:
+    """Part of its own curve where each row's foot point is searched for, on the axis of `Spans`."""
+
+    periodic: bool
+    begin: Array
+    end: Array
+    """Limits (m,) of the domain of each row's curve."""
+    low: Array
+    high: Array
+    floor: Array
+    ceiling: Array
+    """Limits (m,) of the iteration, which are infinite where a stretch is a whole period."""
+    interval: Array
+    """Mean knot interval (m,) of each row's curve."""
+
+    @property
+    def length(self) -> Array:
+        return self.end - self.begin
+
+    def within(self, v: Array) -> Array:
+        """Return v (m,) clipped to the limits of the iteration."""
+        return np.minimum(np.maximum(v, self.floor), self.ceiling)
+
+    def moved_into(self, v: Array) -> Array:
+        """Return v (m,) moved into its stretch by whole periods, or to the nearest limit."""
+        low, high = self.low, self.high
+        if not self.periodic:
+            return np.minimum(np.maximum(v, low), high)
+        period = self.length
+        inside = low + np.mod(v - low, period)
+        nearest = np.where(inside - high < low + period - inside, high, low)
+        return np.where(inside <= high, inside, nearest)
+
+    def in_domain(self, v: Array) -> Array:
+        """Return v (m,) wrapped into the domain of a periodic curve, or clipped to that of an open one."""
+        if self.periodic:
+            v = v - self.length * np.floor((v - self.begin) / self.length)
+        return np.minimum(np.maximum(v, self.begin), self.end)
+
+    def where(self, rows: BoolArray) -> Stretch:
+        names = ("begin", "end", "low", "high", "floor", "ceiling", "interval")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+
+def stretch_of(spans: Spans, curve: IntArray, u_low: Array, u_high: Array) -> Stretch:
+    """Return the stretches of rows on curves `curve` (m,) between the parameters u_low and u_high (m,).
+
+    A stretch lies inside the domain of an open curve and begins inside that of a periodic one. Reversed
+    limits give a stretch of length zero.
+    """
+    begin, end, shift = spans.low.take(curve), spans.high.take(curve), spans.shift.take(curve)
+    interval = spans.interval.take(curve)
+    low, high = u_low + shift, u_high + shift
+    if not spans.periodic:
+        low = np.minimum(np.maximum(low, begin), end)
+        high = np.maximum(low, np.minimum(high, end))
+        return Stretch(False, begin, end, low, high, low, high, interval)
+    period = end - begin
+    whole = ~(high - low < period)
+    if whole.any():
+        low, high = np.where(whole, begin, low), np.where(whole, end, high)
+    turns = period * np.floor((low - begin) / period)
+    low, high = low - turns, np.maximum(low, high) - turns
+    if not whole.any():
+        return Stretch(True, begin, end, low, high, low, high, interval)
+    floor, ceiling = np.where(whole, -np.inf, low), np.where(whole, np.inf, high)
+    return Stretch(True, begin, end, low, high, floor, ceiling, interval)
+
+
+@dataclass(frozen=True, eq=False)
 class FootPoints:
-    """Holds the curve point that is nearest to each of m points, within each point's own stretch."""
+    """Curve point that is nearest to each of m points, within each point's own stretch."""
 
-    u: Floats
+    u: Array
     """The parameters (m,) are inside the domain; those of a periodic curve are wrapped."""
-    position: Floats
-    """These are the curve points S(u) (m, 2), in m."""
-    tangent_unit: Floats
+    position: Array
+    """Curve points S(u) (m, 2), in m."""
+    tangent_unit: Array
     """The unit tangents (m, 2) are in the direction of travel."""
-    normal_unit: Floats
+    normal_unit: Array
     """The unit normals (m, 2) point to the left of the direction of travel."""
-    distance: Floats
+    distance: Array
     """The signed distances normal_unit . (point - S(u)) (m,), in m, are positive left of the curve."""
-    interior: Bools
-    """This is false (m,) at an end of an open curve, and at a limit beyond which the curve comes nearer."""
-    basis: Floats
+    interior: BoolArray
+    """False (m,) at an end of an open curve, and at a limit beyond which the curve comes nearer."""
+    basis: Array
     """Column j of these basis values (m, p + 1) at u belongs to control point `columns[:, j]`."""
-    span: Ints
-    """These are the knot spans (m,) of u; the spans of several curves are numbered consecutively."""
-    columns: Ints
-    """These are the indices (m, p + 1) of the control points that the basis values belong to."""
+    span: IntArray
+    """Knot spans (m,) of u; the spans of several curves are numbered consecutively."""
+    columns: IntArray
+    """Indices (m, p + 1) of the control points that the basis values belong to."""
 
-    def where(self, rows: Ints | Bools | slice) -> FootPoints:
-        """Returns the foot points of some rows."""
+    def where(self, rows: IntArray | BoolArray | slice) -> FootPoints:
         return FootPoints(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Curves:
-    """Holds curves as polynomials on each span; arrays have the component x, y first."""
+    """Curves as polynomials on each span; arrays have the component x, y first."""
 
     spans: Spans
-    """These are the spans of all curves."""
-    coefficients: Floats
-    """This is the result (p + 1, 3, 2, n) of `Spans.curve_coefficients`."""
+    coefficients: Array
+    """Result (p + 1, 3, 2, n) of `Spans.curve_coefficients`."""
 
-    def position(self, v: Floats) -> Floats:
-        """Returns S (2, m) at places v (m,) on the axis."""
+    def position(self, v: Array) -> Array:
+        """Return S (2, m) at places v (m,) on the axis."""
         number, s = self.spans.locate(v)
         return horner(self.coefficients[:, 0].take(number, axis=-1), s)
 
-    def derivatives(self, number: Ints, s: Floats) -> Floats:
-        """Returns S, S', S'' (3, 2, m) at the local coordinates s (m,) on the spans `number` (m,)."""
+    def derivatives(self, number: IntArray, s: Array) -> Array:
+        """Return S, S', S'' (3, 2, m) at the local coordinates s (m,) on the spans `number` (m,)."""
         return horner(self.coefficients.take(number, axis=-1), s)
 
 
 @dataclass(frozen=True, eq=False)
 class _Probe:
-    """Holds the curve and the distance to it at one parameter for each row."""
+    """Curve and the distance to it at one parameter for each row."""
 
-    v: Floats
-    """These are the places (m,) on the axis."""
-    number: Ints
-    """These are the span numbers (m,) from `Spans.locate`."""
-    s: Floats
-    """These are the local coordinates (m,) on the spans."""
-    offset: Floats
-    """These are the offsets S(u) - p (2, m), in m."""
-    first: Floats
-    """These are the derivatives S'(u) (2, m)."""
-    square: Floats
-    """These are the squared distances |S(u) - p|^2 (m,), in m^2."""
-    slope: Floats
+    v: Array
+    """Places (m,) on the axis."""
+    number: IntArray
+    """Span numbers (m,) from `Spans.locate`."""
+    s: Array
+    """Local coordinates (m,) on the spans."""
+    offset: Array
+    """Offsets S(u) - p (2, m), in m."""
+    first: Array
+    """Derivatives S'(u) (2, m)."""
+    square: Array
+    """Squared distances |S(u) - p|^2 (m,), in m^2."""
+    slope: Array
     """The slope f = (S - p) . S' (m,) is half the derivative of the squared distance."""
-    step: Floats
+    step: Array
     """The downhill step (m,) is Newton's -f / f', or Gauss-Newton's -f / |S'|^2 where f' is not positive."""
 
 
 def foot_points(
     tables: SpanPolynomials,
-    control_points: Floats,
-    points: Floats,
-    u_low: Floats,
-    u_high: Floats,
+    control_points: Array,
+    points: Array,
+    u_low: Array,
+    u_high: Array,
     coarse_step: float,
     iterations: int = SEARCH_ITERATIONS,
 ) -> FootPoints:
-    """Returns `u_i = argmin |S(u) - p_i|` over u in [u_low_i, u_high_i], and the curve there.
+    """Return `u_i = argmin |S(u) - p_i|` over u in [u_low_i, u_high_i], and the curve there.
 
     The minimum is global as far as a coarse grid of step `coarse_step` in u resolves it. control_points
     (n, 2) are unwrapped where the curve is periodic, points (m, 2) are in the same frame, in m, and the
@@ -128,15 +193,15 @@ def foot_points(
 
 def joint_foot_points(
     spans: Spans,
-    control_points: Floats,
-    points: Floats,
-    curve: Ints,
-    u_low: Floats,
-    u_high: Floats,
+    control_points: Array,
+    points: Array,
+    curve: IntArray,
+    u_low: Array,
+    u_high: Array,
     coarse_step: float,
     iterations: int = SEARCH_ITERATIONS,
 ) -> FootPoints:
-    """Returns `foot_points` on several curves; `curve` (m,) is the number of each row's own."""
+    """Return `foot_points` on several curves; `curve` (m,) is the number of each row's own."""
     curves = _Curves(spans, spans.curve_coefficients(control_points))
     points_t = np.ascontiguousarray(points.T)
     stretch = stretch_of(spans, curve, u_low, u_high)
@@ -147,14 +212,14 @@ def joint_foot_points(
 
 def refine_foot_points(
     tables: SpanPolynomials,
-    control_points: Floats,
-    points: Floats,
-    u_start: Floats,
-    u_low: Floats,
-    u_high: Floats,
+    control_points: Array,
+    points: Array,
+    u_start: Array,
+    u_low: Array,
+    u_high: Array,
     iterations: int = REFINE_ITERATIONS,
 ) -> FootPoints:
-    """Returns the local minimum of |S(u) - p_i| downhill from u_start, by a few safeguarded Newton steps.
+    """Return the local minimum of |S(u) - p_i| downhill from u_start, by a few safeguarded Newton steps.
 
     The arguments are those of `foot_points`. A start (m,) outside its stretch is moved into it first. A step
     is never longer than one mean knot interval, and no row ends farther from the curve than it began.
@@ -167,15 +232,15 @@ def refine_foot_points(
 
 def refine_joint_foot_points(
     spans: Spans,
-    control_points: Floats,
-    points: Floats,
-    curve: Ints,
-    u_start: Floats,
-    u_low: Floats,
-    u_high: Floats,
+    control_points: Array,
+    points: Array,
+    curve: IntArray,
+    u_start: Array,
+    u_low: Array,
+    u_high: Array,
     iterations: int = REFINE_ITERATIONS,
 ) -> FootPoints:
-    """Returns `refine_foot_points` on several curves; `curve` (m,) is the number of each row's own."""
+    """Return `refine_foot_points` on several curves; `curve` (m,) is the number of each row's own."""
     curves = _Curves(spans, spans.curve_coefficients(control_points))
     points_t = np.ascontiguousarray(points.T)
     stretch = stretch_of(spans, curve, u_low, u_high)
@@ -184,13 +249,13 @@ def refine_joint_foot_points(
     return _finish(spans, control_points, points_t, curve, probe, stretch)
 
 
-def _nearest_on_grid(curves: _Curves, points: Floats, curve: Ints, stretch: Stretch, step: float) -> Floats:
-    """Returns the nearest place (m,) to each point, of a grid in its stretch and the stretch's limits."""
+def _nearest_on_grid(curves: _Curves, points: Array, curve: IntArray, stretch: Stretch, step: float) -> Array:
+    """Return the nearest place (m,) to each point, of a grid in its stretch and the stretch's limits."""
     if len(points) == 0:
         return np.zeros(0)
     low, high = stretch.low, stretch.high
-    own_rows = _rows_of_curves(curve, len(curves.spans.low))
-    grid = np.concatenate([_grid(low[rows], high[rows], step) for rows in own_rows])
+    masks = [curve == k for k in range(len(curves.spans.low))]
+    grid = np.concatenate([_grid(low[rows], high[rows], step) for rows in masks if rows.any()])
     count = len(grid)
     on_curve = curves.position(np.concatenate([grid, low, high]))
     on_grid, ends = on_curve[:, :count], on_curve[:, count:].reshape(2, 2, -1)
@@ -201,23 +266,17 @@ def _nearest_on_grid(curves: _Curves, points: Floats, curve: Ints, stretch: Stre
     return np.asarray(np.choose(choice, [grid[index], low, high]))
 
 
-def _rows_of_curves(curve: Ints, count: int) -> list[Bools]:
-    """Returns a mask (m,) of the rows of each curve that has any."""
-    masks = (curve == k for k in range(count))
-    return [rows for rows in masks if rows.any()]
-
-
-def _grid(low: Floats, high: Floats, step: float) -> Floats:
-    """Returns evenly spaced places from the lowest to the highest limit of stretches (m,) on a curve."""
+def _grid(low: Array, high: Array, step: float) -> Array:
+    """Return evenly spaced places from the lowest to the highest limit of stretches (m,) on a curve."""
     first = float(low.min())
     count = max(int(np.ceil((float(high.max()) - first) / step)), 1) + 1
     return np.asarray(first + step * np.arange(count, dtype=np.float64))
 
 
 def _nearest_of(
-    points: Floats, grid: Floats, on_grid: Floats, low: Floats, high: Floats
-) -> tuple[Ints, Floats]:
-    """Returns the index (m,) of the nearest grid point in each stretch, and its squared distance (m,).
+    points: Array, grid: Array, on_grid: Array, low: Array, high: Array
+) -> tuple[IntArray, Array]:
+    """Return the index (m,) of the nearest grid point in each stretch, and its squared distance (m,).
 
     Rows are taken in chunks, so that the distances fit into memory.
     """
@@ -233,8 +292,7 @@ def _nearest_of(
     return index, least
 
 
-def _newton(curves: _Curves, points_t: Floats, start: Floats, stretch: Stretch, iterations: int) -> _Probe:
-    """Takes Newton steps no longer than a knot interval; a row that would get farther away is bracketed."""
+def _newton(curves: _Curves, points_t: Array, start: Array, stretch: Stretch, iterations: int) -> _Probe:
     reach = stretch.interval
     last = _probe(curves, points_t, start)
     for _ in range(iterations):
@@ -253,14 +311,9 @@ def _newton(curves: _Curves, points_t: Floats, start: Floats, stretch: Stretch, 
 
 
 def _descend(
-    curves: _Curves,
-    points_t: Floats,
-    start: Floats,
-    stretch: Stretch,
-    reach: Floats,
-    iterations: int,
+    curves: _Curves, points_t: Array, start: Array, stretch: Stretch, reach: Array, iterations: int
 ) -> _Probe:
-    """Takes Newton steps that stay inside a bracket, and otherwise goes to the middle of the bracket.
+    """Take Newton steps that stay inside a bracket, and otherwise goes to the middle of the bracket.
 
     The bracket reaches from the nearest place so far to one where the distance surely rises again, so that no
     row ever gets farther away. At first it is `reach` (m,) long, downhill.
@@ -278,22 +331,18 @@ def _descend(
         passed = probe.slope * best.slope <= 0.0
         end = np.where(better, np.where(passed, best.v, end), probe.v)
         step = np.where(better, probe.step, np.inf)
-        best = probe if better.all() else _either(better, probe, best)
+        pairs = [(getattr(probe, f.name), getattr(best, f.name)) for f in fields(_Probe)]
+        best = probe if better.all() else _Probe(*(np.where(better, new, old) for new, old in pairs))
     return best
 
 
-def _either(first: Bools, a: _Probe, b: _Probe) -> _Probe:
-    """Returns a where `first` (m,) is true, and b elsewhere."""
-    return _Probe(*(np.where(first, getattr(a, f.name), getattr(b, f.name)) for f in fields(a)))
-
-
-def _no_farther(square: Floats, than: Floats) -> Bools:
-    """Returns where a squared distance (m,) is no larger than another one, apart from round-off."""
+def _no_farther(square: Array, than: Array) -> BoolArray:
+    """Return where a squared distance (m,) is no larger than another one, apart from round-off."""
     return square <= than + _EQUAL_SQUARE * (1.0 + than)
 
 
-def _probe(curves: _Curves, points_t: Floats, v: Floats) -> _Probe:
-    """Returns the curve at the places v (m,), and its distance from points (2, m)."""
+def _probe(curves: _Curves, points_t: Array, v: Array) -> _Probe:
+    """Return the curve at the places v (m,), and its distance from points (2, m)."""
     number, s = curves.spans.locate(v)
     orders = curves.derivatives(number, s)
     offset, first = orders[0], orders[1]
@@ -307,16 +356,15 @@ def _probe(curves: _Curves, points_t: Floats, v: Floats) -> _Probe:
     return _Probe(v, number, s, offset, first, square, slope, step)
 
 
-def _dot(a: Floats, b: Floats) -> Floats:
-    """Returns the inner products (m,) of columns (2, m)."""
+def _dot(a: Array, b: Array) -> Array:
+    """Return the inner products (m,) of columns (2, m)."""
     products = a * b
     return np.asarray(products[0] + products[1])
 
 
 def _finish(
-    spans: Spans, control_points: Floats, points_t: Floats, curve: Ints, probe: _Probe, stretch: Stretch
+    spans: Spans, control_points: Array, points_t: Array, curve: IntArray, probe: _Probe, stretch: Stretch
 ) -> FootPoints:
-    """Returns all outputs at the places that were found."""
     columns = spans.columns.take(probe.number, axis=0)
     tangent = _unit_tangent(control_points, probe.first, columns, stretch.length)
     normal = np.empty_like(tangent)
@@ -335,12 +383,8 @@ def _finish(
     )
 
 
-def _unit_tangent(control_points: Floats, first: Floats, columns: Ints, length: Floats) -> Floats:
-    """Returns S' / |S'| (2, m).
-
-    Where S' vanishes, it returns the direction of the control polygon, or of the x axis where that vanishes
-    too.
-    """
+def _unit_tangent(control_points: Array, first: Array, columns: IntArray, length: Array) -> Array:
+    """Return S' / |S'| (2, m); where S' vanishes, the direction of the control polygon or of the x axis."""
     norm = np.sqrt(_dot(first, first))
     vanishing = ~(norm * length > _NO_TANGENT * np.abs(control_points).max(initial=0.0))
     if not vanishing.any():
@@ -354,8 +398,8 @@ def _unit_tangent(control_points: Floats, first: Floats, columns: Ints, length: 
     return direction / norm
 
 
-def _interior(probe: _Probe, stretch: Stretch) -> Bools:
-    """Returns false (m,) at an end of an open domain, and at a limit beyond which the distance falls."""
+def _interior(probe: _Probe, stretch: Stretch) -> BoolArray:
+    """Return false (m,) at an end of an open domain, and at a limit beyond which the distance falls."""
     tolerance = _END_TOLERANCE * stretch.length
     at_low = probe.v - stretch.floor <= tolerance
     at_high = stretch.ceiling - probe.v <= tolerance

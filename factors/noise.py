@@ -1,15 +1,17 @@
-"""Noise models on arrays: the whitening of a point's covariance, and Huber's robust loss."""
+"""Noise: whitening, Huber's robust loss, and what was measured of a drive's odometry and detections."""
 
-from __future__ import annotations
+from dataclasses import dataclass, field
+from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from .arrays import Array
+from .se2 import left_of
+from .sensor import SENSOR_SIZE, by_sensor
 
 
 def whiteners(covariances: Array) -> Array:
-    """Returns lower triangular W (m, 2, 2) with `W' W = K^-1` for covariances K (m, 2, 2).
+    """Return lower triangular W (m, 2, 2) with `W' W = K^-1` for covariances K (m, 2, 2).
 
     `W r` has two independent entries of unit variance where r has covariance K.
     """
@@ -22,7 +24,7 @@ def whiteners(covariances: Array) -> Array:
 
 
 def huber_weights(whitened: Array, threshold: float) -> Array:
-    """Returns `w = min(1, threshold / |z|)`, the weight of each whitened residual z in a Gauss-Newton step.
+    """Return `w = min(1, threshold / |z|)`, the weight of each whitened residual z in a Gauss-Newton step.
 
     An infinite threshold gives least squares: every weight is 1.
     """
@@ -30,7 +32,7 @@ def huber_weights(whitened: Array, threshold: float) -> Array:
 
 
 def huber_loss(whitened: Array, threshold: float) -> Array:
-    """Returns Huber's loss of each whitened residual z with threshold k.
+    """Return Huber's loss of each whitened residual z with threshold k.
 
     `rho(z) = z^2 / 2` where `|z| <= k`, and `k (|z| - k / 2)` beyond.
     """
@@ -39,7 +41,159 @@ def huber_loss(whitened: Array, threshold: float) -> Array:
 
 
 def huber_roots(whitened: Array, threshold: float) -> Array:
-    """Returns `sign(z) sqrt(2 rho(z))`, whose half square is the loss rho of `huber_loss`."""
+    """Return `sign(z) sqrt(2 rho(z))`, whose half square is the loss rho of `huber_loss`."""
     size = np.abs(whitened)
     inner = np.minimum(size, threshold)
     return np.sign(whitened) * np.sqrt(inner * (2.0 * size - inner))
+
+
+SURE: Final = 4.0
+"""An error of the sensor is beyond doubt at this number of sigmas."""
+STAYS: Final = 1.5
+"""Stated noise is contradicted where errors that stay make the mean of a cone so many times as uncertain."""
+
+
+@dataclass(frozen=True, eq=False)
+class RayNoise:
+    """Error of a detection in one direction, along the ray or across it.
+
+    Its standard deviation is `sigma[0] + sigma[1] r` at range r. Two errors of one cone that are dt apart
+    have the correlation `share exp(-dt / time)`.
+    """
+
+    LENGTHS: ClassVar = {"sigma": (1, 0)}
+
+    sigma: Array
+    """(2,) Standard deviation at range 0 (m), and its growth with the range (m/m)."""
+    share: float = 0.0
+    """Share of the variance that stays with a cone for a while."""
+    time: float = 1.0
+    """Correlation time of that share, s."""
+
+    def sigmas(self, ranges: Array) -> Array:
+        """Return the standard deviation (m,) of single detections at ranges (m,), in m."""
+        return np.asarray(self.sigma[0] + self.sigma[1] * ranges)
+
+    def inflation(self, count: int, period: float) -> float:
+        """Return the variance of the mean of `count` errors of one cone by that of independent ones.
+
+        Detections are `period` (s) apart: `1 + 2 sum_k (1 - k / count) share exp(-k period / time)`.
+        """
+        k = np.arange(1, max(count, 1))
+        return float(1.0 + 2.0 * self.share * ((1.0 - k / count) * np.exp(-k * period / self.time)).sum())
+
+    def inflation_of_slope(self, count: int, period: float) -> float:
+        """Return the variance of a slope over `count` errors of one cone by that of independent ones.
+
+        With the times g from their middle, and the correlations R, it is `g' R g / g' g`.
+        """
+        times = period * (np.arange(count) - 0.5 * (count - 1))
+        alike = self.share * np.exp(-np.abs(times[:, None] - times) / self.time)
+        return float(1.0 - self.share + times @ alike @ times / max(times @ times, np.finfo(float).tiny))
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredNoise:
+    """Noise of odometry and detections, measured from nothing but the readings of a drive."""
+
+    LENGTHS: ClassVar = {
+        "odometry": (1, 1, 0),
+        "drift": (1, 1, 0),
+        "along": 0,
+        "across": 0,
+        "sensor": (0, 1, 0, 0, 1),
+        "sensor_sigma": (0, 1, 0, 0, 1),
+    }
+
+    odometry: Array
+    """(3,) White noise of a twist from sample to sample: m/s, m/s, rad/s, one sigma."""
+    drift: Array
+    """(3,) Slow part of the odometry's error as a random walk of the pose: m, m and rad by root of s."""
+    interval: float
+    """Time between two twists, s."""
+    along: RayNoise | None = None
+    """Noise along the ray; None where too few cones were seen often enough."""
+    across: RayNoise | None = None
+    """Noise across the ray, as `along`."""
+    count: int = 1
+    """Number of detections of one cone, median."""
+    period: float = 0.1
+    """Time between two perception cycles, s."""
+    per_cycle: float = 1.0
+    """Number of cones seen in a cycle, mean."""
+    sensor: Array = field(default_factory=lambda: np.zeros(SENSOR_SIZE))
+    """(5,) Constant errors of the sensor (`factors.sensor:SENSOR`), while the odometry's scale is held."""
+    sensor_sigma: Array = field(default_factory=lambda: np.full(SENSOR_SIZE, np.inf))
+    """(5,) Their standard deviations; infinite where nothing was measured."""
+    seconds: float = 0.0
+    """Time of driving that was measured on, s."""
+
+    @property
+    def twist_sigma(self) -> Array:
+        """Return the white noise (3,) of a twist with the effect of white noise and slow part together."""
+        return np.asarray(np.hypot(self.odometry, self.drift / np.sqrt(self.interval)))
+
+    def covariances(self, points: Array, *, inflated: bool) -> Array | None:
+        """Return the covariances (m, 2, 2) of detections at points (m, 2), vehicle frame; None if unknown.
+
+        If `inflated`, they are so large that sightings of one cone count as independent ones.
+        """
+        if self.along is None or self.across is None:
+            return None
+        ranges = np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)
+        factors = [
+            one.inflation(self.count, self.period) if inflated else 1.0 for one in (self.along, self.across)
+        ]
+        along = factors[0] * self.along.sigmas(ranges) ** 2
+        across = factors[1] * self.across.sigmas(ranges) ** 2
+        ray = points / ranges[:, None]
+        outer = ray[:, :, None] * ray[:, None, :]
+        return np.asarray(across[:, None, None] * np.eye(2) + (along - across)[:, None, None] * outer)
+
+    def inflated(self, points: Array, covariances: Array) -> Array:
+        """Return covariances (m, 2, 2) of single detections so wide that errors that stay may be forgotten.
+
+        That is `G C G` with the roots of the inflations along and across the ray in G, where one of them is
+        more than `STAYS`.
+        """
+        if self.along is None or self.across is None:
+            return covariances
+        roots = np.sqrt([one.inflation(self.count, self.period) for one in (self.along, self.across)])
+        if (roots < STAYS).all():
+            return covariances
+        ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)[:, None]
+        axes = np.stack([ray, left_of(ray)], axis=1)
+        wider = np.einsum("mki,k,mkj->mij", axes, roots, axes)
+        return np.asarray(wider @ covariances @ wider)
+
+    @property
+    def shown(self) -> Array:
+        """Return those errors (5,) of the sensor that are more than `SURE` sigmas; the others are zero."""
+        return np.where(np.abs(self.sensor) > SURE * self.sensor_sigma, self.sensor, 0.0)
+
+    def corrected(self, points: Array, twist: Array) -> Array:
+        """Return detections at points (m, 2), vehicle frame, without the constant errors of the sensor."""
+        return np.asarray(points + by_sensor(points, np.tile(twist, (len(points), 1))) @ self.sensor)
+
+
+def ray_sigmas(points: Array, covariances: Array) -> Array:
+    """Return the standard deviations (m, 2) along and across the rays to points (m, 2), vehicle frame."""
+    ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)[:, None]
+    axes = np.stack([ray, left_of(ray)], axis=1)
+    return np.asarray(np.sqrt(np.einsum("mki,mij,mkj->mk", axes, covariances, axes)))
+
+
+@dataclass(frozen=True, eq=False)
+class KnownNoise:
+    """What is known of the noise before a drive."""
+
+    LENGTHS: ClassVar = {"odometry": (1, 1, 0), "measured": 0}
+
+    odometry: Array
+    """(3,) Standard deviation of a twist (m/s, m/s, rad/s): stated, or assumed where it is not."""
+    odometry_stated: bool = True
+    """Whether somebody has stated it."""
+    detections_stated: bool = True
+    """Whether the covariances of the detections were stated."""
+    measured: MeasuredNoise | None = None
+    """What was measured on this drive as a whole, or on an earlier one."""

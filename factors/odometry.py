@@ -1,16 +1,12 @@
 """Odometry between two perception cycles: twists integrated on SE(2), with covariance and calibration."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from .arrays import Array
 from .se2 import se2_exp, wrap_angle
-
-Array = NDArray[np.float64]
 
 MIN_SIGMA = 1e-6
 """This smallest sigma of integrated odometry (m, rad) keeps the factor of an empty interval finite."""
@@ -24,14 +20,14 @@ _SERIES_BELOW = 1e-3
 
 @dataclass(frozen=True)
 class IntegratedOdometry:
-    """Holds the relative pose over an interval, as a factor between its two poses needs it."""
+    """Relative pose over an interval, as a factor between its two poses needs it."""
 
     delta: Array
-    """This is the end pose (x, y, theta) in the frame of the start, in m, m and rad."""
+    """End pose (x, y, theta) in the frame of the start, in m, m and rad."""
     covariance: Array
-    """This is the covariance (3, 3) of the end pose, in the frame of the end (GTSAM's tangent of Pose2)."""
+    """Covariance (3, 3) of the end pose, in the frame of the end (GTSAM's tangent of Pose2)."""
     calibration_jacobian: Array
-    """This is the derivative (3, 2) of the end pose, in its own frame, by (scale error, yaw-rate bias)."""
+    """Derivative (3, 2) of the end pose, in its own frame, by (scale error, yaw-rate bias)."""
     whitener: Array
     """This matrix W (3, 3) with `W' W = covariance^-1` whitens a residual."""
     twist: Array = field(default_factory=lambda: np.zeros(3))
@@ -39,7 +35,7 @@ class IntegratedOdometry:
 
 
 def integrate_poses(durations: Array, twists: Array) -> Array:
-    """Returns the poses (k, 3), in the frame of the start, after each of k constant twists.
+    """Return the poses (k, 3), in the frame of the start, after each of k constant twists.
 
     durations (k,) are in s, twists (k, 3) in m/s, m/s and rad/s.
     """
@@ -53,7 +49,7 @@ def integrate_poses(durations: Array, twists: Array) -> Array:
 
 
 def integrate_twists(durations: Array, twists: Array, sigma: Array) -> IntegratedOdometry:
-    """Returns `prod_k exp(dt_k xi_k)` with its first-order covariance and its calibration derivative.
+    """Return `prod_k exp(dt_k xi_k)` with its first-order covariance and its calibration derivative.
 
     durations (k,) are in s. twists (k, 3) are body twists (vx m/s, vy m/s, wz rad/s), each held over its
     duration, and sigma, (3,) or (k, 3), is the standard deviation of each sample. An error e of sample k, in
@@ -74,7 +70,7 @@ def integrate_twists(durations: Array, twists: Array, sigma: Array) -> Integrate
 
 
 def integrated_odometry(delta: Array, covariance: Array, calibration_jacobian: Array) -> IntegratedOdometry:
-    """Returns the odometry with its whitener; `MIN_SIGMA` lifts a covariance of zero."""
+    """Return the odometry with its whitener; `MIN_SIGMA` lifts a covariance of zero."""
     floored = covariance + np.eye(3) * MIN_SIGMA**2
     root, _ = lapack.dpotrf(floored, lower=1)
     whitener, _ = lapack.dtrtri(root, lower=1)
@@ -82,7 +78,7 @@ def integrated_odometry(delta: Array, covariance: Array, calibration_jacobian: A
 
 
 def _midpoints(poses: Array, durations: Array, twists: Array) -> Array:
-    """Returns the poses (k, 3) in the middle of each step.
+    """Return the poses (k, 3) in the middle of each step.
 
     The adjoint there equals the right Jacobian of the exponential to second order.
     """
@@ -93,7 +89,7 @@ def _midpoints(poses: Array, durations: Array, twists: Array) -> Array:
 
 
 def _adjoints_to_end(poses: Array, end: Array) -> Array:
-    """Returns the adjoint maps (k, 3, 3) that carry a tangent at each pose to one at the end pose."""
+    """Return the adjoint maps (k, 3, 3) that carry a tangent at each pose to one at the end pose."""
     theta = poses[:, 2] - end[2]
     c, s = np.cos(theta), np.sin(theta)
     ce, se = np.cos(end[2]), np.sin(end[2])
@@ -106,7 +102,7 @@ def _adjoints_to_end(poses: Array, end: Array) -> Array:
 
 
 def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> tuple[Array, Array, Array]:
-    """Returns `r = Log(delta^-1 start^-1 end)` (m, 3), and its Jacobians (m, 3, 3) by start and end.
+    """Return `r = Log(delta^-1 start^-1 end)` (m, 3), and its Jacobians (m, 3, 3) by start and end.
 
     It is the residual of GTSAM's BetweenFactorPose2, a tangent in the frame of the end (m, m, rad). Poses
     (m, 3) are in the map frame, deltas (m, 3) in the frame of the start. The Jacobians are by (x, y, theta)
@@ -134,7 +130,7 @@ def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> t
 
 
 def _inverse_left_terms(phi: Array) -> tuple[Array, Array]:
-    """Returns `a = (phi/2) cot(phi/2)` of SE(2)'s inverse left Jacobian, and da/dphi."""
+    """Return `a = (phi/2) cot(phi/2)` of SE(2)'s inverse left Jacobian, and da/dphi."""
     small = np.abs(phi) < _SERIES_BELOW
     half = np.where(small, 0.5, 0.5 * phi)
     cot = 1.0 / np.tan(half)

@@ -1,20 +1,17 @@
 """Rigid motions of the plane, SE(2): a pose is `(x, y, theta)` in m, m and rad."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from .arrays import Array
 
 
 def wrap_angle(angle: Array) -> Array:
-    """Returns each angle (rad) wrapped to (-pi, pi]."""
+    """Return each angle (rad) wrapped to (-pi, pi]."""
     return -((np.pi - angle) % (2.0 * np.pi) - np.pi)
 
 
 def rotation(theta: float) -> Array:
-    """Returns R(theta) (2, 2), which turns a vector from the vehicle frame to the map frame."""
+    """Return R(theta) (2, 2), which turns a vector from the vehicle frame to the map frame."""
     c, s = np.cos(theta), np.sin(theta)
     return np.array([[c, -s], [s, c]])
 
@@ -32,12 +29,12 @@ def rotated(covariances: Array, theta: Array) -> Array:
 
 
 def left_of(vectors: Array) -> Array:
-    """Returns vectors (n, 2) turned by a quarter to the left: (x, y) becomes (-y, x)."""
+    """Return vectors (n, 2) turned by a quarter to the left: (x, y) becomes (-y, x)."""
     return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)
 
 
 def compose(pose: Array, delta: Array) -> Array:
-    """Returns `pose * delta` on SE(2), for one pose (3,) or row by row (k, 3).
+    """Return `pose * delta` on SE(2), for one pose (3,) or row by row (k, 3).
 
     Headings are added and not wrapped, so that whole turns accumulate.
     """
@@ -48,13 +45,13 @@ def compose(pose: Array, delta: Array) -> Array:
 
 
 def inverse(pose: Array) -> Array:
-    """Returns the pose (3,) with `pose * inverse = 0`; its heading is not wrapped."""
+    """Return the pose (3,) with `pose * inverse = 0`; its heading is not wrapped."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return np.array([-c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]])
 
 
 def relative(pose: Array, other: Array) -> Array:
-    """Returns `pose^-1 * other` on SE(2): another pose (3,) in the frame of a pose (3,).
+    """Return `pose^-1 * other` on SE(2): another pose (3,) in the frame of a pose (3,).
 
     Headings are subtracted and not wrapped.
     """
@@ -62,12 +59,12 @@ def relative(pose: Array, other: Array) -> Array:
 
 
 def move_points(motion: Array, points: Array) -> Array:
-    """Returns `R p + t` (m, 2): points (m, 2) after the rigid motion (3,) of the map frame."""
+    """Return `R p + t` (m, 2): points (m, 2) after the rigid motion (3,) of the map frame."""
     return np.asarray(points @ rotation(motion[2]).T + motion[:2])
 
 
 def to_map(points_vehicle: Array, poses: Array) -> Array:
-    """Returns `p = R z + t` (m, 2) in the map frame.
+    """Return `p = R z + t` (m, 2) in the map frame.
 
     points_vehicle (m, 2) are in the vehicle frame of each row's own pose (m, 3).
     """
@@ -77,7 +74,7 @@ def to_map(points_vehicle: Array, poses: Array) -> Array:
 
 
 def to_vehicle(points_map: Array, poses: Array) -> Array:
-    """Returns `z = R^T (p - t)` (m, 2) in the vehicle frame of each row's own pose (m, 3).
+    """Return `z = R^T (p - t)` (m, 2) in the vehicle frame of each row's own pose (m, 3).
 
     points_map (m, 2) are in the map frame.
     """
@@ -87,7 +84,7 @@ def to_vehicle(points_map: Array, poses: Array) -> Array:
 
 
 def se2_exp(tangents: Array) -> Array:
-    """Returns the exponential of SE(2), row by row: relative poses (k, 3).
+    """Return the exponential of SE(2), row by row: relative poses (k, 3).
 
     Each row of tangents (k, 3) is a twist `(vx, vy, wz)` times its duration, in m, m and rad.
     """

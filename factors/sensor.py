@@ -3,31 +3,27 @@
 All five are estimated along with the map. They are small, so a detection is corrected linearly in them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import Array
 from .se2 import left_of
 
-Array = NDArray[np.float64]
-
 SENSOR = ("yaw", "lateral", "latency", "range_scale", "range_bias")
-"""These are the entries of the sensor's calibration b: its yaw (rad) and its lateral offset (m), which are
+"""Entries of the sensor's calibration b: its yaw (rad) and its lateral offset (m), which are
 positive to the left, the age of detections at their stamps (s), and the scale error (-) and the bias (m) of
 ranges."""
 
 SENSOR_SIZE = len(SENSOR)
-"""This is the number of these entries."""
+"""Number of these entries."""
 
 RANGE = slice(3, 5)
 """These of them are errors of the ranges."""
 
 
 def by_sensor(points_vehicle: Array, twists: Array) -> Array:
-    """Returns the derivatives C (m, 2, 5) of detections by the calibration b of the sensor, at b = 0.
+    """Return the derivatives C (m, 2, 5) of detections by the calibration b of the sensor, at b = 0.
 
     A detection z, as the sensor believes to see it, is corrected to `z + C b`. points_vehicle z (m, 2) are in
     m, twists (vx, vy, wz) (m, 3) in m/s, m/s and rad/s are those at their stamps. With J the quarter turn and
@@ -49,7 +45,7 @@ def by_sensor(points_vehicle: Array, twists: Array) -> Array:
 
 
 def corrected(measured: Array, twists: Array, sensor: Array) -> Array:
-    """Returns the detections `z + C b` (m, 2), or z as measured where the calibration b (5,) is empty.
+    """Return the detections `z + C b` (m, 2), or z as measured where the calibration b (5,) is empty.
 
     They were measured at (m, 2), vehicle frame, while the vehicle moved with twists (m, 3).
     """
@@ -59,14 +55,14 @@ def corrected(measured: Array, twists: Array, sensor: Array) -> Array:
 
 
 def in_vehicle(directions: Array, poses: Array) -> Array:
-    """Returns vectors (m, 2), map frame, in the vehicle frames of poses (m, 3)."""
+    """Return vectors (m, 2), map frame, in the vehicle frames of poses (m, 3)."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     forward = c * directions[:, 0] + s * directions[:, 1]
     return np.stack([forward, c * directions[:, 1] - s * directions[:, 0]], axis=1)
 
 
 def by_range(points_vehicle: Array) -> Array:
-    """Returns the derivatives (m, 2, 2, 2) of `M^-1` by the range scale and by the range bias.
+    """Return the derivatives (m, 2, 2, 2) of `M^-1` by the range scale and by the range bias.
 
     M is the derivative of a corrected detection by the measured one, z (m, 2). The noise is that of measured
     detections, so a residual r of a corrected one counts as `M^-1 r`. Otherwise least squares would shrink
@@ -89,11 +85,11 @@ class SensorRows:
     factor: Array
     """Residuals and all their derivatives are multiplied by this (m,), as if of measured detections."""
     by_sensor: Array
-    """These are the derivatives (m, 5) of the multiplied residuals, or (m, 0) where nothing is estimated."""
+    """Derivatives (m, 5) of the multiplied residuals, or (m, 0) where nothing is estimated."""
 
 
 def range_rates(directions: Array, poses: Array, measured: Array) -> Array:
-    """Returns the derivatives (m, 2) of `SensorRows.factor` by the range scale and the range bias.
+    """Return the derivatives (m, 2) of `SensorRows.factor` by the range scale and the range bias.
 
     They are `d' R (d M^-1) R' d` along unit vectors d (m, 2), map frame (see `by_range`). The detections were
     measured at (m, 2), vehicle frame, from poses (m, 3) with rotations R.
@@ -111,7 +107,7 @@ def sensor_rows(
     sensor: Array,
     rates: Array | None = None,
 ) -> SensorRows:
-    """Returns factors `f = 1 + rates b` and derivatives `f d' R C + r rates` of residuals `r = d . (p - q)`.
+    """Return factors `f = 1 + rates b` and derivatives `f d' R C + r rates` of residuals `r = d . (p - q)`.
 
     d (m, 2) are unit vectors in the map frame and p corrected detections, measured at (m, 2), vehicle frame,
     from poses (m, 3) while the vehicle moved with twists (m, 3). C is `by_sensor`, b the sensor's calibration
@@ -128,7 +124,7 @@ def sensor_rows(
 
 
 def restored(residual: Array, measured: Array, twists: Array, sensor: Array) -> tuple[Array, Array]:
-    """Returns `M^-1` (m, 2, 2) and the derivatives of `M^-1 r` (m, 2, 5) by the sensor's calibration.
+    """Return `M^-1` (m, 2, 2) and the derivatives of `M^-1 r` (m, 2, 5) by the sensor's calibration.
 
     r (m, 2) are the expected minus the corrected detections, vehicle frame, which were measured at (m, 2)
     while the vehicle moved with twists (m, 3). The derivatives are `-M^-1 C`, and `d M^-1 r` for the errors

@@ -14,7 +14,7 @@ from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.centerline import batch as centerline_batch
 from pathspace_graph.centerline import online as centerline_online
 from pathspace_graph.ckf.mapper import CkfMapper
-from pathspace_graph.factors.measured_noise import KnownNoise
+from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.io.log import Log
 from pathspace_graph.landmark.batch import LandmarkBatch
 from pathspace_graph.landmark.ckf import LandmarkCkf

@@ -41,8 +41,8 @@ from joblib.externals.loky import Future
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from pathspace_graph.factors import linear_arrays
-from pathspace_graph.graph.keys import sizes
+from pathspace_graph.factors import linear as linear_arrays
+from pathspace_graph.graph.variables import sizes
 from pathspace_graph.io.files import atomic_file
 from pathspace_graph.io.limits import shown
 from pathspace_graph.io.parsing import parse_json, read_bytes

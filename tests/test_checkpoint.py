@@ -14,7 +14,7 @@ import pytest
 from pathspace_graph import FixedLagMapper
 from pathspace_graph.checkpoint import Recovery, copied, is_shared
 from pathspace_graph.graph.gaussian import jacobian_factor
-from pathspace_graph.graph.keys import pose_key
+from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.run import split_odometry
 

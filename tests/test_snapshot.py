@@ -14,8 +14,7 @@ from scipy.spatial import KDTree
 from pathspace_graph import FixedLagMapper, MapperSettings
 from pathspace_graph.ckf.mapper import CkfMapper
 from pathspace_graph.errors import InputError
-from pathspace_graph.graph.keys import pose_keys
-from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.variables import Layout, pose_keys
 from pathspace_graph.landmark.ckf import LandmarkCkf
 from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.run import split_odometry

@@ -18,8 +18,7 @@ import gtsam
 import numpy as np
 
 from pathspace_graph.graph.gaussian import as_hessian_factor, factors_of, graph_of, jacobian_factor, keys_of
-from pathspace_graph.graph.keys import are_poses
-from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.variables import Layout, are_poses
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 
 

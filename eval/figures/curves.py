@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.accuracy import closest_points, root_mean_square
-from pathspace_graph.factors.gauge import greville, smoothness_matrix
+from pathspace_graph.factors.residuals import greville, smoothness_matrix
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.settings.knots import BreakSettings
 from pathspace_graph.sim.geometry import ring

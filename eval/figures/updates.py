@@ -13,12 +13,11 @@ from scipy.linalg import block_diag
 
 from pathspace_graph.ckf.expansion import beyond_end, proximity_chain
 from pathspace_graph.ckf.update import SplineMeasurement, fit_detections
-from pathspace_graph.factors.bspline import end_change_matrix
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.mapping.belief import cubature_points, square_root
 from pathspace_graph.settings.comparison import CkfSettings
 from pathspace_graph.sim.geometry import left_normals, unit
-from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 from pathspace_graph.spline.knots import fit_spline
 
 from .curves import posterior

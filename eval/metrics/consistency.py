@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 from scipy.stats import chi2
 
 from pathspace_graph.batch.mapper import BatchResult
-from pathspace_graph.factors.gauge import greville
+from pathspace_graph.factors.residuals import greville
 from pathspace_graph.factors.se2 import left_of, rotation
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary

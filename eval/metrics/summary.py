@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchResult
-from pathspace_graph.factors.measured_noise import ray_sigmas
+from pathspace_graph.factors.noise import ray_sigmas
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import Health, Stretch, counts, stretches
 from pathspace_graph.io.log import Log, Truth

@@ -8,9 +8,9 @@ from scipy.ndimage import minimum_filter1d
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.projection import project
+from pathspace_graph.factors.residuals import project
 from pathspace_graph.factors.se2 import to_map, to_vehicle
-from pathspace_graph.graph.keys import pose_keys
+from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.path import BESIDE, LATERAL_GAP, SIDES, in_front_row

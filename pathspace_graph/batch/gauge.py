@@ -6,11 +6,11 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.gauge import smoothness_matrix
+from pathspace_graph.factors.residuals import smoothness_matrix
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.graph.elimination import owners
-from pathspace_graph.graph.keys import POINT, POSE, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.variables import POINT, POSE, indices, pose_keys
 from pathspace_graph.mapping.state import State
 
 POINTS_A_FACTOR: Final = 8

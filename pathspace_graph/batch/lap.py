@@ -25,9 +25,8 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system, linear_graph
-from pathspace_graph.graph.keys import POSE, are_poses, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.variables import POSE, Layout, are_poses, indices, pose_keys
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.registration import by_motion, sigma_of_information

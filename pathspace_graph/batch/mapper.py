@@ -12,14 +12,13 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import SettingsError, solving
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.measured_noise import KnownNoise
+from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.front_end.front_end import JudgedLog, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
-from pathspace_graph.graph.keys import are_poses, pose_key
-from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.variables import Layout, are_poses, pose_key
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState

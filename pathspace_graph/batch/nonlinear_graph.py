@@ -11,8 +11,8 @@ from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POINT, POSE, pose_key, pose_keys
-from pathspace_graph.graph.odometry import odometry_factor
+from pathspace_graph.graph.rows import odometry_factor
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POINT, POSE, pose_key, pose_keys
 from pathspace_graph.spline.boundary import Boundary
 
 from .gauge import CurveGauge
@@ -28,7 +28,7 @@ SAME: Final = 1e-3
 
 
 def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:
-    """Return every factor of the problem, on the keys of `graph.keys`.
+    """Return every factor of the problem, on the keys of `graph.variables`.
 
     It is a graph of plain least squares, and holds the associations as they are at `at`, and the sigmas
     across the curve divided by the root of their robust weights. Each control point is anchored where it is.

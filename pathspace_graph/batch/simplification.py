@@ -11,8 +11,7 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.footpoint import foot_points
-from pathspace_graph.graph.keys import CONTROL_LETTERS, POINT
-from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.variables import CONTROL_LETTERS, POINT, Layout
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.batch import BatchSettings

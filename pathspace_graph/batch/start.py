@@ -16,9 +16,8 @@ from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, pose_keys
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import Variables
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Variables, pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import BOUNDARIES

@@ -8,14 +8,13 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.projection import ProjectionRows, project
+from pathspace_graph.factors.residuals import ProjectionRows, project
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import SensorRows, range_rates, sensor_rows
 from pathspace_graph.front_end.log_odometry import LogOdometry, sensor_prior, sensor_prior_cost
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
-from pathspace_graph.graph.keys import SENSOR_KEY, are_poses, pose_keys
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.variables import SENSOR_KEY, Layout, are_poses, pose_keys
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings

@@ -16,8 +16,8 @@ from pathspace_graph.batch.nonlinear_graph import drive_factors
 from pathspace_graph.batch.start import CurveMapper
 from pathspace_graph.errors import SettingsError, solving
 from pathspace_graph.factors.gtsam_factors import pose_array
-from pathspace_graph.factors.measured_noise import KnownNoise
-from pathspace_graph.graph.keys import pose_key
+from pathspace_graph.factors.noise import KnownNoise
+from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import BatchRun
 from pathspace_graph.run import settings_dict

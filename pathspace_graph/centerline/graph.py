@@ -9,11 +9,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.gtsam_factors import fill, pose_array
-from pathspace_graph.factors.ribbon import RIBBON, ribbon_factor
+from pathspace_graph.factors.gtsam_factors import fill, pose_array, ribbon_factor
+from pathspace_graph.factors.residuals import RIBBON
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.gaussian import sparse_marginal
-from pathspace_graph.graph.keys import pose_key
+from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.ribbon import Ribbon
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.measured_noise import KnownNoise
+from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import LapBatches, RunNoise, VehicleState

@@ -5,14 +5,14 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.bspline import clamped_knots, end_change_matrix
+from pathspace_graph.factors.bspline import clamped_knots
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
-from pathspace_graph.factors.gauge import greville, smoothness_matrix
-from pathspace_graph.graph.keys import POINT
+from pathspace_graph.factors.residuals import greville, smoothness_matrix
+from pathspace_graph.graph.variables import POINT
 from pathspace_graph.mapping.belief import Belief, point_columns
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary, relocate
-from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 
 SIGMA_START: Final = 0.3
 """Standard deviation (m) of each control point of a new curve, beyond the uncertainty of its first

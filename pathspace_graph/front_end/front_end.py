@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray
-from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise
+from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.factors.odometry import odometry_residuals
 from pathspace_graph.factors.se2 import left_of, move_points, rotation, se2_exp
 from pathspace_graph.graph.smoother import FixedLagSmoother

@@ -8,10 +8,8 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.elimination import owners
-from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, pose_key
-from pathspace_graph.graph.odometry import OdometryChain, calibrated_delta, odometry_rows
-from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import Variables
+from pathspace_graph.graph.rows import OdometryChain, Rows, calibrated_delta, odometry_rows
+from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variables, pose_key
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
 from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
 

@@ -15,8 +15,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
-from pathspace_graph.factors.noise import huber_weights
+from pathspace_graph.factors.noise import MeasuredNoise, RayNoise, huber_weights
 from pathspace_graph.factors.se2 import left_of, rotations, to_map
 from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor
 

@@ -8,7 +8,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray
-from pathspace_graph.factors.measured_noise import KnownNoise
+from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.sensor import SENSOR, SENSOR_SIZE
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import NoiseSource, RunNoise

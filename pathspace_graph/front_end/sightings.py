@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.measured_noise import MeasuredNoise
+from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Odometry
 

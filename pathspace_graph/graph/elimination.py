@@ -15,18 +15,14 @@ from typing import Final, cast
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.factors.arrays import Array, IntArray
 
 from .gaussian import cholesky, factors_of, graph_of, keys_of, normal_equations, require_keys, solve
-from .keys import POSE, are_poses, sizes
 from .rows import Rows, jacobian_factors
-from .variables import Layout, Variables
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from .variables import POSE, Layout, Variables, are_poses, sizes
 
 POSES_IN_FACTOR: Final = 8
 """The rows of this number of poses make one factor. Each factor costs its creation from Python, and each pose
@@ -34,7 +30,7 @@ makes it wider. Between 5 and 10 the time hardly changes."""
 
 
 def owners(cycles: IntArray, side: IntArray | int = 0) -> IntArray:
-    """Returns the number of the factor that the rows of poses belong to, by perception cycles of any shape.
+    """Return the number of the factor that the rows of poses belong to, by perception cycles of any shape.
 
     Rows on the left (0) and the right (1) boundary have no key of the map in common, so each side has its own
     factor: two narrow factors are faster to eliminate than a wide one that is half empty.
@@ -43,7 +39,7 @@ def owners(cycles: IntArray, side: IntArray | int = 0) -> IntArray:
 
 
 def linear_graph(groups: Sequence[Rows], variables: Variables) -> gtsam.GaussianFactorGraph:
-    """Returns the rows as a graph whose unknowns are the changes from the variables' values.
+    """Return the rows as a graph whose unknowns are the changes from the variables' values.
 
     The graph is for one linearization: unlike the window's factors, these are not kept.
     """
@@ -53,7 +49,7 @@ def linear_graph(groups: Sequence[Rows], variables: Variables) -> gtsam.Gaussian
 
 
 def fix_map(groups: Sequence[Rows]) -> list[Rows]:
-    """Returns the rows without derivatives by the map: the problem of the poses given a fixed map."""
+    """Return the rows without derivatives by the map: the problem of the poses given a fixed map."""
     on_poses = []
     for rows in groups:
         poses = are_poses(rows.keys[0]) if len(rows) else np.zeros(0, bool)
@@ -64,19 +60,18 @@ def fix_map(groups: Sequence[Rows]) -> list[Rows]:
 
 
 class Elimination:
-    """Holds a linear problem whose poses have been eliminated."""
+    """Linear problem whose poses have been eliminated."""
 
     def __init__(self, graph: gtsam.GaussianFactorGraph, layout: Layout) -> None:
-        """Eliminates the poses of a graph on the variables of a layout.
+        """Eliminate the poses of a graph on the variables of a layout.
 
         SingularSystemError where the graph does not determine the poses, or holds no factor on a variable.
         """
         require_keys(graph, layout)
         poses = are_poses(layout.keys)
         self.poses = Layout(layout.keys[poses])
-        """These are the columns of the poses."""
         self.map = Layout(layout.keys[~poses])
-        """These are the columns of the other variables, which come first in a solution."""
+        """Columns of the other variables, which come first in a solution."""
         self._net, remaining = _eliminated(graph, self.map, len(self.poses.keys))
         self.information, self.vector = np.zeros((0, 0)), np.zeros(0)
         """The marginal of the map is `1/2 y' L y - g' y`, with information L (n, n) and vector g (n,)."""
@@ -86,7 +81,7 @@ class Elimination:
     # --- solution ----------------------------------------------------------------------------------------
 
     def step(self, damping: Array) -> Array:
-        """Returns the solution (n + 3 P,), where `damping` (n,) is added to the diagonal of the information.
+        """Return the solution (n + 3 P,), where `damping` (n,) is added to the diagonal of the information.
 
         SingularSystemError where the sum is not positive definite.
         """
@@ -94,7 +89,7 @@ class Elimination:
         return np.concatenate([change, self.poses_given(change)])
 
     def poses_given(self, change: Array) -> Array:
-        """Returns the solution of the poses (3 P,), given a change of the map (n,)."""
+        """Return the solution of the poses (3 P,), given a change of the map (n,)."""
         given = gtsam.VectorValues()
         own = np.split(change, self.map.starts[1:])
         for key, values in zip(self.map.keys.tolist(), own if self.map.size else [], strict=True):
@@ -105,30 +100,30 @@ class Elimination:
 
     @cached_property
     def map_covariance(self) -> Array:
-        """Returns the joint covariance (n, n) of the map's variables, in the order of their keys."""
+        """Return the joint covariance (n, n) of the map's variables, in the order of their keys."""
         if self.map.size == 0:
             return np.zeros((0, 0))
         inverse, _ = lapack.dpotri(cholesky(self.information.copy()), lower=1)
         return np.asarray(np.tril(inverse) + np.tril(inverse, -1).T)
 
     def joint(self, keys: IntArray) -> Array:
-        """Returns the joint covariance of some of the map's variables (k,), in the given order."""
+        """Return the joint covariance of some of the map's variables (k,), in the given order."""
         entries = self.map.entries(keys)
         return np.asarray(self.map_covariance[np.ix_(entries, entries)])
 
     @property
     def pose_marginals(self) -> Array:
-        """Returns the covariance (P, 3, 3) of each pose."""
+        """Return the covariance (P, 3, 3) of each pose."""
         return self._pose_covariances[0]
 
     @property
     def cross_covariance(self) -> Array:
-        """Returns the covariance (3 P, n) of every pose with every variable of the map."""
+        """Return the covariance (3 P, n) of every pose with every variable of the map."""
         return self._pose_covariances[1]
 
     @cached_property
     def _pose_covariances(self) -> tuple[Array, Array]:
-        """Returns marginals and cross covariances, computed from the root clique to the leaves.
+        """Return marginals and cross covariances, computed from the root clique to the leaves.
 
         A clique's poses x are `T y + R^-1 w` with w white, where y is in the map or in the clique above. So
         `cov(x, z) = T cov(y, z)` for all z above, and `cov(x) = T cov(y) T' + R^-1 R^-T` (Kaess and Dellaert
@@ -158,7 +153,6 @@ class Elimination:
         return marginals, cross
 
     def _cliques(self) -> Iterator[_Clique]:
-        """Yields the poses' cliques, beginning with the root."""
         for k in reversed(range(self._net.size())):
             conditional = self._net.at(k)
             keys = np.array(conditional.keys(), np.intp)
@@ -182,24 +176,24 @@ class Elimination:
 
 @dataclass(frozen=True, eq=False)
 class _Clique:
-    """Holds the conditional `x = T y + R^-1 w` of some poses x, given the variables y of their separator."""
+    """Conditional `x = T y + R^-1 w` of some poses x, given the variables y of their separator."""
 
     poses: IntArray
-    """These are the entries (f,) of x among the poses."""
+    """Entries (f,) of x among the poses."""
     poses_above: IntArray
-    """These are the entries (p,) of the poses of y among the poses."""
+    """Entries (p,) of the poses of y among the poses."""
     map_above: IntArray
-    """These are the entries (m,) of the map variables of y among the map's."""
+    """Entries (m,) of the map variables of y among the map's."""
     root: Array
-    """This is the inverse R^-1 (f, f)."""
+    """Inverse R^-1 (f, f)."""
     by_poses: Array
-    """These are the columns (f, p) of T for the poses of y."""
+    """Columns (f, p) of T for the poses of y."""
     by_map: Array
-    """These are the columns (f, m) of T for the map variables of y."""
+    """Columns (f, m) of T for the map variables of y."""
 
 
 def eliminated_system(graph: gtsam.GaussianFactorGraph, kept: Layout) -> tuple[Array, Array]:
-    """Returns H (n, n) and g (n,) of `1/2 d' H d - g' d` on a layout, with all other variables eliminated.
+    """Return H (n, n) and g (n,) of `1/2 d' H d - g' d` on a layout, with all other variables eliminated.
 
     Raises as `Elimination` does.
     """
@@ -211,7 +205,7 @@ def eliminated_system(graph: gtsam.GaussianFactorGraph, kept: Layout) -> tuple[A
 def _eliminated(
     graph: gtsam.GaussianFactorGraph, others: Layout, count: int
 ) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
-    """Returns the conditionals of `count` poses, the root last, and the graph that remains on the others."""
+    """Return the conditionals of `count` poses, the root last, and the graph that remains on the others."""
     order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, others.keys.tolist(), False)
     poses = gtsam.Ordering([order.at(k) for k in range(count)])
     try:

@@ -5,24 +5,18 @@ that no factor holds, and `optimizeDensely()` gives numbers for a singular syste
 `S()`, `d()`, `getA()`, `getb()` and `linearTerm()` are views of memory that nobody owns, so none is returned.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from pathspace_graph.errors import SingularSystemError
-from pathspace_graph.factors.gtsam_factors import linear_factor
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.linear import linear_factor
 
-from .keys import POINT, names, sizes
-from .variables import Layout
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from .variables import POINT, Layout, Variables, names, sizes
 
 GraphPart = (
     gtsam.GaussianFactor | gtsam.GaussianFactorGraph | gtsam.GaussianBayesNet | gtsam.GaussianBayesTree
@@ -35,7 +29,7 @@ RANK_TOLERANCE: Final = 1e-12
 
 
 def graph_of(*factors: GraphPart) -> gtsam.GaussianFactorGraph:
-    """Returns a graph that shares the given factors, and the factors of the given graphs, nets and trees."""
+    """Return a graph that shares the given factors, and the factors of the given graphs, nets and trees."""
     graph = gtsam.GaussianFactorGraph()
     for factor in factors:
         graph.push_back(factor)
@@ -43,12 +37,12 @@ def graph_of(*factors: GraphPart) -> gtsam.GaussianFactorGraph:
 
 
 def factors_of(graph: gtsam.GaussianFactorGraph) -> list[gtsam.GaussianFactor]:
-    """Returns the factors of a graph; a Bayes tree in it has given its conditionals."""
+    """Return the factors of a graph; a Bayes tree in it has given its conditionals."""
     return [graph.at(i) for i in range(graph.size())]
 
 
 def keys_of(graph: gtsam.GaussianFactorGraph) -> IntArray:
-    """Returns the keys (k,) of a graph, ascending."""
+    """Return the keys (k,) of a graph, ascending."""
     return np.array(list(graph.keyVector()), np.intp)
 
 
@@ -56,7 +50,7 @@ def keys_of(graph: gtsam.GaussianFactorGraph) -> IntArray:
 
 
 def require_keys(graph: gtsam.GaussianFactorGraph, layout: Layout) -> None:
-    """Raises SingularSystemError where no factor holds a key of the layout, and ValueError for a foreign key.
+    """Raise SingularSystemError where no factor holds a key of the layout, and ValueError for a foreign key.
 
     GTSAM gives a smaller system in the first case, without an error.
     """
@@ -70,7 +64,7 @@ def require_keys(graph: gtsam.GaussianFactorGraph, layout: Layout) -> None:
 
 
 def normal_equations(graph: gtsam.GaussianFactorGraph, layout: Layout) -> tuple[Array, Array]:
-    """Returns H (n, n) and g (n,) of `1/2 d' H d - g' d`, on the columns of a layout.
+    """Return H (n, n) and g (n,) of `1/2 d' H d - g' d`, on the columns of a layout.
 
     H is stored by columns. Raises as `require_keys` does.
     """
@@ -80,7 +74,7 @@ def normal_equations(graph: gtsam.GaussianFactorGraph, layout: Layout) -> tuple[
 
 
 def cholesky(hessian: Array) -> Array:
-    """Returns the lower factor of `L L' = H`, whose upper triangle is not cleared.
+    """Return the lower factor of `L L' = H`, whose upper triangle is not cleared.
 
     It overwrites an H that is stored by columns. SingularSystemError where H is not positive definite.
     """
@@ -91,28 +85,27 @@ def cholesky(hessian: Array) -> Array:
 
 
 def solve(factor: Array, vector: Array) -> Array:
-    """Returns `H^-1 g` from the lower factor of H, for g (n,) or (n, k)."""
+    """Return `H^-1 g` from the lower factor of H, for g (n,) or (n, k)."""
     solution, _ = lapack.dpotrs(factor, vector, lower=1)
     return np.asarray(solution)
 
 
 def half_solve(factor: Array, columns: Array) -> Array:
-    """Returns `L^-1 G` (n, k), so that `half' half = G' H^-1 G`; it may overwrite G."""
+    """Return `L^-1 G` (n, k), so that `half' half = G' H^-1 G`; it may overwrite G."""
     half, _ = lapack.dtrtrs(factor, columns, lower=1, overwrite_b=1)
     return np.asarray(half)
 
 
 @dataclass(frozen=True, eq=False)
 class FactoredSystem:
-    """Holds the Cholesky factor of normal equations."""
+    """Cholesky factor of normal equations."""
 
     layout: Layout
-    """These are the columns of the system's variables."""
     factor: Array
-    """This is the lower Cholesky factor (n, n); its upper triangle is not cleared."""
+    """Lower Cholesky factor (n, n); its upper triangle is not cleared."""
 
     def covariance(self, keys: IntArray) -> Array:
-        """Returns the joint covariance (q, q) of keys (k,), in their order, all others marginalized out."""
+        """Return the joint covariance (q, q) of keys (k,), in their order, all others marginalized out."""
         entries = self.layout.entries(keys)
         unit = np.zeros((self.layout.size, len(entries)), order="F")
         unit[entries, np.arange(len(entries))] = 1.0
@@ -121,25 +114,68 @@ class FactoredSystem:
 
 
 def factorize(graph: gtsam.GaussianFactorGraph, layout: Layout) -> FactoredSystem:
-    """Returns the factored normal equations of a graph. Raises as `require_keys` and `cholesky` do."""
+    """Return the factored normal equations of a graph. Raises as `require_keys` and `cholesky` do."""
     return FactoredSystem(layout, cholesky(normal_equations(graph, layout)[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class HeldMap:
+    """What was known of a closed map when its gauge was held: the most that is claimed of it."""
+
+    keys: IntArray
+    """(k,) Keys of all its points."""
+    covariance: Array
+    """(2k, 2k) Their joint covariance then (m^2)."""
+
+    def claimed(self, joint: Array) -> Array:
+        """Return the covariance (q, q) of variables, given the joint one (2k + q, 2k + q) with the map's.
+
+        The variables y follow the map m by `A = Sigma_ym Sigma_mm^-1`. With D what the detections since then
+        have taken off the map's covariance, the result is `Sigma_yy + A D A'`.
+        """
+        n = len(self.covariance)
+        now, mixed, others = joint[:n, :n], joint[:n, n:], joint[n:, n:]
+        by_map = np.linalg.solve(now, mixed).T
+        values, vectors = np.linalg.eigh(self.covariance - now)
+        root = by_map @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        return np.asarray(others + root @ root.T)
 
 
 # --- factors ---------------------------------------------------------------------------------------------
 
 
 def jacobian_factor(keys: IntArray, A: Array, b: Array) -> gtsam.GaussianConditional:
-    """Returns the factor `1/2 |A d - b|^2` on any number of keys (k,), with whitened A (m, n), b (m,)."""
+    """Return the factor `1/2 |A d - b|^2` on any number of keys (k,), with whitened A (m, n), b (m,)."""
     return linear_factor(keys.tolist(), sizes(keys).tolist(), A, b)
 
 
+def absolute_factor(
+    keys: IntArray, root: Array, variables: Variables, mean: Array | None = None
+) -> gtsam.GaussianConditional:
+    """Return the factor `1/2 |A (x - m)|^2` on keys (k,), with A the `root`, and m the values by default."""
+    entries = variables.layout.entries(keys)
+    change = variables.change(entries) if mean is None else mean - variables.reference[entries]
+    return jacobian_factor(keys, root, root @ change)
+
+
+def calibration_factors(variables: Variables, mean: Array, sigma: Array) -> list[gtsam.GaussianConditional]:
+    """Return the factors `(b - mean) / sigma` of the calibrations of the odometry and of the sensor."""
+    factors = []
+    for key in variables.calibration_keys:
+        keys = np.array([key])
+        entries = variables.layout.entries(keys)
+        root = np.diag(1.0 / sigma[entries])
+        factors.append(absolute_factor(keys, root, variables, mean[entries]))
+    return factors
+
+
 def as_hessian_factor(graph: gtsam.GaussianFactorGraph) -> gtsam.HessianFactor:
-    """Returns one factor on all keys of a graph, which is the sum of its factors."""
+    """Return one factor on all keys of a graph, which is the sum of its factors."""
     return gtsam.HessianFactor(graph)
 
 
 def square_root_form(information: Array, vector: Array) -> tuple[Array, Array]:
-    """Returns A (r, n) and b (r,) with `A'A = L` and `A'b = g`, where L (n, n) has rank r.
+    """Return A (r, n) and b (r,) with `A'A = L` and `A'b = g`, where L (n, n) has rank r.
 
     A is a Cholesky factor with pivoting, of L scaled to a diagonal of ones. A direction whose information is
     below `RANK_TOLERANCE` of that has no row.
@@ -155,7 +191,7 @@ def square_root_form(information: Array, vector: Array) -> tuple[Array, Array]:
 
 
 def as_rows(graph: gtsam.GaussianFactorGraph) -> gtsam.GaussianConditional:
-    """Returns one factor of rows on all keys of a graph.
+    """Return one factor of rows on all keys of a graph.
 
     Where round-off has left a direction with negative information, the rows have none about it.
     """
@@ -169,7 +205,7 @@ def as_rows(graph: gtsam.GaussianFactorGraph) -> gtsam.GaussianConditional:
 def eliminate(
     graph: gtsam.GaussianFactorGraph, keys: IntArray
 ) -> tuple[gtsam.GaussianConditional, gtsam.GaussianFactorGraph]:
-    """Returns the conditional of all keys (k,) together, and the graph of the others.
+    """Return the conditional of all keys (k,) together, and the graph of the others.
 
     It splits `p(x) = p(keys | others) p(others)`. Factors that hold none of the keys stay as they are.
     """
@@ -182,7 +218,7 @@ def eliminate(
 
 
 def marginalize(graph: gtsam.GaussianFactorGraph, keys: IntArray) -> gtsam.GaussianFactorGraph:
-    """Returns the graph with variables (k,) marginalized out, one after the other.
+    """Return the graph with variables (k,) marginalized out, one after the other.
 
     Factors that hold none of them stay as they are. Keys that no factor holds are ignored.
     """
@@ -194,7 +230,7 @@ def marginalize(graph: gtsam.GaussianFactorGraph, keys: IntArray) -> gtsam.Gauss
 
 
 def sparse_marginal(graph: gtsam.GaussianFactorGraph, keys: IntArray) -> gtsam.GaussianFactorGraph:
-    """Returns the graph of some of the keys (k,) of a large and sparse graph, all others marginalized out."""
+    """Return the graph of some of the keys (k,) of a large and sparse graph, all others marginalized out."""
     order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, keys.tolist(), False)
     others = gtsam.Ordering([order.at(i) for i in range(order.size() - len(keys))])
     _, remaining = graph.eliminatePartialMultifrontal(others)
@@ -204,7 +240,7 @@ def sparse_marginal(graph: gtsam.GaussianFactorGraph, keys: IntArray) -> gtsam.G
 def remove_information(
     graph: gtsam.GaussianFactorGraph, layout: Layout, values: Array
 ) -> gtsam.GaussianFactorGraph:
-    """Returns the graph without a layout's variables; the information about all others is kept.
+    """Return the graph without a layout's variables; the information about all others is kept.
 
     The graph need not determine these variables: `NEGLIGIBLE` information about `values` (n,) of their
     unknowns makes them regular.
@@ -217,7 +253,7 @@ def remove_information(
 def condition(
     graph: gtsam.GaussianFactorGraph, layout: Layout, fixed: int, value: Array
 ) -> tuple[Array, Array]:
-    """Returns the normal equations on a layout, given the value of the unknown of one more key, `fixed`."""
+    """Return the normal equations on a layout, given the value of the unknown of one more key, `fixed`."""
     joint = Layout(np.sort(np.append(layout.keys, fixed)))
     hessian, vector = normal_equations(graph, joint)
     free, known = joint.entries(layout.keys), joint.entries(np.array([fixed]))
@@ -230,7 +266,7 @@ def condition(
 def merge_variables(
     graph: gtsam.GaussianFactorGraph, removed: IntArray, kept: IntArray, offset: Array
 ) -> gtsam.GaussianFactorGraph:
-    """Returns the graph where each key of `removed` (k,) is replaced by that of `kept` (k,).
+    """Return the graph where each key of `removed` (k,) is replaced by that of `kept` (k,).
 
     The unknowns satisfy `d_removed = d_kept + offset` (n,). This is exact: with `d_old = E d_new + e`, the
     information becomes `E' L E` and the vector `E' (g - L e)`.
@@ -248,14 +284,9 @@ def merge_variables(
 
 
 def substitute_points(
-    graph: gtsam.GaussianFactorGraph,
-    old: IntArray,
-    new: IntArray,
-    change: Array,
-    offset: Array,
-    sigma: float,
+    graph: gtsam.GaussianFactorGraph, old: IntArray, new: IntArray, change: Array, offset: Array, sigma: float
 ) -> gtsam.GaussianFactorGraph:
-    """Returns the graph where points `new` (k,) replace points `old` (n,), as one factor and an elimination.
+    """Return the graph where points `new` (k,) replace points `old` (n,), as one factor and an elimination.
 
     The unknowns satisfy `d_old = (E x I) d_new + offset + N(0, sigma^2)`, with E the matrix `change` (n, k)
     and `offset` (2 n,). The information about the old points is carried over, reduced by a shift of sigma

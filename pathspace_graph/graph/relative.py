@@ -1,4 +1,4 @@
-"""Relative factors: Gaussian information on coordinates in the frame of a pose.
+"""Relative factors: Gaussian information on coordinates in the frame of a pose, and submaps made of them.
 
 All measurements of a drive are relative: detections relate poses to map points, and odometry relates poses to
 poses. So what is left of them after an elimination is a function of coordinates in the frame of any one of
@@ -9,26 +9,26 @@ vehicle had drifted to.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
+
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.se2 import compose, relative
 
 from .gaussian import (
     condition,
     graph_of,
     jacobian_factor,
     keys_of,
+    marginalize,
     normal_equations,
     remove_information,
     square_root_form,
 )
-from .keys import ORIGIN_KEY, POSE
-from .variables import Layout, Variables, rotation_blocks
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from .variables import ORIGIN_KEY, POSE, Layout, Variables, rotation_blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,18 +40,18 @@ class RelativeFactor:
     """
 
     frame: int
-    """This is the key of the pose in whose frame the factor is."""
+    """Key of the pose in whose frame the factor is."""
     keys: Layout
     """The variables y are the calibration, map points and poses, by their keys."""
     root: Array
-    """This is A (r, q), a square root of the information."""
+    """A (r, q), a square root of the information."""
     right: Array
-    """This is b (r,)."""
+    """Right-hand side b (r,)."""
     local: Array
-    """This is the linearization point y0 (q,)."""
+    """Linearization point y0 (q,)."""
 
     def factor(self, variables: Variables) -> gtsam.GaussianFactor:
-        """Returns the factor on its keys and the frame's, linearized at the variables' values.
+        """Return the factor on its keys and the frame's, linearized at the variables' values.
 
         The origin of the map frame does not move, so the factor does not hold it.
         """
@@ -65,7 +65,7 @@ class RelativeFactor:
         return jacobian_factor(keys[keys != ORIGIN_KEY], jacobian[:, ~fixed], jacobian @ now - residual)
 
     def without(self, keys: IntArray) -> RelativeFactor:
-        """Returns the factor without information about some keys."""
+        """Return the factor without information about some keys."""
         removed = Layout(np.intersect1d(self.keys.keys, keys))
         if removed.size == 0:
             return self
@@ -79,7 +79,7 @@ class RelativeFactor:
 def relative_factor(
     graph: gtsam.GaussianFactorGraph, frame: int, pose: Array, reference: Array, variables: Variables
 ) -> RelativeFactor:
-    """Returns a graph of relative measurements as a factor in the frame of a pose.
+    """Return a graph of relative measurements as a factor in the frame of a pose.
 
     The pose of the frame is at `pose` (3,), and its unknown is measured from `reference` (3,). In the frame
     of a fixed pose the variables are linear functions of the unknowns, so the change of frame is exact.
@@ -103,13 +103,13 @@ def relative_factor(
 
 
 def rotations(keys: Layout, heading: float) -> Array:
-    """Returns the rotation (q, q) of points and poses from a frame with a heading (rad) to the map frame."""
+    """Return the rotation (q, q) of points and poses from a frame with a heading (rad) to the map frame."""
     x = keys.turning
     return rotation_blocks(keys.size, x, np.full(len(x), heading))
 
 
 def to_frame(values: Array, frame: Array, keys: Layout) -> Array:
-    """Returns values (q,) of keys, which are in the map frame, in the frame of a pose (3,)."""
+    """Return values (q,) of keys, which are in the map frame, in the frame of a pose (3,)."""
     c, s = np.cos(frame[2]), np.sin(frame[2])
     local, x = values.copy(), keys.turning
     dx, dy = values[x] - frame[0], values[x + 1] - frame[1]
@@ -119,7 +119,7 @@ def to_frame(values: Array, frame: Array, keys: Layout) -> Array:
 
 
 def from_frame(local: Array, frame: Array, keys: Layout) -> Array:
-    """Returns values (q,) of keys, which are in the frame of a pose (3,), in the map frame."""
+    """Return values (q,) of keys, which are in the frame of a pose (3,), in the map frame."""
     c, s = np.cos(frame[2]), np.sin(frame[2])
     values, x = local.copy(), keys.turning
     values[x] = frame[0] + c * local[x] - s * local[x + 1]
@@ -129,7 +129,7 @@ def from_frame(local: Array, frame: Array, keys: Layout) -> Array:
 
 
 def by_frame_of(values: Array, frame: Array, keys: Layout) -> Array:
-    """Returns the derivative (q, 3) of `to_frame` by the pose of the frame."""
+    """Return the derivative (q, 3) of `to_frame` by the pose of the frame."""
     c, s = np.cos(frame[2]), np.sin(frame[2])
     matrix, x = np.zeros((keys.size, POSE)), keys.turning
     dx, dy = values[x] - frame[0], values[x + 1] - frame[1]
@@ -137,3 +137,74 @@ def by_frame_of(values: Array, frame: Array, keys: Layout) -> Array:
     matrix[x + 1, 0], matrix[x + 1, 1], matrix[x + 1, 2] = s, -c, -c * dx - s * dy
     matrix[keys.headings, 2] = -1.0
     return matrix
+
+
+class Submaps:
+    """Submaps of the drive up to loop closure; the last of them is unfinished."""
+
+    def __init__(self, first: gtsam.GaussianFactorGraph, interval: float) -> None:
+        self.first = first
+        """Absolute prior of the calibration and the first pose."""
+        self.interval = interval
+        self.finished: list[RelativeFactor] = []
+        """Finished submaps, in the order of the drive."""
+        self.keyframes: dict[int, tuple[Array, Array]] = {}
+        """Each keyframe, by key, has its pose (3,) when it was marginalized, and its reference (3,)."""
+        self._hung: dict[
+            int, tuple[int, Array]
+        ] = {}  # the anchor of a keyframe, and the keyframe in its frame
+        self._graph: gtsam.GaussianFactorGraph | None = None
+        self._keyframe = 0
+        self._driven = 0.0
+
+    def add_pose(self, pose: int, factors: gtsam.GaussianFactorGraph, variables: Variables) -> None:
+        """Add the window's oldest pose, by its key, and its factors, without the prior, to the submap.
+
+        The pose is marginalized out unless it is the keyframe. The next pose is the end of the submap.
+        """
+        if self._driven >= self.interval:
+            self.finish(variables)
+        entries = variables.layout.entries(np.array([pose]))
+        if self._graph is None:
+            self._keyframe, self._graph, self._driven = pose, factors, 0.0
+            self.keyframes[pose] = variables.linearized[entries].copy(), variables.reference[entries].copy()
+        else:
+            self._graph = marginalize(graph_of(self._graph, factors), np.array([pose]))
+        following = variables.linearized[variables.layout.entries(np.array([pose + 1]))]
+        self._driven += float(np.hypot(*(following[:2] - variables.linearized[entries[:2]])))
+
+    def finish(self, variables: Variables) -> None:
+        """Finish the current submap at the oldest pose of the window."""
+        if self._graph is not None:
+            self.finished.append(self._finished_submap(variables))
+            self._graph = None
+
+    def hang(self, anchor: int, pose: Array) -> None:
+        """Hang all new keyframes on an anchor, by its key, which is at a pose (3,); they move with it."""
+        for key, (keyframe, _) in self.keyframes.items():
+            if key not in self._hung:
+                self._hung[key] = anchor, relative(pose, keyframe)
+
+    def carry(self, anchors: Mapping[int, Array]) -> None:
+        """Place all hung keyframes anew, given the poses (3,) of their anchors."""
+        for key, (anchor, local) in self._hung.items():
+            self.keyframes[key] = compose(anchors[anchor], local), self.keyframes[key][1]
+        self._hung = {}
+
+    def remove_information(self, keys: IntArray, variables: Variables) -> None:
+        self.finish(variables)
+        self.finished = [submap.without(keys) for submap in self.finished]
+
+    def graph(self, variables: Variables) -> gtsam.GaussianFactorGraph:
+        """Return the prior as a graph on keyframes: all submaps, linearized at the variables' values."""
+        return graph_of(self.first, *(submap.factor(variables) for submap in self.finished))
+
+    def insert_keyframes(self, variables: Variables) -> None:
+        for key, (pose, reference) in self.keyframes.items():
+            variables.insert(np.array([key]), pose, reference)
+
+    def _finished_submap(self, variables: Variables) -> RelativeFactor:
+        """Return the marginal of the current submap, given that its keyframe is where it was."""
+        assert self._graph is not None
+        pose, reference = self.keyframes[self._keyframe]
+        return relative_factor(self._graph, self._keyframe, pose, reference, variables)

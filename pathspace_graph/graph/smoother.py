@@ -1,110 +1,113 @@
 """The fixed-lag smoother: a window of GTSAM factors on the map and the last few seconds of poses.
 
-In each cycle the system of the window is solved. Then the oldest pose is eliminated, and the graph that
+In each cycle the stale factors of the window are linearized again. `graph.hessian(ordering)` and one dense
+Cholesky factor give the step and the joint covariance. Then the oldest pose is eliminated, and the graph that
 remains is the prior. GTSAM's own fixed-lag smoothers freeze the linearization point of every variable that a
 marginal touches, which here is the whole map.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
+from typing import Final, Generic
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
 
 from .gaussian import (
+    FactoredSystem,
+    HeldMap,
+    absolute_factor,
     as_hessian_factor,
+    as_rows,
+    calibration_factors,
+    cholesky,
+    factorize,
     graph_of,
-    jacobian_factor,
     marginalize,
     merge_variables,
+    normal_equations,
     remove_information,
+    solve,
+    sparse_marginal,
     substitute_points,
 )
-from .inactive import InactiveMap
-from .keys import (
-    CALIBRATION_KEY,
-    POINT,
-    POSE,
-    are_poses,
-    indices,
-    name,
-    pose_key,
-    pose_keys,
-)
-from .odometry import calibrated_delta
-from .submaps import Submaps
-from .system import HeldMap, SmootherSettings, WindowSystem
-from .user_factors import check_factors
-from .variables import Layout
-from .window import M_co
+from .inactive import Follower, InactiveChain, InactiveMap
+from .relative import Submaps
+from .rows import Rows, calibrated_delta, predicted_covariance
+from .variables import CALIBRATION_KEY, POINT, POSE, POSE_LETTER, SENSOR_LETTER, Layout, pose_key, pose_keys
+from .window import M_co, SmootherSettings, UserFactors, WindowFactors, check_factors
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-
-STIFFNESS = 1e4
+STIFFNESS: Final = 1e4
 """A gauge that is held has this number of times its information."""
-TIME_TOLERANCE = 1e-9
+TIME_TOLERANCE: Final = 1e-9
 """A pose leaves once it is older than the lag by more than this time (s), since stamps have round-off."""
+NO_KEYS: Final = np.zeros(0, np.intp)
 
 
-class FixedLagSmoother(WindowSystem[M_co]):
-    """Adds poses to the system of the window, marginalizes the oldest, and closes the loop."""
+class FixedLagSmoother(Generic[M_co]):
+    """Window, prior and inactive part of a map: solves for the active variables, cycle by cycle."""
 
     def __init__(self, settings: SmootherSettings, map_rows: M_co) -> None:
-        super().__init__(settings, map_rows)
-        self._begin_calibration()
-
-    # --- new variables and factors -----------------------------------------------------------------------
-
-    def _begin_calibration(self) -> None:
+        self.settings, self.map, self.variables = settings, map_rows, map_rows.variables
+        self.times: list[float] = []
+        """Stamps (s) of the poses in the window."""
+        self.window = WindowFactors(map_rows, settings.tolerances)
+        self.user_factors = UserFactors()
+        self.inactive = InactiveChain() if settings.relative else InactiveMap()
+        """Variables that a cycle does not solve for."""
+        self.followers: list[Follower] = []
+        """What is moved together with the open map."""
+        self.submaps: Submaps | None = None
+        """The prior in submaps, while the loop is open and the user gave no factors on poses."""
+        self.last_step: FactoredSystem | None = None
+        """Damped system of the last Gauss-Newton step; None before the first one."""
+        self.held: HeldMap | None = None
+        """What was known of a closed map when its gauge was held; None before."""
+        self.epoch = 0
+        """Number of changes of the prior other than the marginalization of a pose."""
+        sigmas = np.array(settings.sigmas_calibrations)
+        self.calibration_prior: tuple[Array, Array] = (
+            np.resize(settings.calibrations or 0.0, len(sigmas)),
+            sigmas,
+        )
+        """Means and standard deviations of the priors of the calibrations, (2,) or (7,)."""
         self.variables.insert_calibrations(self.calibration_prior[0])
-        self.prior = graph_of(self.prior, *self._calibration_factors(*self.calibration_prior))
+        self.prior = graph_of(*calibration_factors(self.variables, *self.calibration_prior))
+        """Information from everything that has left the window."""
 
-    def believe_calibrations(self, mean: Array, sigma: Array) -> None:
-        """Give the priors of the calibrations other means and standard deviations, (2,) or (7,).
+    @property
+    def first_cycle(self) -> int:
+        """Return the perception cycle of the oldest pose in the window."""
+        return self.variables.first_cycle
 
-        Calibrations are never eliminated, so their priors are terms of the sum, and are exchanged exactly.
-        """
-        before = self.calibration_prior
-        if (mean == before[0]).all() and (sigma == before[1]).all():
-            return
-        after = self._calibration_factors(mean, sigma)
-        negative = [factor.negate() for factor in self._calibration_factors(*before)]
-        self.calibration_prior, self.epoch = (mean, sigma), self.epoch + 1
-        self.prior = graph_of(self.prior, *after, *negative)
-        if self.submaps is not None:
-            self.submaps.first = graph_of(self.submaps.first, *after, *negative)
+    @property
+    def next_cycle(self) -> int:
+        """Return the number of the next perception cycle, counted from 0."""
+        return self.first_cycle + len(self.times)
 
-    def _calibration_factors(self, mean: Array, sigma: Array) -> list[gtsam.GaussianConditional]:
-        """Return the factor `(b - mean) / sigma` of the calibration of the odometry, and of the sensor."""
-        factors = []
-        for key in self.variables.calibration_keys:
-            keys = np.array([key])
-            entries = self.variables.layout.entries(keys)
-            root = np.diag(1.0 / sigma[entries])
-            factors.append(
-                jacobian_factor(keys, root, root @ (mean[entries] - self.variables.reference[entries]))
-            )
-        return factors
+    @property
+    def _cycles(self) -> IntArray:
+        return np.arange(self.first_cycle, self.next_cycle)
 
-    def measure_bias(self, value: float, sigma: float) -> None:
-        """Adds a measurement of the yaw rate's bias (rad/s), which a vehicle at rest makes."""
-        keys, row = np.array([CALIBRATION_KEY]), np.array([[0.0, 1.0 / sigma]])
-        reference = self.variables.reference[self.variables.layout.entries(keys)]
-        measured = jacobian_factor(keys, row, row @ (np.array([0.0, value]) - reference))
-        self.prior, self.epoch = graph_of(self.prior, measured), self.epoch + 1
-        if self.submaps is not None:
-            self.submaps.first = graph_of(self.submaps.first, measured)
+    @property
+    def layout(self) -> Layout:
+        """Return the columns of the active variables, which a step solves for."""
+        return self.inactive.active(self.variables.layout)
+
+    @property
+    def chain(self) -> InactiveChain | None:
+        """Return the inactive part of an open map; None where parts are in the map frame."""
+        return self.inactive if isinstance(self.inactive, InactiveChain) else None
+
+    # --- expand: new poses, factors and measurements -----------------------------------------------------
 
     def predict(
         self, t: float, odometry: IntegratedOdometry, sigmas_start: tuple[float, float, float]
     ) -> Array:
-        """Adds and returns the pose (3,) at t (s), predicted by the calibrated odometry since the newest one.
+        """Add and return the pose (3,) at t (s), predicted by the calibrated odometry since the newest one.
 
         The drive starts at (0, 0, 0) with standard deviations `sigmas_start` (m, m, rad).
         """
@@ -118,38 +121,30 @@ class FixedLagSmoother(WindowSystem[M_co]):
         return pose
 
     def add_first_pose(self, t: float, pose: Array, covariance: Array) -> None:
-        """Adds the first pose (3,) with its covariance (3, 3), in the map frame."""
-        key = pose_keys(np.array([self.next_cycle]))
-        self.variables.insert(key, pose)
+        """Add the first pose (3,) with its covariance (3, 3), in the map frame."""
+        self.variables.insert(pose_keys(np.array([self.next_cycle])), pose)
+        self.add_pose_prior(self.next_cycle, covariance)
         self.times.append(t)
-        root = np.linalg.cholesky(np.linalg.inv(covariance)).T
-        self.prior.push_back(jacobian_factor(key, root, np.zeros(POSE)))
         self.submaps = Submaps(graph_of(self.prior), self.settings.keyframe_interval)
 
     def add_pose(self, t: float, pose: Array, odometry: IntegratedOdometry) -> None:
-        """Adds the next pose (3,) at t (s), and the odometry that leads to it."""
+        """Add the next pose (3,) at t (s), and the odometry that leads to it."""
         self.window.of_cycle.pop(self.next_cycle - 1, None)
         self.variables.insert(pose_keys(np.array([self.next_cycle])), pose)
         self.times.append(t)
         self.window.odometry.append(odometry)
 
-    def check_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
-        """Raises a SettingsError for the first of a user's factors that cannot be used; nothing changes."""
-        if factors:
-            window = f"{name(pose_key(self.first_cycle))} to {name(pose_key(self.next_cycle))}"
-            expected = f"poses in the window, {window}, of control points and of the calibration"
-            check_factors(factors, self._is_known, expected, self._values_of)
+    def add_pose_prior(self, cycle: int, covariance: Array) -> None:
+        """Add a prior to the pose of a cycle at its present value, with a covariance (3, 3), map frame."""
+        root = np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).T, np.float64)
+        self.prior.push_back(absolute_factor(pose_keys(np.array([cycle])), root, self.variables))
 
-    def _values_of(self, keys: IntArray) -> gtsam.Values:
-        """Returns the values of known keys; the pose of the next cycle is where the newest one is."""
-        next_key = pose_key(self.next_cycle)
-        values = self.variables.gtsam_values(keys[keys != next_key])
-        if next_key in keys:
-            values.insert(next_key, gtsam.Pose2(*self.variables.poses[-1]) if self.times else gtsam.Pose2())
-        return values
+    def check_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
+        """Raise a SettingsError for the first of a user's factors that cannot be used; nothing changes."""
+        check_factors(factors, self.variables, self.next_cycle)
 
     def add_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
-        """Adds the user's factors on any variables, and on the pose of the next cycle, after their check.
+        """Add the user's factors on any variables, and on the pose of the next cycle, after their check.
 
         Factors on poses may be absolute, which a submap cannot be. So submaps are dropped then, and the prior
         keeps its linearization point when the loop closes. Inactive variables of a factor become active.
@@ -161,29 +156,117 @@ class FixedLagSmoother(WindowSystem[M_co]):
         if self.chain is not None or np.isin(self.user_factors.keys, self.inactive.keys).any():
             self.reactivate()
 
-    def _is_known(self, key: int) -> bool:
-        """Returns whether a user's factor may hold a key."""
-        cycle = int(indices(np.array(key)))
-        if are_poses(np.array(key)):
-            return self.first_cycle <= cycle <= self.next_cycle
-        return bool(self.variables.layout.positions(np.array(key)) >= 0)
+    def believe_calibrations(self, mean: Array, sigma: Array) -> None:
+        """Give the priors of the calibrations other means and standard deviations, (2,) or (7,).
 
-    def remove_information(self, keys: IntArray) -> None:
-        """Removes all prior information about map points."""
-        self.activate(keys)
-        self.epoch += 1
-        now = self.variables.change(self.variables.layout.entries(keys))
-        self.prior = remove_information(self.prior, Layout(keys), now)
+        Calibrations are never eliminated, so their priors are terms of the sum, and are exchanged exactly.
+        """
+        before = self.calibration_prior
+        if (mean == before[0]).all() and (sigma == before[1]).all():
+            return
+        self.calibration_prior = mean, sigma
+        negative = [factor.negate() for factor in calibration_factors(self.variables, *before)]
+        self._add_to_prior(*calibration_factors(self.variables, mean, sigma), *negative)
+
+    def measure_bias(self, value: float, sigma: float) -> None:
+        """Add a measurement of the yaw rate's bias (rad/s), which a vehicle at rest makes."""
+        keys, row = np.array([CALIBRATION_KEY]), np.array([[0.0, 1.0 / sigma]])
+        self._add_to_prior(absolute_factor(keys, row, self.variables, np.array([0.0, value])))
+
+    def _add_to_prior(self, *factors: gtsam.GaussianFactor) -> None:
+        self.prior, self.epoch = graph_of(self.prior, *factors), self.epoch + 1
         if self.submaps is not None:
-            self.submaps.remove_information(keys, self.variables)
+            self.submaps.first = graph_of(self.submaps.first, *factors)
 
-    # --- marginalization ---------------------------------------------------------------------------------
+    # --- update: Gauss-Newton ----------------------------------------------------------------------------
+
+    def step(self, sigma_step: float | None = None) -> None:
+        """Take one Gauss-Newton step; `sigma_step` (m) damps it as a prior on the motion of map points."""
+        negative_gradient = self.factorize(sigma_step)
+        assert self.last_step is not None
+        entries = self.variables.layout.entries(self.last_step.layout.keys)
+        self.variables.values[entries] += solve(self.last_step.factor, negative_gradient)
+        self.map.correct()
+
+    def factorize(self, sigma_step: float | None = None) -> Array:
+        """Factor the system of a step into `last_step`, and return the negative gradient (n,).
+
+        No variable moves. SingularSystemError where the system is not positive definite.
+        """
+        while not self.window.relinearize(self._cycles, self.inactive.members) and len(self.inactive):
+            self.activate(self.inactive.newest)  # rare: a detection has moved to where the map is inactive
+        user, layout = self.user_factors.linearized(self.variables), self.layout
+        held = self.chain.hold(self.variables) if self.chain is not None else []
+        graph = graph_of(self.prior, *self.window.linear, *user, *held)
+        hessian, vector = normal_equations(graph, layout)
+        now = self.variables.change(self.variables.layout.entries(layout.keys))
+        negative_gradient = vector - hessian @ now
+        if sigma_step is not None:
+            first, last = layout.block(SENSOR_LETTER).stop, layout.block(POSE_LETTER).start
+            points = np.arange(first, last)
+            hessian[points, points] += sigma_step**-2
+        self.last_step = FactoredSystem(layout, cholesky(hessian))
+        return negative_gradient
+
+    def linear_graph(self, whole: bool = False) -> gtsam.GaussianFactorGraph:
+        """Return the window and its prior, linearized at the variables' values, and change nothing.
+
+        The unknowns are `value - reference`, with poses (x, y, theta) in the map frame. If `whole`, the graph
+        is also on the inactive variables, which must be up to date.
+        """
+        if not whole:
+            prior = self.absolute_prior()
+        elif self.chain is not None:  # its links hold the weak priors of the inactive part
+            prior = self.chain.joint(self.prior, self.variables)
+        else:
+            prior = self.inactive.joint_prior(self.prior)
+        fresh = self.window.fresh(self._cycles, whole and self.chain is None)
+        return graph_of(prior, *fresh, *self.user_factors.linearized(self.variables, whole))
+
+    def absolute_prior(self) -> gtsam.GaussianFactorGraph:
+        """Return the prior of the active variables in the map frame; the inactive ones must be up to date."""
+        if self.chain is None or len(self.chain) == 0:
+            return self.prior
+        return self.chain.marginal(self.prior, self.variables)
+
+    # --- covariances -------------------------------------------------------------------------------------
+
+    def last_covariance(self, keys: IntArray) -> Array:
+        """Return the joint covariance (q, q) of variables (k,) in the last step, in their order."""
+        assert self.last_step is not None
+        return self.last_step.covariance(keys)
+
+    def covariance(self, keys: IntArray) -> Array:
+        """Return the joint covariance (q, q) of variables (k,) at the estimate, without damping.
+
+        It is in the order of the keys, with poses as (x, y, theta) in the map frame (m, m, rad). Once a map
+        is held, no more is claimed of it than was known then.
+        """
+        if self.held is None:
+            return self._covariance(keys)
+        return self.held.claimed(self._covariance(np.concatenate([self.held.keys, keys])))
+
+    def _covariance(self, keys: IntArray) -> Array:
+        """Return the joint covariance (q, q) of variables (k,) by the detections alone."""
+        whole = bool(np.isin(keys, self.inactive.keys).any())
+        if whole or self.chain is not None:
+            self.refresh()
+        if whole and self.chain is not None:
+            marginal = sparse_marginal(self.linear_graph(True), keys)
+            return factorize(marginal, Layout(np.sort(keys))).covariance(keys)
+        layout = self.variables.layout if whole else self.layout
+        return factorize(self.linear_graph(whole), layout).covariance(keys)
+
+    def predicted_covariance(self, rows: Rows, together: int = 1) -> Array:
+        """Return `rows.predicted_covariance` (m / k, k, k) of every k = `together` rows in the last step."""
+        assert self.last_step is not None
+        newest = self.variables.poses[-2:], self.window.odometry, self.next_cycle - 1
+        return predicted_covariance(self.last_step, rows, *newest, together)
+
+    # --- simplify the system: marginalize poses, deactivate map points -----------------------------------
 
     def marginalize(self, held_from: int | None = None) -> None:
-        """Marginalizes poses that are older than the lag, or too many.
-
-        The cycles from `held_from` on stay.
-        """
+        """Marginalize poses that are older than the lag, or too many; the cycles from `held_from` on stay."""
         lag, most = self.settings.lag + TIME_TOLERANCE, self.settings.max_poses
         while len(self.times) > 1 and (self.times[-1] - self.times[0] > lag or len(self.times) > most):
             if self.first_cycle == held_from:
@@ -191,16 +274,16 @@ class FixedLagSmoother(WindowSystem[M_co]):
             self._marginalize_oldest()
 
     def _marginalize_oldest(self) -> None:
-        """Adds the factors of the oldest pose to the prior, and marginalizes the pose.
+        """Add the factors of the oldest pose to the prior, and marginalize the pose.
 
         The pose stays as a keyframe where inactive variables depend on it.
         """
         cycle, key = self.first_cycle, pose_key(self.first_cycle)
         user = self.user_factors.remove(np.array([key]), self.variables)
-        own = graph_of(self.window.of_cycle.pop(cycle).linear, *user)
+        factors = graph_of(self.window.of_cycle.pop(cycle).linear, *user)
         if self.submaps is not None:
-            self.submaps.add_pose(key, own, self.variables)
-        self.prior = graph_of(self.prior, own)
+            self.submaps.add_pose(key, factors, self.variables)
+        self.prior = graph_of(self.prior, factors)
         self.variables.first_cycle += 1
         if key not in self.inactive.anchors:
             self.prior = marginalize(self.prior, np.array([key]))
@@ -208,15 +291,96 @@ class FixedLagSmoother(WindowSystem[M_co]):
         self._drop_oldest(cycle)
 
     def _drop_oldest(self, cycle: int) -> None:
-        """Removes the stamp, the odometry and the detections of the oldest pose, which leaves the window."""
         self.times.pop(0)
         self.window.odometry.drop_first()
         self.map.drop_cycle(cycle)
 
-    # --- loop closure and other variables ----------------------------------------------------------------
+    def deactivate(self, keys: IntArray) -> None:
+        """Deactivate active map points (k,) on which the window has no factor."""
+        if len(keys) == 0:
+            return
+        shared = [*self.window.weak_on(keys), *self.user_factors.deactivate(keys, self.variables)]
+        user = self.user_factors.remove(keys, self.variables)
+        keyframes = self.variables.keyframes
+        self._finish_submap()
+        if self.chain is not None:
+            self.prior = self.chain.attach(self.prior, keys, shared, self.variables)
+        else:
+            self.prior = self.inactive.push(graph_of(self.prior, *user), keys, keyframes, shared)
+        self.variables.remove(keyframes)
+        self.window.drop(self.inactive.members)  # a factor linearized earlier may still hold one of them
+
+    def _finish_submap(self) -> None:
+        """Finish the current submap, so that it stays small when other map points become active."""
+        if self.submaps is not None:
+            self.submaps.finish(self.variables)
+            if self.chain is not None and len(self.chain):
+                anchor = int(self.chain.anchors[0])
+                self.submaps.hang(anchor, self.variables.of(self.chain.anchors))
+
+    def carry(self) -> None:
+        """Move an open map so that the drive began at the origin, after its inactive part is updated."""
+        if self.chain is None or len(self.chain) == 0:
+            return
+        self._finish_submap()
+        self.prior = self.chain.carry(self.prior, self.variables, self.followers)
+        self.window.relinearize(self._cycles, self.inactive.members)
+
+    def refresh(self) -> None:
+        """Update the inactive variables."""
+        self.inactive.refresh(self.variables)
+
+    def activate(self, keys: IntArray) -> None:
+        """Make map points (k,) active, and at least all that depend on them."""
+        if self.chain is None:
+            self.reactivate()
+            return
+        if not self.chain.holds(keys):
+            return
+        self._finish_submap()
+        self.refresh()
+        self._place_keyframes(self.chain)
+        while self.chain.holds(keys):
+            back = self.chain.newest
+            self.prior = graph_of(as_rows(graph_of(self.prior, self.chain.detach(self.variables))))
+            self.map.activate(back)
+
+    def reactivate(self, with_prior: bool = True) -> None:
+        """Make all variables active, and return the information about them to the prior.
+
+        Without `with_prior` the prior is left alone, because the submaps will replace it.
+        """
+        chain = self.chain
+        if chain is None and len(self.inactive) == 0:
+            return
+        self.carry()
+        self._finish_submap()
+        self.refresh()
+        if chain is not None:  # its anchors become keyframes
+            self._place_keyframes(chain)
+            self.prior = graph_of(self.prior, *(chain.detach(self.variables) for _ in range(len(chain))))
+        elif with_prior:
+            self.prior = self.inactive.joint_prior(self.prior)
+        self.inactive = InactiveMap()
+        self.user_factors.reactivate()
+        self._marginalize_keyframes()
+        self.map.activate_all()
+
+    def _place_keyframes(self, chain: InactiveChain) -> None:
+        if self.submaps is not None:
+            anchors = np.union1d(chain.anchors, self.variables.keyframes)
+            active = {int(key): self.variables.of(np.array([key])) for key in anchors}
+            self.submaps.carry(chain.poses | active)
+
+    def _marginalize_keyframes(self) -> None:
+        keyframes = self.variables.keyframes
+        self.prior = marginalize(self.prior, keyframes)
+        self.variables.remove(keyframes)
+
+    # --- what happens once: closing, other variables, another prior --------------------------------------
 
     def solve_loop(self, iterations: int, sigma_step: float | None) -> None:
-        """Optimizes the whole loop on the graph of its submaps, each relinearized in its own frame.
+        """Optimize the whole loop on the graph of its submaps, each relinearized in its own frame.
 
         The keyframes are variables during the optimization, and are marginalized afterwards. Without submaps
         (a user's factors are absolute) the prior keeps its linearization point.
@@ -233,7 +397,7 @@ class FixedLagSmoother(WindowSystem[M_co]):
         self._marginalize_keyframes()
 
     def substitute(self, old: IntArray, new: IntArray, points: Array, change: Array, sigma: float) -> None:
-        """Replaces map points `old` (n,) by `new` (k,) at `points` (k, 2): `c_old = E c_new + N(0, sigma^2)`.
+        """Replace map points `old` (n,) by `new` (k,) at `points` (k, 2): `c_old = E c_new + N(0, sigma^2)`.
 
         E is `change` (n, k). The prior of the old points is carried over, reduced by a shift of sigma (m).
         """
@@ -247,7 +411,7 @@ class FixedLagSmoother(WindowSystem[M_co]):
         self.window.clear()
 
     def merge(self, removed: IntArray, kept: IntArray) -> None:
-        """Merges map points `removed` (k,) into points `kept` (k,), which keep their values.
+        """Merge map points `removed` (k,) into points `kept` (k,), which keep their values.
 
         The prior is transformed exactly. Submaps are not, so the loop must be closed. The map's rows must be
         on the kept keys from now on.
@@ -260,8 +424,17 @@ class FixedLagSmoother(WindowSystem[M_co]):
         self.variables.remove(removed)
         self.window.clear()
 
+    def remove_information(self, keys: IntArray) -> None:
+        """Remove all prior information about map points."""
+        self.activate(keys)
+        self.epoch += 1
+        now = self.variables.change(self.variables.layout.entries(keys))
+        self.prior = remove_information(self.prior, Layout(keys), now)
+        if self.submaps is not None:
+            self.submaps.remove_information(keys, self.variables)
+
     def hold_gauge(self, keys: IntArray, across: Array) -> None:
-        """Holds where a closed map as a whole is, by its points (k,) in ascending order.
+        """Hold where a closed map as a whole is, by its points (k,) in ascending order.
 
         The rows C `across` (3, 2k) give the rigid motion (x, y, theta) by `C dx`, for moves dx of the points.
         It is held at the present estimate, where the shape of the map goes on to be estimated.
@@ -270,53 +443,44 @@ class FixedLagSmoother(WindowSystem[M_co]):
         known = self.covariance(keys)
         information = STIFFNESS * np.linalg.inv(across @ known @ across.T)
         root = np.linalg.cholesky(information).T @ across
-        now = self.variables.change(self.variables.layout.entries(keys))
-        self.prior = graph_of(self.prior, jacobian_factor(keys, root, root @ now))
+        self.prior = graph_of(self.prior, absolute_factor(keys, root, self.variables))
         self.held, self.epoch = HeldMap(keys, known), self.epoch + 1
 
-    def restart(self, first_cycle: int, removed: IntArray, added: IntArray, points: Array) -> None:
-        """Replaces map points `removed` (n,) by `added` (k,) at `points` (k, 2), and drops the prior.
-
-        Poses before `first_cycle` leave the window, and what is known of them is dropped as well. The window
-        keeps its later poses with their odometry. A new prior must be set, on all that remains.
-        """
-        self.epoch, self.submaps, self.inactive = self.epoch + 1, None, InactiveMap()
-        self.held = None
-        self.prior, keyframes = gtsam.GaussianFactorGraph(), self.variables.keyframes
-        leaving = np.arange(self.first_cycle, first_cycle)
-        for cycle in leaving.tolist():
-            self._drop_oldest(cycle)
-        self.variables.first_cycle = first_cycle
-        self.variables.remove(np.concatenate([keyframes, pose_keys(leaving), removed]))
-        self.variables.insert(added, points.ravel())
-        self.window.clear()
-
     def forget_poses(self, first_cycle: int) -> None:
-        """Removes the poses before `first_cycle`, and all prior information about where the poses are.
+        """Remove the poses before `first_cycle`, and all prior information about where the poses are.
 
         The window keeps its later poses with their odometry, and the prior keeps what is known of the map and
         the calibration. A prior must be set for one of the poses, by `add_pose_prior`.
         """
         self.reactivate()
         self.epoch, self.submaps = self.epoch + 1, None
-        window, leaving = pose_keys(self._cycles), np.arange(self.first_cycle, first_cycle)
-        user = self.user_factors.remove(pose_keys(leaving), self.variables)
-        self.prior = marginalize(graph_of(self.prior, *user), window)
+        leaving = pose_keys(np.arange(self.first_cycle, first_cycle))
+        user = self.user_factors.remove(leaving, self.variables)
+        self.prior = marginalize(graph_of(self.prior, *user), pose_keys(self._cycles))
+        self._drop_before(first_cycle)
+
+    def restart(self, first_cycle: int, removed: IntArray, added: IntArray, points: Array) -> None:
+        """Replace map points `removed` (n,) by `added` (k,) at `points` (k, 2), and drop the prior.
+
+        Poses before `first_cycle` leave the window, and what is known of them is dropped as well. The window
+        keeps its later poses with their odometry. A new prior must be set, on all that remains.
+        """
+        self.epoch, self.submaps, self.inactive = self.epoch + 1, None, InactiveMap()
+        self.held, self.prior = None, gtsam.GaussianFactorGraph()
+        self._drop_before(first_cycle, np.append(self.variables.keyframes, removed))
+        self.variables.insert(added, points.ravel())
+
+    def _drop_before(self, first_cycle: int, also: IntArray = NO_KEYS) -> None:
+        """Remove the poses before a cycle, other variables (k,) with them, and all factors of the window."""
+        leaving = np.arange(self.first_cycle, first_cycle)
         for cycle in leaving.tolist():
             self._drop_oldest(cycle)
         self.variables.first_cycle = first_cycle
-        self.variables.remove(pose_keys(leaving))
+        self.variables.remove(np.append(also, pose_keys(leaving)))
         self.window.clear()
 
-    def add_pose_prior(self, cycle: int, covariance: Array) -> None:
-        """Adds a prior to the pose of a cycle at its present value, with a covariance (3, 3), map frame."""
-        key = pose_keys(np.array([cycle]))
-        root = np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).T, np.float64)
-        now = self.variables.change(self.variables.layout.entries(key))
-        self.prior.push_back(jacobian_factor(key, root, root @ now))
-
     def set_prior(self, keys: IntArray, mean: Array, information: Array) -> None:
-        """Sets the prior to a Gaussian of ascending keys (k,), with mean (n,) and information (n, n)."""
+        """Set the prior to a Gaussian of ascending keys (k,), with mean (n,) and information (n, n)."""
         root = np.asarray(np.linalg.cholesky(information).T, np.float64)
-        change = mean - self.variables.reference[self.variables.layout.entries(keys)]
-        self.prior = graph_of(as_hessian_factor(graph_of(jacobian_factor(keys, root, root @ change))))
+        prior = absolute_factor(keys, root, self.variables, mean)
+        self.prior = graph_of(as_hessian_factor(graph_of(prior)))

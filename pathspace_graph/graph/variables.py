@@ -1,37 +1,120 @@
-"""Variables: values by key in one flat vector, in the order of the keys."""
+"""Variables: what a GTSAM key means, and values by key in one flat vector, in the order of the keys.
+
+    b_0   calibration of the odometry (scale error [-], yaw-rate bias [rad/s])
+    c_0   calibration of the sensor (`factors.sensor:SENSOR`), where it is estimated
+    l_j   control point j of the left boundary (m, m), map frame
+    m_i   landmark i of the landmark graphs (m, m), map frame
+    r_j   control point j of the right boundary (m, m), map frame
+    x_k   pose of perception cycle k (m, m, rad), map frame
+    y_0   the origin of the map frame, as a pose: the open map hangs on it, and it does not move
+
+A control point keeps its key while its boundary grows; a curve on new knots has new keys. A pose is
+`(x, y, theta)` with theta unwrapped, and it changes by addition: its unknowns are not the tangent of
+`gtsam.Pose2`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cached_property
-from typing import ClassVar, TypeVar, cast
+from functools import cache, cached_property
+from typing import ClassVar, Final, TypeVar, cast
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .keys import (
-    CALIBRATION_KEY,
-    CALIBRATION_LETTER,
-    FIRST_POSE,
-    POINT,
-    POSE,
-    SENSOR_KEY,
-    SENSOR_LETTER,
-    are_poses,
-    letter_keys,
-    name,
-    pose_key,
-    sizes,
-)
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.sensor import SENSOR_SIZE
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+CONTROL_LETTERS: Final = ("l", "r")
+"""The keys of a boundary's control points have this letter, by the label of the boundary (left, right)."""
+LANDMARK_LETTER: Final = "m"
+"""The keys of landmarks have this letter."""
+CALIBRATION_LETTER: Final = "b"
+"""The key of the odometry's calibration has this letter."""
+SENSOR_LETTER: Final = "c"
+"""The key of the sensor's calibration has this letter."""
+POSE_LETTER: Final = "x"
+"""The keys of poses have this letter."""
+POSE: Final = 3
+"""A pose has this number of entries: x, y, theta."""
+POINT: Final = 2
+"""Every other variable but the sensor's calibration has this number of entries."""
+CALIBRATION_KEY: Final = int(gtsam.symbol(CALIBRATION_LETTER, 0))
+"""Key of the odometry's calibration."""
+SENSOR_KEY: Final = int(gtsam.symbol(SENSOR_LETTER, 0))
+"""Key of the sensor's calibration. The keys of all points and poses are greater."""
+
+_INDEX_BITS: Final = 56
+"""GTSAM keeps the index of a symbol in this number of low bits, and its letter in the highest byte."""
+_NAMES_IN_MESSAGE: Final = 3
+"""A message names at most this number of keys."""
+
+
+@cache
+def letter_keys(letter: str) -> tuple[int, int]:
+    """Return the first key of a letter, and the first key after its last one."""
+    first = int(gtsam.symbol(letter, 0))
+    return first, first + (1 << _INDEX_BITS)
+
+
+FIRST_POSE: Final = letter_keys(POSE_LETTER)[0]
+"""Poses have the last keys: every key from this one on belongs to a pose."""
+ORIGIN_KEY: Final = int(gtsam.symbol("y", 0))
+"""Key of the origin of the map frame, which is a pose at (0, 0, 0) by definition."""
+_FIRST_LANDMARK: Final = letter_keys(LANDMARK_LETTER)[0]
+_FIRST_CONTROL: Final = tuple(letter_keys(letter)[0] for letter in CONTROL_LETTERS)
+
+
+def pose_key(cycle: int) -> int:
+    """Return the key `symbol('x', cycle)` of the pose at a perception cycle, counted from 0."""
+    return FIRST_POSE + int(cycle)
+
+
+def pose_keys(cycles: IntArray) -> IntArray:
+    """Return the keys of the poses at perception cycles, in any shape."""
+    return FIRST_POSE + np.asarray(cycles, np.intp)
+
+
+def control_keys(label: int, numbers: IntArray) -> IntArray:
+    """Return the keys of a boundary's control points by their numbers, in any shape."""
+    return _FIRST_CONTROL[label] + np.asarray(numbers, np.intp)
+
+
+def landmark_keys(numbers: IntArray) -> IntArray:
+    """Return the keys of landmarks by their numbers, in any shape."""
+    return _FIRST_LANDMARK + np.asarray(numbers, np.intp)
+
+
+def indices(keys: IntArray) -> IntArray:
+    """Return the index of each key: the cycle of a pose, or the number of a point."""
+    return np.asarray(keys & ((1 << _INDEX_BITS) - 1))
+
+
+def are_poses(keys: IntArray) -> BoolArray:
+    """Return which keys belong to poses."""
+    return np.asarray(keys >= FIRST_POSE)
+
+
+def sizes(keys: IntArray) -> IntArray:
+    """Return the number of entries of each key's variable, which its letter determines."""
+    return np.where(are_poses(keys), POSE, np.where(keys == SENSOR_KEY, SENSOR_SIZE, POINT))
+
+
+def name(key: int) -> str:
+    """Return a key as text, such as `x12`."""
+    return str(gtsam.DefaultKeyFormatter(key))
+
+
+def names(keys: IntArray) -> str:
+    return ", ".join(name(key) for key in keys[:_NAMES_IN_MESSAGE].tolist())
+
+
 T = TypeVar("T", bound=NDArray[np.generic])
 
 UNKNOWN = -1
-"""This is the column of a key that a layout does not hold."""
+"""Column of a key that a layout does not hold."""
 
 
 class Layout:
@@ -42,68 +125,65 @@ class Layout:
 
     def __init__(self, keys: IntArray) -> None:
         self.keys = keys
-        """The keys (K,) are in ascending order."""
         self.widths: IntArray = sizes(keys)
         """Each key has this number of columns (K,)."""
         ends = self.widths.cumsum()
         self.starts: IntArray = ends - self.widths
         """Each key begins at this column (K,)."""
         self.size = int(ends[-1]) if len(keys) else 0
-        """This is the number of all columns."""
         self._blocks: dict[str, slice] = {}
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:
-        """Returns the keys as an ordering of GTSAM."""
         return gtsam.Ordering(self.keys.tolist())
 
     @cached_property
     def turning(self) -> IntArray:
-        """Returns the columns of the x of all points and poses, which a rigid motion turns with y."""
+        """Return the columns of the x of all points and poses, which a rigid motion turns with y."""
         return np.asarray(self.starts[self.keys > SENSOR_KEY])
 
     @cached_property
     def headings(self) -> IntArray:
-        """Returns the columns of the headings of all poses."""
+        """Return the columns of the headings of all poses."""
         return np.asarray(self.starts[are_poses(self.keys)] + POSE - 1)
 
     def positions(self, keys: IntArray) -> IntArray:
-        """Returns the index of each key, in any shape; it is UNKNOWN for a key that is not in the layout."""
+        """Return the index of each key, in any shape; it is UNKNOWN for a key that is not in the layout."""
         if len(self.keys) == 0:
             return np.full(np.shape(keys), UNKNOWN)
         places = np.minimum(self.keys.searchsorted(keys), len(self.keys) - 1)
         return np.where(self.keys[places] == keys, places, UNKNOWN)
 
     def columns(self, keys: IntArray) -> IntArray:
-        """Returns the first column of each key, in any shape; UNKNOWN for a key that is not in the layout."""
+        """Return the first column of each key, in any shape; UNKNOWN for a key that is not in the layout."""
         places = self.positions(keys)
         return np.where(places >= 0, self.starts[places], UNKNOWN) if len(self.keys) else places
 
     def entries(self, keys: IntArray) -> IntArray:
-        """Returns all columns (n,) of keys (k,), one key after the other; the layout must hold them."""
+        """Return all columns (n,) of keys (k,), one key after the other; the layout must hold them."""
         return spread(self.columns(keys), sizes(keys))
 
     def block(self, letter: str) -> slice:
-        """Returns the columns of all keys of a letter."""
+        """Return the columns of all keys of a letter."""
         if letter not in self._blocks:
             self._blocks[letter] = slice(*(self.begin(key) for key in letter_keys(letter)))
         return self._blocks[letter]
 
     def begin(self, key: int) -> int:
-        """Returns the first column of a key, or where it would be if the layout held the key."""
+        """Return the first column of a key, or where it would be if the layout held the key."""
         place = int(self.keys.searchsorted(key))
         return int(self.starts[place]) if place < len(self.keys) else self.size
 
 
 def spread(starts: IntArray, widths: IntArray) -> IntArray:
-    """Returns the columns (n,) of blocks (k,) with these first columns and widths, one after the other."""
+    """Return the columns (n,) of blocks (k,) with these first columns and widths, one after the other."""
     ends = np.cumsum(widths)
     total = int(ends[-1]) if len(ends) else 0
     return np.repeat(starts - (ends - widths), widths) + np.arange(total)
 
 
 def rotation_blocks(size: int, columns: IntArray, angles: Array) -> Array:
-    """Returns the identity (size, size) with R(angle) in the two columns from each of `columns` (k,) on."""
+    """Return the identity (size, size) with R(angle) in the two columns from each of `columns` (k,) on."""
     matrix, c, s = np.eye(size), np.cos(angles), np.sin(angles)
     matrix[columns, columns], matrix[columns, columns + 1] = c, -s
     matrix[columns + 1, columns], matrix[columns + 1, columns + 1] = s, c
@@ -111,12 +191,12 @@ def rotation_blocks(size: int, columns: IntArray, angles: Array) -> Array:
 
 
 def _inserted(array: T, at: int, values: T) -> T:
-    """Returns an array with values inserted before an index; `np.insert` takes ten times as long."""
+    """Return an array with values inserted before an index; `np.insert` takes ten times as long."""
     return cast(T, np.concatenate([array[:at], values, array[at:]]))
 
 
 class Variables:
-    """Holds a value for each key, and the reference that its unknown is measured from.
+    """Value for each key, and the reference that its unknown is measured from.
 
     Linear factors are functions of `value - reference`. The reference of a variable is its first value and
     never changes, so the factors of the prior need no shift when their variables move.
@@ -124,15 +204,14 @@ class Variables:
 
     def __init__(self) -> None:
         self.layout = Layout(np.zeros(0, np.intp))
-        """The layout says which entries belong to which key."""
         self.values: Array = np.zeros(0)
-        """These are the values (n,): calibration, points (m) and poses (m, m, rad)."""
+        """Values (n,): calibration, points (m) and poses (m, m, rad)."""
         self.reference: Array = np.zeros(0)
-        """These are the first values (n,)."""
+        """First values (n,)."""
         self.linearized: Array = np.zeros(0)
-        """These are the linearization points (n,): the values when the factors were linearized last."""
+        """Linearization points (n,): the values when the factors were linearized last."""
         self.first_cycle = 0
-        """This is the perception cycle of the window's oldest pose; older poses are keyframes."""
+        """Perception cycle of the window's oldest pose; older poses are keyframes."""
         self._first_pose = (
             self.layout,
             -1,
@@ -140,7 +219,7 @@ class Variables:
         )  # layout, first cycle, and column where the window's poses begin
 
     def copy(self) -> Variables:
-        """Returns variables with the same keys and copies of the values."""
+        """Return variables with the same keys and copies of the values."""
         other = Variables()
         other.layout, other.reference = self.layout, self.reference
         other.values, other.linearized = self.values.copy(), self.linearized.copy()
@@ -149,11 +228,11 @@ class Variables:
 
     @property
     def keys(self) -> IntArray:
-        """Returns all keys (K,), ascending."""
+        """Return all keys (K,), ascending."""
         return self.layout.keys
 
     def insert(self, keys: IntArray, values: Array, reference: Array | None = None) -> None:
-        """Inserts variables: ascending, new keys (k,), and their values (n,) one after the other.
+        """Insert variables: ascending, new keys (k,), and their values (n,) one after the other.
 
         Their references are the values, unless `reference` (n,) is given for variables that come back.
         ValueError where a key is known already.
@@ -177,7 +256,6 @@ class Variables:
         self.linearized = _inserted(self.linearized, at, values)
 
     def remove(self, keys: IntArray) -> None:
-        """Removes variables (k,)."""
         kept_entries = np.ones(self.layout.size, bool)
         kept_entries[self.layout.entries(keys)] = False
         kept_keys = np.ones(len(self.layout.keys), bool)
@@ -188,7 +266,7 @@ class Variables:
 
     @contextmanager
     def looked_at(self) -> Iterator[None]:
-        """Restores all values at the end: to look at the estimate must not change it."""
+        """Restore all values at the end: to look at the estimate must not change it."""
         values = self.values.copy()
         try:
             yield
@@ -196,56 +274,56 @@ class Variables:
             self.values[:] = values
 
     def of(self, keys: IntArray) -> Array:
-        """Returns a copy of the values (n,) of keys (k,), one after the other."""
+        """Return a copy of the values (n,) of keys (k,), one after the other."""
         return self.values[self.layout.entries(keys)]
 
     def change(self, columns: IntArray) -> Array:
-        """Returns `value - reference`, the unknowns, at some entries."""
+        """Return `value - reference`, the unknowns, at some entries."""
         return np.asarray(self.values[columns] - self.reference[columns])
 
     def block(self, letter: str) -> Array:
-        """Returns a view of the values (n,) of all keys of a letter."""
+        """Return a view of the values (n,) of all keys of a letter."""
         return self.values[self.layout.block(letter)]
 
     @property
     def calibration(self) -> Array:
-        """Returns a view of the odometry's calibration: scale error (-) and yaw-rate bias (rad/s)."""
+        """Return a view of the odometry's calibration: scale error (-) and yaw-rate bias (rad/s)."""
         return self.block(CALIBRATION_LETTER)
 
     @property
     def calibrations(self) -> Array:
-        """Returns a view of the calibrations of the odometry and, where it is estimated, of the sensor."""
+        """Return a view of the calibrations of the odometry and, where it is estimated, of the sensor."""
         first, last = self.layout.block(CALIBRATION_LETTER), self.layout.block(SENSOR_LETTER)
         return self.values[first.start : last.stop]
 
     @property
     def sensor_key(self) -> int | None:
-        """Returns the key of the sensor's calibration, if it is estimated."""
+        """Return the key of the sensor's calibration, if it is estimated."""
         return SENSOR_KEY if len(self.sensor) else None
 
     @property
     def calibration_keys(self) -> IntArray:
-        """Returns the keys of the calibrations: the odometry's, and the sensor's if it is estimated."""
+        """Return the keys of the calibrations: the odometry's, and the sensor's if it is estimated."""
         return np.asarray(self.keys[self.keys <= SENSOR_KEY])
 
     def insert_calibrations(self, values: Array) -> None:
-        """Inserts the calibration of the odometry (2,), or of odometry and sensor (7,)."""
+        """Insert the calibration of the odometry (2,), or of odometry and sensor (7,)."""
         self.insert(np.array([CALIBRATION_KEY, SENSOR_KEY])[: 1 if len(values) == POINT else 2], values)
 
     @property
     def sensor(self) -> Array:
-        """Returns a view of the sensor's calibration (5,), which is empty where it is not estimated."""
+        """Return a view of the sensor's calibration (5,), which is empty where it is not estimated."""
         return self.block(SENSOR_LETTER)
 
     @property
     def keyframes(self) -> IntArray:
-        """Returns the keys of the poses that are older than the window, oldest first."""
+        """Return the keys of the poses that are older than the window, oldest first."""
         first, last = self.keys.searchsorted([FIRST_POSE, pose_key(self.first_cycle)])
         return self.keys[first:last]
 
     @property
     def poses(self) -> Array:
-        """Returns a view of the window's poses (P, 3), oldest first."""
+        """Return a view of the window's poses (P, 3), oldest first."""
         known = self._first_pose
         if known[0] is not self.layout or known[1] != self.first_cycle:
             begin = self.layout.begin(pose_key(self.first_cycle))
@@ -253,11 +331,11 @@ class Variables:
         return self.values[known[2] :].reshape(-1, POSE)
 
     def poses_at(self, cycles: IntArray) -> Array:
-        """Returns the window's poses (m, 3) at perception cycles (m,)."""
+        """Return the window's poses (m, 3) at perception cycles (m,)."""
         return self.poses[cycles - self.first_cycle]
 
     def gtsam_values(self, keys: IntArray) -> gtsam.Values:
-        """Returns the values of keys (k,) for GTSAM: a pose is a `Pose2`, any other variable a vector."""
+        """Return the values of keys (k,) for GTSAM: a pose is a `Pose2`, any other variable a vector."""
         values = gtsam.Values()
         starts, poses = self.layout.columns(keys).tolist(), are_poses(keys).tolist()
         for key, start, width, is_pose in zip(

@@ -1,81 +1,110 @@
-"""The window's linear factors: one for each cycle and a few weak priors, relinearized where they are stale.
+"""The factors of the window: the map's and the odometry's, relinearized where they are stale, and the user's.
 
 This is the fluid relinearization of iSAM2 (Kaess et al. 2012). No linearization point in the window is ever
 frozen.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from .gaussian import as_hessian_factor, graph_of
-from .keys import CALIBRATION_LETTER, POSE, POSE_LETTER, SENSOR_LETTER
-from .odometry import OdometryChain
-from .rows import LinearFactor, Rows, jacobian_factors, stacked_factor
-from .variables import Variables
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array, IntArray
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-
+from .gaussian import as_hessian_factor, graph_of, jacobian_factor, normal_equations, square_root_form
+from .rows import LinearFactor, OdometryChain, Rows, jacobian_factors, stacked_factor
+from .variables import (
+    CALIBRATION_LETTER,
+    POSE,
+    POSE_LETTER,
+    SENSOR_LETTER,
+    Layout,
+    Variables,
+    are_poses,
+    name,
+    pose_key,
+    rotation_blocks,
+    sizes,
+)
 
 SENSOR_LEVER = 10.0
 """A change of the sensor's calibration moves detections by about this much (m by its unit): they are ten
 metres away, and the vehicle drives at ten metres a second."""
 
 
+@dataclass(frozen=True)
+class SmootherSettings:
+    """Settings of the fixed-lag smoother."""
+
+    lag: float
+    """Poses stay in the window for this time (s)."""
+    tolerances: tuple[float, float]
+    """Factors are linearized again where a point or a position has moved by the first tolerance (m), or a
+    heading by the second (rad)."""
+    keyframe_interval: float
+    """Length of path (m) between the keyframes of the submaps."""
+    sigmas_calibrations: tuple[float, ...]
+    """Prior standard deviations of the calibrations: scale error (-) and yaw-rate bias (rad/s) of the
+    odometry, and five of the sensor where they are estimated."""
+    calibrations: tuple[float, ...] = ()
+    """Prior means of the same; zero by default."""
+    max_poses: int = 400
+    """The window holds at most this number of poses."""
+    relative: bool = False
+    """While the loop is open, each part of the map is known in the frame of a pose beside it. The rows of the
+    map must not change under a rigid motion of all variables."""
+
+
 class MapRows(Protocol):
     """States what the engine must know about a map: its rows, and the variables that they depend on."""
 
     variables: Variables
-    """These are the map points, the calibration and the poses."""
     reached_inactive: bool
     """If true, a row of the last call of `rows` should be on an inactive map point, but is not."""
 
     @property
     def structure(self) -> object:
-        """Returns an object that is replaced by another one when the weak priors get other variables."""
+        """Return an object that is replaced by another one when the weak priors get other variables."""
 
     def changed(self) -> IntArray:
-        """Returns the cycles (k,) whose detections in use have changed since the last linearization."""
+        """Return the cycles (k,) whose detections in use have changed since the last linearization."""
 
     def rows(self, cycles: IntArray) -> list[Rows]:
-        """Returns rows of the detections of some cycles at the variables' values.
+        """Return rows of the detections of some cycles at the variables' values.
 
         The pose is the first key of a row, and the cycle is its owner.
         """
 
     def correct(self) -> None:
-        """Corrects the detections by the present calibration of the sensor."""
+        """Correct the detections by the present calibration of the sensor."""
 
     def linearized(self, cycles: IntArray) -> None:
-        """Notes that the graph now holds the rows that were returned last, which are of these cycles."""
+        """Note that the graph now holds the rows that were returned last, which are of these cycles."""
 
     def gauge(self, whole: bool) -> list[Rows]:
-        """Returns the nonlinear weak priors on the active map points, or on all if `whole`."""
+        """Return the nonlinear weak priors on the active map points, or on all if `whole`."""
 
     def linear_gauge(self, whole: bool) -> list[Rows]:
-        """Returns the linear weak priors, which are made again only when `structure` changes."""
+        """Return the linear weak priors, which are made again only when `structure` changes."""
 
     def activate(self, keys: IntArray) -> None:
-        """Makes some map points active, which lie next to the active ones."""
+        """Make some map points active, which lie next to the active ones."""
 
     def activate_all(self) -> None:
-        """Makes every map point active."""
+        """Make every map point active."""
 
     def drop_cycle(self, cycle: int) -> None:
-        """Notes that the pose of a cycle, the window's oldest, has been marginalized."""
+        """Note that the pose of a cycle, the window's oldest, has been marginalized."""
 
 
 M_co = TypeVar("M_co", bound=MapRows, covariant=True)
 
 
 class WindowFactors(Generic[M_co]):
-    """Holds the factors of the poses in the window and of the map.
+    """Factors of the poses in the window and of the map.
 
     A factor is linearized again where a map point or a position in it has moved farther than the first
     tolerance (m) since the last linearization, or a heading farther than the second (rad).
@@ -84,26 +113,26 @@ class WindowFactors(Generic[M_co]):
     def __init__(self, map_rows: M_co, tolerances: tuple[float, float]) -> None:
         self.map, self.variables = map_rows, map_rows.variables
         self.odometry = OdometryChain()
-        """This is the odometry between each pose of the window and the next."""
+        """Odometry between each pose of the window and the next."""
         self.exact = False
         """If true, the tolerances are zero: factors of all variables that moved are linearized again."""
         self.of_cycle: dict[int, LinearFactor] = {}
         """Each perception cycle has a factor with its detections and the odometry to the next cycle."""
         self.gauge: dict[int, LinearFactor] = {}
-        """These are the nonlinear weak priors by owner."""
+        """Nonlinear weak priors by owner."""
         self._tolerances = tolerances
         self._linear_gauge = gtsam.GaussianFactorGraph()
         self._structure: object = None
 
     @property
     def linear(self) -> Iterator[gtsam.GaussianFactor | gtsam.GaussianFactorGraph]:
-        """Yields all factors as they were linearized last."""
+        """Yield all factors as they were linearized last."""
         yield self._linear_gauge
         for factor in (*self.of_cycle.values(), *self.gauge.values()):
             yield factor.linear
 
     def fresh(self, cycles: IntArray, whole: bool) -> list[gtsam.GaussianFactor]:
-        """Returns factors of some cycles and weak priors, linearized at the variables' values.
+        """Return factors of some cycles and weak priors, linearized at the variables' values.
 
         The factors that are kept do not change. The weak priors are on the active map points, or on all if
         `whole`.
@@ -113,13 +142,13 @@ class WindowFactors(Generic[M_co]):
         return [*(factor.linear for factor in own.values()), *stacked_factor(weak, self.variables)]
 
     def weak_on(self, keys: IntArray) -> list[gtsam.GaussianFactor]:
-        """Returns the weak priors that hold any of some active map points (k,), as one factor."""
+        """Return the weak priors that hold any of some active map points (k,), as one factor."""
         weak = [*self.map.gauge(False), *self.map.linear_gauge(False)]
         touching = [rows.where(np.asarray(np.isin(rows.keys, keys).any(axis=1))) for rows in weak]
         return [*stacked_factor(touching, self.variables)]
 
     def relinearize(self, cycles: IntArray, inactive: frozenset[int]) -> bool:
-        """Linearizes stale factors again, and returns true.
+        """Linearize stale factors again, and returns true.
 
         Where one of them would hold an inactive variable, it changes nothing and returns false.
         """
@@ -136,19 +165,18 @@ class WindowFactors(Generic[M_co]):
         return True
 
     def drop(self, keys: frozenset[int]) -> None:
-        """Drops the factors of cycles that hold any of some keys, so that they are linearized again."""
+        """Drop the factors of cycles that hold any of some keys, so that they are linearized again."""
         self.of_cycle = {cycle: own for cycle, own in self.of_cycle.items() if keys.isdisjoint(own.keys)}
 
     def clear(self) -> None:
-        """Drops every factor, since the map has other variables."""
+        """Drop every factor, since the map has other variables."""
         self.of_cycle, self._structure = {}, None
 
     def _rows(self, cycles: IntArray) -> list[Rows]:
-        """Returns the rows of the detections and of the odometry of some cycles."""
         return [*self.map.rows(cycles), *self.odometry.rows(self.variables, cycles)]
 
     def _moved(self) -> IntArray:
-        """Returns the keys of variables that moved by more than the tolerance since their linearization.
+        """Return the keys of variables that moved by more than the tolerance since their linearization.
 
         The odometry's calibration is never among them, since every row is linear in it. That of the sensor
         moves the foot points of detections.
@@ -164,7 +192,6 @@ class WindowFactors(Generic[M_co]):
         return layout.keys[np.logical_or.reduceat(moved, layout.starts)]
 
     def _stale(self, cycles: IntArray, moved: IntArray) -> IntArray:
-        """Returns the cycles whose factor is missing, holds a moved variable, or has other detections now."""
         changed, moved_keys = set(self.map.changed().tolist()), frozenset(moved.tolist())
         return np.array(
             [
@@ -178,7 +205,6 @@ class WindowFactors(Generic[M_co]):
         )
 
     def _relinearize_gauge(self, moved: IntArray) -> None:
-        """Linearizes weak priors on moved map points again, or all priors if they are on other points now."""
         structure, moved_keys = self.map.structure, frozenset(moved.tolist())
         if structure is not self._structure:
             self.gauge, self._structure = {}, structure
@@ -192,3 +218,150 @@ class WindowFactors(Generic[M_co]):
         if kept:
             stale = [group.where(~np.isin(group.owner, kept)) for group in stale]
         self.gauge |= jacobian_factors(stale, self.variables)
+
+
+@dataclass(frozen=True, eq=False)
+class _UserFactor:
+    factor: gtsam.NonlinearFactor
+    keys: IntArray
+
+    @property
+    def holds_pose(self) -> bool:
+        return bool(are_poses(self.keys).any())
+
+    def holds_any(self, keys: IntArray) -> bool:
+        return bool(np.isin(self.keys, keys).any())
+
+
+class UserFactors:
+    """User's factors, which stay nonlinear until one of their variables is eliminated."""
+
+    def __init__(self) -> None:
+        self._active: list[_UserFactor] = []
+        self._inactive: list[_UserFactor] = []
+        self.given = False
+        """The flag is set once the user has given any factor, which may be absolute."""
+
+    def add(self, factors: Sequence[gtsam.NonlinearFactor]) -> bool:
+        """Add factors that `check_factors` lets pass, and return whether any of them holds a pose."""
+        new = [_UserFactor(factor, np.array(list(factor.keys()), np.intp)) for factor in factors]
+        self._active += new
+        self.given |= len(new) > 0
+        return any(one.holds_pose for one in new)
+
+    @property
+    def keys(self) -> IntArray:
+        """Return the keys (k,) of all active factors; a key may occur several times."""
+        return np.concatenate([np.zeros(0, np.intp), *(one.keys for one in self._active)])
+
+    @property
+    def count(self) -> int:
+        return len(self._active) + len(self._inactive)
+
+    @property
+    def factors(self) -> list[gtsam.NonlinearFactor]:
+        return [one.factor for one in self._active]
+
+    def linearized(self, variables: Variables, whole: bool = False) -> list[gtsam.GaussianFactor]:
+        """Return the active factors, and the inactive ones too if `whole`, linearized at the values."""
+        return _linear(self._active + self._inactive if whole else self._active, variables)
+
+    def remove(self, keys: IntArray, variables: Variables) -> list[gtsam.GaussianFactor]:
+        """Remove every factor that holds one of these variables (k,), and return them linearized."""
+        removed, self._active = self._split(lambda one: one.holds_any(keys))
+        return _linear(removed, variables)
+
+    def deactivate(self, keys: IntArray, variables: Variables) -> list[gtsam.GaussianFactor]:
+        """Deactivate factors on one of the map points (k,) and on no pose, and returns them linearized."""
+        inactive, self._active = self._split(lambda one: one.holds_any(keys) and not one.holds_pose)
+        self._inactive += inactive
+        return _linear(inactive, variables)
+
+    def reactivate(self) -> None:
+        self._active, self._inactive = self._active + self._inactive, []
+
+    def _split(self, condition: Callable[[_UserFactor], bool]) -> tuple[list[_UserFactor], list[_UserFactor]]:
+        meets = [condition(one) for one in self._active]
+        chosen = [one for one, met in zip(self._active, meets, strict=True) if met]
+        return chosen, [one for one, met in zip(self._active, meets, strict=True) if not met]
+
+
+def check_factors(factors: Sequence[gtsam.NonlinearFactor], variables: Variables, next_cycle: int) -> None:
+    """Raise a SettingsError for the first factor that is not one, or whose keys or numbers cannot be used.
+
+    A factor may hold any variable, poses of the window, and that of the next cycle, which is linearized where
+    the newest one is. It must give finite numbers.
+    """
+    first, following = pose_key(variables.first_cycle), pose_key(next_cycle)
+    keys_known = np.append(variables.keys[~are_poses(variables.keys)], np.arange(first, following + 1))
+    expected = (
+        f"poses in the window, {name(first)} to {name(following)}, of control points and of the calibration"
+    )
+    for row, factor in enumerate(factors):
+        if not isinstance(factor, gtsam.NonlinearFactor):
+            raise _unusable(row, "a gtsam.NonlinearFactor", type(factor).__name__)
+        keys = list(factor.keys())
+        unknown = [key for key in keys if key not in keys_known]
+        if unknown:
+            raise _unusable(row, f"keys of {expected}", name(unknown[0]))
+        try:
+            linear = factor.linearize(_values_of(np.array(keys, np.intp), following, variables))
+        except Exception as error:  # whatever a user's own function raises, or GTSAM where types differ
+            raise _unusable(row, "a factor that can be linearized", error) from error
+        if linear is not None and not all(np.isfinite(part).all() for part in linear.jacobian()):
+            raise _unusable(row, "finite numbers", "others where it is linearized")
+
+
+def _values_of(keys: IntArray, following: int, variables: Variables) -> gtsam.Values:
+    """Return the values of known keys; the pose of the next cycle, `following`, is at the newest one."""
+    values = variables.gtsam_values(keys[keys != following])
+    if following in keys:
+        newest = variables.poses[-1] if len(variables.poses) else np.zeros(POSE)
+        values.insert(following, gtsam.Pose2(*newest))
+    return values
+
+
+def _unusable(row: int, expected: str, found: object) -> SettingsError:
+    return SettingsError(f"factors, row {row}: expected {expected}, found {found}")
+
+
+def _linear(factors: Sequence[_UserFactor], variables: Variables) -> list[gtsam.GaussianFactor]:
+    return [linear for linear in (_linearized(one, variables) for one in factors) if linear is not None]
+
+
+def _linearized(one: _UserFactor, variables: Variables) -> gtsam.GaussianFactor | None:
+    """Return `1/2 |A d - b|^2` with d = value - reference.
+
+    The tangent of `gtsam.Pose2` is in the frame of the pose, and our unknowns are in the map frame. So with R
+    the rotation of the pose, `A_xy` becomes `A_xy R'`.
+    """
+    linear = one.factor.linearize(variables.gtsam_values(one.keys))
+    if linear is None:
+        return None
+    keys = np.array(list(linear.keys()), np.intp)
+    matrix, right = linear.jacobian()
+    A, b = np.array(matrix, float), np.array(right, float).ravel()
+    A = A @ _rotations(keys, variables).T
+    return jacobian_factor(keys, A, b + A @ variables.change(variables.layout.entries(keys)))
+
+
+def as_nonlinear(factor: gtsam.GaussianFactor, variables: Variables) -> gtsam.LinearContainerFactor:
+    """Return a linear factor on our unknowns as a factor of a nonlinear graph, about the variables' values.
+
+    This is the inverse of the linearization of a user's factor: `A_xy R` on each pose, and `b - A d_now`.
+    """
+    layout = Layout(np.sort(np.array(list(factor.keys()), np.intp)))
+    information, vector = normal_equations(graph_of(factor), layout)
+    turn = _rotations(layout.keys, variables)
+    negative_gradient = vector - information @ variables.change(variables.layout.entries(layout.keys))
+    root, right = square_root_form(turn.T @ information @ turn, turn.T @ negative_gradient)
+    linear = jacobian_factor(layout.keys, root, right)
+    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(linear), variables.gtsam_values(layout.keys))
+
+
+def _rotations(keys: IntArray, variables: Variables) -> Array:
+    """Return the rotation (n, n), on keys (k,), of poses' x and y from their own frames to the map frame."""
+    widths, poses = sizes(keys), are_poses(keys)
+    starts = np.cumsum(widths) - widths
+    headings = variables.of(keys[poses])[POSE - 1 :: POSE]
+    return rotation_blocks(int(widths.sum()), starts[poses], headings)

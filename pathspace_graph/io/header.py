@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
+from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.sensor import SENSOR
 
 from .limits import MAX_HEADER_BYTES, MAX_NOISE, shown

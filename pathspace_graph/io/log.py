@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise
+from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.labels import NAMES, label_from_name
 from pathspace_graph.lengths import POSE
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Final, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.measured_noise import MeasuredNoise
+from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.lengths import POSE, scaled

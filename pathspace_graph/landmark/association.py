@@ -13,10 +13,10 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.landmark import landmark_residuals
+from pathspace_graph.factors.residuals import landmark_residuals
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import by_sensor
-from pathspace_graph.graph.keys import POINT
+from pathspace_graph.graph.variables import POINT
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.tentative import nearest_within
 from pathspace_graph.settings.comparison import LandmarkSettings

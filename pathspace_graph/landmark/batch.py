@@ -16,16 +16,15 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import solving
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.landmark import landmark_residuals
-from pathspace_graph.factors.measured_noise import KnownNoise
-from pathspace_graph.factors.noise import huber_loss
+from pathspace_graph.factors.noise import KnownNoise, huber_loss
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
+from pathspace_graph.factors.residuals import landmark_residuals
 from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry, sensor_prior, sensor_prior_cost
 from pathspace_graph.graph.elimination import Damping, Elimination, linear_graph, owners
-from pathspace_graph.graph.keys import POINT, POSE, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.variables import POINT, POSE, indices, pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import BatchRun, RunNoise
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN

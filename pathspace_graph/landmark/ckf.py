@@ -18,10 +18,10 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.measured_noise import KnownNoise
+from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.front_end.front_end import FrontEnd
-from pathspace_graph.graph.keys import POINT
+from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunNoise, VehicleState

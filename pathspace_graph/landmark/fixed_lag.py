@@ -12,11 +12,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.measured_noise import KnownNoise
+from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.front_end.front_end import FrontEnd, at_nearest_pose
-from pathspace_graph.graph.keys import POINT
 from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunNoise, VehicleState

@@ -9,14 +9,21 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.landmark import landmark_residuals
 from pathspace_graph.factors.noise import huber_weights, whiteners
+from pathspace_graph.factors.residuals import landmark_residuals
 from pathspace_graph.factors.sensor import restored
 from pathspace_graph.front_end.front_end import LateDetections
-from pathspace_graph.graph.keys import LANDMARK_LETTER, POINT, POSE, SENSOR_KEY, landmark_keys, pose_keys
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
-from pathspace_graph.graph.variables import Variables
+from pathspace_graph.graph.variables import (
+    LANDMARK_LETTER,
+    POINT,
+    POSE,
+    SENSOR_KEY,
+    Variables,
+    landmark_keys,
+    pose_keys,
+)
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import NO_COVARIANCE, Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT

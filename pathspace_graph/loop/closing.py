@@ -13,7 +13,7 @@ from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, left_of, relative
-from pathspace_graph.graph.keys import control_keys, pose_keys
+from pathspace_graph.graph.variables import control_keys, pose_keys
 from pathspace_graph.mapping.registration import RefinedMotion
 from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
 from pathspace_graph.mapping.smoother import CurveSmoother

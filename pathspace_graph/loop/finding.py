@@ -18,7 +18,7 @@ from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import to_map, wrap_angle
 from pathspace_graph.graph.gaussian import half_solve
-from pathspace_graph.graph.keys import POSE
+from pathspace_graph.graph.variables import POSE
 from pathspace_graph.health import Evidence
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT

@@ -14,7 +14,7 @@ from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor, corrected
-from pathspace_graph.graph.keys import POINT, POSE
+from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings

@@ -7,12 +7,11 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.gauge import pair_residuals
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.projection import ProjectionRows, project
+from pathspace_graph.factors.residuals import ProjectionRows, pair_residuals, project
 from pathspace_graph.factors.sensor import SensorRows
-from pathspace_graph.graph.keys import CONTROL_LETTERS, SENSOR_KEY, control_keys, pose_keys
 from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.variables import CONTROL_LETTERS, SENSOR_KEY, control_keys, pose_keys
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Gauge
 

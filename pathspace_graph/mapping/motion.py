@@ -8,12 +8,11 @@ import numpy as np
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.measured_noise import KnownNoise
+from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrate_twists
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, SENSOR_KEY, pose_key
 from pathspace_graph.graph.smoother import FixedLagSmoother
-from pathspace_graph.graph.system import SmootherSettings
-from pathspace_graph.graph.window import MapRows
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, SENSOR_KEY, pose_key
+from pathspace_graph.graph.window import MapRows, SmootherSettings
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings

@@ -6,11 +6,11 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.projection import sigma_across
-from pathspace_graph.graph.chain import Follower
-from pathspace_graph.graph.keys import pose_keys
+from pathspace_graph.factors.residuals import sigma_across
+from pathspace_graph.graph.inactive import Follower
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import relocate

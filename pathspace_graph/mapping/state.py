@@ -7,10 +7,9 @@ from typing import Final, Self
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.bspline import SpanPolynomials, Spans, lay_out
 from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_joint_foot_points
-from pathspace_graph.factors.spans import SpanPolynomials, Spans, lay_out
-from pathspace_graph.graph.keys import CONTROL_LETTERS, control_keys
-from pathspace_graph.graph.variables import Variables
+from pathspace_graph.graph.variables import CONTROL_LETTERS, Variables, control_keys
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 

@@ -15,10 +15,10 @@ from pathspace_graph.factors.gtsam_factors import (
     spline_projection_factors,
 )
 from pathspace_graph.graph.gaussian import factors_of
-from pathspace_graph.graph.keys import POINT, POSE, control_keys, name, pose_key, pose_keys
-from pathspace_graph.graph.odometry import odometry_factor
-from pathspace_graph.graph.user_factors import as_nonlinear
+from pathspace_graph.graph.rows import odometry_factor
+from pathspace_graph.graph.variables import POINT, POSE, control_keys, name, pose_key, pose_keys
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
+from pathspace_graph.graph.window import as_nonlinear
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import LapBatches, VehicleState
 from pathspace_graph.loop.track_loop import TrackLoop

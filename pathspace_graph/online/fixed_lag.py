@@ -12,7 +12,7 @@ import numpy as np
 from pathspace_graph.checkpoint import Recovery
 from pathspace_graph.errors import ReadingError, SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.measured_noise import KnownNoise
+from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd, Reading, at_nearest_pose
 from pathspace_graph.front_end.gate import Admitted
 from pathspace_graph.io.log import Detections, Odometry

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.graph.keys import POINT, POSE
+from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import SIDES, DrivenPath, along_and_across, crosses

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pathspace_graph.factors.measured_noise import MeasuredNoise
+from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.results import RunNoise, VehicleState
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.measured_noise import RayNoise, ray_sigmas
+from pathspace_graph.factors.noise import RayNoise, ray_sigmas
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.measurement import DRIFT, LEAST
 from pathspace_graph.front_end.sightings import GATE, MAX_RANGE, TwistRecord

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import ReadingError
-from pathspace_graph.factors.measured_noise import KnownNoise
+from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.lengths import POSE, scaled, times
 from pathspace_graph.run import settings_dict

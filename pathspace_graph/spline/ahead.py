@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.se2 import left_of, to_vehicle, wrap_angle
-from pathspace_graph.factors.spans import SpanPolynomials
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
 from .centre_line import points_across

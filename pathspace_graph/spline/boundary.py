@@ -5,18 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.bspline import SpanPolynomials, Spans, lay_out
 from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_foot_points
-from pathspace_graph.factors.gauge import greville, smoothness_coefficients, smoothness_matrix
+from pathspace_graph.factors.residuals import greville, smoothness_coefficients, smoothness_matrix
 from pathspace_graph.factors.se2 import move_points
-from pathspace_graph.factors.spans import SpanPolynomials, Spans, lay_out
 from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 
 from .bspline import BSpline
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 ROUND_OFF = 1e-9
 """Parameters that differ from a knot by no more than this (m) lie on the knot."""
@@ -26,10 +23,10 @@ SAME_DIRECTION = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
-    """Holds the spacing and smoothness priors of a stretch of control points, by their indices."""
+    """Spacing and smoothness priors of a stretch of control points, by their indices."""
 
     points: IntArray
-    """(k,) These are the control points in driving order."""
+    """(k,) Control points in driving order."""
     pairs: IntArray
     """(r, 2) Each row is a control point and the next one."""
     nominal: Array
@@ -42,7 +39,7 @@ class Gauge:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Holds how an extension places control points: a linear map of what they are fitted to.
+    """How an extension places control points: a linear map of what they are fitted to.
 
     The control points from index `kept` on are `by_known @ known[first:] + by_target @ targets`, and the
     second differences that the fit assumes to be zero would move them by `by_bend`.
@@ -53,14 +50,14 @@ class Placement:
     kept: int
     """The control points before this index stay where they are."""
     by_known: Array
-    """(f, n - first) This is the derivative of the placed control points by the known ones."""
+    """(f, n - first) Derivative of the placed control points by the known ones."""
     by_target: Array
-    """(f, k) This is their derivative by the targets."""
+    """(f, k) Their derivative by the targets."""
     by_bend: Array
-    """(f, t) This is their derivative by the second differences."""
+    """(f, t) Their derivative by the second differences."""
 
     def place(self, known: Array, targets: Array) -> Array:
-        """Returns all control points (n', 2), from the known ones (n, 2) and the targets (k, 2)."""
+        """Return all control points (n', 2), from the known ones (n, 2) and the targets (k, 2)."""
         placed = self.by_known @ known[self.first :] + self.by_target @ targets
         return np.concatenate([known[: self.kept], placed])
 
@@ -103,17 +100,16 @@ class Boundary:
         self.nominal = following - self.abscissae[: len(following)]
         """Each control point has this nominal distance to the next one (m)."""
         self.everything = np.arange(self.size)
-        """(m,) These are the indices of all control points."""
         self._gauge: Gauge | None = None
 
     def gauge_on(self, points: IntArray) -> Gauge:
-        """Returns the priors between control points (k,) in driving order; the last result is cached."""
+        """Return the priors between control points (k,) in driving order; the last result is cached."""
         if self._gauge is None or self._gauge.points is not points:
             self._gauge = self._new_gauge(points)
         return self._gauge
 
     def _new_gauge(self, points: IntArray) -> Gauge:
-        """Builds the priors: the second differences D are weighted by `1 / (sigma_smoothness spacing)`."""
+        """Build the priors: the second differences D are weighted by `1 / (sigma_smoothness spacing)`."""
         whole = self.periodic and len(points) == self.size
         abscissae = self.abscissae[points]
         abscissae = abscissae + self.length * (abscissae < abscissae[:1])  # a stretch past the seam
@@ -130,21 +126,21 @@ class Boundary:
 
     @property
     def numbers(self) -> IntArray:
-        """Returns (m,) the numbers of the control points' keys."""
+        """Return (m,) the numbers of the control points' keys."""
         return self.first + self.everything
 
     @property
     def knots(self) -> Array:
-        """Returns all knots; a periodic curve's continue past both ends of its domain."""
+        """Return all knots; a periodic curve's continue past both ends of its domain."""
         return self.tables.knots
 
     @property
     def length(self) -> float:
-        """Returns the length of the domain in parameter units (about metres)."""
+        """Return the length of the domain in parameter units (about metres)."""
         return self.tables.high - self.tables.low
 
     def extended(self, control_points: Array) -> Array:
-        """Returns control points as the kernels take them: those of a periodic curve repeat at the end."""
+        """Return control points as the kernels take them: those of a periodic curve repeat at the end."""
         return (
             np.concatenate([control_points, control_points[: self.degree]])
             if self.periodic
@@ -152,29 +148,27 @@ class Boundary:
         )
 
     def columns(self, span: IntArray) -> IntArray:
-        """Returns (m, degree + 1) the control points that shape the curve on each span (m,)."""
+        """Return (m, degree + 1) the control points that shape the curve on each span (m,)."""
         columns = span[:, None] - self.degree + np.arange(self.degree + 1)
         return columns % self.size if self.periodic else columns
 
     def spline(self, control_points: Array) -> BSpline:
-        """Returns the curve with control points (m, 2) as a `BSpline`."""
         spline = BSpline(self.knots, self.extended(control_points), self.degree, self.periodic)
         spline.__dict__["tables"] = self.tables
         return spline
 
     def find(self, control_points: Array, points: Array, low: Array, high: Array) -> FootPoints:
-        """Searches the foot points of points (m, 2) in the stretches [low, high], each (m,)."""
+        """Search the foot points of points (m, 2) in the stretches [low, high], each (m,)."""
         s, spans = self.settings, self._spans_from(float(np.min(low, initial=np.inf)))
         alone, search = np.zeros(len(points), np.intp), (s.search_step, s.search_iterations)
         return joint_foot_points(spans, control_points, points, alone, low, high, *search)
 
     def _spans_from(self, u: float) -> Spans:
-        """Returns the curve's spans; an open curve's spans before u are left out of the search."""
         first = 0 if self.periodic else int(self.tables.locate(np.array([u]))[0][0])
         return lay_out([self.tables.tail(first) if first else self.tables], [first], [self.size])
 
     def refine(self, control_points: Array, points: Array, u: Array) -> FootPoints:
-        """Refines the foot points of points (m, 2), starting at the parameters u (m,)."""
+        """Refine the foot points of points (m, 2), starting at the parameters u (m,)."""
         s = self.settings
         low, high = u - s.refine_room, self.believed(u + s.refine_room)
         unwrapped = self.extended(control_points)
@@ -182,31 +176,31 @@ class Boundary:
 
     @property
     def trusted(self) -> float:
-        """Returns the parameter up to which foot points are allowed: an open curve's end is extrapolated."""
+        """Return the parameter up to which foot points are allowed: an open curve's end is extrapolated."""
         return np.inf if self.periodic else self.confirmed_end + self.settings.confirmed_margin
 
     @property
     def unseen(self) -> float:
-        """Returns the length (m) of the curve's end, up to where it is confirmed, without any cone."""
+        """Return the length (m) of the curve's end, up to where it is confirmed, without any cone."""
         return self.confirmed_end - (self.cone_parameters[-1] if self.cone_parameters else 0.0)
 
     def believed(self, high: Array) -> Array:
-        """Returns upper limits (m,) of stretches, clipped so that they exclude the extrapolated end."""
+        """Return upper limits (m,) of stretches, clipped so that they exclude the extrapolated end."""
         return np.minimum(high, self.trusted)
 
     def evaluate(self, control_points: Array, u: Array, derivative: int = 0) -> Array:
-        """Returns S(u) or a derivative of it as (m, 2)."""
+        """Return S(u) or a derivative of it as (m, 2)."""
         values, span = self.tables.evaluate(np.asarray(u, float), derivative)
         return np.asarray(np.einsum("mj,mjd->md", values[derivative], control_points[self.columns(span)]))
 
     def closed(self, knots: Array) -> Boundary:
-        """Returns the boundary on periodic knots: all of it is confirmed, and its keys are new."""
+        """Return the boundary on periodic knots: all of it is confirmed, and its keys are new."""
         boundary = Boundary(knots, True, self.settings, self.gauge, self.first + self.size)
         boundary.confirmed_end = boundary.tables.high
         return boundary
 
     def grow(self, control_points: Array, targets_u: Array, targets: Array) -> Array:
-        """Extends the curve through targets (k, 2) at parameters (k,) and returns its control points (n', 2).
+        """Extend the curve through targets (k, 2) at parameters (k,) and returns its control points (n', 2).
 
         Knots are appended until the domain holds the last parameter, which becomes `confirmed_end`. No basis
         function of the old curve changes. The old control points that act only beyond the last cone before
@@ -217,12 +211,11 @@ class Boundary:
         return placement.place(control_points, targets)
 
     def _last_cone_before_end(self) -> float:
-        """Returns the parameter of the last cone before the confirmed end, or the end if there is none."""
         before = int(np.searchsorted(self.cone_parameters, self.confirmed_end - ROUND_OFF))
         return self.cone_parameters[before - 1] if before else self.confirmed_end
 
     def extend(self, old: int, targets_u: Array, from_u: float | None = None) -> Placement:
-        """Extends a curve of `old` control points to targets at parameters (k,), as `grow` does.
+        """Extend a curve of `old` control points to targets at parameters (k,), as `grow` does.
 
         The curve is placed anew from `from_u` on, by default from its confirmed end on; its end stays where
         it is. Returns how the control points are to be placed.
@@ -238,12 +231,12 @@ class Boundary:
         return placement
 
     def settled(self, size: int, u: float | None = None) -> int:
-        """Returns how many of the first `size` control points act before u, by default `confirmed_end`."""
+        """Return how many of the first `size` control points act before u, by default `confirmed_end`."""
         u = self.confirmed_end if u is None else u
         return max(int(np.searchsorted(self.knots[:size], u - ROUND_OFF)) - 1, 0)
 
     def move(self, motion: Array) -> None:
-        """Moves the observed cones by a rigid motion (3,) of the map frame."""
+        """Move the observed cones by a rigid motion (3,) of the map frame."""
         if self.observed:
             self.observed = [*move_points(motion, np.array(self.observed))]
 
@@ -253,12 +246,12 @@ class Boundary:
         self.cone_parameters.extend(u.tolist())
 
     def take_back(self, kept: int) -> None:
-        """Removes all observed cones but the first `kept`; the curve is confirmed up to the last of these."""
+        """Remove all observed cones but the first `kept`; the curve is confirmed up to the last of these."""
         self.confirmed_end = self.cone_parameters[kept - 1]
         del self.observed[kept:], self.cone_parameters[kept:]
 
     def _placement(self, old: int, targets_u: Array, from_u: float) -> Placement:
-        """Fits the control points that act beyond `from_u` to targets at parameters (k,) and to the curve."""
+        """Fit the control points that act beyond `from_u` to targets at parameters (k,) and to the curve."""
         kept, held_u = self.settled(old, from_u), np.zeros(0)
         if old:
             held_u = np.linspace(max(from_u - self.nominal[0], 0.0), from_u, self.settings.fit_held)
@@ -277,7 +270,7 @@ class Boundary:
         return Placement(first, kept, by_known, fit[:, held:bent], weight * fit[:, bent:])
 
     def _held_design(self, columns: IntArray, values: Array, first: int, old: int) -> Array:
-        """Returns (k, old - first) the basis of the old curve, whose control points end at index `old`."""
+        """Return (k, old - first) the basis of the old curve, whose control points end at index `old`."""
         design = np.zeros((len(columns), old - first))
         rows = np.broadcast_to(np.arange(len(columns))[:, None], columns.shape)
         np.add.at(design, (rows, np.minimum(columns, old - 1) - first), values)
@@ -285,14 +278,14 @@ class Boundary:
 
 
 def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
-    """Returns an open boundary of one span, from parameter 0 to the spacing."""
+    """Return an open boundary of one span, from parameter 0 to the spacing."""
     p = settings.degree
     knots = settings.spacing * np.arange(-p, p + 2, dtype=float)
     return Boundary(knots, False, settings, gauge)
 
 
 def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float) -> float:
-    """Returns the parameter of the nearest point whose tangent is within 60 degrees of a pose's heading.
+    """Return the parameter of the nearest point whose tangent is within 60 degrees of a pose's heading.
 
     A closed curve is searched everywhere. An open one, which grows with the vehicle, is searched on its last
     `room` metres; its end is returned if no tangent there agrees with the heading.

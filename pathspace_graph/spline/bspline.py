@@ -10,18 +10,16 @@ import numpy as np
 from scipy.interpolate import BSpline as ScipyBSpline
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import (
-    Floats,
-    Ints,
+    SpanPolynomials,
     clamped_knots,
-    end_change_matrix,
     periodic_knots,
     scatter,
     uniform_knots,
 )
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.se2 import left_of
-from pathspace_graph.factors.spans import SpanPolynomials
 
 _PERIODIC_TOLERANCE: Final = 1e-9
 """A periodic spline repeats if |difference| <= tolerance * (1 + largest value)."""
@@ -44,12 +42,11 @@ class BSpline:
     LENGTHS: ClassVar = {"knots": 1, "control_points": 1}
     DIMENSION: ClassVar = 2
 
-    knots: Floats
+    knots: Array
     """(n + p + 1,) The knots never decrease."""
-    control_points: Floats
-    """(n, 2) These are the control points in m, map frame; a periodic curve's last p repeat the first p."""
+    control_points: Array
+    """(n, 2) Control points in m, map frame; a periodic curve's last p repeat the first p."""
     degree: int = 3
-    """The degree p is at least 1."""
     periodic: bool = False
     """A periodic curve is closed: its parameters are taken modulo the length of the domain."""
 
@@ -103,19 +100,19 @@ class BSpline:
 
     @classmethod
     def open_uniform(
-        cls, control_points: Floats, degree: int = 3, interval: float = 1.0, start: float = 0.0
+        cls, control_points: Array, degree: int = 3, interval: float = 1.0, start: float = 0.0
     ) -> Self:
-        """Returns a curve on equally spaced knots with floating (unclamped) ends, which begins at `start`."""
+        """Return a curve on equally spaced knots with floating (unclamped) ends, which begins at `start`."""
         return cls(uniform_knots(len(control_points), degree, interval, start), control_points, degree)
 
     @classmethod
-    def clamped_from(cls, breaks: Floats, control_points: Floats, degree: int = 3) -> BSpline:
-        """Returns a clamped curve on breaks (k + 1,) with k + p control points."""
+    def clamped_from(cls, breaks: Array, control_points: Array, degree: int = 3) -> BSpline:
+        """Return a clamped curve on breaks (k + 1,) with k + p control points."""
         return cls(clamped_knots(breaks, degree), control_points, degree)
 
     @classmethod
-    def periodic_from(cls, breaks: Floats, control_points: Floats, degree: int = 3) -> Self:
-        """Returns a closed curve on one period of breaks (m + 1,) with m distinct control points."""
+    def periodic_from(cls, breaks: Array, control_points: Array, degree: int = 3) -> Self:
+        """Return a closed curve on one period of breaks (m + 1,) with m distinct control points."""
         if len(breaks) != len(control_points) + 1 or len(control_points) <= degree:
             raise SettingsError(
                 f"a periodic spline of m > {degree} distinct control points needs m + 1 breaks, "
@@ -126,90 +123,90 @@ class BSpline:
 
     @property
     def domain(self) -> tuple[float, float]:
-        """Returns the first and the last parameter, knots[p] and knots[n]."""
+        """Return the first and the last parameter, knots[p] and knots[n]."""
         return float(self.knots[self.degree]), float(self.knots[len(self.control_points)])
 
     @property
     def size(self) -> int:
-        """Returns the number m of distinct control points."""
+        """Return the number m of distinct control points."""
         return len(self.control_points) - (self.degree if self.periodic else 0)
 
     @property
-    def distinct_control_points(self) -> Floats:
-        """Returns (m, 2) the control points without those that a periodic curve repeats."""
+    def distinct_control_points(self) -> Array:
+        """Return (m, 2) the control points without those that a periodic curve repeats."""
         return self.control_points[: self.size]
 
     @property
-    def breaks(self) -> Floats:
-        """Returns the distinct knots of the domain, both ends included."""
+    def breaks(self) -> Array:
+        """Return the distinct knots of the domain, both ends included."""
         return np.unique(self.knots[self.degree : len(self.control_points) + 1])
 
     @cached_property
     def tables(self) -> SpanPolynomials:
-        """Returns the basis as polynomials on each span."""
+        """Return the basis as polynomials on each span."""
         return SpanPolynomials(self.knots, self.degree, self.periodic)
 
-    def with_points(self, distinct: Floats) -> Self:
-        """Returns the spline of the same basis with other distinct control points (m, 2)."""
+    def with_points(self, distinct: Array) -> Self:
+        """Return the spline of the same basis with other distinct control points (m, 2)."""
         points = np.concatenate([distinct, distinct[: self.degree]]) if self.periodic else distinct
         spline = replace(self, control_points=points)
         spline.__dict__["tables"] = self.tables
         return spline
 
-    def local_basis(self, u: Floats, derivative: int = 0) -> tuple[Floats, Ints]:
-        """Returns the basis (k, p + 1) at u (k,) and the distinct control points (k, p + 1) it multiplies."""
+    def local_basis(self, u: Array, derivative: int = 0) -> tuple[Array, IntArray]:
+        """Return the basis (k, p + 1) at u (k,) and the distinct control points (k, p + 1) it multiplies."""
         values, span = self.tables.evaluate(u, derivative)
         columns = span[:, None] + np.arange(-self.degree, 1)
         return values[derivative], columns % self.size if self.periodic else columns
 
-    def basis_matrix(self, u: Floats, derivative: int = 0) -> Floats:
-        """Returns B (k, m) for the distinct control points: S(u) = B c."""
+    def basis_matrix(self, u: Array, derivative: int = 0) -> Array:
+        """Return B (k, m) for the distinct control points: S(u) = B c."""
         values, span = self.tables.evaluate(u, derivative)
         return scatter(values[derivative], span - self.degree, self.size, self.periodic)
 
-    def evaluate(self, u: Floats, derivative: int = 0) -> Floats:
-        """Returns d^r S / du^r (k, 2) at u (k,); u is clipped to the domain, or wrapped if periodic."""
+    def evaluate(self, u: Array, derivative: int = 0) -> Array:
+        """Return d^r S / du^r (k, 2) at u (k,); u is clipped to the domain, or wrapped if periodic."""
         values, columns = self.local_basis(u, derivative)
-        position: Floats = np.einsum("kj,kjd->kd", values, self.control_points[columns])
+        position: Array = np.einsum("kj,kjd->kd", values, self.control_points[columns])
         return position
 
-    def tangent_unit(self, u: Floats) -> Floats:
-        """Returns S' / |S'| (k, 2), which is zero where S' vanishes."""
+    def tangent_unit(self, u: Array) -> Array:
+        """Return S' / |S'| (k, 2), which is zero where S' vanishes."""
         first = self.evaluate(u, 1)
         norm = np.linalg.norm(first, axis=1, keepdims=True)
         return np.asarray(np.divide(first, norm, out=np.zeros_like(first), where=norm > 0.0))
 
-    def normal_unit(self, u: Floats) -> Floats:
-        """Returns the unit normals (k, 2) to the left, which are zero where S' vanishes."""
+    def normal_unit(self, u: Array) -> Array:
+        """Return the unit normals (k, 2) to the left, which are zero where S' vanishes."""
         return left_of(self.tangent_unit(u))
 
-    def curvature(self, u: Floats) -> Floats:
-        """Returns (x' y'' - y' x'') / |S'|^3 (k,) in 1/m: positive in a left turn, zero where S' vanishes."""
+    def curvature(self, u: Array) -> Array:
+        """Return (x' y'' - y' x'') / |S'|^3 (k,) in 1/m: positive in a left turn, zero where S' vanishes."""
         first, second = self.evaluate(u, 1), self.evaluate(u, 2)
         cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
         cube = np.linalg.norm(first, axis=1) ** 3
         return np.asarray(np.divide(cross, cube, out=np.zeros_like(cross), where=cube > 0.0))
 
-    def foot_points(self, points: Floats) -> FootPoints:
-        """Searches the whole curve for the foot points of points (k, 2), map frame."""
+    def foot_points(self, points: Array) -> FootPoints:
+        """Search the whole curve for the foot points of points (k, 2), map frame."""
         low, high = self.domain
         step = (high - low) / (_GRID_PER_SPAN * (len(self.control_points) - self.degree))
         lows, highs = np.full(len(points), low), np.full(len(points), high)
         return foot_points(self.tables, self.control_points, points, lows, highs, step)
 
     def length(self) -> float:
-        """Returns the length of the curve in m."""
+        """Return the length of the curve in m."""
         return float(self._break_lengths[-1])
 
-    def arc_length(self, u: Floats) -> Floats:
-        """Returns the length (k,) from the first parameter to u (k,), in m: Gauss-Legendre on each span."""
+    def arc_length(self, u: Array) -> Array:
+        """Return the length (k,) from the first parameter to u (k,), in m: Gauss-Legendre on each span."""
         breaks = self.breaks
         u = np.clip(u, breaks[0], breaks[-1])
         index = np.clip(np.searchsorted(breaks, u, side="right") - 1, 0, len(breaks) - 2)
         return self._break_lengths[index] + self._gauss_lengths(breaks[index], u)
 
-    def parameters_at(self, lengths: Floats) -> Floats:
-        """Returns u (k,) at arc lengths (k,), clipped to the curve: the inverse of `arc_length`."""
+    def parameters_at(self, lengths: Array) -> Array:
+        """Return u (k,) at arc lengths (k,), clipped to the curve: the inverse of `arc_length`."""
         low, high = self.domain
         lengths = np.clip(lengths, 0.0, self.length())
         grid = np.linspace(low, high, _GRID_PER_SPAN * (len(self.breaks) - 1) + 1)
@@ -221,26 +218,25 @@ class BSpline:
         return u
 
     @cached_property
-    def _break_lengths(self) -> Floats:
-        """Returns the arc length at each break."""
+    def _break_lengths(self) -> Array:
         breaks = self.breaks
         return np.concatenate([[0.0], np.cumsum(self._gauss_lengths(breaks[:-1], breaks[1:]))])
 
-    def _gauss_lengths(self, starts: Floats, ends: Floats) -> Floats:
-        """Returns the integrals (k,) of |S'| over intervals that cross no knot."""
+    def _gauss_lengths(self, starts: Array, ends: Array) -> Array:
+        """Return the integrals (k,) of |S'| over intervals that cross no knot."""
         half = 0.5 * (ends - starts)
         nodes = (0.5 * (starts + ends))[:, None] + half[:, None] * _GAUSS_NODES
         speed = np.linalg.norm(self.evaluate(nodes.ravel(), 1), axis=1).reshape(nodes.shape)
         return np.asarray(half * (speed @ _GAUSS_WEIGHTS))
 
-    def with_end_knots(self, knots: Floats) -> BSpline:
-        """Returns the same curve on knots that differ only outside the domain; the change is exact."""
+    def with_end_knots(self, knots: Array) -> BSpline:
+        """Return the same curve on knots that differ only outside the domain; the change is exact."""
         self._refuse_periodic("change the ends of")
         matrix = end_change_matrix(self.knots, self.degree, knots)
         return BSpline(knots, matrix @ self.control_points, self.degree)
 
     def clamp(self, start: bool = True, end: bool = True) -> BSpline:
-        """Returns the same curve with (p + 1)-fold knots at the chosen ends, which become control points."""
+        """Return the same curve with (p + 1)-fold knots at the chosen ends, which become control points."""
         knots, p = self.knots.copy(), self.degree
         if start:
             knots[:p] = knots[p]
@@ -249,7 +245,7 @@ class BSpline:
         return self.with_end_knots(knots)
 
     def unclamp(self, start: bool = True, end: bool = True) -> BSpline:
-        """Returns the same curve with floating ends: p knots repeat the chosen end's interval outward."""
+        """Return the same curve with floating ends: p knots repeat the chosen end's interval outward."""
         knots, p = self.knots.copy(), self.degree
         outward = np.arange(1, p + 1)
         if start:
@@ -258,8 +254,8 @@ class BSpline:
             knots[-p:] = knots[-p - 1] + (knots[-p - 1] - knots[-p - 2]) * outward
         return self.with_end_knots(knots)
 
-    def extension_knots(self, point: Floats) -> Floats:
-        """Returns the knots (n + p + 2,) of `extend_to`; the new interval follows from the chord."""
+    def extension_knots(self, point: Array) -> Array:
+        """Return the knots (n + p + 2,) of `extend_to`; the new interval follows from the chord."""
         low, high = self.domain
         chord = float(np.linalg.norm(point - self.evaluate(np.array([high]))[0]))
         mean = (high - low) / (len(self.breaks) - 1)
@@ -269,8 +265,8 @@ class BSpline:
         kept = self.knots[: len(self.control_points) + 1]
         return np.concatenate([kept, np.full(self.degree + 1, new_end)])
 
-    def extend_to(self, point: Floats) -> BSpline:
-        """Returns the curve extended to a point (2,), unchanged on its old domain and clamped at the point.
+    def extend_to(self, point: Array) -> BSpline:
+        """Return the curve extended to a point (2,), unchanged on its old domain and clamped at the point.
 
         The old end is unclamped, and the point becomes the last control point (Hu et al. 2002).
         """
@@ -279,8 +275,8 @@ class BSpline:
         kept = end_change_matrix(self.knots, self.degree, knots) @ self.control_points
         return BSpline(knots, np.concatenate([kept, np.reshape(point, (1, 2))]), self.degree)
 
-    def grow(self, control_points: Floats, interval: float | None = None) -> BSpline:
-        """Returns the curve with control points (k, 2) appended at its floating end.
+    def grow(self, control_points: Array, interval: float | None = None) -> BSpline:
+        """Return the curve with control points (k, 2) appended at its floating end.
 
         No basis function and no other control point changes. Each new point appends a knot, `interval` after
         the last one (by default the last interval), and the domain advances by one knot. A clamped end would
@@ -295,31 +291,63 @@ class BSpline:
         return BSpline(knots, np.concatenate([self.control_points, control_points]), self.degree)
 
     def reversed(self) -> BSpline:
-        """Returns the same curve in the opposite direction: S(-u) on [-high, -low]."""
+        """Return the same curve in the opposite direction: S(-u) on [-high, -low]."""
         return BSpline(-self.knots[::-1], self.control_points[::-1], self.degree, self.periodic)
 
-    def covariance_at(self, u: Floats, joint_covariance: Floats) -> Floats:
-        """Returns cov S(u) = B Sigma B^T (k, 2, 2), cross terms between control points included.
+    def covariance_at(self, u: Array, joint_covariance: Array) -> Array:
+        """Return cov S(u) = B Sigma B^T (k, 2, 2), cross terms between control points included.
 
         The joint covariance Sigma (2 m, 2 m) is ordered by control point: x0, y0, x1, y1 and so on.
         """
         values, columns = self.local_basis(u)
         blocks = joint_covariance.reshape(self.size, 2, self.size, 2).transpose(0, 2, 1, 3)
         local = blocks[columns[:, :, None], columns[:, None, :]]
-        covariance: Floats = np.einsum("ki,kijab,kj->kab", values, local, values)
+        covariance: Array = np.einsum("ki,kijab,kj->kab", values, local, values)
         return covariance
 
-    def normal_sigma(self, u: Floats, joint_covariance: Floats) -> Floats:
-        """Returns sqrt(n^T cov S(u) n) (k,): the standard deviation across the curve in m."""
+    def normal_sigma(self, u: Array, joint_covariance: Array) -> Array:
+        """Return sqrt(n^T cov S(u) n) (k,): the standard deviation across the curve in m."""
         normal = left_of(self.tangent_unit(u))
         variance = np.einsum("ka,kab,kb->k", normal, self.covariance_at(u, joint_covariance), normal)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def to_scipy(self) -> ScipyBSpline:
-        """Returns the same curve as scipy's class, which gives NaN outside of an open domain."""
+        """Return the same curve as scipy's class, which gives NaN outside of an open domain."""
         extrapolate: Literal["periodic", False] = "periodic" if self.periodic else False
         return ScipyBSpline(self.knots, self.control_points, self.degree, extrapolate=extrapolate)
 
     def _refuse_periodic(self, what: str) -> None:
         if self.periodic:
             raise SettingsError(f"cannot {what} a periodic spline: it has no ends")
+
+
+def end_change_matrix(knots: Array, degree: int, new_knots: Array) -> Array:
+    """Return M (n, n) with C_new = M C, which keeps the curve where only knots outside the domain change.
+
+    The control point c_j is the blossom, at the knots t_{j+1} to t_{j+p}, of the polynomial of any span that
+    it acts on (Ramshaw 1989). So clamping, unclamping and the extension of Hu et al. (2002) are one formula.
+    The first and the last span of the domain must not be empty. Knots beyond index n + p - 1 are not read.
+    """
+    count = len(knots) - degree - 1
+    matrix = np.eye(count)
+    for j in range(count):
+        arguments = new_knots[j + 1 : j + degree + 1]
+        if not np.array_equal(arguments, knots[j + 1 : j + degree + 1]):
+            span = degree if j < degree else count - 1
+            matrix[j] = 0.0
+            matrix[j, span - degree : span + 1] = _blossom(knots, degree, span, arguments)
+    return matrix
+
+
+def _blossom(knots: Array, degree: int, span: int, arguments: Array) -> Array:
+    """Return the weights (p + 1,) of a span's control points in the blossom of its polynomial.
+
+    They follow from de Boor's recurrence, with another argument at each level.
+    """
+    weights = np.eye(degree + 1)
+    for r, x in enumerate(arguments, start=1):
+        lower = knots[span - degree + r : span + 1]
+        upper = knots[span + 1 : span + degree - r + 2]
+        share = ((x - lower) / (upper - lower))[:, None]
+        weights = (1.0 - share) * weights[:-1] + share * weights[1:]
+    return np.asarray(weights[0])

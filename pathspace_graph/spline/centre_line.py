@@ -12,8 +12,7 @@ from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.gauge import greville, smoothness_coefficients
-from pathspace_graph.factors.ribbon import RIBBON
+from pathspace_graph.factors.residuals import RIBBON, greville, smoothness_coefficients
 from pathspace_graph.factors.se2 import left_of
 
 from .bspline import BSpline

@@ -1,21 +1,17 @@
 """Knots placed by the cones: each cone begins with a knot, and the knots that matter least are removed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.settings.knots import FitSettings
 
 from .bspline import BSpline
 from .knots import energy_rows
-
-Array = NDArray[np.float64]
 
 EVEN: Final = 1e-9
 """The square of the interval (m^2) that a removal leaves is weighed by this against the cost of the removal
@@ -29,12 +25,11 @@ impose the same constraint up to rounding, and the cost of the second one would 
 
 @dataclass(frozen=True, eq=False)
 class Thinned:
-    """Holds a least-squares spline through ordered points, after the removal of some knots."""
+    """Least-squares spline through ordered points, after the removal of some knots."""
 
     breaks: Array
-    """(b + 1,) These are the knots that remain, in the parameter of the points (m)."""
+    """(b + 1,) Knots that remain, in the parameter of the points (m)."""
     size: int
-    """The spline has this number of distinct control points."""
     residual: Array
     """(k, 2) Each row is the offset from the spline to a point, at the point's parameter (m)."""
     leverage: Array
@@ -42,12 +37,12 @@ class Thinned:
 
     @property
     def rss(self) -> float:
-        """Returns the residual sum of squares (m^2)."""
+        """Return the residual sum of squares (m^2)."""
         return float((self.residual**2).sum())
 
     @property
     def crossed(self) -> float:
-        """Returns the sum of squares (m^2) where each point in turn is left out of the fit."""
+        """Return the sum of squares (m^2) where each point in turn is left out of the fit."""
         return float(((self.residual / (1.0 - self.leverage)[:, None]) ** 2).sum())
 
 
@@ -70,7 +65,7 @@ def chosen_breaks(points: Array, periodic: bool, fit: FitSettings, least: int, m
 def thin(
     points: Array, u: Array, high: float, periodic: bool, fit: FitSettings, least: int
 ) -> Iterator[Thinned]:
-    """Yields least-squares curves with one knot less each, from a knot at each point down to `least` points.
+    """Yield least-squares curves with one knot less each, from a knot at each point down to `least` points.
 
     The points (k, 2) have the parameters u (k,) in [0, high]; `least` counts control points, and where there
     are too few points for so many, the first curve is the only one. Each step removes the knot whose removal
@@ -104,21 +99,20 @@ def thin(
 
 
 def _breaks(u: Array, high: float) -> Array:
-    """Returns the distinct parameters among 0, u (k,) and `high`."""
+    """Return the distinct parameters among 0, u (k,) and `high`."""
     inner = np.unique(u[(u > COINCIDENT) & (u < high - COINCIDENT)])
     inner = inner[np.diff(inner, prepend=0.0) > COINCIDENT]
     return np.concatenate([[0.0], inner, [high]])
 
 
 def _frame(breaks: Array, periodic: bool, degree: int) -> BSpline:
-    """Returns a spline on the breaks whose control points are zero."""
     count = len(breaks) - 1
     build = BSpline.periodic_from if periodic else BSpline.clamped_from
     return build(breaks, np.zeros((count if periodic else count + degree, 2)), degree)
 
 
 def _jumps(frame: BSpline) -> Array:
-    """Returns (b - 1, m) the jump of the highest derivative at each inner break, by control point."""
+    """Return (b - 1, m) the jump of the highest derivative at each inner break, by control point."""
     breaks = frame.breaks
     highest = frame.basis_matrix(0.5 * (breaks[1:] + breaks[:-1]), frame.degree)
     return np.asarray(np.diff(highest, axis=0))

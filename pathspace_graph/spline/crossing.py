@@ -1,32 +1,28 @@
 """Whether the two boundaries of a map cross, which those of a track never do."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 
-Array = NDArray[np.float64]
-
 
 def sampled(spline: BSpline, step: float) -> Array:
-    """Returns points (n, 2) of a spline, from its beginning to its end, about this step (m) apart."""
+    """Return points (n, 2) of a spline, from its beginning to its end, about this step (m) apart."""
     low, high = spline.domain
     return spline.evaluate(np.linspace(low, high, max(int((high - low) / step), 1) + 1))
 
 
 def boundaries_cross(splines: Mapping[int, BSpline], step: float) -> bool:
-    """Returns whether the left and the right boundary cross, sampled at this step (m)."""
+    """Return whether the left and the right boundary cross, sampled at this step (m)."""
     return polylines_cross(sampled(splines[LEFT], step), sampled(splines[RIGHT], step))
 
 
 def polylines_cross(a: Array, b: Array) -> bool:
-    """Returns whether a segment of the polyline a (n, 2) crosses one of the polyline b (m, 2)."""
+    """Return whether a segment of the polyline a (n, 2) crosses one of the polyline b (m, 2)."""
     middle_a, middle_b = 0.5 * (a[1:] + a[:-1]), 0.5 * (b[1:] + b[:-1])
     reach = 0.5 * (np.hypot(*np.diff(a, axis=0).T).max() + np.hypot(*np.diff(b, axis=0).T).max())
     near = KDTree(middle_a).query_ball_tree(KDTree(middle_b), reach)
@@ -38,6 +34,6 @@ def polylines_cross(a: Array, b: Array) -> bool:
 
 
 def _side(p: Array, q: Array, point: Array) -> Array:
-    """Returns on which side of the lines from p to q (k, 2) the points (k, 2) lie: positive on the left."""
+    """Return on which side of the lines from p to q (k, 2) the points (k, 2) lie: positive on the left."""
     along, to = q - p, point - p
     return np.asarray(along[:, 0] * to[:, 1] - along[:, 1] * to[:, 0])

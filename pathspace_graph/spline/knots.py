@@ -1,17 +1,14 @@
 """Knots by curvature (paper: Simplification), refits onto other knots, and fits to ordered points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.bspline import Floats
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.settings.knots import BreakSettings, FitSettings
 
@@ -27,8 +24,8 @@ _BENDING_PER_SPAN: Final = 3
 """The second derivative is taken at this number of places on each such span."""
 
 
-def quantile_breaks(u: Floats, curvature: Floats, count: int, settings: BreakSettings) -> Floats:
-    """Returns breaks (count + 1,) at equal quantiles of (1 - b) |kappa| / sum |kappa| + b / N.
+def quantile_breaks(u: Array, curvature: Array, count: int, settings: BreakSettings) -> Array:
+    """Return breaks (count + 1,) at equal quantiles of (1 - b) |kappa| / sum |kappa| + b / N.
 
     The N intervals between the increasing parameters u (N + 1,) have equal lengths; kappa (N,) is their
     curvature in 1/m, and b is the linear baseline. SettingsError is raised if `count` is less than 1.
@@ -47,8 +44,8 @@ def quantile_breaks(u: Floats, curvature: Floats, count: int, settings: BreakSet
 
 def curvature_weighted_breaks(
     spline: BSpline, count: int, settings: BreakSettings, low: float | None = None, high: float | None = None
-) -> Floats:
-    """Returns breaks (count + 1,) in the spline's own parameter between low and high (default: its domain).
+) -> Array:
+    """Return breaks (count + 1,) in the spline's own parameter between low and high (default: its domain).
 
     As in the paper's Simplification, the curvature at equal distances along the curve is a probability
     density, to which the linear baseline is added; the knots are its equal quantiles. An open curve counts
@@ -66,8 +63,8 @@ def curvature_weighted_breaks(
     return quantile_breaks(u, curvature, count, settings)
 
 
-def _equal_lengths(spline: BSpline, low: float, high: float, count: int) -> Floats:
-    """Returns parameters (count + 1,) from low to high at equal distances, extrapolated beyond an end."""
+def _equal_lengths(spline: BSpline, low: float, high: float, count: int) -> Array:
+    """Return parameters (count + 1,) from low to high at equal distances, extrapolated beyond an end."""
     first, last = spline.domain
     grid = np.linspace(low, high, 4 * count + 1)
     chords = np.linalg.norm(np.diff(spline.evaluate(grid), axis=0), axis=1)
@@ -81,21 +78,21 @@ def _equal_lengths(spline: BSpline, low: float, high: float, count: int) -> Floa
 
 @dataclass(frozen=True, eq=False)
 class Refit:
-    """Holds the change of basis between an old and a new spline; it is the same for both coordinates."""
+    """Change of basis between an old and a new spline; it is the same for both coordinates."""
 
-    new_from_old: Floats
+    new_from_old: Array
     """(m_new, m_old) The matrix F fits the new curve to samples of the old one: C_new = F C_old."""
-    old_from_new: Floats
+    old_from_new: Array
     """(m_old, m_new) The matrix E fits the old curve to samples of the new one: C_old ~ E C_new."""
 
 
 def refit(
     old: BSpline,
     new: BSpline,
-    u_map: Callable[[Floats], Floats] | None = None,
+    u_map: Callable[[Array], Array] | None = None,
     within: tuple[float, float] = (-np.inf, np.inf),
 ) -> Refit:
-    """Fits the bases of two splines to each other; only the knots of `new` are used, not its control points.
+    """Fit the bases of two splines to each other; only the knots of `new` are used, not its control points.
 
     `u_map` maps increasing parameters of the old spline to those of the new one (default: the same ones). A
     periodic new spline wraps them, so the beginning of an open curve and an end that overlaps it lie on the
@@ -112,8 +109,8 @@ def refit(
     return Refit(new_from_old=_least_squares(stacked, target), old_from_new=_least_squares(B_old, B_new))
 
 
-def _least_squares(matrix: Floats, right: Floats) -> Floats:
-    """Returns argmin |M X - R| by normal equations, which a sampled B-spline basis keeps well conditioned.
+def _least_squares(matrix: Array, right: Array) -> Array:
+    """Return argmin |M X - R| by normal equations, which a sampled B-spline basis keeps well conditioned.
 
     Where a stretch has no sample, X is the least of all that are as good.
     """
@@ -124,8 +121,7 @@ def _least_squares(matrix: Floats, right: Floats) -> Floats:
     return np.asarray(scipy.linalg.cho_solve(factor, matrix.T @ right, check_finite=False))
 
 
-def _refit_samples(old: BSpline, new: BSpline) -> Floats:
-    """Returns the middles of equal parts of every old span, dense enough for the new spans."""
+def _refit_samples(old: BSpline, new: BSpline) -> Array:
     widths = np.diff(old.breaks)
     finer = int(np.ceil(widths.max() / np.diff(new.breaks).min()))
     parts = _SAMPLES_PER_SPAN * min(max(1, finer), _SAMPLES_PER_SPAN)
@@ -133,15 +129,15 @@ def _refit_samples(old: BSpline, new: BSpline) -> Floats:
     return (old.breaks[:-1, None] + widths[:, None] * offsets).ravel()
 
 
-def _sparse_spans(spline: BSpline, u: Floats) -> NDArray[np.bool_]:
-    """Returns (spans,) whether a span has fewer samples than control points."""
+def _sparse_spans(spline: BSpline, u: Array) -> BoolArray:
+    """Return (spans,) whether a span has fewer samples than control points."""
     low, high = spline.domain
     inside = low + np.mod(u - low, high - low) if spline.periodic else u
     return np.histogram(inside, spline.breaks)[0] <= spline.degree
 
 
-def _bending_rows(spline: BSpline) -> Floats:
-    """Returns rows whose product with the control points is h^2 S'' at places on every span of width h."""
+def _bending_rows(spline: BSpline) -> Array:
+    """Return rows whose product with the control points is h^2 S'' at places on every span of width h."""
     breaks = spline.breaks
     width = np.diff(breaks)
     offsets = (np.arange(_BENDING_PER_SPAN) + 0.5) / _BENDING_PER_SPAN
@@ -152,13 +148,9 @@ def _bending_rows(spline: BSpline) -> Floats:
 
 
 def fit_spline(
-    points: Floats,
-    size: int,
-    periodic: bool,
-    settings: FitSettings | None = None,
-    breaks: Floats | None = None,
+    points: Array, size: int, periodic: bool, settings: FitSettings | None = None, breaks: Array | None = None
 ) -> BSpline:
-    """Fits a spline of `size` distinct control points to ordered points (k, 2) in m, by least squares.
+    """Fit a spline of `size` distinct control points to ordered points (k, 2) in m, by least squares.
 
     The points' parameters begin as chord lengths and are moved to the foot points. Knots follow the
     curvature, unless `breaks` are given (in chord lengths from the first point). The fit with the smallest
@@ -181,8 +173,8 @@ def fit_spline(
     return best
 
 
-def _chord_lengths(points: Floats, periodic: bool) -> tuple[Floats, float]:
-    """Returns the chord length (k,) from the first point to each point, and that of the whole curve."""
+def _chord_lengths(points: Array, periodic: bool) -> tuple[Array, float]:
+    """Return the chord length (k,) from the first point to each point, and that of the whole curve."""
     following = np.roll(points, -1, axis=0) if periodic else points[1:]
     chords = np.linalg.norm(following - points[: len(following)], axis=1)
     along = np.concatenate([[0.0], np.cumsum(chords)])
@@ -192,9 +184,9 @@ def _chord_lengths(points: Floats, periodic: bool) -> tuple[Floats, float]:
 
 
 def _fit_on(
-    points: Floats, u: Floats, breaks: Floats, periodic: bool, settings: FitSettings
-) -> tuple[BSpline, Floats, float]:
-    """Fits on given breaks and refreshes foot points; returns spline, parameters (k,) and rmse (m)."""
+    points: Array, u: Array, breaks: Array, periodic: bool, settings: FitSettings
+) -> tuple[BSpline, Array, float]:
+    """Fit on given breaks and refreshes foot points; returns spline, parameters (k,) and rmse (m)."""
     p = settings.degree
     count = len(breaks) - 1
     build = BSpline.periodic_from if periodic else BSpline.clamped_from
@@ -213,8 +205,8 @@ def _fit_on(
     return frame, u, rmse
 
 
-def energy_rows(spline: BSpline) -> Floats:
-    """Returns rows R with |R c|^2 = integral of |S''|^2 (exact up to degree 4), or of |S'|^2 for degree 1."""
+def energy_rows(spline: BSpline) -> Array:
+    """Return rows R with |R c|^2 = integral of |S''|^2 (exact up to degree 4), or of |S'|^2 for degree 1."""
     nodes, weights = np.polynomial.legendre.leggauss(3)
     breaks = spline.breaks
     half = 0.5 * np.diff(breaks)

@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.gauge import greville, smoothness_coefficients
-from pathspace_graph.factors.ribbon import RIBBON
+from pathspace_graph.factors.residuals import RIBBON, greville, smoothness_coefficients
 from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.labels import LEFT, RIGHT
 

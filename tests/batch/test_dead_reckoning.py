@@ -18,7 +18,7 @@ from pathspace_graph.batch.start import (
 )
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
-from pathspace_graph.graph.keys import pose_keys
+from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable

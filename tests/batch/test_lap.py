@@ -26,9 +26,8 @@ from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.graph.elimination import eliminated_system, linear_graph
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor
-from pathspace_graph.graph.keys import CALIBRATION_KEY, are_poses, indices, pose_keys
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.variables import CALIBRATION_KEY, Layout, are_poses, indices, pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES

@@ -16,7 +16,7 @@ from pathspace_graph.cli import main
 from pathspace_graph.commands.batch import NOT_CONVERGED
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.eval.metrics.reference import gap
-from pathspace_graph.graph.keys import CALIBRATION_KEY
+from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Log, write_log
 from pathspace_graph.io.map import SplineBoundary, read_map
 from pathspace_graph.online.fixed_lag import FixedLagMapper

@@ -16,7 +16,7 @@ from pathspace_graph.batch.nonlinear_graph import beside_factor, nonlinear_graph
 from pathspace_graph.batch.system import Evaluation
 from pathspace_graph.factors.gtsam_factors import pose_array
 from pathspace_graph.factors.se2 import rotation
-from pathspace_graph.graph.keys import POSE, are_poses
+from pathspace_graph.graph.variables import POSE, are_poses
 from pathspace_graph.mapping.state import State
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings

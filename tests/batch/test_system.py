@@ -13,7 +13,7 @@ from pathspace_graph.batch.start import start_odometry
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved, own_settings
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
-from pathspace_graph.graph.keys import pose_key
+from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings

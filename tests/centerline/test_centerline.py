@@ -16,7 +16,7 @@ from pathspace_graph.centerline.online import CenterlineMapper
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import for_map
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
-from pathspace_graph.graph.keys import pose_key
+from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT

@@ -7,29 +7,34 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pathspace_graph.factors.bspline import Floats, clamped_knots, periodic_knots, uniform_knots
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.bspline import (
+    SpanPolynomials,
+    clamped_knots,
+    periodic_knots,
+    uniform_knots,
+)
 from pathspace_graph.factors.footpoint import FootPoints, foot_points, refine_foot_points
-from pathspace_graph.factors.spans import SpanPolynomials
 
 GRID = 400
 """Coarse grid steps over the domain."""
 
 
-def curve_points(tables: SpanPolynomials, control_points: Floats, u: Floats) -> Floats:
+def curve_points(tables: SpanPolynomials, control_points: Array, u: Array) -> Array:
     """S(u) (k, 2)."""
     values, span = tables.evaluate(u)
     columns = span[:, None] + np.arange(-tables.degree, 1)
     return np.einsum("kj,kjd->kd", values[0], control_points[columns])
 
 
-def whole(tables: SpanPolynomials, control_points: Floats, points: Floats, step: float = 0.0) -> FootPoints:
+def whole(tables: SpanPolynomials, control_points: Array, points: Array, step: float = 0.0) -> FootPoints:
     """Foot points with the whole domain as the stretch."""
     step = step or (tables.high - tables.low) / GRID
     low, high = np.full(len(points), tables.low), np.full(len(points), tables.high)
     return foot_points(tables, control_points, points, low, high, step)
 
 
-def assert_sane(feet: FootPoints, tables: SpanPolynomials, control_points: Floats, points: Floats) -> None:
+def assert_sane(feet: FootPoints, tables: SpanPolynomials, control_points: Array, points: Array) -> None:
     """Everything finite, inside the domain, and consistent with everything else."""
     for array in (feet.u, feet.position, feet.tangent_unit, feet.normal_unit, feet.distance, feet.basis):
         assert np.isfinite(array).all()
@@ -46,7 +51,7 @@ def assert_sane(feet: FootPoints, tables: SpanPolynomials, control_points: Float
 
 
 @st.composite
-def curves(draw: st.DrawFn) -> tuple[SpanPolynomials, Floats, np.random.Generator]:
+def curves(draw: st.DrawFn) -> tuple[SpanPolynomials, Array, np.random.Generator]:
     """Open or periodic curves of degree 1 to 4, some with repeated knots or control points."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     degree, m = draw(st.integers(1, 4)), draw(st.integers(5, 12))
@@ -68,7 +73,7 @@ def curves(draw: st.DrawFn) -> tuple[SpanPolynomials, Floats, np.random.Generato
 @settings(max_examples=80, deadline=None)
 @given(curve=curves())
 def test_no_point_of_a_dense_grid_is_nearer(
-    curve: tuple[SpanPolynomials, Floats, np.random.Generator],
+    curve: tuple[SpanPolynomials, Array, np.random.Generator],
 ) -> None:
     tables, control_points, rng = curve
     points = np.concatenate([rng.normal(size=(15, 2)) * 8.0, control_points])
@@ -86,7 +91,7 @@ def test_no_point_of_a_dense_grid_is_nearer(
 @settings(max_examples=80, deadline=None)
 @given(curve=curves(), share=st.floats(0.0, 1.2))
 def test_foot_points_stay_in_their_stretch(
-    curve: tuple[SpanPolynomials, Floats, np.random.Generator], share: float
+    curve: tuple[SpanPolynomials, Array, np.random.Generator], share: float
 ) -> None:
     tables, control_points, rng = curve
     period = tables.high - tables.low
@@ -106,7 +111,7 @@ def test_foot_points_stay_in_their_stretch(
         assert (beyond <= 1e-8).all()
 
 
-def straight() -> tuple[SpanPolynomials, Floats]:
+def straight() -> tuple[SpanPolynomials, Array]:
     """The x axis from 0 to 10, S(u) = (u, 0)."""
     knots = uniform_knots(13, 3)
     greville = (knots[1:-3] + knots[2:-2] + knots[3:-1]) / 3.0
@@ -135,7 +140,7 @@ def test_a_stretch_limit_is_interior_only_where_the_foot_point_is_inside() -> No
     assert warm.interior.tolist() == [False, False, True]
 
 
-def circle(degree: int = 3, m: int = 16) -> tuple[SpanPolynomials, Floats]:
+def circle(degree: int = 3, m: int = 16) -> tuple[SpanPolynomials, Array]:
     """A closed curve close to a circle of radius 10 about the origin, once around in u = 16."""
     angle = 2.0 * np.pi * np.arange(m) / m
     points = 10.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)

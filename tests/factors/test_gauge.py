@@ -5,21 +5,18 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from pathspace_graph.factors.bspline import uniform_knots
-from pathspace_graph.factors.gauge import (
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.bspline import SpanPolynomials, uniform_knots
+from pathspace_graph.factors.residuals import (
     greville,
+    pair_residuals,
     smoothness_coefficients,
     smoothness_matrix,
-    spacing_residuals,
 )
-from pathspace_graph.factors.spans import SpanPolynomials
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.jacobians import assert_jacobians
-
-Array = NDArray[np.float64]
 
 NEARLY_COINCIDING = 1e-3
 """Distance of two control points at which the direction still has a derivative to difference (m)."""
@@ -27,8 +24,9 @@ NEARLY_COINCIDING = 1e-3
 
 def dense_spacing(points: Array, nominal: Array, periodic: bool) -> tuple[Array, Array]:
     """Residuals and their dense Jacobian by all control points (2 m,)."""
-    residual, direction = spacing_residuals(points.reshape(-1, 2), nominal, periodic)
-    m = points.size // 2
+    first, m = points.reshape(-1, 2), points.size // 2
+    second = np.roll(first, -1, axis=0)
+    residual, direction = pair_residuals(first[: len(nominal)], second[: len(nominal)], nominal)
     jacobian = np.zeros((len(residual), m, 2))
     rows = np.arange(len(residual))
     jacobian[rows, rows] -= direction
@@ -53,7 +51,7 @@ def test_spacing_jacobians_of_nearly_coinciding_points() -> None:
 
 
 def test_coinciding_points_have_no_direction_and_nothing_is_nan() -> None:
-    residual, direction = spacing_residuals(np.array([[1.0, 2.0], [1.0, 2.0]]), np.array([3.0]), False)
+    residual, direction = pair_residuals(np.array([[1.0, 2.0]]), np.array([[1.0, 2.0]]), np.array([3.0]))
     assert residual.tolist() == [-3.0]
     assert direction.tolist() == [[0.0, 0.0]]
 

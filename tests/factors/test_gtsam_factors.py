@@ -5,23 +5,22 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from pathspace_graph.factors.bspline import periodic_knots
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.bspline import SpanPolynomials, periodic_knots
 from pathspace_graph.factors.footpoint import foot_points
-from pathspace_graph.factors.gauge import greville, smoothness_matrix
 from pathspace_graph.factors.gtsam_factors import (
     calibrated_odometry_factor,
-    linear_factor,
     odometry_factor,
     pose_array,
     smoothness_factors,
     spacing_factors,
     spline_projection_factor,
 )
+from pathspace_graph.factors.linear import linear_factor
 from pathspace_graph.factors.odometry import IntegratedOdometry
-from pathspace_graph.factors.spans import SpanPolynomials
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE
+from pathspace_graph.factors.residuals import greville, smoothness_matrix
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE
 
 from ..scenes.gtsam import (
     CONTROL_KEYS,
@@ -47,8 +46,6 @@ from ..scenes.gtsam import (
     to_values,
 )
 from ..scenes.jacobians import assert_jacobians
-
-Array = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["isotropic", "anisotropic"])

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+
+from pathspace_graph.factors.arrays import Array
 
 from ..scenes.jacobians import assert_jacobians
-
-Array = NDArray[np.float64]
 
 
 def bearing_and_range(a: Array, b: Array, error: float = 0.0) -> tuple[Array, Array, Array]:

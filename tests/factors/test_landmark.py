@@ -7,13 +7,11 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from pathspace_graph.factors.landmark import landmark_residuals
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.residuals import landmark_residuals
 
 from ..scenes.jacobians import assert_jacobians
-
-Array = NDArray[np.float64]
 
 
 def one_detection(pose: Array, landmark: Array, detection: Array) -> Sequence[Array]:

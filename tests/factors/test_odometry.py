@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import MIN_SIGMA, integrate_poses, integrate_twists, odometry_residuals
 from pathspace_graph.factors.se2 import compose, se2_exp
 
 from ..scenes.jacobians import assert_jacobians
-
-Array = NDArray[np.float64]
 
 SIGMA = np.array([0.25, 0.12, 0.035])
 

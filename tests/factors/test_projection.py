@@ -6,17 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from pathspace_graph.factors.bspline import clamped_knots, periodic_knots, uniform_knots
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.bspline import SpanPolynomials, clamped_knots, periodic_knots, uniform_knots
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
-from pathspace_graph.factors.projection import project, sigma_across
+from pathspace_graph.factors.residuals import project, sigma_across
 from pathspace_graph.factors.se2 import to_map, to_vehicle
-from pathspace_graph.factors.spans import SpanPolynomials
 
 from ..scenes.jacobians import assert_jacobians
-
-Array = NDArray[np.float64]
 
 SPACING = 3.0
 """Knot interval of the test curves (m)."""
@@ -29,7 +26,7 @@ MAX_BEND = 0.8
 """This is the largest curvature times distance; at 1 the point is the centre of curvature."""
 
 
-def control_columns(tables: SpanPolynomials, span: NDArray[np.intp]) -> NDArray[np.intp]:
+def control_columns(tables: SpanPolynomials, span: IntArray) -> IntArray:
     """Distinct control points (m, degree + 1) of each span."""
     count = len(tables.knots) - tables.degree - 1 - (tables.degree if tables.periodic else 0)
     return (span[:, None] + np.arange(-tables.degree, 1)) % count
@@ -62,7 +59,7 @@ def find(tables: SpanPolynomials, distinct: Array, points: Array, u: Array) -> F
     return foot_points(tables, unwrapped(tables, distinct), points, u - ROOM, u + ROOM, 0.25)
 
 
-def well_posed(tables: SpanPolynomials, distinct: Array, points: Array, u: Array) -> NDArray[np.bool_]:
+def well_posed(tables: SpanPolynomials, distinct: Array, points: Array, u: Array) -> BoolArray:
     """Interior foot points away from kinks and centres of curvature, where the nearest point jumps."""
     foot = find(tables, distinct, points, u)
     values, _ = tables.evaluate(foot.u, 2)

@@ -7,19 +7,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from pathspace_graph.factors.bspline import uniform_knots
-from pathspace_graph.factors.gtsam_factors import pose_array
-from pathspace_graph.factors.ribbon import RIBBON, beyond_edge, ribbon_factor
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.bspline import SpanPolynomials, uniform_knots
+from pathspace_graph.factors.gtsam_factors import pose_array, ribbon_factor
+from pathspace_graph.factors.residuals import RIBBON, beyond_edge
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.factors.sensor import SENSOR_SIZE
-from pathspace_graph.factors.spans import SpanPolynomials
 
 from ..scenes.jacobians import assert_jacobians
 from .test_projection import control_columns, find, points_beside, random_curve, unwrapped
-
-Array = NDArray[np.float64]
 
 
 def random_ribbon(rng: np.random.Generator, degree: int, kind: str) -> tuple[SpanPolynomials, Array]:

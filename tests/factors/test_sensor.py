@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, rotation, se2_exp, to_map
 from pathspace_graph.factors.sensor import (
     SENSOR,
@@ -18,8 +18,6 @@ from pathspace_graph.factors.sensor import (
     restored,
     sensor_rows,
 )
-
-Array = NDArray[np.float64]
 
 TWIST = np.array([[10.0, 0.5, 0.4]])
 """The vehicle moves with this twist (m/s, m/s, rad/s)."""

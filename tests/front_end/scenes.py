@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
+from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end.measurement import measure

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.front_end.log_odometry import sensor_prior, sensor_prior_cost
-from pathspace_graph.graph.keys import CALIBRATION_KEY, SENSOR_KEY, control_keys, pose_keys
-from pathspace_graph.graph.variables import Variables
+from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variables, control_keys, pose_keys
 from pathspace_graph.settings.calibration import CalibrationSettings
 
 KNOWN, ESTIMATED = CalibrationSettings(sensor=False), CalibrationSettings()

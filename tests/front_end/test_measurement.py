@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
+from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.measurement import (
     FOLLOWED,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise, RayNoise
+from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, RayNoise
 from pathspace_graph.front_end.front_end import FrontEnd, judge_log, measure_log
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.io.log import Log

@@ -10,7 +10,7 @@ import pytest
 from pathspace_graph.ckf.mapper import CkfMapper
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.motion import MotionCheck, Rest, mean_bias
-from pathspace_graph.graph.keys import CALIBRATION_KEY
+from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.mapping.motion import BiasMeasurement

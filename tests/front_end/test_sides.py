@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pathspace_graph.factors.measured_noise import KnownNoise
+from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd, judge_log
 from pathspace_graph.front_end.sides import FORGET_AFTER, NearCones, SideJudge
 from pathspace_graph.io.log import Detections, Log, Odometry

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.measured_noise import MeasuredNoise
+from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end.sightings import (

@@ -7,29 +7,27 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import odometry_residuals
 from pathspace_graph.factors.se2 import compose, inverse, move_points, rotation
-from pathspace_graph.graph.chain import InactiveChain, pose_and_reference
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, keys_of, marginalize, normal_equations
-from pathspace_graph.graph.keys import (
+from pathspace_graph.graph.inactive import InactiveChain, pose_and_reference
+from pathspace_graph.graph.relative import from_frame, relative_factor
+from pathspace_graph.graph.rows import Rows, jacobian_factors
+from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
     ORIGIN_KEY,
     POSE,
+    Layout,
+    Variables,
     are_poses,
     control_keys,
     pose_key,
     pose_keys,
 )
-from pathspace_graph.graph.relative import from_frame, relative_factor
-from pathspace_graph.graph.rows import Rows, jacobian_factors
-from pathspace_graph.graph.variables import Layout, Variables
 
 from ..scenes.graph import schur
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 SMALL = 1e-5
 """Residuals are of this size, so that the squares of the changes that they ask for do not matter."""

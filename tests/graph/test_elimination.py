@@ -7,16 +7,22 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
 from pathspace_graph.graph.gaussian import cholesky
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POINT, POSE, landmark_keys, pose_key, pose_keys
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import Layout, Variables
-
-Array = NDArray[np.float64]
+from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    POINT,
+    POSE,
+    Layout,
+    Variables,
+    landmark_keys,
+    pose_key,
+    pose_keys,
+)
 
 SIZES = (st.integers(0, 1000), st.integers(1, 40), st.integers(1, 6))
 

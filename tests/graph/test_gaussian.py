@@ -7,9 +7,9 @@ import gc
 import gtsam
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.graph.gaussian import (
     as_hessian_factor,
     cholesky,
@@ -28,8 +28,7 @@ from pathspace_graph.graph.gaussian import (
     solve,
     square_root_form,
 )
-from pathspace_graph.graph.keys import POSE
-from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.variables import POSE, Layout
 
 from ..scenes.graph import (
     KEYS,
@@ -42,9 +41,6 @@ from ..scenes.graph import (
     random_graph,
     schur,
 )
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 LAYOUT = Layout(KEYS)
 CHAIN = [np.append(MAP_KEYS[k : k + 4], POSE_KEYS[k : k + 1]) for k in range(4)] + [

@@ -5,12 +5,18 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.graph.gaussian import graph_of, keys_of, normal_equations
 from pathspace_graph.graph.inactive import InactiveMap
-from pathspace_graph.graph.keys import CALIBRATION_KEY, CONTROL_LETTERS, control_keys, pose_keys
-from pathspace_graph.graph.variables import Layout, Variables
+from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    CONTROL_LETTERS,
+    Layout,
+    Variables,
+    control_keys,
+    pose_keys,
+)
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.smoother import CurveSmoother
@@ -22,9 +28,6 @@ from pathspace_graph.settings.mapper import FarSettings, MapperSettings
 from ..scenes.drives import bean_track, lap_log, map_log
 from ..scenes.graph import columns_of, random_factor, random_graph, schur
 from ..scenes.linear_drive import LinearDrive
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 POINTS = control_keys(0, np.arange(4))
 OLD, NEW = pose_keys(np.array([5])), pose_keys(np.array([9]))

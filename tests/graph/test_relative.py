@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse
 from pathspace_graph.graph.gaussian import graph_of, keys_of, normal_equations
-from pathspace_graph.graph.keys import CALIBRATION_KEY, ORIGIN_KEY, POSE, control_keys, pose_key
 from pathspace_graph.graph.relative import RelativeFactor, from_frame, relative_factor, to_frame
-from pathspace_graph.graph.variables import Layout, Variables
+from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    ORIGIN_KEY,
+    POSE,
+    Layout,
+    Variables,
+    control_keys,
+    pose_key,
+)
 
 from ..scenes.graph import random_graph
-
-Array = NDArray[np.float64]
 
 FRAME = pose_key(4)
 KEYS = np.array([CALIBRATION_KEY, *control_keys(0, np.arange(2)), pose_key(2), pose_key(7)])

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.gaussian import factorize, graph_of, keys_of, normal_equations
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
-from pathspace_graph.graph.odometry import calibrated_delta
-from pathspace_graph.graph.rows import LinearFactor, Rows
+from pathspace_graph.graph.rows import LinearFactor, Rows, calibrated_delta
 from pathspace_graph.graph.smoother import FixedLagSmoother
-from pathspace_graph.graph.system import SmootherSettings
-from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Layout, control_keys, pose_key, pose_keys
+from pathspace_graph.graph.window import SmootherSettings
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
@@ -23,9 +21,6 @@ from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
 from ..scenes.drives import ODOMETRY_SIGMA, bean_track, lap_log, true_poses
 from ..scenes.graph import columns_of
 from ..scenes.linear_drive import LinearDrive, LinearTrack
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 # --- poses that come and go ------------------------------------------------------------------------------
 

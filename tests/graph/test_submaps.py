@@ -8,21 +8,24 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import odometry_residuals
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, keys_of, normal_equations
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
-from pathspace_graph.graph.relative import RelativeFactor
+from pathspace_graph.graph.relative import RelativeFactor, Submaps
 from pathspace_graph.graph.rows import Rows, jacobian_factors
-from pathspace_graph.graph.submaps import Submaps
-from pathspace_graph.graph.variables import Layout, Variables
+from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    POSE,
+    Layout,
+    Variables,
+    control_keys,
+    pose_key,
+    pose_keys,
+)
 
 from ..scenes.graph import columns_of, dense_rows, schur
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 NOTHING = np.zeros(0, np.intp)
 KEYFRAME, END = pose_key(2), pose_key(6)

@@ -7,14 +7,20 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import MIN_SIGMA, integrate_twists
 from pathspace_graph.graph.gaussian import keys_of, normal_equations
-from pathspace_graph.graph.keys import CALIBRATION_KEY, are_poses, control_keys, pose_key, pose_keys
-from pathspace_graph.graph.user_factors import UserFactors
-from pathspace_graph.graph.variables import Variables
+from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    Variables,
+    are_poses,
+    control_keys,
+    pose_key,
+    pose_keys,
+)
+from pathspace_graph.graph.window import UserFactors
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.labels import RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -27,7 +33,6 @@ from ..scenes.drives import CYCLE, DT, ODOMETRY_SIGMA, bean_track, exact_log, la
 from ..scenes.graph import columns_of
 from ..scenes.linear_drive import LinearDrive
 
-Array = NDArray[np.float64]
 R0 = int(control_keys(1, np.array(0)))
 Factors = Mapping[int, Sequence[gtsam.NonlinearFactor]]
 

@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from pathspace_graph.graph.keys import (
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
     CONTROL_LETTERS,
     POSE,
+    UNKNOWN,
+    Layout,
+    Variables,
     are_poses,
     control_keys,
     indices,
@@ -21,15 +24,12 @@ from pathspace_graph.graph.keys import (
     name,
     pose_key,
     pose_keys,
+    rotation_blocks,
     sizes,
+    spread,
 )
-from pathspace_graph.graph.variables import UNKNOWN, Layout, Variables, rotation_blocks, spread
 
 from ..scenes.graph import KEYS, LEFT_KEYS, MAP_KEYS, POSE_KEYS, RIGHT_KEYS, columns_of, random_variables
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-
 
 # --- keys ------------------------------------------------------------------------------------------------
 

@@ -6,20 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import IntArray
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.graph.gaussian import graph_of, keys_of, normal_equations
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
 from pathspace_graph.graph.rows import LinearFactor
-from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Layout, control_keys, pose_key, pose_keys
 from pathspace_graph.graph.window import WindowFactors
 
 from ..scenes.graph import dense_rows
 from ..scenes.linear_drive import LinearTrack
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 CYCLES = np.arange(4)
 TOLERANCE_POINT, TOLERANCE_HEADING = 0.1, 0.01

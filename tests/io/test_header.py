@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
+from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.io.log import Log, read_log, write_log
 
 from .test_log import assert_same, small_log

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.landmark import landmark_residuals
-from pathspace_graph.graph.keys import pose_key
+from pathspace_graph.factors.residuals import landmark_residuals
+from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.landmark.association import (
     Gates,

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, merge_variables, normal_equations
-from pathspace_graph.graph.keys import landmark_keys, sizes
+from pathspace_graph.graph.variables import landmark_keys, sizes
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.landmark.landmark_map import LandmarkState
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.factors.landmark import landmark_residuals
-from pathspace_graph.graph.keys import pose_key
+from pathspace_graph.factors.residuals import landmark_residuals
+from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.landmark.batch import (

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.accuracy import cone_distances
 from pathspace_graph.graph.gaussian import keys_of, normal_equations
-from pathspace_graph.graph.keys import control_keys
-from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.variables import Layout, control_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT

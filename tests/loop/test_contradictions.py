@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from pathspace_graph.factors.se2 import to_vehicle
-from pathspace_graph.graph.keys import pose_keys
+from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.finding import KnownLoop, Loop, is_mapped
 from pathspace_graph.loop.mending import SETTLE, SIGHTINGS, Contradictions, in_rows

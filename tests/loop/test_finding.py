@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.factors.se2 import compose, inverse, move_points, to_vehicle
 from pathspace_graph.graph.gaussian import factorize, marginalize
-from pathspace_graph.graph.keys import pose_keys
-from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.variables import Layout, pose_keys
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_keys
+from pathspace_graph.graph.variables import CALIBRATION_KEY, pose_keys
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.recognition import RecognizedPlace, find_place, may_tell_place
 from pathspace_graph.mapping.curve_map import CurveMap

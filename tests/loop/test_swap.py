@@ -16,8 +16,7 @@ from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.factors.se2 import relative
 from pathspace_graph.graph.gaussian import normal_equations
-from pathspace_graph.graph.keys import pose_keys
-from pathspace_graph.graph.variables import Layout, Variables
+from pathspace_graph.graph.variables import Layout, Variables, pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.loop import drive_record, track_loop
 from pathspace_graph.loop.closing import _move_poses

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.measured_noise import KnownNoise
+from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.graph.smoother import FixedLagSmoother

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.graph.keys import CALIBRATION_KEY, pose_keys
+from pathspace_graph.graph.variables import CALIBRATION_KEY, pose_keys
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping import path as path_module
 from pathspace_graph.mapping import registration

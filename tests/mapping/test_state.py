@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.graph.keys import CALIBRATION_KEY, control_keys, pose_keys
+from pathspace_graph.graph.variables import CALIBRATION_KEY, control_keys, pose_keys
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import SplineSettings

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, normal_equations
-from pathspace_graph.graph.keys import are_poses, control_keys, pose_key
-from pathspace_graph.graph.user_factors import as_nonlinear
-from pathspace_graph.graph.variables import Layout
+from pathspace_graph.graph.variables import Layout, are_poses, control_keys, pose_key
+from pathspace_graph.graph.window import as_nonlinear
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pathspace_graph.graph.keys import CALIBRATION_KEY
+from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.settings.mapper import MapperSettings
 

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from pathspace_graph import FixedLagMapper, ReadingError, SettingsError
 from pathspace_graph.ckf.mapper import CkfMapper
 from pathspace_graph.factors.se2 import compose, se2_exp
-from pathspace_graph.graph.keys import pose_key, pose_keys
 from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.variables import pose_key, pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import NAMES
 from pathspace_graph.landmark.ckf import LandmarkCkf

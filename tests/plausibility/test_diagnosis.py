@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pathspace_graph.factors.measured_noise import MeasuredNoise, RayNoise
+from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import CALIBRATION
 from pathspace_graph.io.results import RunNoise, VehicleState

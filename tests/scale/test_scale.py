@@ -22,7 +22,7 @@ from pathspace_graph.errors import ReadingError
 from pathspace_graph.estimators import ONLINE, make_batch, make_online
 from pathspace_graph.eval.metrics.measures import measure
 from pathspace_graph.eval.metrics.summary import laps_of, summarize
-from pathspace_graph.factors.measured_noise import KnownNoise, MeasuredNoise, RayNoise
+from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, RayNoise
 from pathspace_graph.health import Health
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import SplineBoundary

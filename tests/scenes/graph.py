@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_keys
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import Layout, Variables
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Layout, Variables, control_keys, pose_keys
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]

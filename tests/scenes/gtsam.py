@@ -8,9 +8,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.bspline import uniform_knots
+from pathspace_graph.factors.bspline import SpanPolynomials, uniform_knots
 from pathspace_graph.factors.footpoint import foot_points
-from pathspace_graph.factors.gauge import greville, smoothness_matrix, spacing_residuals
 from pathspace_graph.factors.gtsam_factors import (
     calibrated_odometry_factor,
     pose_array,
@@ -20,10 +19,9 @@ from pathspace_graph.factors.gtsam_factors import (
 )
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists, odometry_residuals
-from pathspace_graph.factors.projection import project
+from pathspace_graph.factors.residuals import greville, pair_residuals, project, smoothness_matrix
 from pathspace_graph.factors.se2 import compose, rotation, to_map
-from pathspace_graph.factors.spans import SpanPolynomials
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -145,7 +143,7 @@ def detection_rows(scene: Scene, label: int, state: Array) -> Rows:
 def gauge_rows(scene: Scene, label: int, state: Array) -> list[Rows]:
     """Spacing, smoothness and anchors of a boundary."""
     control, base = scene.control(label, state), 2 * SIZE * label
-    residual, direction = spacing_residuals(control, np.full(SIZE - 1, SPACING), False)
+    residual, direction = pair_residuals(control[:-1], control[1:], np.full(SIZE - 1, SPACING))
     first = base + 2 * np.arange(SIZE - 1)[:, None] + np.arange(4)
     spacing = first, np.concatenate([-direction, direction], 1) / SIGMA_SPACING, residual / SIGMA_SPACING
     D = np.kron(smooth(), np.eye(2)) / SIGMA_SMOOTHNESS

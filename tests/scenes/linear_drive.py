@@ -10,12 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import IntegratedOdometry
-from pathspace_graph.graph.keys import CALIBRATION_KEY, POSE, control_keys, pose_key, pose_keys
-from pathspace_graph.graph.odometry import OdometryChain
-from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.rows import OdometryChain, Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
-from pathspace_graph.graph.system import SmootherSettings
-from pathspace_graph.graph.variables import Variables
+from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    POSE,
+    Variables,
+    control_keys,
+    pose_key,
+    pose_keys,
+)
+from pathspace_graph.graph.window import SmootherSettings
 
 from .graph import columns_of, dense_rows
 

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline as ScipyBSpline
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 from pathspace_graph.spline.boundary import Boundary, open_boundary, relocate
 
 from ..scenes.maps import boundary_through
-
-Array = NDArray[np.float64]
 
 SPLINE = SplineSettings(spacing=3.0)
 

@@ -10,13 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.bspline import Floats, uniform_knots
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.bspline import uniform_knots
 from pathspace_graph.spline.bspline import BSpline
 
 TOLERANCE = 1e-12
 
 
-def wandering(rng: np.random.Generator, n: int) -> Floats:
+def wandering(rng: np.random.Generator, n: int) -> Array:
     """Control points (n, 2) of a curve that goes on about 3 m each step."""
     heading = np.cumsum(rng.normal(scale=0.4, size=n))
     return np.cumsum(3.0 * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
@@ -42,7 +43,7 @@ def open_splines(draw: st.DrawFn) -> BSpline:
     return spline.clamp(start=draw(st.booleans()), end=draw(st.booleans()))
 
 
-def inside(spline: BSpline, count: int = 200) -> Floats:
+def inside(spline: BSpline, count: int = 200) -> Array:
     return np.linspace(*spline.domain, count)
 
 
@@ -235,7 +236,7 @@ POINTS = np.stack([np.arange(6.0), np.zeros(6)], axis=1)
     ],
 )
 def test_what_is_no_spline_is_refused(
-    knots: Floats, points: Floats, degree: int, periodic: bool, message: str
+    knots: Array, points: Array, degree: int, periodic: bool, message: str
 ) -> None:
     with pytest.raises(SettingsError, match=message):
         BSpline(knots, points, degree, periodic)

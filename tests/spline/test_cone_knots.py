@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.accuracy import closest_points
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.settings.knots import FitSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.cone_knots import chosen_breaks, thin
 from pathspace_graph.spline.knots import energy_rows, fit_spline
-
-Array = NDArray[np.float64]
 
 FIT = FitSettings(rounds=1)
 

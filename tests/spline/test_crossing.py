@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.crossing import boundaries_cross, polylines_cross, sampled
-
-Array = NDArray[np.float64]
 
 STEP = 0.25
 """Curves are sampled at this step (m)."""

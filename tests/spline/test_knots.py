@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.bspline import Floats
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.settings.knots import BreakSettings, FitSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import curvature_weighted_breaks, fit_spline, quantile_breaks, refit
@@ -17,7 +17,7 @@ from pathspace_graph.spline.knots import curvature_weighted_breaks, fit_spline, 
 from ..scenes.paths import TRACKS
 
 
-def hairpin() -> Floats:
+def hairpin() -> Array:
     """Two straights of 40 m joined by a half circle of radius 4 m, a point every metre."""
     x = np.arange(0.0, 40.0)
     angle = np.linspace(-np.pi / 2, np.pi / 2, 13)
@@ -36,7 +36,7 @@ def ring(m: int, seed: int = 0) -> BSpline:
     return BSpline.periodic_from(breaks, points)
 
 
-def empty(breaks: Floats, periodic: bool, degree: int = 3) -> BSpline:
+def empty(breaks: Array, periodic: bool, degree: int = 3) -> BSpline:
     """A spline on the breaks whose control points don't matter."""
     count = len(breaks) - 1
     if periodic:

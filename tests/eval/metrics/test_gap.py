@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.reference import aligned_distance, from_batch, gap
 from pathspace_graph.factors.bspline import clamped_knots
-from pathspace_graph.factors.gauge import greville
+from pathspace_graph.factors.residuals import greville
 from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.io.results import RunResult

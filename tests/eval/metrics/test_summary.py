@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.summary import lap_times, laps_of, not_mapped, summarize
-from pathspace_graph.factors.measured_noise import MeasuredNoise
+from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunNoise, RunResult, VehicleState

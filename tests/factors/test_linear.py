@@ -5,9 +5,9 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from pathspace_graph.factors.linear_arrays import (
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.linear import (
     conditional_of,
     frontals_of,
     hessian_factor_of,
@@ -20,7 +20,7 @@ from pathspace_graph.factors.linear_arrays import (
 KEYS, WIDTHS = np.array([7, 3, 12, 5, 4], np.intp), np.array([2, 3, 2, 5, 2], np.intp)
 
 
-def rows(count: int, seed: int = 0) -> NDArray[np.float64]:
+def rows(count: int, seed: int = 0) -> Array:
     return np.random.default_rng(seed).normal(size=(count, int(WIDTHS.sum()) + 1))
 
 

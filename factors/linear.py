@@ -1,38 +1,50 @@
 """GTSAM's linear factors as arrays, and back again to the last bit."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TypeVar
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from .arrays import Array, IntArray
+
 F = TypeVar("F", bound=gtsam.JacobianFactor)
 
 
+def linear_factor(keys: Sequence[int], dims: Sequence[int], A: Array, b: Array) -> gtsam.GaussianConditional:
+    """Return the factor `1/2 |A x - b|^2` on any number of keys; A (m, sum of dims) and b (m,) are whitened.
+
+    The binding's constructors take at most three keys. A Gaussian conditional has no such limit, and it is a
+    Jacobian factor. The binding does not check shapes: ValueError where they do not fit.
+    """
+    if len(keys) != len(dims) or len(set(keys)) != len(keys):
+        raise ValueError(f"expected one size for each of {len(keys)} different keys, found {len(dims)}")
+    if A.shape != (len(b), sum(dims)):
+        raise ValueError(f"expected a matrix of shape {(len(b), sum(dims))}, found {A.shape}")
+    blocks = np.empty((len(b), A.shape[1] + 1), order="F")
+    blocks[:, :-1], blocks[:, -1] = A, b
+    return gtsam.GaussianConditional(list(keys), 1, gtsam.VerticalBlockMatrix([*dims, 1], blocks, False))
+
+
 def keys_of_factor(factor: gtsam.GaussianFactor) -> IntArray:
-    """Returns the keys (k,) of a factor in its own order."""
+    """Return the keys (k,) of a factor in its own order."""
     return np.array(list(factor.keys()), np.intp)
 
 
 def jacobian_matrix(factor: gtsam.JacobianFactor) -> Array:
-    """Returns `[A b]` (m, n + 1) of a factor or a conditional; ValueError where it has a noise model."""
+    """Return `[A b]` (m, n + 1) of a factor or a conditional; ValueError where it has a noise model."""
     if factor.get_model() is not None:
         raise ValueError(f"expected whitened rows, found a {type(factor.get_model()).__name__} noise model")
     return np.array(factor.augmentedJacobian(), np.float64, order="F")
 
 
 def jacobian_factor_of(keys: IntArray, widths: IntArray, matrix: Array) -> gtsam.JacobianFactor:
-    """Returns the factor with the rows `[A b]` (m, n + 1) on keys (k,), whose variables have widths (k,)."""
+    """Return the factor with the rows `[A b]` (m, n + 1) on keys (k,), whose variables have widths (k,)."""
     return gtsam.JacobianFactor(conditional_of(keys, widths, 1, matrix))
 
 
 def frontals_of(conditional: gtsam.GaussianConditional, widths: Sequence[int]) -> int:
-    """Returns the number of frontal keys of a conditional, given the widths (k,) of all its variables."""
+    """Return the number of frontal keys of a conditional, given the widths (k,) of all its variables."""
     size = conditional.R().shape[1]  # the view is not read, only its shape
     return int(np.cumsum(widths).searchsorted(size)) + 1
 
@@ -40,7 +52,7 @@ def frontals_of(conditional: gtsam.GaussianConditional, widths: Sequence[int]) -
 def conditional_of(
     keys: IntArray, widths: IntArray, frontals: int, matrix: Array
 ) -> gtsam.GaussianConditional:
-    """Returns the conditional of the first `frontals` keys, with the rows `[A b]` (m, n + 1).
+    """Return the conditional of the first `frontals` keys, with the rows `[A b]` (m, n + 1).
 
     ValueError is raised where the numbers do not fit each other, which GTSAM does not check.
     """
@@ -53,12 +65,12 @@ def conditional_of(
 
 
 def hessian_matrix(factor: gtsam.HessianFactor) -> Array:
-    """Returns `[[H, g], [g', f]]` (n + 1, n + 1) of a factor `1/2 d' H d - g' d + f / 2`."""
+    """Return `[[H, g], [g', f]]` (n + 1, n + 1) of a factor `1/2 d' H d - g' d + f / 2`."""
     return np.array(factor.augmentedInformation(), np.float64, order="F")
 
 
 def hessian_factor_of(keys: IntArray, widths: IntArray, matrix: Array) -> gtsam.HessianFactor:
-    """Returns the factor with `[[H, g], [g', f]]` (n + 1, n + 1) on keys (k,) of widths (k,).
+    """Return the factor with `[[H, g], [g', f]]` (n + 1, n + 1) on keys (k,) of widths (k,).
 
     The binding has constructors for at most three keys. So this is the sum of a factor for each block of H,
     in which each number is added to zeros alone. ValueError is raised where the numbers do not fit.

@@ -1,0 +1,187 @@
+"""Residuals of detections and weak priors, with their Jacobians, as functions of arrays."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .arrays import Array
+from .bspline import SpanPolynomials
+from .footpoint import FootPoints
+from .se2 import to_vehicle
+
+
+@dataclass(frozen=True)
+class ProjectionRows:
+    """Row for each detection: residual, standard deviation and Jacobian blocks, not whitened."""
+
+    residual: Array
+    """Signed distance (m,) of the detection from the curve, in m, positive left of travel."""
+    sigma: Array
+    """Standard deviation (m,) of the detection across the curve, in m."""
+    by_pose: Array
+    """Derivatives (m, 3) by the pose (x, y, theta) in the map frame."""
+    by_control: Array
+    """Derivatives (m, degree + 1, 2) by the control points of the foot point's span."""
+
+
+def sigma_across(normals: Array, covariances: Array, poses: Array, sigma_model: float) -> Array:
+    """Return `sqrt(n^T R K R^T n + sigma_model^2)` (m,), the sigma of each detection across the curve, in m.
+
+    normals n (m, 2) are in the map frame, covariances K (m, 2, 2) in the vehicle frame of each row's pose
+    (m, 3).
+    """
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    nx, ny = c * normals[:, 0] + s * normals[:, 1], -s * normals[:, 0] + c * normals[:, 1]
+    variance = (
+        nx * nx * covariances[:, 0, 0] + 2.0 * nx * ny * covariances[:, 0, 1] + ny * ny * covariances[:, 1, 1]
+    )
+    return np.sqrt(variance + sigma_model**2)
+
+
+def project(
+    points_map: Array, covariances: Array, poses: Array, foot: FootPoints, sigma_model: float
+) -> ProjectionRows:
+    """Return `r = n . (p - S(u))` with u the foot point of `p = R z + t` (paper: Update).
+
+    points_map p (m, 2) are in m, covariances (m, 2, 2) in the vehicle frame of each row's pose (m, 3). At an
+    interior foot point `p - S` is along n while `S'` and `dn/du` are along the tangent. So every term through
+    u vanishes, and with J the quarter turn
+
+        dr/dt = n,   dr/dtheta = n . (J R z),   dr/dc_j = -beta_j(u) n
+
+    are exact at any distance from the curve. They are not exact at an end of the curve or of a stretch: such
+    rows are to be left out (`foot.interior`).
+    """
+    n = foot.normal_unit
+    arm = points_map - poses[:, :2]
+    by_theta = n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]
+    return ProjectionRows(
+        residual=foot.distance,
+        sigma=sigma_across(n, covariances, poses, sigma_model),
+        by_pose=np.concatenate([n, by_theta[:, None]], axis=1),
+        by_control=-foot.basis[:, :, None] * n[:, None, :],
+    )
+
+
+# --- a ribbon: a centre line with a width ----------------------------------------------------------------
+
+RIBBON: Final = 3
+"""Number of entries of a ribbon's control point: x, y (m, map frame) and half the width h (m)."""
+_LEAST_SPREAD = 0.05
+"""1 - k d, which vanishes at the centre of curvature, counts as at least this."""
+
+
+@dataclass(frozen=True)
+class RibbonRows:
+    """Row for each detection: residual, gradient and Jacobian blocks, not whitened."""
+
+    residual: Array
+    """How far (m,) the detection lies outside of the edge of its side, in m."""
+    by_point: Array
+    """Derivatives (m, 2) by the detection in the map frame."""
+    by_control: Array
+    """Derivatives (m, degree + 1, 3) by the control points (x, y, h) of the span."""
+
+
+def beyond_edge(tables: SpanPolynomials, control_points: Array, sides: Array, foot: FootPoints) -> RibbonRows:
+    """Return `r = s n . (p - C(u)) - h(u)`, with u the foot point of p on the centre line C.
+
+    The side s (m,) is 1 for the left edge and -1 for the right one. control_points (n, 3) are those of the
+    ribbon, with those that a closed one repeats. The distance d = n . (p - C) does not depend on u, but h
+    does. With the unit tangent t, the speed |C'| and the curvature k of the centre line,
+
+        du/dp = t / (|C'| (1 - k d)),   du/dc_j = (d beta'_j n / |C'| - beta_j t) / (|C'| (1 - k d)),
+        dr/dp = s n - h' du/dp,   dr/dc_j = -s beta_j n - h' du/dc_j,   dr/dh_j = -beta_j
+
+    are exact at an interior foot point.
+    """
+    (basis, slope, bend), span = tables.evaluate(foot.u, 2)
+    columns = span[:, None] + np.arange(-tables.degree, 1)
+    points = control_points[columns]
+    half, half_slope = (np.einsum("mj,mj->m", values, points[:, :, 2]) for values in (basis, slope))
+    first, second = (np.einsum("mj,mjd->md", values, points[:, :, :2]) for values in (slope, bend))
+    speed = np.hypot(first[:, 0], first[:, 1])
+    curvature = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / speed**3
+    n, t, d = foot.normal_unit, foot.tangent_unit, foot.distance
+    along = half_slope / (speed * np.maximum(1.0 - curvature * d, _LEAST_SPREAD))
+    by_control = np.empty((*basis.shape, RIBBON))
+    turning = (along * d / speed)[:, None] * slope + sides[:, None] * basis
+    by_control[:, :, :2] = (along[:, None] * basis)[:, :, None] * t[:, None]
+    by_control[:, :, :2] -= turning[:, :, None] * n[:, None]
+    by_control[:, :, 2] = -basis
+    return RibbonRows(sides * d - half, sides[:, None] * n - along[:, None] * t, by_control)
+
+
+@dataclass(frozen=True)
+class LandmarkResiduals:
+    """Two rows for each detection, in the vehicle frame, not whitened."""
+
+    residual: Array
+    """Each row (m, 2) is the expected minus the measured position of the landmark, in m."""
+    by_pose: Array
+    """Derivatives (m, 2, 3) by the pose (x, y, theta) in the map frame."""
+    by_landmark: Array
+    """Derivatives (m, 2, 2) by the landmark in the map frame, the transposed rotations."""
+
+
+def landmark_residuals(poses: Array, landmarks: Array, points_vehicle: Array) -> LandmarkResiduals:
+    """Return `r = R^T (l - t) - z`, with poses (m, 3) and landmarks l (m, 2) in the map frame.
+
+    The detections z are points_vehicle (m, 2) in the vehicle frame, in m. The derivatives are
+
+        dr/dt = -R^T,   dr/dtheta = (a_y, -a_x) with a = R^T (l - t),   dr/dl = R^T
+    """
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    expected = to_vehicle(landmarks, poses)
+    by_landmark = np.stack([np.column_stack([c, s]), np.column_stack([-s, c])], axis=1)
+    by_theta = np.column_stack([expected[:, 1], -expected[:, 0]])
+    by_pose = np.concatenate([-by_landmark, by_theta[:, :, None]], axis=2)
+    return LandmarkResiduals(expected - points_vehicle, by_pose, by_landmark)
+
+
+def pair_residuals(first: Array, second: Array, nominal: Array) -> tuple[Array, Array]:
+    """Return `r_j = |b_j - a_j| - nominal_j` (k,) of pairs of points a, b (k, 2), and unit directions (k, 2).
+
+    The residual is that of GTSAM's RangeFactor2, with dr/db_j = -dr/da_j the direction, which is zero for
+    coinciding points. All are in m.
+    """
+    offset = second - first
+    length = np.hypot(offset[:, 0], offset[:, 1])
+    return length - nominal, offset / np.maximum(length, np.finfo(float).tiny)[:, None]
+
+
+def smoothness_coefficients(abscissae: Array, period: float | None, spacing: float | None = None) -> Array:
+    """Return second divided differences over abscissae (m,), times the squared spacing: (m - 2, 3).
+
+    Row j holds the coefficients of the points j, j + 1 and j + 2. They are the second difference where points
+    are evenly spaced, and give zero for points on a straight line whatever their spacing. A curve that is
+    closed after `period` has m rows, whose points are counted around. The spacing is the mean gap of these
+    abscissae where `spacing` is not given.
+    """
+    m = len(abscissae)
+    extended = abscissae if period is None else np.concatenate([abscissae, abscissae[:2] + period])
+    gaps = np.diff(extended)
+    mean = gaps[:m].mean() if spacing is None else spacing  # the period repeats one gap, which counts once
+    before, after = gaps[:-1], gaps[1:]
+    scale = 2.0 * mean**2 / (before + after)
+    return np.column_stack([scale / before, -scale / before - scale / after, scale / after])
+
+
+def smoothness_matrix(abscissae: Array, period: float | None, spacing: float | None = None) -> Array:
+    """Return the matrix D (m - 2, m), or (m, m) for a closed curve, of `smoothness_coefficients`.
+
+    `D c` is in m. The prior `D c ~ N(0, sigma^2)` is linear, so it is a Jacobian factor.
+    """
+    coefficients, m = smoothness_coefficients(abscissae, period, spacing), len(abscissae)
+    matrix = np.zeros((len(coefficients), m))
+    rows = np.arange(len(coefficients))
+    for k in range(3):
+        matrix[rows, (rows + k) % m] += coefficients[:, k]
+    return matrix
+
+
+def greville(knots: Array, degree: int) -> Array:
+    """Return the Greville abscissae `(t_{j+1} + ... + t_{j+p}) / p` (n,), where control points act most."""
+    n = len(knots) - degree - 1
+    windows = np.lib.stride_tricks.sliding_window_view(knots[1:-1], degree)
+    return np.asarray(windows[:n].mean(axis=1))
