@@ -9,7 +9,7 @@ from .arrays import Array
 from .se2 import se2_exp, wrap_angle
 
 MIN_SIGMA = 1e-6
-"""This smallest sigma of integrated odometry (m, rad) keeps the factor of an empty interval finite."""
+"""Smallest sigma of integrated odometry (m, rad), which keeps the factor of an empty interval finite."""
 
 CALIBRATION_SIZE = 2
 """The calibration has two entries: the scale error of the speeds (-) and the bias of the yaw rate (rad/s)."""
@@ -29,9 +29,9 @@ class IntegratedOdometry:
     calibration_jacobian: Array
     """Derivative (3, 2) of the end pose, in its own frame, by (scale error, yaw-rate bias)."""
     whitener: Array
-    """This matrix W (3, 3) with `W' W = covariance^-1` whitens a residual."""
+    """Matrix W (3, 3) with `W' W = covariance^-1`, which whitens a residual."""
     twist: Array = field(default_factory=lambda: np.zeros(3))
-    """This twist (3,), in m/s, m/s and rad/s, was in force at the end."""
+    """Twist (3,) at the end, in m/s, m/s and rad/s."""
 
 
 def integrate_poses(durations: Array, twists: Array) -> Array:

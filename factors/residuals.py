@@ -1,6 +1,7 @@
 """Residuals of detections and weak priors, with their Jacobians, as functions of arrays."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from .se2 import to_vehicle
 
 @dataclass(frozen=True)
 class ProjectionRows:
-    """Row for each detection: residual, standard deviation and Jacobian blocks, not whitened."""
+    """A row for each detection: residual, standard deviation and Jacobian blocks, not whitened."""
 
     residual: Array
     """Signed distance (m,) of the detection from the curve, in m, positive left of travel."""
@@ -73,7 +74,7 @@ _LEAST_SPREAD = 0.05
 
 @dataclass(frozen=True)
 class RibbonRows:
-    """Row for each detection: residual, gradient and Jacobian blocks, not whitened."""
+    """A row for each detection: residual, gradient and Jacobian blocks, not whitened."""
 
     residual: Array
     """How far (m,) the detection lies outside of the edge of its side, in m."""

@@ -80,7 +80,7 @@ def by_range(points_vehicle: Array) -> Array:
 
 @dataclass(frozen=True)
 class SensorRows:
-    """Says how residuals of corrected detections depend on the calibration of the sensor."""
+    """How residuals of corrected detections depend on the calibration of the sensor."""
 
     factor: Array
     """Residuals and all their derivatives are multiplied by this (m,), as if of measured detections."""

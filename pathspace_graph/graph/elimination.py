@@ -137,9 +137,7 @@ class Elimination:
             x, y, m = clique.poses, clique.poses_above, clique.map_above
             above = np.zeros((len(y), len(y)))
             if len(y):
-                columns, joint = joints[
-                    clique_of[y].max()
-                ]  # the deepest clique that holds one of y holds all
+                columns, joint = joints[clique_of[y].max()]  # the deepest that holds one of y holds all
                 place[columns] = np.arange(len(columns))
                 above = joint[np.ix_(place[y], place[y])]
             cross[x] = clique.by_map @ self.map_covariance[m] + clique.by_poses @ cross[y]
@@ -156,10 +154,7 @@ class Elimination:
         for k in reversed(range(self._net.size())):
             conditional = self._net.at(k)
             keys = np.array(conditional.keys(), np.intp)
-            R, S = (
-                np.array(conditional.R()),
-                np.array(conditional.S()),
-            )  # copies: both are views of freed memory
+            R, S = np.array(conditional.R()), np.array(conditional.S())  # copies: views of freed memory
             count = len(R) // POSE
             root, _ = lapack.dtrtri(R)
             above, on_poses = keys[count:], are_poses(keys[count:])

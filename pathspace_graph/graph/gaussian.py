@@ -23,7 +23,7 @@ GraphPart = (
 )
 """A graph can be extended by each of these types."""
 NEGLIGIBLE: Final = 1e-6
-"""This information (1/m^2) is negligible, but keeps a pivot from being zero."""
+"""Negligible information (1/m^2), which keeps a pivot from being zero."""
 RANK_TOLERANCE: Final = 1e-12
 """Information below this share of the diagonal's counts as zero."""
 

@@ -137,7 +137,7 @@ value gives the same step."""
 
 
 class Follower(Protocol):
-    """Describes what else is in the map frame, and must go where the open map goes."""
+    """What else is in the map frame, and must go where the open map goes."""
 
     def move(self, motion: Array) -> None:
         """Move everything by a rigid motion (3,) of the map frame: a turn (rad) and then a shift (m, m)."""

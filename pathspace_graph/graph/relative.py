@@ -150,9 +150,7 @@ class Submaps:
         """Finished submaps, in the order of the drive."""
         self.keyframes: dict[int, tuple[Array, Array]] = {}
         """Each keyframe, by key, has its pose (3,) when it was marginalized, and its reference (3,)."""
-        self._hung: dict[
-            int, tuple[int, Array]
-        ] = {}  # the anchor of a keyframe, and the keyframe in its frame
+        self._hung: dict[int, tuple[int, Array]] = {}  # a keyframe's anchor, and its pose in that frame
         self._graph: gtsam.GaussianFactorGraph | None = None
         self._keyframe = 0
         self._driven = 0.0

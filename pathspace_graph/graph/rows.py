@@ -95,7 +95,7 @@ def jacobian_factors(groups: Sequence[Rows], variables: Variables) -> dict[int, 
 
 
 class _FactorBlocks:
-    """Says where each derivative goes in the buffer of all factors, each of which is stored by columns."""
+    """Where each derivative goes in the buffer of all factors, each of which is stored by columns."""
 
     def __init__(self, groups: Sequence[Rows], layout: Layout) -> None:
         owner = np.concatenate([rows.owner for rows in groups])

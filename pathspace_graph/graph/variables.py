@@ -212,11 +212,7 @@ class Variables:
         """Linearization points (n,): the values when the factors were linearized last."""
         self.first_cycle = 0
         """Perception cycle of the window's oldest pose; older poses are keyframes."""
-        self._first_pose = (
-            self.layout,
-            -1,
-            0,
-        )  # layout, first cycle, and column where the window's poses begin
+        self._first_pose = self.layout, -1, 0  # layout, first cycle, and where the window's poses begin
 
     def copy(self) -> Variables:
         """Return variables with the same keys and copies of the values."""

@@ -59,7 +59,7 @@ class SmootherSettings:
 
 
 class MapRows(Protocol):
-    """States what the engine must know about a map: its rows, and the variables that they depend on."""
+    """What the engine must know about a map: its rows, and the variables that they depend on."""
 
     variables: Variables
     reached_inactive: bool
