@@ -36,7 +36,7 @@ class Export:
     format: Annotated[Format, arg(name="as")]
     """The format is the centre line with widths as TUM raceline CSV (`centerline`), the trajectory in the TUM
     format (`tum`), boundaries and centre line as GeoJSON (`geojson`), both boundaries as CSV with the columns
-    x, y and label (`points`), both boundaries with one lanelet as OSM XML (`lanelet2`), or the centre line
+    x, y and label (`points`), both boundaries with lanelets as OSM XML (`lanelet2`), or the centre line
     with the speed that friction and curvature allow as CSV (`profile`)."""
     out: Path
     """The result is written to this file, or to standard output (`-`); an earlier file is kept as a numbered

@@ -19,7 +19,7 @@ from pathspace_graph.export.local_plane import LocalPlane
 from pathspace_graph.export.tables import sampled, write_centre_line, write_points, write_profile
 from pathspace_graph.io.csv_table import read_table
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
-from pathspace_graph.labels import BIG_ORANGE, LEFT, RIGHT
+from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT
 from pathspace_graph.settings.output import SpeedSettings
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.spline.speed import speed_profile
@@ -152,25 +152,66 @@ def test_landmarks_are_multi_points_in_geojson(tmp_path: Path) -> None:
 
 @every_map
 def test_lanelet2(make: Callable[[], Map], tmp_path: Path) -> None:
+    """A loop is four lanelets, each of which ends with the nodes that the next one begins with."""
     file, track = tmp_path / "map.osm", make()
     write_lanelet2(file, track, 0.7, PLANE)
     root = ET.parse(file).getroot()
     nodes = {node.get("id"): node for node in root.findall("node")}
-    ways = {way.get("id"): way for way in root.findall("way")}
-    (relation,) = root.findall("relation")
-    assert {tag.get("k"): tag.get("v") for tag in relation.findall("tag")}["type"] == "lanelet"
-    members = {member.get("role"): ways[member.get("ref")] for member in relation.findall("member")}
-    assert len(nodes) + len(ways) + 1 == len({element.get("id") for element in root})
+    ways = {way.get("id"): [ref.get("ref") for ref in way.findall("nd")] for way in root.findall("way")}
+    relations = root.findall("relation")
+    assert len(relations) == (4 if track.closed else 1)
+    assert len(nodes) + len(ways) + len(relations) == len({element.get("id") for element in root})
     for label, name in ((LEFT, "left"), (RIGHT, "right")):
-        refs = [ref.get("ref") for ref in members[name].findall("nd")]
-        assert (refs[0] == refs[-1]) == track.closed
-        own = [nodes[ref] for ref in refs[: len(refs) - track.closed]]
-        points = points_of(track, label, 0.7)
-        degrees = np.array([[float(node.get("lat", "")), float(node.get("lon", ""))] for node in own])
-        assert PLANE.to_map(degrees) == pytest.approx(points, abs=2e-5)
-        tags = [{tag.get("k"): tag.get("v") for tag in node.findall("tag")} for node in own]
-        local = np.array([[float(tag["local_x"] or ""), float(tag["local_y"] or "")] for tag in tags])
-        assert local == pytest.approx(points, abs=1e-5)
+        own = [ways[member.get("ref")] for r in relations for member in r if member.get("role") == name]
+        for refs, following in zip(own, own[1:] + own[:1], strict=True):
+            assert (refs[-1] == following[0]) == track.closed
+        row = [nodes[ref] for refs in own for ref in refs[: len(refs) - track.closed]]
+        degrees = np.array([[float(node.get("lat", "")), float(node.get("lon", ""))] for node in row])
+        points = PLANE.to_map(degrees)
+        curve = track.curve(label, "a test").spline
+        assert curve.foot_points(points).distance == pytest.approx(0.0, abs=2e-5)
+        ring = np.concatenate([points, points[:1]]) if track.closed else points
+        steps = np.linalg.norm(np.diff(ring, axis=0), axis=1)
+        assert steps == pytest.approx(0.7, abs=0.05)
+        assert steps.sum() == pytest.approx(curve.length(), rel=1e-3)
+
+
+def orange(track: Map) -> Map:
+    points = np.array([[1.0, 2.0], [3.0, 4.0]])
+    cones = {ORANGE: PointBoundary(points, np.eye(4)), BIG_ORANGE: PointBoundary(points[:1] + 5.0, np.eye(2))}
+    return replace(track, points=cones)
+
+
+def test_lanelet2_reads_a_loop_that_leads_round(tmp_path: Path) -> None:
+    """The package finds lengths, successors, a route over all lanelets, and the orange cones."""
+    for name in ("", ".io", ".projection", ".routing", ".traffic_rules"):
+        pytest.importorskip(f"lanelet2{name}")
+    import lanelet2  # noqa: PLC0415
+
+    file, track = tmp_path / "map.osm", orange(ring_map())
+    write_lanelet2(file, track, 0.7, PLANE)
+    origin = lanelet2.io.Origin(PLANE.latitude, PLANE.longitude)
+    loaded = lanelet2.io.load(str(file), lanelet2.projection.UtmProjector(origin))
+    lanelets = list(loaded.laneletLayer)
+    assert len(lanelets) == 4
+    lengths = [lanelet2.geometry.length(lanelet2.geometry.to2D(lanelet.centerline)) for lanelet in lanelets]
+    assert sum(lengths) == pytest.approx(2 * np.pi * 20.0, rel=0.01)
+    rules = lanelet2.traffic_rules.create(
+        lanelet2.traffic_rules.Locations.Germany, lanelet2.traffic_rules.Participants.Vehicle
+    )
+    graph = lanelet2.routing.RoutingGraph(loaded, rules)
+    visited = [lanelets[0]]
+    for _ in range(4):
+        (following,) = graph.following(visited[-1])
+        visited.append(following)
+    assert visited[-1].id == lanelets[0].id
+    assert len({lanelet.id for lanelet in visited}) == 4
+    assert [lanelet.id for lanelet in graph.getRoute(visited[0], visited[3]).shortestPath()] == [
+        lanelet.id for lanelet in visited[:4]
+    ]
+    cones = [point for point in loaded.pointLayer if "type" in point.attributes]
+    assert sorted(cone.attributes["subtype"] for cone in cones) == ["big_orange", "orange", "orange"]
+    assert {cone.attributes["type"] for cone in cones} == {"cone"}
 
 
 def test_what_needs_two_curves_says_so(tmp_path: Path) -> None:
