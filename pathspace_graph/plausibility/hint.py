@@ -1,10 +1,12 @@
-"""A hint: what is odd about a log, where it is, its likely cause, and what to do."""
+"""A hint: what is odd about a log, where it is, its likely cause, and what to do; and the table of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Final, Literal
+
+from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE
 
 Cause = Literal[
     "stamps",
@@ -27,30 +29,123 @@ Cause = Literal[
 
 @dataclass(frozen=True)
 class Hint:
-    """Names a likely mistake in a log, with the figure that shows it."""
+    """A likely mistake in a log, with the figure that shows it."""
 
     LENGTHS: ClassVar = {"found": 1, "likely": 1, "advice": 1}
 
     cause: Cause
-    """The mistake is of this kind."""
     file: str
-    """It is in this file of the log."""
     columns: str
-    """It is in these columns."""
+    """Columns of the file, in words."""
     found: str
-    """This was found, with its figure."""
+    """What was found, with its figure."""
     likely: str
-    """This is the likely cause."""
     advice: str
-    """This mends it."""
 
     @property
     def line(self) -> str:
-        """Returns the hint in one line."""
+        """The hint in one line."""
         return f"{self.file}, {self.columns}: {self.found}; likely cause: {self.likely}; {self.advice}"
 
 
 def because(hints: Sequence[Hint]) -> str:
-    """Returns the likely causes of a refusal in words, or nothing where there is no hint."""
+    """Return the likely causes of a refusal in words, or nothing where there is no hint."""
     causes = [f"{hint.likely} ({hint.file}, {hint.columns}: {hint.found})" for hint in hints]
     return f"likely cause: {'; '.join(causes)}" if causes else ""
+
+
+_T, _XY, _V, _WZ, _K = "column t", "columns x, y", "columns vx, vy", "column wz", "columns xx, xy, yy"
+_LABEL = "column label"
+_EXPECTED = (
+    "{as_written:.0%} of the detections lie where the odometry expects them, and {share:.0%} if it is so"
+)
+_TURNED = "static cones move as they would for a sensor that is turned by {angle}"
+_BY_READINGS = "--noise measured takes what is measured"
+_CLASSES = "the classes of the detector were not turned into left and right"
+
+TABLE: Final[dict[str, tuple[Cause, str, str, str, str, str]]] = {
+    "unit of stamps": ("stamps", "{file}", _T, "rows follow each other after {step:.4g} s as a rule",
+        "the stamps are in {unit}, not in seconds", "multiply column t by {factor:g}"),
+    "fraction of seconds": ("stamps", "{file}", _T,
+        "the stamps fall {falls} times and stay between {low:.4g} and {high:.4g}",
+        "this is only the fraction of each second", "add the seconds to it"),
+    "whole seconds": ("stamps", "{file}", _T, "the stamps are whole numbers, {rows:.0f} rows to each",
+        "these are only the whole seconds", "add the fraction of each second"),
+    "milliseconds": ("stamps", ODOMETRY_FILE, _T, _EXPECTED,
+        "the stamps are in milliseconds, not in seconds", "multiply column t by 0.001"),
+    "two clocks": ("clocks", DETECTIONS_FILE, _T,
+        "the stamps go from {begin:.12g} to {end:.12g} s, those of " + ODOMETRY_FILE
+        + " from {first:.12g} to {last:.12g} s",
+        "the two files were stamped by different clocks, such as the sensor's and the receiver's",
+        "stamp both by one clock"),
+    "late": ("clocks", DETECTIONS_FILE, _T, _EXPECTED,
+        "the detections are stamped about {seconds:g} s too {way}",
+        "stamp odometry and detections when they are measured, by one clock"),
+    "unit of positions": ("positions", DETECTIONS_FILE, _XY, "detections are {typical:.4g} m away as a rule",
+        "the positions {what}", "multiply x and y by {factor:g}"),
+    "too fast": ("speeds", ODOMETRY_FILE, _V,
+        "the speed is more than {speed:.4g} m/s in a tenth of the rows",
+        "the speeds are not in m/s, but in mm/s or cm/s", "give them in m/s"),
+    "turns too fast": ("yaw rate", ODOMETRY_FILE, _WZ,
+        "the yaw rate is more than {rate:.4g} rad/s in a tenth of the rows",
+        "the yaw rate is in degrees per second, not in rad/s", "multiply it by pi/180"),
+    "unit of speeds": ("speeds", ODOMETRY_FILE, _V, _EXPECTED, "the speeds {what}",
+        "multiply vx and vy by {factor:.5g}"),
+    "unit of yaw rate": ("yaw rate", ODOMETRY_FILE, _WZ, _EXPECTED, "the yaw rate {what}",
+        "multiply it by {factor:.5g}"),
+    "pose": ("odometry", ODOMETRY_FILE, "columns vx, vy, wz", _EXPECTED,
+        "the odometry is a pose (x, y, heading), not a twist", "give the body twist"),
+    "twist in the map frame": ("odometry", ODOMETRY_FILE, _V, _EXPECTED,
+        "vx and vy are along the axes of a fixed frame, not of the vehicle",
+        "turn them by the heading into the vehicle's frame"),
+    "nothing": ("map frame", DETECTIONS_FILE, _XY, _EXPECTED,
+        "the detections are in the frame of the map, or the vehicle stood while its wheels turned",
+        "give the detections in the vehicle's frame"),
+    "vx and vy swapped": ("odometry", ODOMETRY_FILE, _V, _EXPECTED,
+        "vx and vy are swapped, or in a frame whose x axis points to a side", "give vx ahead, vy left"),
+    "backward": ("odometry", ODOMETRY_FILE, _V, _EXPECTED, "the speed ahead is negative",
+        "negate columns vx and vy"),
+    "y to the right": ("y to the right", DETECTIONS_FILE, "column y", _EXPECTED,
+        "y points to the right in the detections, not to the left", "negate column y"),
+    "yaw rate to the right": ("yaw rate", ODOMETRY_FILE, _WZ, _EXPECTED,
+        "the yaw rate is positive to the right, as where z points down, or y points to the right",
+        "negate column wz, or column y of the detections"),
+    "frame": ("sensor frame", DETECTIONS_FILE, _XY, _EXPECTED, "{what}", "{how}"),
+    "camera": ("sensor frame", DETECTIONS_FILE, _XY,
+        "column {thin} varies by {least:.2g} m only, the other one by {most:.2g} m",
+        "the detections are in the frame of a camera, with z ahead, x to the right and y down",
+        "put z into column x and -x into column y"),
+    "turned": ("sensor frame", DETECTIONS_FILE, _XY, _TURNED,
+        "the sensor is turned by {angle} in the vehicle{side}",
+        "state the sensor's mounting, or turn the detections by that into the vehicle's frame"),
+    "place": ("mounting", DETECTIONS_FILE, _XY,
+        "static cones move as they would for a sensor {place} of the point that the odometry describes",
+        "the detections are in the sensor's frame, whose origin is not the vehicle's",
+        "add {ahead:.2f} to x and {left:.2f} to y, or state the sensor's mounting"),
+    "covariances": ("covariances", DETECTIONS_FILE, _K,
+        "detections of one cone are {scatter:.2g} m apart as a rule, by their covariances {claimed:.2g} m",
+        "the covariances are in {unit}, or no covariances at all",
+        "give each detection's covariance in m^2"),
+    "one label": ("labels", DETECTIONS_FILE, _LABEL,
+        "all labels are {label}, and {share:.0%} of the cones are on that side", _CLASSES,
+        "write left, right or unknown for each detection"),
+    "foreign labels": ("labels", DETECTIONS_FILE, _LABEL, "the labels are {words}", _CLASSES,
+        "write left, right or unknown (or blue, yellow) for each detection"),
+    "unexplained": ("unexplained", DETECTIONS_FILE, _XY,
+        "only {share:.0%} of the detections lie where any motion expects them",
+        "bearings in degrees were taken for radians, or the two files are not of one drive",
+        "compare a few cycles with what the sensor saw"),
+    "noise of odometry": ("noise", LOG_FILE, "[odometry] sigma", "{figures}",
+        "the stated noise is too {size}", _BY_READINGS),
+    "noise of detections": ("noise", DETECTIONS_FILE, _K,
+        "detections scatter by {scatter:.2g} m {way} the ray at {at:.0f} m, where {stated:.2g} m is stated",
+        "the covariances are too {size}", _BY_READINGS),
+}  # fmt: skip
+"""Cause, file, columns, figure, likely cause and advice of each mistake, with places for its numbers."""
+
+
+def told(mistake: str, **figures: object) -> Hint:
+    """Return the hint about a mistake of the table, with its figures; a share is written as `12 %`."""
+    cause, *texts = TABLE[mistake]
+    file, columns, found, likely, advice = (text.format(**figures) for text in texts)
+    return Hint(cause, file, columns, found.replace("%", " %") if "%}" in texts[2] else found, likely, advice)

@@ -2,29 +2,59 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
+from typing import Final
 
-from pathspace_graph.io.log import DETECTIONS_FILE, Log
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.lengths import scaled
 from pathspace_graph.scale.scene import scale_of
 from pathspace_graph.settings.plausibility import PlausibilitySettings
 
-from .hint import Hint
-from .hypotheses import Trial, Trials, verdict
-from .meanings import frame_hints, odometry_hints
-from .motions import Meaning, motions
-from .mounting import Mounting, best_lateness, mounting_of
+from .hint import Hint, told
+from .hypotheses import Frame, Mounting, Trial, Trials, Verdict, best_lateness, mounting_of, verdict
 from .noise import noise_hints
-from .pairs import Pairs, pairs_of
-from .units import beyond_any_vehicle, one_clock, positions_in_metres, stamps_in_seconds, whole_stamps
+from .pairs import DEGREE, Meaning, Pairs, motions, pairs_of
 
-COLUMNS = "columns x, y"
-"""The detections are in these columns."""
+Array = NDArray[np.float64]
+
+TIMES: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
+"""Units of stamps by their size in s."""
+LENGTHS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}
+"""Units of positions by their size in m."""
+SPEEDS: Final = {
+    1.0 / 3.6: "are in km/h, not in m/s",
+    0.44704: "are in miles per hour, not in m/s",
+    0.514444: "are in knots, not in m/s",
+    1e-2: "are in cm/s, not in m/s",
+    1e-3: "are in mm/s, not in m/s",
+    3.6: "were divided by 3.6 although they were in m/s",
+    1e3: "were divided by 1000 although they were in m/s",
+}
+"""What a unit of the speeds (m/s) means."""
+RATES: Final = {
+    DEGREE: "is in degrees per second, not in rad/s",
+    1.0 / DEGREE: "was turned from degrees to radians although it was in rad/s",
+}
+"""What a unit of the yaw rate (rad/s) means."""
+FRAMES: Final = {
+    Frame(180.0): "the sensor's frame has x to the rear and y to the right",
+    Frame(-90.0): "the sensor's frame has x to the right and y ahead",
+    Frame(90.0): "the sensor's frame has x to the left and y to the rear",
+    Frame(90.0, True): "the columns x and y are swapped",
+    Frame(180.0, True): "the sensor's frame has x to the rear",
+    Frame(-90.0, True): "the sensor's frame has x to the right and y to the rear",
+}
+"""What a frame in quarter turns means; the one with y to the right has its own hint."""
+MIRRORED: Final = Frame(0.0, True)
+"""y points to the right and x ahead."""
 
 
 def hints(log: Log, settings: PlausibilitySettings | None = None) -> list[Hint]:
-    """Returns the likely mistakes in a log, each with its figure; there are none in a good one.
+    """Return the likely mistakes in a log, each with its figure; there are none in a good one.
 
     Only the readings are looked at, never the truth. Where a log is short, or stands still, or goes straight
     on, the evidence is weak, and nothing is said.
@@ -37,7 +67,7 @@ def hints(log: Log, settings: PlausibilitySettings | None = None) -> list[Hint]:
 
 
 def _hints(log: Log, settings: PlausibilitySettings) -> list[Hint]:
-    """Returns the hints about a log at scale 1."""
+    """Return the hints about a log at scale 1."""
     of_parts = whole_stamps(log)
     if of_parts:
         return of_parts
@@ -54,8 +84,88 @@ def _hints(log: Log, settings: PlausibilitySettings) -> list[Hint]:
     return found or noise_hints(log, settings)
 
 
+# --- figures that tell units by themselves ---------------------------------------------------------------
+
+
+def whole_stamps(log: Log) -> list[Hint]:
+    """Return a hint for each file whose stamps are only the seconds, or only the fraction of a second."""
+    found = []
+    for file, t in _stamps(log).items():
+        falls = np.flatnonzero(np.diff(t) < 0.0)
+        if len(falls) >= 2 and np.ptp(t) <= max(1.0, 1.0 / min(TIMES)):
+            found.append(told("fraction of seconds", file=file, falls=len(falls), low=t.min(), high=t.max()))
+        elif len(t) > 2 and (np.diff(t) == 0.0).mean() > 0.5 and (t == np.floor(t)).all():
+            found.append(told("whole seconds", file=file, rows=len(t) / len(np.unique(t))))
+    return found
+
+
+def stamps_in_seconds(log: Log, settings: PlausibilitySettings) -> tuple[Log, list[Hint]]:
+    """Return the log with its stamps in seconds, and a hint for each file in which they are not."""
+    found, factors = [], {}
+    for file, t in _stamps(log).items():
+        step = _median(np.abs(np.diff(t)))
+        fitting = [one for one in TIMES if settings.shortest_step <= step * one <= settings.longest_step]
+        if step > settings.longest_step and fitting:
+            factors[file] = fitting[0]
+            found.append(
+                told("unit of stamps", file=file, step=step, unit=TIMES[fitting[0]], factor=fitting[0])
+            )
+    if not found:
+        return log, []
+    of_odometry, of_cycles = (factors.get(file, 1.0) for file in (ODOMETRY_FILE, DETECTIONS_FILE))
+    odometry = replace(log.odometry, t=log.odometry.t * of_odometry)
+    cycles = tuple(replace(cycle, t=cycle.t * of_cycles) for cycle in log.cycles)
+    return replace(log, odometry=odometry, cycles=cycles), found
+
+
+def one_clock(log: Log) -> list[Hint]:
+    """Return a hint where the stamps of all cycles are before or after those of the odometry."""
+    if not log.cycles:
+        return []
+    first, last = float(log.odometry.t[0]), float(log.odometry.t[-1])
+    begin, end = log.cycles[0].t, log.cycles[-1].t
+    if begin <= last and end >= first:
+        return []
+    return [told("two clocks", begin=begin, end=end, first=first, last=last)]
+
+
+def positions_in_metres(log: Log, settings: PlausibilitySettings) -> tuple[Log, list[Hint]]:
+    """Return the log with its detections in metres, and a hint where they were not."""
+    typical = _median(np.concatenate([np.zeros(0), *(np.hypot(*c.points_vehicle.T) for c in log.cycles)]))
+    if typical > settings.farthest:
+        fitting = [unit for unit in LENGTHS if typical * unit <= settings.far] or [min(LENGTHS)]
+        unit, what = fitting[0], f"are in {LENGTHS[fitting[0]]}, not in metres"
+    elif 0.0 < typical < settings.nearest:
+        unit, what = 1e3, "were divided by 1000 although they were in metres"
+    else:
+        return log, []
+    cycles = [replace(cycle, points_vehicle=cycle.points_vehicle * unit) for cycle in log.cycles]
+    hint = told("unit of positions", typical=typical, what=what, factor=unit)
+    return replace(log, cycles=tuple(cycles)), [hint]
+
+
+def beyond_any_vehicle(odometry: Odometry, settings: PlausibilitySettings) -> list[Hint]:
+    """Return hints about speeds and yaw rates that no vehicle has."""
+    speed = float(np.quantile(np.hypot(odometry.twist[:, 0], odometry.twist[:, 1]), 0.9))
+    rate = float(np.quantile(np.abs(odometry.twist[:, 2]), 0.9))
+    found = [told("too fast", speed=speed)] if speed > settings.fastest else []
+    return found + ([told("turns too fast", rate=rate)] if rate > settings.fastest_turn else [])
+
+
+def _stamps(log: Log) -> dict[str, Array]:
+    """Return the stamps (s) of the rows of odometry and of the cycles, by file."""
+    return {ODOMETRY_FILE: log.odometry.t, DETECTIONS_FILE: np.array([cycle.t for cycle in log.cycles])}
+
+
+def _median(values: Array) -> float:
+    return float(np.median(values)) if len(values) else 0.0
+
+
+# --- what the motion of the detections tells -------------------------------------------------------------
+
+
 def telling_pairs(log: Log, pairs: Pairs, settings: PlausibilitySettings) -> Pairs:
-    """Returns the pairs of cycles that see the same cones if the odometry is right.
+    """Return the pairs of cycles that see the same cones if the odometry is right.
 
     One stretch of a track looks like the next. So cycles without cones in common agree best with a vehicle
     that does not move. Where the odometry is impossible anyway, the pairs are those that follow each other.
@@ -67,7 +177,7 @@ def telling_pairs(log: Log, pairs: Pairs, settings: PlausibilitySettings) -> Pai
 
 
 def _by_motion(trials: Trials, settings: PlausibilitySettings) -> list[Hint]:
-    """Returns what the motion of the detections tells."""
+    """Return the hints about frame, odometry, clocks, mounting, covariances and labels."""
     if len(trials.pairs) == 0:
         return beyond_any_vehicle(trials.log.odometry, settings)
     best, found = _meant(trials, settings)
@@ -85,98 +195,136 @@ def _by_motion(trials: Trials, settings: PlausibilitySettings) -> list[Hint]:
 
 
 def _meant(trials: Trials, settings: PlausibilitySettings) -> tuple[Trial, list[Hint]]:
-    """Returns the hypothesis that explains the log, and what it says of frame and odometry."""
+    """Return the hypothesis that explains the log, and what it says of frame and odometry."""
     best = trials.best()
-    told = verdict(best, trials.as_written, settings)
-    if best is trials.as_written or not told.is_clear(settings):
+    compared = verdict(best, trials.as_written, settings)
+    if best is trials.as_written or not compared.is_clear(settings):
         return trials.as_written, beyond_any_vehicle(trials.log.odometry, settings)
     if is_a_line(trials.pairs, settings):
         return trials.as_written, [_optical(trials.pairs)]
-    return best, frame_hints(best, trials, told) + odometry_hints(best, told)
+    return best, _of_frame(best, trials, compared) + _of_odometry(best.hypothesis.meaning, compared)
+
+
+def _of_frame(best: Trial, trials: Trials, compared: Verdict) -> list[Hint]:
+    """Return a hint about the frame of the detections, where it is not the vehicle's.
+
+    Where detections turn the other way than the odometry, colours tell which is wrong. The odometry may also
+    be the one that goes backward or to a side.
+    """
+    frame = best.hypothesis.frame
+    vx, vy = np.median(trials.log.odometry.twist[:, :2], axis=0)
+    sees_ahead = np.nanmedian(trials.pairs.before[..., 0]) > 0.0
+    if frame == Frame():
+        return []
+    if frame == MIRRORED:
+        of_detections = best.sided >= trials.as_written.sided
+        mistake = "y to the right" if of_detections else "yaw rate to the right"
+    elif abs(vy) > abs(vx) and abs(frame.turn) == 90.0:
+        mistake = "vx and vy swapped"
+    elif vx < 0.0 and sees_ahead and frame == Frame(180.0):
+        mistake = "backward"
+    else:
+        mistake = "frame"
+    side = "with y to the right, and " if frame.mirrored else ""
+    what = FRAMES.get(frame, f"the sensor's frame is {side}turned by {_angle(frame.turn)}")
+    return [told(mistake, what=what, how=_mended(frame), **compared.figures)]
+
+
+def _mended(frame: Frame) -> str:
+    """Return how to turn detections into the vehicle's frame."""
+    matrix = frame.matrix
+    if np.allclose(matrix, np.round(matrix), atol=1e-9):
+        signs = {1: "", -1: "-"}
+        terms = [
+            f"{signs[int(row[k])]}{'xy'[k]}"
+            for row in np.round(matrix)
+            for k in np.flatnonzero(np.round(row))
+        ]
+        return f"put {terms[0]} into column x and {terms[1]} into column y"
+    mirror = "negate column y, then " if frame.mirrored else ""
+    return f"{mirror}turn the detections by {_angle(frame.turn)}"
+
+
+def _angle(turn: float, decimals: int = 0) -> str:
+    return f"{abs(turn):.{decimals}f} degrees to the {'left' if turn > 0.0 else 'right'}"
+
+
+def _of_odometry(meaning: Meaning, compared: Verdict) -> list[Hint]:
+    """Return hints about what the odometry means, where it is not a twist of the vehicle in SI units."""
+    figures = compared.figures
+    if meaning == Meaning(speed=1e-3, rate=1e-3):
+        return [told("milliseconds", **figures)]
+    if meaning.content == "nothing":
+        return [told("nothing", **figures)]
+    found = [] if meaning.content == "twist" else [told(meaning.content, **figures)]
+    if meaning.speed != 1.0:
+        found.append(told("unit of speeds", what=SPEEDS[meaning.speed], factor=meaning.speed, **figures))
+    if meaning.rate != 1.0:
+        found.append(told("unit of yaw rate", what=RATES[meaning.rate], factor=meaning.rate, **figures))
+    return found
 
 
 def _late(trials: Trials, best: Trial, settings: PlausibilitySettings) -> tuple[Trial, list[Hint]]:
-    """Returns the trial with the lateness of the detections, and a hint where there is a large one."""
+    """Return the trial with the lateness of the detections, and a hint where there is a large one."""
     late = best_lateness(trials, best, settings)
-    told = verdict(late, best, settings)
-    if not told.is_clear(settings):
+    compared = verdict(late, best, settings)
+    if not compared.is_clear(settings):
         return best, []
     seconds = late.hypothesis.late
-    likely = f"the detections are stamped about {abs(seconds):g} s too {'late' if seconds > 0.0 else 'early'}"
-    advice = "stamp odometry and detections when they are measured, by one clock"
-    return late, [Hint("clocks", DETECTIONS_FILE, "column t", told.text, likely, advice)]
-
-
-# --- the mounting ----------------------------------------------------------------------------------------
+    way = "late" if seconds > 0.0 else "early"
+    return late, [told("late", seconds=abs(seconds), way=way, **compared.figures)]
 
 
 def _turned(found: list[Hint], best: Trial, mounting: Mounting, settings: PlausibilitySettings) -> list[Hint]:
-    """Returns the hints with one about a sensor that is turned by an angle that is no quarter turn."""
+    """Return the hints with one about a sensor that is turned by an angle that is no quarter turn."""
     yaw, sigma = mounting.yaw
     frame = best.hypothesis.frame
     if frame.turn % 90.0 == 0.0 and (abs(yaw) < settings.turned or sigma > settings.turned_sigma):
         return found
-    turn = frame.turn + yaw
-    angle = f"{abs(turn):.1f} degrees to the {'left' if turn > 0.0 else 'right'}"
-    side = ", with y to the right" if frame.mirrored else ""
-    figure = next((hint.found for hint in found if hint.cause == "sensor frame"), "")
-    figure = figure or f"static cones move as they would for a sensor that is turned by {angle}"
-    likely = f"the sensor is turned by {angle} in the vehicle{side}"
-    advice = "state the sensor's mounting, or turn the detections by that into the vehicle's frame"
-    others = [hint for hint in found if hint.cause not in ("sensor frame", "y to the right")]
-    return [*others, Hint("sensor frame", DETECTIONS_FILE, COLUMNS, figure, likely, advice)]
+    hint = told(
+        "turned",
+        angle=_angle(frame.turn + yaw, 1),
+        side=", with y to the right" if frame.mirrored else "",
+    )
+    figure = next((one.found for one in found if one.cause == "sensor frame"), hint.found)
+    others = [one for one in found if one.cause not in ("sensor frame", "y to the right")]
+    return [*others, replace(hint, found=figure)]
 
 
 def _placed(mounting: Mounting, settings: PlausibilitySettings) -> list[Hint]:
-    """Returns a hint where the sensor sits metres away from the point that the odometry describes."""
+    """Return a hint where the sensor sits metres away from the point that the odometry describes."""
     length, sigma = mounting.arm
     if length < settings.arm or sigma > settings.arm_sigma * length:
         return []
     ahead, left = mounting.values[1:].tolist()
     place = f"{abs(ahead):.1f} m {'ahead' if ahead > 0.0 else 'behind'} and {abs(left):.1f} m to the "
     place += "left" if left > 0.0 else "right"
-    found = f"static cones move as they would for a sensor {place} of the point that the odometry describes"
-    likely = "the detections are in the sensor's frame, whose origin is not the vehicle's"
-    advice = f"add {ahead:.2f} to x and {left:.2f} to y, or state the sensor's mounting"
-    return [Hint("mounting", DETECTIONS_FILE, COLUMNS, found, likely, advice)]
-
-
-# --- covariances and labels ------------------------------------------------------------------------------
+    return [told("place", place=place, ahead=ahead, left=left)]
 
 
 def _certain(mounting: Mounting, settings: PlausibilitySettings) -> list[Hint]:
-    """Returns a hint where the covariances are far from how detections of one cone scatter."""
+    """Return a hint where the covariances are far from how detections of one cone scatter."""
     scatter, claimed = mounting.scatter, mounting.claimed
     if claimed * settings.claimed_less < scatter:
-        likely = "the covariances are in another unit, or no covariances at all"
+        unit = "another unit"
     elif claimed > settings.claimed_more * max(scatter, settings.least_scatter):
-        likely = "the covariances are in mm^2 or cm^2, not in m^2, or no covariances at all"
+        unit = "mm^2 or cm^2, not in m^2"
     else:
         return []
-    found = (
-        f"detections of one cone are {scatter:.2g} m apart as a rule, by their covariances {claimed:.2g} m"
-    )
-    advice = "give each detection's covariance in m^2"
-    return [Hint("covariances", DETECTIONS_FILE, "columns xx, xy, yy", found, likely, advice)]
+    return [told("covariances", scatter=scatter, claimed=claimed, unit=unit)]
 
 
 def _labelled(trials: Trials, best: Trial, settings: PlausibilitySettings) -> list[Hint]:
-    """Returns a hint where one label stands for cones on both sides of the vehicle."""
+    """Return a hint where one label stands for cones on both sides of the vehicle."""
     labels = np.concatenate([cycle.labels for cycle in trials.log.cycles])
     present = [label for label in (LEFT, RIGHT) if (labels == label).any()]
     if len(present) != 1 or (labels == UNKNOWN).any() or abs(best.sided - 0.5) > settings.both_sides:
         return []
-    found = f"all labels are {NAMES[present[0]]}, and {best.sided:.0%} of the cones are on that side"
-    likely = "the classes of the detector were not turned into left and right"
-    advice = "write left, right or unknown for each detection"
-    return [Hint("labels", DETECTIONS_FILE, "column label", found.replace("%", " %"), likely, advice)]
-
-
-# --- what no motion explains -----------------------------------------------------------------------------
+    return [told("one label", label=NAMES[present[0]], share=best.sided)]
 
 
 def _unexplained(trials: Trials, best: Trial, settings: PlausibilitySettings) -> list[Hint]:
-    """Returns a hint where detections of cycles close to each other agree with no motion at all."""
+    """Return a hint where detections of cycles close to each other agree with no motion at all."""
     pairs = trials.pairs
     motion = trials.motion(best.hypothesis)
     ranges = np.nanmedian(np.hypot(pairs.before[..., 0], pairs.before[..., 1]))
@@ -186,25 +334,15 @@ def _unexplained(trials: Trials, best: Trial, settings: PlausibilitySettings) ->
     share = float(best.explained[near].mean()) if near.sum() >= settings.least_near else 1.0
     if share > settings.unexplained:
         return []
-    if is_a_line(pairs, settings):
-        return [_optical(pairs)]
-    found = f"only {share:.0%} of the detections lie where any motion expects them".replace("%", " %")
-    likely = "bearings in degrees were taken for radians, or the two files are not of one drive"
-    advice = "compare a few cycles with what the sensor saw"
-    return [Hint("unexplained", DETECTIONS_FILE, COLUMNS, found, likely, advice)]
+    return [_optical(pairs)] if is_a_line(pairs, settings) else [told("unexplained", share=share)]
 
 
 def is_a_line(pairs: Pairs, settings: PlausibilitySettings) -> bool:
-    """Returns whether one coordinate of all detections hardly varies beside the other."""
+    """Return whether one coordinate of all detections hardly varies beside the other."""
     spread = np.nanstd(pairs.before.reshape(-1, 2), axis=0)
     return bool(spread.min() < settings.line * spread.max())
 
 
 def _optical(pairs: Pairs) -> Hint:
     spread = np.nanstd(pairs.before.reshape(-1, 2), axis=0)
-    thin = "xy"[int(spread.argmin())]
-    found = f"column {thin} varies by {spread.min():.2g} m only, the other one by {spread.max():.2g} m"
-    likely = "the detections are in the frame of a camera, with z ahead, x to the right and y down"
-    return Hint(
-        "sensor frame", DETECTIONS_FILE, COLUMNS, found, likely, "put z into column x and -x into column y"
-    )
+    return told("camera", thin="xy"[int(spread.argmin())], least=spread.min(), most=spread.max())

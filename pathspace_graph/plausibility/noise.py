@@ -12,15 +12,14 @@ from pathspace_graph.factors.noise import RayNoise, ray_sigmas
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.measurement import DRIFT, LEAST
 from pathspace_graph.front_end.sightings import GATE, MAX_RANGE, TwistRecord
-from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, Log
+from pathspace_graph.io.log import Log
 from pathspace_graph.settings.plausibility import PlausibilitySettings
 
-from .hint import Hint
+from .hint import Hint, told
 
 Array = NDArray[np.float64]
 
 TWIST: Final = (("vx", "m/s"), ("vy", "m/s"), ("wz", "rad/s"))
-ADVICE: Final = "--noise measured takes what is measured"
 
 
 def noise_hints(log: Log, settings: PlausibilitySettings) -> list[Hint]:
@@ -53,9 +52,8 @@ def _odometry(log: Log, settings: PlausibilitySettings) -> list[Hint]:
             if which[k]
         ]
         if figures:
-            likely = f"the stated noise is too {size}"
-            likely += ", unless it stands for errors that change slowly" if size == "large" else ""
-            hints.append(Hint("noise", LOG_FILE, "[odometry] sigma", ", ".join(figures), likely, ADVICE))
+            slow = ", unless it stands for errors that change slowly" if size == "large" else ""
+            hints.append(told("noise of odometry", figures=", ".join(figures), size=size + slow))
     return hints
 
 
@@ -76,10 +74,8 @@ def _detections(log: Log, settings: PlausibilitySettings) -> list[Hint]:
             at = float(np.median(ranges[near]))
             scatter = float(ray.sigmas(np.array([at]))[0])
             stated = scatter * float(np.median(sigmas[near, axis] / ray.sigmas(ranges[near])))
-            found = f"detections scatter by {scatter:.2g} m {name} the ray at {at:.0f} m"
-            found += f", where {stated:.2g} m is stated"
-            likely = f"the covariances are too {size}"
-            hints.append(Hint("noise", DETECTIONS_FILE, "columns xx, xy, yy", found, likely, ADVICE))
+            figures = {"scatter": scatter, "at": at, "stated": stated}
+            hints.append(told("noise of detections", way=name, size=size, **figures))
     return hints
 
 

@@ -16,7 +16,7 @@ from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.labels import UNKNOWN, label_from_name
 from pathspace_graph.settings.front_end import LimitSettings
 
-from .hint import Hint, because
+from .hint import Hint, because, told
 from .judge import hints
 
 MOST: Final = 1e20
@@ -82,7 +82,4 @@ def _foreign_labels(folder: Path, log: Log) -> list[Hint]:
     foreign = [word for word, _ in words.most_common() if word.strip().lower() not in NO_LABEL]
     if not foreign:
         return []
-    found = f"the labels are {', '.join(shown(word) for word in foreign[:SHOWN_WORDS])}"
-    likely = "the classes of the detector were not turned into left and right"
-    advice = "write left, right or unknown (or blue, yellow) for each detection"
-    return [Hint("labels", DETECTIONS_FILE, "column label", found, likely, advice)]
+    return [told("foreign labels", words=", ".join(shown(word) for word in foreign[:SHOWN_WORDS]))]

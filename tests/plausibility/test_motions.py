@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.io.log import Odometry
-from pathspace_graph.plausibility.motions import DEGREE, Meaning, motions
+from pathspace_graph.plausibility.pairs import DEGREE, Meaning, motions
 
 T = 0.1 * np.arange(11)
 
