@@ -54,10 +54,10 @@ ARROWS: dict[str, set[str]] = {
     "eval.experiment": BELOW_EVAL | {"eval.metrics", "eval.figures"},
     "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.figures", "eval.experiment"},
     "eval": BELOW_EVAL | {"eval.metrics", "eval.experiment"},
-    "view": BELOW_MAPPING | {"eval.metrics", "eval.figures"},
+    "eval.view": BELOW_MAPPING | {"eval.metrics", "eval.figures"},
     "commands": BELOW_EVAL
-    | {"export", "convert", "view"}
-    | {f"eval.{room}" for room in ("metrics", "figures", "experiment", "benchmark")},
+    | {"export", "convert"}
+    | {f"eval.{room}" for room in ("metrics", "figures", "experiment", "benchmark", "view")},
     "options": {"io", "settings"},
     "frames": {"io"},
     "cli": {"options", "commands"},

@@ -24,6 +24,7 @@ from pathspace_graph.eval.metrics.summary import (
     summarize,
     vehicle_of,
 )
+from pathspace_graph.eval.view.watch import check_watchers, watchers
 from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import Log
@@ -38,7 +39,6 @@ from pathspace_graph.progress import progress
 from pathspace_graph.run import Observer, OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
-from pathspace_graph.view.watch import check_watchers, watchers
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -50,7 +50,7 @@ FRAMES: Final = {
 }
 """What a frame in quarter turns means; the one with y to the right has its own hint."""
 MIRRORED: Final = Frame(0.0, True)
-"""y points to the right and x ahead."""
+"""Frame in which y points to the right and x ahead."""
 
 
 def hints(log: Log, settings: PlausibilitySettings | None = None) -> list[Hint]:

@@ -25,7 +25,8 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import CONDITIONS, LOST, Health
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
-from pathspace_graph.labels import BOUNDARIES, NAMES
+from pathspace_graph.labels import BIG_ORANGE, BOUNDARIES, NAMES
+from pathspace_graph.labels import ORANGE as ORANGE_CONE
 from pathspace_graph.run import ObservedCycle
 from pathspace_graph.settings.output import RecordingSettings
 
@@ -88,6 +89,8 @@ class Recorder:
             self._style_lines(_path(label, "tentative"), color, 1.0, MIDDLE)
             self._style_lines(_path(label, "band"), pale(color), 0.7, LOW)
             self._style_points(_path(label, "points"), color, 2.0, MIDDLE)
+        for label in (ORANGE_CONE, BIG_ORANGE):
+            self._style_points(_path(label, "points"), RED, 3.0 if label == BIG_ORANGE else 2.0, MIDDLE)
         self._style_lines(entities.TRAJECTORY, TRAJECTORY_COLOR, 0.7, MIDDLE)
         self._style_lines(entities.WINDOW, TRAJECTORY_COLOR, 2.0, HIGH)
         self._style_lines(entities.VEHICLE, "#000000", 1.5, TOP)
@@ -137,8 +140,8 @@ class Recorder:
         self._stream.log(path, self._rerun.Points2D.from_fields(positions=points))
 
     def _show_map(self, track: Map) -> None:
-        """Shows each curve, its tentative stretch dashed, and control points or landmarks."""
-        for label, boundary in track.boundaries.items():
+        """Shows each curve, its tentative stretch dashed, control points or landmarks, and orange cones."""
+        for label, boundary in (*track.boundaries.items(), *track.points.items()):
             if isinstance(boundary, PointBoundary):
                 self._points(_path(label, "points"), boundary.points)
                 continue

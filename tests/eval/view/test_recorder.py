@@ -10,16 +10,16 @@ import pytest
 from rerun.chunk import RrdReader
 
 from pathspace_graph.estimators import make_online
+from pathspace_graph.eval.view import entities
+from pathspace_graph.eval.view.recorder import dashes, pale
+from pathspace_graph.eval.view.recording import recording
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.view import entities
-from pathspace_graph.view.recorder import dashes, pale
-from pathspace_graph.view.recording import recording
 
-from ..scenes.drives import ahead, corridor, exact_log
-from .conftest import BAND_EVERY, Watched
+from ...scenes.drives import ahead, corridor, exact_log
+from .conftest import BAND_EVERY, OrangeMapper, Watched
 
 Rows = dict[str, dict[int, dict[str, Any]]]
 
@@ -164,6 +164,15 @@ def test_every_online_estimator_is_shown_as_far_as_it_says_something(
     kind = "used" if name.endswith("fixed-lag") else "detected"
     assert of(rows, f"{entities.READINGS}/{kind}", "Points2D:positions")[last]
     assert (last in rows[entities.WINDOW]) == name.endswith("fixed-lag")
+
+
+def test_orange_cones_are_shown_in_every_cycle(corridor_log: Log, tmp_path: Any) -> None:
+    with recording(tmp_path / "a.rrd") as recorder:
+        mapper = OrangeMapper(odometry_sigma=corridor_log.odometry_sigma)
+        run_online(corridor_log, mapper, observers=[recorder])
+    shown = of(read(tmp_path / "a.rrd"), f"{entities.MAP}/orange/points", "Points2D:positions")
+    assert set(range(len(corridor_log.cycles))) <= set(shown)
+    np.testing.assert_allclose(shown[0], OrangeMapper.cones)
 
 
 def test_dashes_are_every_other_piece() -> None:

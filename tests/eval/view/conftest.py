@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from pathspace_graph.eval.view.animation import Animation, lap_seconds
+from pathspace_graph.eval.view.film import film
+from pathspace_graph.eval.view.recording import recording
 from pathspace_graph.io.log import Log
+from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.io.results import RunResult
+from pathspace_graph.labels import ORANGE
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import ObservedCycle, run_online
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
-from pathspace_graph.view.animation import COLORS, Animation, lap_seconds
-from pathspace_graph.view.film import film
-from pathspace_graph.view.recording import recording
 
-from ..scenes.drives import bean_track, lap_log, noisy
+from ...scenes.drives import bean_track, lap_log, noisy
 
 BAND_EVERY = 7
 FILM = FilmSettings(seconds_per_lap=1.0, frames_per_second=10.0, width=300, height=200, hold=0.5)
@@ -47,7 +50,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Watched:
     settings = RecordingSettings(band_every=BAND_EVERY)
     with (
         recording(rrd, settings=settings, truth=log.truth) as recorder,
-        film(gif, FILM.frames_per_second, COLORS) as reel,
+        film(gif, FILM.frames_per_second) as reel,
     ):
         animation = Animation(reel, lap_seconds(log), FILM, log.truth, "a bean")
         mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
@@ -55,3 +58,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Watched:
         watched = run_online(log, mapper, observers=look)
         animation.finish()
     return Watched(log, alone, watched, cycles, window, rrd, gif)
+
+
+class OrangeMapper(FixedLagMapper):
+    """Maps two orange cones, wherever it is."""
+
+    cones = np.array([[3.0, 2.5], [3.0, -2.5]])
+
+    def map(self) -> Map:
+        return replace(super().map(), points={ORANGE: PointBoundary(self.cones, np.eye(4))})
+
+    def outline(self) -> Map:
+        return replace(super().outline(), points={ORANGE: PointBoundary(self.cones, np.eye(4))})

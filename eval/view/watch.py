@@ -12,7 +12,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.run import Observer
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 
-from .animation import COLORS, Animation, lap_seconds
+from .animation import Animation, lap_seconds
 from .film import check_film_file, film
 from .recording import check_recording, recording
 
@@ -66,7 +66,7 @@ def watchers(options: Watched, log: Log) -> Iterator[list[Observer]]:
         if options.animate is not None:
             if not log.cycles:
                 raise SettingsError("--animate: expected a log with perception cycles, found none")
-            reel = stack.enter_context(film(options.animate, options.film.frames_per_second, COLORS))
+            reel = stack.enter_context(film(options.animate, options.film.frames_per_second))
             track = log.source.get("track", "")
             title = f"Mapped online by {options.estimator}" + (f", track: {track}" if track else "")
             animation = Animation(reel, lap_seconds(log), options.film, log.truth, title)

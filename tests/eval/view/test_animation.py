@@ -12,14 +12,14 @@ from PIL import Image, ImageSequence
 
 from pathspace_graph.cli import main
 from pathspace_graph.estimators import make_online
+from pathspace_graph.eval.view.animation import Animation, lap_seconds
 from pathspace_graph.io.log import Log, Odometry, write_log
 from pathspace_graph.run import ObservedCycle, run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.output import FilmSettings
-from pathspace_graph.view.animation import Animation, lap_seconds
 
-from ..scenes.drives import ahead, bean_track, corridor, detections, exact_log, lap_log
-from .conftest import FILM, Watched
+from ...scenes.drives import ahead, bean_track, corridor, detections, exact_log, lap_log
+from .conftest import FILM, OrangeMapper, Watched
 
 
 class Reel:
@@ -45,7 +45,8 @@ def test_a_lap_takes_the_time_of_film_that_was_asked_for(run: Watched) -> None:
         assert gif.size == (FILM.width, FILM.height)
     driven = run.log.cycles[-1].t - run.log.cycles[0].t
     frames = 1 + int(driven / lap_seconds(run.log) * FILM.seconds_per_lap * FILM.frames_per_second)
-    assert len(durations) == frames + 1  # the last one is held
+    assert len(durations) == frames
+    assert durations[-1] == pytest.approx(durations[0] + FILM.hold)  # the last one is held
     assert sum(durations) == pytest.approx(frames / FILM.frames_per_second + FILM.hold)
 
 
@@ -92,6 +93,20 @@ def test_every_online_estimator_has_a_film(name: str, short_log: Log) -> None:
     run_online(short_log, make_online(name, MapperSettings(), short_log), observers=[animation])
     assert {"time", "lap", "open", "rmse"} <= reel.words[-1]
     assert ("landmarks" in reel.words[-1]) == name.startswith("landmark")
+
+
+def test_orange_cones_are_drawn(short_log: Log) -> None:
+    figures: list[Figure] = []
+
+    class Kept(Reel):
+        def add(self, figure: Figure, seconds: float) -> None:
+            figures.append(figure)
+
+    animation = Animation(Kept(), lap_seconds(short_log), FILM)
+    run_online(short_log, OrangeMapper(odometry_sigma=short_log.odometry_sigma), observers=[animation])
+    places = [line.get_xydata() for line in figures[-1].axes[0].lines if line.get_marker() == "^"]
+    assert len(places) == 1
+    np.testing.assert_array_equal(places[0], OrangeMapper.cones)
 
 
 def test_what_happens_is_told_for_a_while(short_log: Log) -> None:

@@ -22,6 +22,7 @@ from pathspace_graph.eval.figures.map_plot import (
     TRAJECTORY_COLOR,
     MapStyle,
     draw_boundary,
+    draw_orange,
     draw_trajectory,
     draw_unhealthy,
 )
@@ -53,8 +54,6 @@ DPI: Final = 100.0
 """A frame has this resolution (dots per inch), which decides how large the text is."""
 VEHICLE: Final = np.array([[2.4, 0.0], [-1.2, 1.2], [-0.6, 0.0], [-1.2, -1.2]])
 """The vehicle is drawn as this arrow (m, vehicle frame), larger than it is, so that it is seen."""
-COLORS: Final = (*PALETTE, GREY, LIGHT, "#000000")
-"""A frame has these colours on white, and what lies between them."""
 NOTICE_SECONDS: Final = 2.0
 """A frame tells what happened for this time (s) of the film."""
 
@@ -177,6 +176,8 @@ class Animation:
             draw_points(axes, self._cones, "x", LIGHT, markersize=3.0, markeredgewidth=0.7, zorder=1)
             for label, boundary in sorted(cycle.map.boundaries.items()):
                 draw_boundary(axes, boundary, label, _STYLE)
+            for label, cones in sorted(cycle.map.points.items()):
+                draw_orange(axes, cones.points, label, _STYLE)
             path = np.array(self._poses)
             draw_trajectory(axes, path, _STYLE)
             draw_unhealthy(axes, path, self._healths, _STYLE)
@@ -222,7 +223,12 @@ class Animation:
             y = 1.0 - _LINE * (number + 0.5)
             axes.text(0.0, y, moment.name, color=DARK, va="center", fontsize=8.5)
             axes.text(1.0, y, moment.value, color=moment.color, va="center", ha="right", fontsize=8.5)
-        axes.legend(handles=_legend(self._truth), loc="lower left", borderaxespad=0.0, borderpad=0.0)
+        axes.legend(
+            handles=_legend(self._truth, bool(cycle.map.points)),
+            loc="lower left",
+            borderaxespad=0.0,
+            borderpad=0.0,
+        )
 
 
 def _moments(cycle: ObservedCycle, seconds: Sequence[float]) -> list[Moment]:
@@ -271,7 +277,7 @@ def _draw_vehicle(axes: Axes, pose: Array, window: Array) -> None:
     axes.add_patch(Polygon(outline, facecolor="black", edgecolor="white", linewidth=0.5, zorder=10))
 
 
-def _legend(truth: Truth | None) -> list[Any]:
+def _legend(truth: Truth | None, orange: bool) -> list[Any]:
     def line(name: str, color: str, **look: Any) -> Line2D:
         return Line2D([], [], color=color, label=name, **look)
 
@@ -288,4 +294,6 @@ def _legend(truth: Truth | None) -> list[Any]:
         line("trajectory", TRAJECTORY_COLOR, linewidth=0.8),
         line("window", TRAJECTORY_COLOR, linewidth=2.6),
     ]
+    if orange:
+        entries.append(mark("orange cone", RED, "^"))
     return entries if truth is None or len(truth.cones) == 0 else [*entries, mark("true cone", LIGHT, "x")]
