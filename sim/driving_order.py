@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from .geometry import direction, left_normals, ring
+from .curves import direction, left_normals, ring
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int_]
@@ -32,9 +32,9 @@ class DrivingOrder:
     """Says which cones make each boundary, in driving order."""
 
     left: IntArray
-    """These are indices into the left cones (n,)."""
+    """Indices into the left cones (n,)."""
     right: IntArray
-    """These are indices into the right cones (m,)."""
+    """Indices into the right cones (m,)."""
     closed: bool
     """The walk came back to where it began where this is true."""
 

@@ -22,7 +22,7 @@ Mistake = Callable[[Log], Log]
 """It spoils a log."""
 
 DEGREE: Final = float(np.pi / 180.0)
-"""This is a degree in radians."""
+"""A degree in radians."""
 
 
 def with_points(log: Log, change: Callable[[FloatArray], FloatArray]) -> Log:
@@ -190,4 +190,4 @@ MISTAKES: Final[dict[str, Mistake]] = {
         y_to_the_right(log), (1.0, 1.0, 1.0 / DEGREE)
     ),
 }
-"""These are the mistakes by name; those up to `2 m ahead` are the common ones."""
+"""Mistakes by name; those up to `2 m ahead` are the common ones."""

@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int_]
 
 FALSE_POSITIVE: Final = -1
-"""This is the association of a detection that is of no cone."""
+"""Association of a detection that is of no cone."""
 CAMERAS: Final = 2
 """This number of cameras may see a cone at once."""
 
@@ -31,10 +31,10 @@ class OdometryNoise:
     """Each measurement of [vx, vy, wz] has these standard deviations (m/s, m/s, rad/s), white from sample to
     sample."""
     scale: float = 0.004
-    """This is the standard deviation of the relative scale error of vx and vy, which is drawn once for a log
+    """Standard deviation of the relative scale error of vx and vy, which is drawn once for a log
     (-)."""
     gyro_bias: float = 0.0015
-    """This is the standard deviation of the bias of wz, which is drawn once for a log (rad/s)."""
+    """Standard deviation of the bias of wz, which is drawn once for a log (rad/s)."""
     slow: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), repr=False)
     """Standard deviations of the slow errors of [vx, vy, wz] (m/s, m/s, rad/s), beside the white noise."""
     slow_time: float = field(default=5.0, repr=False)
@@ -65,17 +65,17 @@ class SensorSettings:
     rate: float = 10.0
     """The detector gives this number of perception cycles per second (Hz)."""
     range_max: float = 15.0
-    """This is the greatest true range of a detected cone (m)."""
+    """Greatest true range of a detected cone (m)."""
     range_min: float = 0.5
-    """This is the least true range of a detected cone (m)."""
+    """Least true range of a detected cone (m)."""
     fov: float = float(np.deg2rad(110.0))
-    """This is the field of view, the whole angle (rad)."""
+    """Field of view, the whole angle (rad)."""
     range_sigma: float = 0.05
-    """This is the standard deviation of the range at range 0 (m)."""
+    """Standard deviation of the range at range 0 (m)."""
     range_sigma_growth: float = 0.012
     """The standard deviation of the range grows by this with the range (m/m)."""
     bearing_sigma: float = float(np.deg2rad(0.9))
-    """This is the standard deviation of the bearing (rad)."""
+    """Standard deviation of the bearing (rad)."""
     detection_probability: float = 0.98
     """A cone in the field of view is detected with this probability at range 0."""
     detection_falloff: float = 0.01

@@ -26,8 +26,8 @@ from pathspace_graph.io.parsing import parse_yaml, read_text
 from pathspace_graph.labels import BIG_ORANGE, POINTS, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
+from .curves import along_polyline, arc_lengths, direction, left_normals, ring, unit
 from .driving_order import driving_order
-from .geometry import along_polyline, arc_lengths, direction, left_normals, ring, unit
 from .track import Track
 
 FloatArray = NDArray[np.float64]

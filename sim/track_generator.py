@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from pathspace_graph.errors import SettingsError, check_numbers
 
-from .geometry import along_polyline, arc_lengths, curvature, left_normals, ring, unit
+from .curves import along_polyline, arc_lengths, curvature, left_normals, ring, unit
 from .track import Track
 
 FloatArray = NDArray[np.float64]
@@ -106,7 +106,7 @@ class _Layout:
     corners: FloatArray
     """Each row is a corner (n, 2) in m."""
     radii: FloatArray
-    """This is the radius of the arc at each corner (n,) in m."""
+    """Radius of the arc at each corner (n,) in m."""
 
 
 def _least_radius(width: float, settings: TrackGeneratorSettings) -> float:

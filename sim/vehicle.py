@@ -12,8 +12,7 @@ from scipy.interpolate import CubicSpline
 
 from pathspace_graph.errors import SettingsError, check_numbers
 
-from .centre_line import CentreLine
-from .geometry import arc_lengths, curvature, direction, left_normals
+from .curves import CentreLine, arc_lengths, curvature, direction, left_normals
 from .track import Track
 
 FloatArray = NDArray[np.float64]
@@ -31,21 +30,21 @@ class VehicleSettings:
     """Describes how the vehicle drives."""
 
     speed_max: float = 12.0
-    """This is the greatest speed (m/s)."""
+    """Greatest speed (m/s)."""
     speed_start: float = 0.0
-    """This is the speed at the start pose (m/s)."""
+    """Speed at the start pose (m/s)."""
     acceleration_lateral: float = 5.0
-    """This is the greatest lateral acceleration (m/s^2), which limits the speed in corners."""
+    """Greatest lateral acceleration (m/s^2), which limits the speed in corners."""
     acceleration: float = 3.0
-    """This is the greatest longitudinal acceleration (m/s^2)."""
+    """Greatest longitudinal acceleration (m/s^2)."""
     deceleration: float = 4.0
-    """This is the greatest longitudinal deceleration (m/s^2)."""
+    """Greatest longitudinal deceleration (m/s^2)."""
     wander: float = 0.3
     """The smooth lateral wander leads at most this far from the middle (m)."""
     wander_wavelengths: tuple[float, float] = (15.0, 60.0)
-    """These are the shortest and the longest wavelength of the wander (m)."""
+    """Shortest and the longest wavelength of the wander (m)."""
     half_width: float = 0.75
-    """This is half the vehicle's width (m); the wander never brings its side nearer to the cones than
+    """Half the vehicle's width (m); the wander never brings its side nearer to the cones than
     `margin`."""
     margin: float = 0.25
     """The vehicle's side keeps this distance from the cones (m) where the track is wide enough."""
@@ -83,7 +82,7 @@ class Drive:
     """Holds what the vehicle truly did."""
 
     t: FloatArray
-    """These are the stamps (N,) in s, from 0."""
+    """Stamps (N,) in s, from 0."""
     poses: FloatArray
     """Each row is a true pose [x, y, theta] (N, 3), map frame; the first is (0, 0, 0), and theta is not
     wrapped."""

@@ -13,7 +13,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.metrics.summary import lap_times
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.settings.checked import Positive
-from pathspace_graph.sim.geometry import along_polyline, arc_lengths, left_normals, unit
+from pathspace_graph.sim.curves import along_polyline, arc_lengths, left_normals, unit
 from pathspace_graph.sim.sensor import SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track

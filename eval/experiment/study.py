@@ -16,8 +16,7 @@ from pathspace_graph.io.limits import MAX_HEADER_BYTES, MAX_VARIANTS, shown
 from pathspace_graph.io.overrides import Overrides, flatten, override
 from pathspace_graph.io.parsing import parse_toml, read_text
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.sim.presets import PLAIN, PRESETS, preset
-from pathspace_graph.sim.simulate import SimulationSettings
+from pathspace_graph.sim.simulate import PLAIN, PRESETS, SimulationSettings, preset
 
 SHIPPED: Final = Path(__file__).parents[1] / "studies"
 """Folder of the studies that ship with the package."""

@@ -22,7 +22,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.files import atomic_file, replacing
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import BOUNDARIES, NAMES
-from pathspace_graph.sim.geometry import left_normals
+from pathspace_graph.sim.curves import left_normals
 from pathspace_graph.spline.bspline import BSpline
 
 Array = NDArray[np.float64]

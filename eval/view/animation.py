@@ -28,9 +28,7 @@ from pathspace_graph.eval.figures.map_plot import (
 )
 from pathspace_graph.eval.figures.style import (
     DARK,
-    GREY,
     LIGHT,
-    PALETTE,
     RED,
     SIGMAS,
     draw_points,

@@ -17,10 +17,8 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import LOG_FILE, Log, write_log
 from pathspace_graph.progress import progress
-from pathspace_graph.sim.events import EVENTS
-from pathspace_graph.sim.presets import PRESETS, preset
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track import Track
+from pathspace_graph.sim.simulate import PRESETS, SimulationSettings, preset, simulate
+from pathspace_graph.sim.track import EVENTS, Track
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 

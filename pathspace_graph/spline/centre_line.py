@@ -12,7 +12,7 @@ from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.residuals import RIBBON, greville, smoothness_coefficients
+from pathspace_graph.factors.residuals import RIBBON
 from pathspace_graph.factors.se2 import left_of
 
 from .bspline import BSpline
@@ -222,8 +222,7 @@ class _Fit:
         values, columns = ribbon.local_basis(u)
         rows = np.repeat(np.arange(len(u)), values.shape[1])
         self._basis = csr_array((values.ravel(), (rows, columns.ravel())), shape=(len(u), ribbon.size))
-        period = ribbon.tables.length if ribbon.periodic else None
-        bending = smoothness_coefficients(greville(ribbon.knots, ribbon.degree)[: ribbon.size], period)
+        bending = ribbon.bending
         rows = np.repeat(np.arange(len(bending)), bending.shape[1])
         columns = (np.arange(len(bending))[:, None] + np.arange(bending.shape[1])) % ribbon.size
         D = csr_array((bending.ravel(), (rows, columns.ravel())), shape=(len(bending), ribbon.size))

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pathspace_graph.io.log import Log
-from pathspace_graph.sim.presets import preset
-from pathspace_graph.sim.simulate import simulate
+from pathspace_graph.sim.simulate import preset, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
 from ..scenes.drives import SHORT

@@ -23,8 +23,7 @@ from pathspace_graph.front_end.measurement import (
 )
 from pathspace_graph.front_end.sightings import TwistRecord
 from pathspace_graph.io.log import Log
-from pathspace_graph.sim.presets import preset
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
 from .scenes import WHITE, Camera

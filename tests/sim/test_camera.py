@@ -11,9 +11,8 @@ import pytest
 from pathspace_graph.cli import main
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Log, read_log
-from pathspace_graph.sim.presets import CAMERA, CAMERA_FAULTS, INS, preset
 from pathspace_graph.sim.sensor import ConeSensor, OdometryNoise, SensorSettings, measure_twists
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.simulate import CAMERA, CAMERA_FAULTS, INS, SimulationSettings, preset, simulate
 
 from ..scenes.drives import bean_track
 from ..scenes.paths import ROOT

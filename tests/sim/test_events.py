@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.sim.events import EVENTS, acceleration, skidpad
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track import to_map_frame
+from pathspace_graph.sim.track import EVENTS, acceleration, skidpad, to_map_frame
 
 
 def test_the_circles_of_a_skidpad_are_those_of_the_rules() -> None:

@@ -25,8 +25,7 @@ from pathspace_graph.eval.experiment.study import (
 from pathspace_graph.eval.metrics.summary import lap_times
 from pathspace_graph.io.overrides import as_type, leaves, override
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.sim.presets import CAMERA, CAMERA_FAULTS, INS, INS_RATE
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.simulate import CAMERA, CAMERA_FAULTS, INS, INS_RATE, SimulationSettings, simulate
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.vehicle import VehicleSettings
 

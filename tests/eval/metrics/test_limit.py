@@ -27,9 +27,8 @@ from pathspace_graph.landmark.batch import solve_landmarks
 from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.faults import Faults, SensorFaults
-from pathspace_graph.sim.presets import preset
 from pathspace_graph.sim.sensor import SensorSettings
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.vehicle import VehicleSettings
 from pathspace_graph.spline.bspline import BSpline
 

@@ -1,4 +1,4 @@
-"""The middle of a track: a smooth curve between two rows of cones, by arc length."""
+"""Sampled curves in the plane, and the middle of a track: a smooth curve between two rows of cones."""
 
 from __future__ import annotations
 
@@ -11,10 +11,45 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
-from .geometry import along_polyline, arc_lengths, curvature, direction, left_normals, ring, unit
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int_]
+
+
+def ring(points: FloatArray) -> FloatArray:
+    """Returns the points (n, 2) of a closed curve with the first one repeated at the end (n + 1, 2)."""
+    return np.vstack([points, points[:1]])
+
+
+def arc_lengths(points: FloatArray) -> FloatArray:
+    """Returns the path length (n,) in m along a polyline (n, 2) from its first point to each."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def along_polyline(at: FloatArray, s: FloatArray, points: FloatArray) -> FloatArray:
+    """Interpolates a polyline (n, 2) with increasing parameters `s` (n,) at the values `at` (k,): (k, 2)."""
+    return np.column_stack([np.interp(at, s, points[:, 0]), np.interp(at, s, points[:, 1])])
+
+
+def unit(vectors: FloatArray) -> FloatArray:
+    """Returns the vectors (n, 2) scaled to length 1."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def left_normals(tangents: FloatArray) -> FloatArray:
+    """Returns the vectors (n, 2) turned a quarter to the left."""
+    return np.stack([-tangents[..., 1], tangents[..., 0]], axis=-1)
+
+
+def direction(theta: float) -> FloatArray:
+    """Returns the unit vector (2,) of a heading in rad."""
+    return np.array([np.cos(theta), np.sin(theta)])
+
+
+def curvature(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Returns the signed curvature (n,) in 1/m, positive to the left, from both derivatives (n, 2)."""
+    cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    return np.asarray(cross / np.linalg.norm(first, axis=1) ** 3)
+
 
 STEP: Final = 0.25
 """While the curve is fitted, its samples are this far apart (m)."""
@@ -43,7 +78,7 @@ class CentreLine:
     closed: bool
     """The end meets the beginning where this is true."""
     clearance: FloatArray
-    """This is the distance to the nearer row of cones at the spline's knots (k,) in m."""
+    """Distance to the nearer row of cones at the spline's knots (k,) in m."""
 
     def points(self, s: FloatArray) -> FloatArray:
         """Returns the points (n, 2) of the curve at `s` (n,)."""
