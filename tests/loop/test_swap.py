@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -212,7 +214,7 @@ def test_a_batch_that_does_not_converge_keeps_the_prior_and_says_so(
 ) -> None:
     """Its optimum is farther away than nothing at all, so it is never near enough."""
     monkeypatch.setattr(drive_record, "SOLVED", 0.0)
-    monkeypatch.setattr(drive_record, "solve_lap", _unconverged)
+    monkeypatch.setattr(drive_record, "_submit", _unconverged)
     _, results = map_log(log(), FixedLagMapper())
     assert [result.notice for result in results if result.notice] == [
         "the map goes on from the window's own prior: the batch of the lap has not converged"
@@ -227,10 +229,13 @@ def test_a_process_that_dies_keeps_the_prior_and_says_so(monkeypatch: pytest.Mon
     ]
 
 
-def _unconverged(lap: OpenLap) -> LapMarginal:
-    marginal = solve_lap(lap)
-    assert marginal is not None
-    return replace(marginal, convergence=replace(marginal.convergence, converged=False))
+def _unconverged(work: Callable[..., LapMarginal | None], *arguments: object) -> Future[LapMarginal | None]:
+    """Solves a lap in this process, and says that it has not converged."""
+    marginal, future = work(*arguments), Future[LapMarginal | None]()
+    if marginal is not None:
+        marginal = replace(marginal, convergence=replace(marginal.convergence, converged=False))
+    future.set_result(marginal)
+    return future
 
 
 def _exit(lap: OpenLap) -> LapMarginal:
