@@ -29,7 +29,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
 _POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])
-"""These unit vectors choose the position of a pose."""
+"""Unit vectors that choose the position of a pose."""
 FOUND: Final = "the vehicle was lost, and is found again"
 """Begin of the notice of a cycle in which the window starts anew at the place that was found."""
 BESIDE: Final = 1.0
@@ -372,12 +372,12 @@ class Search:
         behind = np.append(behind, 0.0)
         _, first = np.unique(behind // STEP, return_index=True)
         ahead = poses[-1, :2] + LEAD * np.array([np.cos(poses[-1, 2]), np.sin(poses[-1, 2])])
-        own = np.concatenate([poses[first, :2], ahead[None]]) @ np.array([1.0, 1j])
+        path = np.concatenate([poses[first, :2], ahead[None]]) @ np.array([1.0, 1j])
         target = self.loop.at(self.loop.stations[:, None] - np.append(behind[first], -LEAD))
-        mean, means = own.mean(), target.mean(axis=1)
-        turn = ((own - mean).conj() * (target - means[:, None])).sum(axis=1)
+        mean, means = path.mean(), target.mean(axis=1)
+        turn = ((path - mean).conj() * (target - means[:, None])).sum(axis=1)
         turn /= np.maximum(np.abs(turn), np.finfo(float).tiny)
-        misfit = np.abs(turn[:, None] * (own - mean) - (target - means[:, None]))
+        misfit = np.abs(turn[:, None] * (path - mean) - (target - means[:, None]))
         centre = poses[-1, :2] @ np.array([1.0, 1j])
         shift = means - centre - turn * (mean - centre)
         return np.column_stack([shift.real, shift.imag, np.angle(turn)]), np.sqrt((misfit**2).mean(axis=1))

@@ -113,10 +113,10 @@ class Contradictions:
 
     def _undisputed(self, label: int, chosen: IntArray) -> BoolArray:
         """Return which tracks (k,) were seen more often than those of the other colour at the same place."""
-        own, (other,) = self._tracks[label], (self._tracks[b] for b in BOUNDARIES if b != label)
-        apart = np.hypot(*(own.points[chosen, None] - other.points).transpose(2, 0, 1))
+        tracks, (other,) = self._tracks[label], (self._tracks[b] for b in BOUNDARIES if b != label)
+        apart = np.hypot(*(tracks.points[chosen, None] - other.points).transpose(2, 0, 1))
         rival = np.where(apart < other.settings.merge_radius, other.counts, 0).max(axis=1, initial=0)
-        return np.asarray(own.counts[chosen] > rival)
+        return np.asarray(tracks.counts[chosen] > rival)
 
 
 def _is_new(loop: Loop, label: int, points: Array) -> BoolArray:
@@ -195,9 +195,9 @@ class Mending:
         end = len(marginal.poses)
         cones = carried(cones, self._lap, marginal.poses[end - len(self._lap) :])
         distance = np.full(len(cones), np.inf)
-        for own, spline in marginal.splines.items():
+        for number, spline in marginal.splines.items():
             curve = KDTree(sampled(spline, SAMPLE))
-            distance[label == own] = curve.query(cones[label == own])[0]
+            distance[label == number] = curve.query(cones[label == number])[0]
         explained = distance < BESIDE
         if explained.mean() < EXPLAINED:
             return ""
@@ -226,15 +226,15 @@ def led_through(track: CurveMap, label: int, stretches: list[Stretch], poses: Ar
     that lie beside a row of the stretches' cones, or are one of them, are removed.
     """
     state, settings = track.state, track.settings
-    own = [stretch for stretch in stretches if stretch.label == label]
-    if not own:
+    chosen = [stretch for stretch in stretches if stretch.label == label]
+    if not chosen:
         return state.spline(label)
     boundary = state.boundaries[label]
     u = track.cones.get(label, np.arange(boundary.tables.low, boundary.tables.high, settings.spline.spacing))
     cones = boundary.evaluate(state.control_points(label), u)
     lap, stations = newest_lap(poses, boundary.length)
     at = along_and_across(cones, lap, stations)[0]
-    for stretch in own:
+    for stretch in chosen:
         new_at = along_and_across(stretch.cones, lap, stations)[0]
         kept = ~_is_replaced(cones, at, stretch.cones, new_at, settings)
         cones, at = np.concatenate([cones[kept], stretch.cones]), np.append(at[kept], new_at)

@@ -53,9 +53,9 @@ class Stretch:
     """The cones of the newest stretch of both curves."""
 
     cones: dict[int, Array]
-    """Each boundary has cones (k, 2) at these points in m, map frame."""
+    """(k, 2) Positions of each boundary's cones in m, map frame."""
     normals: dict[int, Array]
-    """Each of these cones has the unit normal (k, 2) of its curve."""
+    """(k, 2) Unit normals of the curve at them."""
 
     def tells_place(self, centre: Array, settings: ClosingSettings) -> bool:
         """Return whether the stretch, laid on itself, holds the vehicle at `centre` (2,) in every direction.

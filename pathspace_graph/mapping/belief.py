@@ -69,14 +69,14 @@ def transform(function: Callable[[Array], Array], mean: Array, covariance: Array
     return Transformed(centre, spread.T @ spread, np.asarray(slope).T)
 
 
-# === The state of the paper's filters: the vehicle's pose and points of the map, with a joint covariance.
+# --- the belief ------------------------------------------------------------------------------------------
 
 
 _ODOMETRY: Final = slice(POSE, POSE + CALIBRATION_SIZE)
 HEAD: Final = POSE + CALIBRATION_SIZE + SENSOR_SIZE
 """The state has this many entries before its points."""
 SENSOR_COLUMNS: Final = np.arange(POSE + CALIBRATION_SIZE, HEAD)
-"""These entries of the state are the calibration of the sensor."""
+"""Entries of the sensor's calibration in the state."""
 
 
 class Belief:
@@ -212,9 +212,9 @@ class Belief:
 
     def add_points(self, detections: Array, covariances: Array) -> None:
         """Add points at the end of x, at detections (k, 2) with covariances (k, 2, 2), vehicle frame."""
-        own = block_diag(self.covariance[:POSE, :POSE], *covariances)
+        joint = block_diag(self.covariance[:POSE, :POSE], *covariances)
         mean = np.concatenate([self.pose, detections.ravel()])
-        placed = transform(lambda x: to_map_rows(x[:, :POSE], x[:, POSE:]), mean, own)
+        placed = transform(lambda x: to_map_rows(x[:, :POSE], x[:, POSE:]), mean, joint)
         cross = placed.slope[:, :POSE] @ self.covariance[:POSE]
         self.mean = np.concatenate([self.mean, placed.mean])
         self.covariance = np.block([[self.covariance, cross.T], [cross, placed.covariance]])

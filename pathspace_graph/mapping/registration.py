@@ -241,18 +241,18 @@ def _match(
     hessian, negative_gradient = np.zeros((3, 3)), np.zeros(3)
     matched, u, inlier = [np.zeros(0, np.intp)], [np.zeros(0)], [np.zeros(0, bool)]
     for label, boundary in state.boundaries.items():
-        own = np.flatnonzero(seen.labels == label)
-        low, high = (np.full(len(own), end) for end in stretches[label])
-        foot = boundary.find(state.control_points(label), moved[own], low, high)
+        of_label = np.flatnonzero(seen.labels == label)
+        low, high = (np.full(len(of_label), end) for end in stretches[label])
+        foot = boundary.find(state.control_points(label), moved[of_label], low, high)
         used = foot.interior & (np.abs(foot.distance) < reach)
-        n, arm = foot.normal_unit[used], moved[own[used]] - motion.centre - motion.vector[:2]
+        n, arm = foot.normal_unit[used], moved[of_label[used]] - motion.centre - motion.vector[:2]
         sigma = np.sqrt(
-            np.einsum("mi,mij,mj->m", n, seen.covariances[own[used]], n) + settings.sigma_reading**2
+            np.einsum("mi,mij,mj->m", n, seen.covariances[of_label[used]], n) + settings.sigma_reading**2
         )
         jacobian = by_motion(n, arm) / sigma[:, None]
         hessian += jacobian.T @ jacobian
         negative_gradient -= jacobian.T @ (foot.distance[used] / sigma)
-        matched.append(own[foot.interior])
+        matched.append(of_label[foot.interior])
         u.append(foot.u[foot.interior])
         inlier.append(np.abs(foot.distance[foot.interior]) < settings.inlier_distance)
     inside, parameters, inliers = np.concatenate(matched), np.concatenate(u), np.concatenate(inlier)

@@ -135,7 +135,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         detections, labels = self.map.detections, self.map.state.curves.labels.tolist()
         newest = int(detections.cycle.searchsorted(self.next_cycle - 1))
         rows = [detections.open_to(label, 0 if label in retest else newest) for label in labels]
-        return np.concatenate(rows), np.repeat(np.arange(len(rows)), [len(own) for own in rows])
+        return np.concatenate(rows), np.repeat(np.arange(len(rows)), [len(of_label) for of_label in rows])
 
     def joint_variance(self, rows: IntArray, points: Array, foot: FootPoints) -> Array:
         """Return `g_i' Sigma g_i` (m,) in m^2: the variance of each residual of detections (m,).

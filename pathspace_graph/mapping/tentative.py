@@ -180,7 +180,7 @@ class OrangeCones:
     """
 
     MOST: Final = 500
-    """This number of cycles is remembered, the newest ones, to be placed again when poses are corrected."""
+    """Newest cycles that are remembered, to be placed again when poses are corrected."""
 
     def __init__(self, settings: GrowthSettings, sigma: float) -> None:
         """Keep how detections are merged, and a standard deviation (m) that none of them averages out."""
