@@ -23,17 +23,14 @@ TERMINATED: Final = 143
 
 @dataclass(frozen=True)
 class Command:
-    """Names a command, which is imported only when it is called.
-
-    `--help` need not wait for GTSAM and matplotlib.
-    """
+    """A command, which is imported only when it is called: the overview need not wait for GTSAM."""
 
     module: str
-    """This module of `commands` holds the command."""
+    """Module of `commands`."""
     name: str
-    """This dataclass in it has the options as fields, and does the work in `run`."""
+    """Dataclass in it with the options as fields, which does the work in `run`."""
     summary: str
-    """This line stands in the list of commands."""
+    """Line in the list of commands."""
 
 
 COMMANDS: Final = {
@@ -62,7 +59,7 @@ COMMANDS: Final = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a command; returns 0 on success.
+    """Run a command; return 0 on success.
 
     Bad usage and bad input give one line on standard error and 2; an estimate that cannot be computed, 3.
     """
@@ -101,7 +98,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def overview() -> str:
-    """Returns the list of commands."""
+    """Return the list of commands."""
     width = max(map(len, COMMANDS)) + 2
     lines = [f"  {name:<{width}}{command.summary}" for name, command in COMMANDS.items()]
     usage = f"usage: {PROGRAM} COMMAND [OPTIONS]"
@@ -109,7 +106,7 @@ def overview() -> str:
 
 
 def parse_command(name: str, arguments: list[str]) -> Any:
-    """Returns the command with its options, or None where its help was asked for and printed."""
+    """Return the command with its options, or None where its help was asked for and printed."""
     options = import_module(".options", __package__)
     command = import_module(f".commands.{COMMANDS[name].module}", __package__)
     return options.parse(getattr(command, COMMANDS[name].name), f"{PROGRAM} {name}", arguments)

@@ -183,16 +183,11 @@ def _of_file(error: ReadingError, folder: Path, log: Log, odometry: Odometry) ->
 
 
 def _stamp_or_none(detections: Any) -> float | None:
-    """Return the stamp of a cycle (s), or None where it has none."""
     t = getattr(detections, "t", None)
     return float(t) if isinstance(t, int | float) and abs(t) < inf else None
 
 
-# --- stamps ----------------------------------------------------------------------------------------------
-
-
 def _stamp(value: Any) -> float:
-    """Return the stamp of a cycle (s)."""
     try:
         t = float(value)
     except (TypeError, ValueError, OverflowError):
@@ -234,9 +229,6 @@ def _check_order(stamps: Array, t: float, newest: Newest, limits: LimitSettings)
     raise ReadingError("odometry.t", expected, float(known[at]), at - len(before))
 
 
-# --- twists ----------------------------------------------------------------------------------------------
-
-
 def _checked_twists(odometry: Odometry, limits: LimitSettings) -> tuple[Array, Array]:
     """Return the stamps (k,) and the twists (k, 3), all of them finite, possible and in order of time."""
     stamps = _numbers(odometry.t, "odometry.t", (-1,))
@@ -273,9 +265,6 @@ def _since(stamps: Array, twists: Array, newest: Newest) -> tuple[Array, Array]:
     elif newest.twist is not None:
         stamps, twists = np.append(newest.t, stamps), np.concatenate([newest.twist[None], twists])
     return stamps, twists
-
-
-# --- detections ------------------------------------------------------------------------------------------
 
 
 def possible_detections(detections: Detections, t: float, limits: LimitSettings) -> tuple[Detections, str]:
@@ -327,7 +316,6 @@ def _has_covariance(covariances: Array) -> BoolArray:
 
 
 def _labels(values: Any, count: int) -> NDArray[np.int_]:
-    """Return the labels (m,) of detections as integers."""
     field = "detections.labels"
     labels = _array(values, field, (count,))
     if count and labels.dtype.kind not in "iu":
@@ -338,9 +326,6 @@ def _labels(values: Any, count: int) -> NDArray[np.int_]:
         known = ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))
         raise ReadingError(field, f"one of {known}", labels[row], row)
     return labels.astype(np.int_)
-
-
-# --- arrays ----------------------------------------------------------------------------------------------
 
 
 def _numbers(values: Any, field: str, shape: tuple[int, ...]) -> Array:
@@ -357,14 +342,12 @@ def _array(values: Any, field: str, shape: tuple[int, ...]) -> NDArray[Any]:
         array = np.asarray(values)
     except ValueError:
         raise ReadingError(field, "an array", "rows of different lengths") from None
-    fits = array.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, array.shape, strict=True))
-    if not fits:
+    if array.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, array.shape, strict=True)):
         raise ReadingError(field, f"the shape {shape}".replace("-1", "m"), f"the shape {array.shape}")
     return array
 
 
 def _of_type(kind: type[Any], value: Any, field: str) -> Any:
-    """Return a value of a type, or raise a ReadingError."""
     if not isinstance(value, kind):
         raise ReadingError(field, kind.__name__, type(value).__name__)
     return value

@@ -9,9 +9,9 @@ from functools import wraps
 from typing import Any, ClassVar, Final, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import ReadingError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.lengths import POSE, scaled, times
@@ -20,7 +20,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .scene import SceneScale, scale_of
 
-Array = NDArray[np.float64]
 C = TypeVar("C", bound=type[Any])
 
 ANSWERS: Final = ("map", "outline", "readings", "vehicle_state", "noise_used", "window_poses")
@@ -28,15 +27,18 @@ ANSWERS: Final = ("map", "outline", "readings", "vehicle_state", "noise_used", "
 
 
 class FrontDoor:
-    """Holds the scale of an online estimator and, until that is final, what it takes to begin anew."""
+    """The scale of an estimator and, until that is final, what it takes to begin anew."""
 
     constant: ClassVar = True
     """An estimator that goes back to what it was before an update keeps it."""
 
-    def __init__(self, settings: MapperSettings, noise: Any, others: tuple[Any, ...], named: Any) -> None:
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Any = None, *others: Any, **named: Any
+    ) -> None:
         """Keep what an estimator is made from, whose settings may give the scale."""
+        settings = settings or MapperSettings()
         self.scene = SceneScale(settings.scale)
-        self.made_from = (settings, noise, *deepcopy((others, named)))
+        self.made_from = (settings, odometry_sigma, *deepcopy((others, named)))
         self.cycles: list[tuple[Odometry, Detections]] = []
 
     def make(self, begin: Callable[..., None], estimator: Any) -> None:
@@ -88,14 +90,8 @@ def at_scale(estimator: C) -> C:
     begin, step = estimator.__init__, estimator.update
 
     @wraps(begin)
-    def begin_at_scale(
-        self: Any,
-        settings: MapperSettings | None = None,
-        odometry_sigma: Any = None,
-        *others: Any,
-        **named: Any,
-    ) -> None:
-        self._door = FrontDoor(settings or MapperSettings(), odometry_sigma, others, named)
+    def begin_at_scale(self: Any, *arguments: Any, **named: Any) -> None:
+        self._door = FrontDoor(*arguments, **named)
         self._door.make(begin, self)
 
     @wraps(step)
@@ -152,22 +148,16 @@ def log_at_scale(estimator: C) -> C:
     begin, solve = estimator.__init__, estimator.solve
 
     @wraps(begin)
-    def begin_and_keep(
-        self: Any,
-        settings: MapperSettings | None = None,
-        odometry_sigma: Any = None,
-        *others: Any,
-        **named: Any,
-    ) -> None:
-        self._made_from = (settings or MapperSettings(), odometry_sigma, others, named)
-        begin(self, settings, odometry_sigma, *others, **named)
+    def begin_and_keep(self: Any, *arguments: Any, **named: Any) -> None:
+        self._door = FrontDoor(*arguments, **named)
+        begin(self, *arguments, **named)
 
     @wraps(solve)
     def solve_at_scale(self: Any, log: Log, *options: Any, **named: Any) -> Any:
-        settings, noise, others, own = self._made_from
+        settings, noise, others, by_name = self._door.made_from
         scale = settings.scale or scale_of(log)
         inner = object.__new__(type(self))
-        begin(inner, replace(settings, scale=1.0), noise_at(noise, scale), *others, **own)
+        begin(inner, replace(settings, scale=1.0), noise_at(noise, scale), *others, **by_name)
         result = scaled(solve(inner, scaled(log, 1.0 / scale), *options, **named), scale)
         return replace(result, settings=settings_dict(settings))
 

@@ -1,17 +1,13 @@
 """The scale of a scene, from the width of its road and the gaps of its rows where the drive begins."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-
-Array = NDArray[np.float64]
 
 WIDTH: Final = 3.5
 """Distance of a cone from the nearest one of the other side on a track of Formula Student, m, median."""

@@ -1,1 +1,1 @@
-"""Settings: frozen dataclasses with a sentence for each field, and no number anywhere else."""
+"""Settings: frozen dataclasses of what a user or a study changes; every other number is a constant."""

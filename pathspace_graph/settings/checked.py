@@ -10,24 +10,24 @@ from pathspace_graph.errors import SettingsError
 
 
 class Positive:
-    """Holds settings whose numbers are all positive and, unless they are listed as unlimited, finite."""
+    """Settings whose numbers are all positive and, unless they are listed as unlimited, finite."""
 
     UNLIMITED: ClassVar[tuple[str, ...]] = ()
-    """These numbers may be infinite, which means that there is no limit."""
+    """Numbers that may be infinite, which means that there is no limit."""
 
     SIGNED: ClassVar[tuple[str, ...]] = ()
-    """These numbers may have either sign."""
+    """Numbers that may have either sign."""
 
     prefix: ClassVar[str]
-    """This stands before the names of the settings on the command line."""
+    """What stands before the names of the settings on the command line."""
 
     def __init_subclass__(cls, group: str | None = None) -> None:
-        """Sets the prefix from the name of the group, which is by default that of the class."""
+        """Set the prefix from the name of the group, which is by default that of the class."""
         group = cls.__name__.removesuffix("Settings").lower() if group is None else group
         cls.prefix = "" if group == "mapper" else f"{group}."
 
     def __post_init__(self) -> None:
-        """Raises a SettingsError that names the first wrong setting, as the command line knows it."""
+        """Raise a SettingsError that names the first wrong setting, as the command line knows it."""
         for entry in fields(self):  # type: ignore[arg-type]  # every heir is a dataclass
             value = getattr(self, entry.name)
             if isinstance(value, bool) or not isinstance(value, int | float):
