@@ -23,12 +23,8 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-<<<<<<< HEAD
 from pathspace_graph.landmark.batch import solve_landmarks
-=======
-from pathspace_graph.landmark.oracle import solve_landmarks
 from pathspace_graph.settings import calibration
->>>>>>> 5ded1ab (The limit's test is certain of its start by the constant)
 from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.faults import Faults, SensorFaults
