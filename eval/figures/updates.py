@@ -229,7 +229,7 @@ def fit() -> Fit:
     covariances = _ray_covariances(detections - np.array(_VEHICLE), _SIGMAS)
     foot_u = curve.foot_points(detections).u
     basis = curve.basis_matrix(foot_u)
-    settings = CkfSettings(ridge=RIDGE, penalty="solution")
+    settings = CkfSettings(ridge=RIDGE)
     measurement = fit_detections(basis, detections, covariances, curve.control_points, settings)
     sigma_points = _sigma_points(detections, covariances)
     innovations = sigma_points - basis @ curve.control_points

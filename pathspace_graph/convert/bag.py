@@ -158,7 +158,7 @@ def transform_between(static: list[Any], body: str, sensor: str) -> Array | None
         step = np.eye(4)
         step[:3, :3], step[:3, 3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), (p.x, p.y, p.z)
         edges.setdefault(parent, []).append((child, step))
-        edges.setdefault(child, []).append((parent, np.linalg.inv(step)))
+        edges.setdefault(child, []).append((parent, np.asarray(np.linalg.inv(step), float)))
     known, waiting = {body: np.eye(4)}, [body]
     while waiting:
         frame = waiting.pop()

@@ -101,9 +101,10 @@ def twist_of(message: Any, wheelbase: float | None = None) -> Array | None:
     drive = getattr(message, "drive", message)
     speed = next((getattr(drive, name) for name in SPEEDS if hasattr(drive, name)), None)
     if speed is not None:
-        steering = getattr(drive, "steering_angle", None)
-        known = steering is not None and wheelbase is not None
-        return np.array([speed, 0.0, speed * np.tan(steering) / wheelbase if known else np.nan], dtype=float)
+        steering, rate = getattr(drive, "steering_angle", None), np.nan
+        if steering is not None and wheelbase is not None:
+            rate = float(speed) * np.tan(float(steering)) / wheelbase
+        return np.array([float(speed), 0.0, rate])
     if pose_of(message) is None:
         raise MessageError(f"expected a message with a twist, a speed or a pose, found {_names(message)}")
     return None

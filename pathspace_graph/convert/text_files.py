@@ -244,7 +244,7 @@ def _covariances(file: _File) -> Array:
 def _labels(file: _File, rule: LabelRule) -> NDArray[np.int_]:
     if not file.has("label"):
         return np.full(len(file.table), UNKNOWN)
-    return rule.of_all(file.table.columns[file.column("label").name])
+    return rule.of_all(np.array(file.table.columns[file.column("label").name]))
 
 
 # --- JSON lines ------------------------------------------------------------------------------------------
@@ -282,8 +282,11 @@ def read_json_lines(file: Path, rule: LabelRule) -> Recording:
 def _points_of_objects(objects: list[dict[str, Any]], rule: LabelRule) -> Points:
     points, covariances, labels = [], [], []
     for one in objects:
-        r, bearing = (one.get(key) for key in ("range", "bearing"))
-        place = (one["x"], one["y"]) if r is None else (r * np.cos(bearing), r * np.sin(bearing))
+        if "range" in one:
+            r, bearing = float(one["range"]), float(one["bearing"])
+            place = r * np.cos(bearing), r * np.sin(bearing)
+        else:
+            place = one["x"], one["y"]
         points.append(np.array(place, dtype=float))
         covariances.append(np.array(one.get("covariance", UNSTATED), dtype=float).reshape(2, 2))
         labels.append(rule.of(one["label"]) if "label" in one else UNKNOWN)
