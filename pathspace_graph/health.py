@@ -77,7 +77,7 @@ class HealthMonitor:
         self._offered, self._last_offered, self._wrong = 0, None, None
 
     def update(self, evidence: Evidence) -> Health:
-        """Returns the health at a cycle."""
+        """Return the health at a cycle."""
         if self._recent and self._recent[-1].closed != evidence.closed:
             self.restart()
         self._remember(evidence)
@@ -94,7 +94,7 @@ class HealthMonitor:
         return self._beside_gap(offered) if health == Health(GOOD) else health
 
     def _beside_gap(self, offered: int) -> Health:
-        """Returns the health where nothing is wrong, but the map may have a gap of a boundary."""
+        """Return the health where nothing is wrong, but the map may have a gap of a boundary."""
         unmapped = [sum(one.unmapped[label] for one in self._recent) for label in BOUNDARIES]
         most = (1.0 - self.settings.share_degraded) * (offered + sum(unmapped))
         names = [NAMES[label] for label in BOUNDARIES if unmapped[label] > most]
@@ -103,7 +103,7 @@ class HealthMonitor:
         return Health(DEGRADED, f"the {names[0]} boundary is not mapped here") if names else Health(GOOD)
 
     def _wrong_side(self) -> str:
-        """Returns which boundary is wrong, where the other one explains its detections, or an empty string.
+        """Return which boundary is wrong, where the other one explains its detections, or an empty string.
 
         It is the map that is wrong then: a vehicle that is lost has both boundaries beside it. A boundary
         stays wrong while too little of the other one is mapped to say anything.
@@ -116,7 +116,7 @@ class HealthMonitor:
         return "" if self._wrong is None else f"the {NAMES[self._wrong]} boundary is not where the map has it"
 
     def _holds(self, label: int) -> bool | None:
-        """Returns whether a boundary explains its detections, or None if there are too few of them."""
+        """Return whether a boundary explains its detections, or None if there are too few of them."""
         offered = sum(one.offered_by[label] for one in self._recent)
         explained = sum(one.explained_by[label] for one in self._recent)
         if offered < self.settings.min_offered / len(BOUNDARIES):
@@ -124,7 +124,7 @@ class HealthMonitor:
         return explained >= self.settings.share_degraded * offered
 
     def _remember(self, evidence: Evidence) -> None:
-        """Adds the evidence of a cycle, and drops what is too old and not needed for `min_offered`."""
+        """Add the evidence of a cycle, and drops what is too old and not needed for `min_offered`."""
         recent = self._recent
         recent.append(evidence)
         self._offered += evidence.offered
@@ -136,7 +136,7 @@ class HealthMonitor:
             self._offered -= recent.popleft().offered
 
     def _judge(self, newest: Evidence, share: float, innovation: float, most: float) -> Health:
-        """Returns the health by the share of explained detections, and by the innovation and its limit."""
+        """Return the health by the share of explained detections, and by the innovation and its limit."""
         settings = self.settings
         lost = settings.share_lost if newest.closed else 0.0  # on an open map it goes on by dead reckoning
         degraded = settings.share_degraded if newest.closed else settings.open_degraded
@@ -177,7 +177,7 @@ class Stretch:
 
 
 def stretches(t: Sequence[float], healths: Sequence[Health]) -> list[Stretch]:
-    """Returns the stretches of a run that were not good, from the stamps and the health of its cycles."""
+    """Return the stretches of a run that were not good, from the stamps and the health of its cycles."""
     found = []
     for condition, group in groupby(zip(t, healths, strict=True), key=lambda cycle: cycle[1].condition):
         cycles = list(group)
@@ -187,6 +187,6 @@ def stretches(t: Sequence[float], healths: Sequence[Health]) -> list[Stretch]:
 
 
 def counts(healths: Sequence[Health]) -> dict[str, int]:
-    """Returns the number of cycles of each condition."""
+    """Return the number of cycles of each condition."""
     number = Counter(health.condition for health in healths)
     return {condition: number[condition] for condition in CONDITIONS}

@@ -51,7 +51,7 @@ class LapCounter:
         self._last: tuple[float, float, float] | None = None
 
     def update(self, pose: ArrayLike) -> int:
-        """Returns the lap, counted from 1, that the next `pose` (3,) [x, y, theta] belongs to."""
+        """Return the lap, counted from 1, that the next `pose` (3,) [x, y, theta] belongs to."""
         x, y, theta = (float(value) for value in np.asarray(pose, dtype=float))
         if self._last is not None:
             self._path += float(np.hypot(x - self._last[0], y - self._last[1]))
@@ -64,7 +64,7 @@ class LapCounter:
 
     @property
     def last_lap_is_complete(self) -> bool:
-        """Says whether the current lap has come back to within `end_tolerance` of the start line."""
+        """Say whether the current lap has come back to within `end_tolerance` of the start line."""
         if self._last is None or not self._has_driven_a_lap():
             return False
         x, y, theta = self._last
@@ -72,7 +72,7 @@ class LapCounter:
 
     @property
     def completed(self) -> int:
-        """Returns the number of complete laps, with a last one that ends just before the line."""
+        """Return the number of complete laps, with a last one that ends just before the line."""
         return self.lap - 1 + int(self.last_lap_is_complete)
 
     def _has_driven_a_lap(self) -> bool:
@@ -92,7 +92,7 @@ class LapCounter:
 
 
 def lap_end_indices(poses: Array, settings: LapSettings | None = None) -> NDArray[np.intp]:
-    """Returns the index of the pose (k,) at which each complete lap ends, of poses (N, 3) in the map frame.
+    """Return the index of the pose (k,) at which each complete lap ends, of poses (N, 3) in the map frame.
 
     A last lap that ends within `end_tolerance` of the line is complete, and ends with the last pose. A lap
     that the log breaks off is not listed.

@@ -66,13 +66,13 @@ class OnlineEstimator(Protocol):
 
     @property
     def settings(self) -> Any:
-        """Returns a frozen dataclass with all settings of the estimator."""
+        """Return a frozen dataclass with all settings of the estimator."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """Processes one perception cycle: the twists since the last one, and the detections of this one."""
 
     def map(self) -> Map:
-        """Returns a copy of the map as it stands."""
+        """Return a copy of the map as it stands."""
 
 
 class BatchEstimator(Protocol):
@@ -80,10 +80,10 @@ class BatchEstimator(Protocol):
 
     @property
     def settings(self) -> Any:
-        """Returns a frozen dataclass with all settings of the estimator."""
+        """Return a frozen dataclass with all settings of the estimator."""
 
     def solve(self, log: Log) -> BatchRun:
-        """Returns the optimum over a whole log, whose truth is not read."""
+        """Return the optimum over a whole log, whose truth is not read."""
 
 
 @runtime_checkable
@@ -91,7 +91,7 @@ class OutliningEstimator(Protocol):
     """Describes an online estimator whose map is cheap to look at in every cycle."""
 
     def outline(self) -> Map:
-        """Returns a copy of the map as it stands, without covariances, which are empty (0, 0)."""
+        """Return a copy of the map as it stands, without covariances, which are empty (0, 0)."""
 
 
 @runtime_checkable
@@ -99,7 +99,7 @@ class VehicleEstimator(Protocol):
     """Describes an online estimator that says how well it knows the vehicle's pose and its calibration."""
 
     def vehicle_state(self) -> VehicleState:
-        """Returns the newest pose and the calibration, with their joint covariance."""
+        """Return the newest pose and the calibration, with their joint covariance."""
 
 
 @runtime_checkable
@@ -107,7 +107,7 @@ class NoiseEstimator(Protocol):
     """Describes an online estimator that says which noise it uses."""
 
     def noise_used(self) -> RunNoise:
-        """Returns the noise that is used now, and what was measured so far."""
+        """Return the noise that is used now, and what was measured so far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,7 @@ class ReadingEstimator(Protocol):
     """Describes an online estimator that says which detections of the newest cycle it used, and where."""
 
     def readings(self) -> Readings:
-        """Returns the detections of the newest cycle as they were used or gated."""
+        """Return the detections of the newest cycle as they were used or gated."""
 
 
 @runtime_checkable
@@ -140,7 +140,7 @@ class WindowEstimator(Protocol):
     """Describes an online estimator that keeps a window of poses."""
 
     def window_poses(self) -> Array:
-        """Returns a copy of the poses (P, 3) in the window, the oldest first, map frame."""
+        """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
 
 
 @runtime_checkable
@@ -148,7 +148,7 @@ class LookedAtEstimator(Protocol):
     """Describes an online estimator that has to be told that it is looked at only."""
 
     def looked_at(self) -> AbstractContextManager[None]:
-        """Returns a context in which nothing that is asked for changes the estimate."""
+        """Return a context in which nothing that is asked for changes the estimate."""
 
 
 @runtime_checkable
@@ -156,19 +156,19 @@ class BatchingEstimator(Protocol):
     """Describes an online estimator that has batches solved by another process while it goes on."""
 
     def wait(self) -> None:
-        """Waits for the batch whose result the next update may take, however long that takes."""
+        """Wait for the batch whose result the next update may take, however long that takes."""
 
     def batches(self) -> LapBatches:
-        """Returns the cycles in which batches have ended."""
+        """Return the cycles in which batches have ended."""
 
 
 def scale(estimator: OnlineEstimator) -> float:
-    """Returns the scale of the scene as an estimator knows it; 1 where it takes every scene as it is."""
+    """Return the scale of the scene as an estimator knows it; 1 where it takes every scene as it is."""
     return float(getattr(estimator, "scale", 1.0))
 
 
 def outline(estimator: OnlineEstimator) -> Map:
-    """Returns the present map, without covariances where the estimator can give it so."""
+    """Return the present map, without covariances where the estimator can give it so."""
     return estimator.outline() if isinstance(estimator, OutliningEstimator) else estimator.map()
 
 
@@ -195,7 +195,7 @@ class ObservedCycle:
 
     @cached_property
     def record(self) -> CycleRecord:
-        """Returns the cycle as a row of `cycles.csv` has it."""
+        """Return the cycle as a row of `cycles.csv` has it."""
         result = self.result
         return CycleRecord(
             cycle=self.number,
@@ -219,24 +219,24 @@ class ObservedCycle:
 
     @cached_property
     def outline(self) -> Map:
-        """Returns the map as it stands, without covariances where the estimator can give it so."""
+        """Return the map as it stands, without covariances where the estimator can give it so."""
         return outline(self.estimator)
 
     @cached_property
     def map(self) -> Map:
-        """Returns the map as it stands, with its covariances, which takes much longer than the outline."""
+        """Return the map as it stands, with its covariances, which takes much longer than the outline."""
         estimator = self.estimator
         with estimator.looked_at() if isinstance(estimator, LookedAtEstimator) else nullcontext():
             return estimator.map()
 
     @cached_property
     def readings(self) -> Readings | None:
-        """Returns which detections were used; it is None where the estimator does not say it."""
+        """Return which detections were used; it is None where the estimator does not say it."""
         return self.estimator.readings() if isinstance(self.estimator, ReadingEstimator) else None
 
     @cached_property
     def window(self) -> Array:
-        """Returns the poses (P, 3) in the window, the oldest first; a filter has none."""
+        """Return the poses (P, 3) in the window, the oldest first; a filter has none."""
         estimator = self.estimator
         return estimator.window_poses() if isinstance(estimator, WindowEstimator) else np.zeros((0, 3))
 
@@ -255,7 +255,7 @@ class Stopwatch:
 
     @property
     def spent(self) -> float:
-        """Returns the time (s) of all stages so far."""
+        """Return the time (s) of all stages so far."""
         return sum(self.laps.values())
 
     def lap(self, name: str) -> None:
@@ -266,7 +266,7 @@ class Stopwatch:
 
 
 def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
-    """Yields each perception cycle with the twists since the cycle before it, none later than its stamp.
+    """Yield each perception cycle with the twists since the cycle before it, none later than its stamp.
 
     The rows tile the time without a gap, row i being in force during [t_i, t_(i+1)). The first row begins at
     the stamp of the cycle before with the twist that was held then. The last row is held until the cycle.
@@ -278,7 +278,7 @@ def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
 
 
 def timed_wait(estimator: OnlineEstimator) -> float:
-    """Waits for what the next update may take from another process, and returns the wall time (s) of that.
+    """Wait for what the next update may take from another process, and returns the wall time (s) of that.
 
     So the update itself waits for nothing, and a replay depends on no other process's speed.
     """
@@ -292,7 +292,7 @@ def timed_wait(estimator: OnlineEstimator) -> float:
 def timed_update(
     estimator: OnlineEstimator, odometry: Odometry, detections: Detections
 ) -> tuple[CycleResult, float]:
-    """Does one update, and returns the estimate and the wall time (s) that the update took."""
+    """Do one update, and returns the estimate and the wall time (s) that the update took."""
     begin = time.perf_counter()
     estimate = estimator.update(odometry, detections)
     return estimate, time.perf_counter() - begin
@@ -346,7 +346,7 @@ class _Run:
         self._records: list[CycleRecord] = []
 
     def cycle(self, odometry: Odometry, detections: Detections) -> None:
-        """Runs and times one update, records it, and shows it to the observers."""
+        """Run and times one update, records it, and shows it to the observers."""
         self._take_snapshots(before=detections.t)
         self._waited += timed_wait(self._estimator)
         result, seconds = timed_update(self._estimator, odometry, detections)
@@ -364,7 +364,7 @@ class _Run:
             self._observing += time.perf_counter() - begin
 
     def result(self, name: str) -> RunResult:
-        """Returns the results after the last cycle."""
+        """Return the results after the last cycle."""
         self._take_snapshots(before=float("inf"))
         track = self._estimator.map()
         if self._laps.last_lap_is_complete:
@@ -399,5 +399,5 @@ def _vehicle_state(estimator: OnlineEstimator) -> VehicleState | None:
 
 
 def settings_dict(settings: Any) -> dict[str, Any]:
-    """Returns a settings dataclass with all nested ones as dictionaries; it is empty for anything else."""
+    """Return a settings dataclass with all nested ones as dictionaries; it is empty for anything else."""
     return asdict(settings) if is_dataclass(settings) and not isinstance(settings, type) else {}

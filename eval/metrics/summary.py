@@ -32,7 +32,7 @@ from .trajectory import ate, trajectory_errors
 Array = NDArray[np.float64]
 
 LIBRARIES: Final = ("pathspace-graph", "gtsam", "numpy", "scipy")
-"""The versions of these libraries are recorded."""
+"""Libraries whose versions are recorded."""
 
 
 def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
@@ -152,7 +152,7 @@ def stretches_of(result: RunResult) -> list[Stretch]:
 
 
 def health_of(record: CycleRecord) -> Health:
-    """Return the health that a cycle's record holds."""
+    """Return the health in a cycle's record."""
     return Health(record.health, record.reason)
 
 

@@ -59,7 +59,7 @@ class Compare:
     """These settings hold for every estimator."""
 
     def run(self) -> None:
-        """Checks everything, runs, writes and reports; the exit code is 3 where an estimator failed."""
+        """Check everything, runs, writes and reports; the exit code is 3 where an estimator failed."""
         estimators = choose(self.estimators)
         reference = choose_reference(self.reference, estimators)
         check_jobs(self.jobs)

@@ -56,7 +56,7 @@ class Export:
     """The `profile` of an open track ends at a standstill."""
 
     def run(self) -> None:
-        """Reads the map and writes the file."""
+        """Read the map and writes the file."""
         check_file_target(self.out)
         if not LEAST_STEP <= self.step < np.inf:
             raise SettingsError(
@@ -100,7 +100,7 @@ class Export:
 
 
 def write_true_path(folder: Path, out: Path) -> None:
-    """Writes the true poses of a log in the TUM format; InputError where they are not known."""
+    """Write the true poses of a log in the TUM format; InputError where they are not known."""
     truth = read_log(folder).truth
     if truth is None or len(truth.poses) == 0:
         raise InputError(folder, f"expected a log with {TRUTH_POSES_FILE}, or a map, found neither")
@@ -109,13 +109,13 @@ def write_true_path(folder: Path, out: Path) -> None:
 
 
 def copy_trajectory(source: Path, target: Path) -> None:
-    """Copies the trajectory of a map, which is in the TUM format already, once it is found right."""
+    """Copy the trajectory of a map, which is in the TUM format already, once it is found right."""
     read_trajectory(source)
     shutil.copyfile(source, target)
 
 
 def check_length(track: Map, step: float, file: Path) -> None:
-    """Raises an InputError where a curve has too many points at this step (m)."""
+    """Raise an InputError where a curve has too many points at this step (m)."""
     most = MOST_POINTS * step
     for boundary in track.boundaries.values():
         if isinstance(boundary, SplineBoundary) and boundary.spline.length() > most:

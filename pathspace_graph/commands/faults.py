@@ -27,6 +27,6 @@ class FaultSuite(StudyCommand):
     """Each fault is run at its greatest strength only."""
 
     def run(self) -> None:
-        """Checks, runs, writes and reports the suite; the exit code is 3 where runs failed."""
+        """Check, runs, writes and reports the suite; the exit code is 3 where runs failed."""
         chosen = replace(only(suite(), self.only), estimators=(self.estimator,))
         self.execute(strongest(chosen) if self.quick else chosen, write_suite)

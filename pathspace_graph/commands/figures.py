@@ -22,7 +22,7 @@ class Figures:
     backup."""
 
     def run(self) -> None:
-        """Computes, draws, writes and reports."""
+        """Compute, draws, writes and reports."""
         check_target(self.out, MARKER)
         with progress("drawing", len(FIGURES)) as advance, threadpool_limits(limits=1):
             write_figures(self.out, advance)

@@ -35,7 +35,7 @@ class Plot:
     """The picture has this title."""
 
     def run(self) -> None:
-        """Reads, draws and writes."""
+        """Read, draws and writes."""
         check_plot_file(self.out)
         check_file_target(self.out)
         if not 0.0 < self.band_scale < np.inf:

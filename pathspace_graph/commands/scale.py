@@ -46,7 +46,7 @@ class Scale:
     """These settings hold for every estimator."""
 
     def run(self) -> None:
-        """Checks everything, simulates, times, writes and reports."""
+        """Check everything, simulates, times, writes and reports."""
         names = tuple(dict.fromkeys(self.estimators or ONLINE))
         for name in names:
             check_online(name)

@@ -48,7 +48,7 @@ class Simulate:
 
     @classmethod
     def start(cls, arguments: Sequence[str]) -> Simulate:
-        """Returns the command with the presets among its arguments, before any other option is set."""
+        """Return the command with the presets among its arguments, before any other option is set."""
         words = [word for argument in arguments for word in argument.split("=", 1)]
         pairs = ((word.removeprefix("--"), value) for word, value in pairwise(words))
         # a wrong name is refused with the other options
@@ -56,7 +56,7 @@ class Simulate:
         return cls(out=MISSING, settings=preset(names))
 
     def run(self) -> None:
-        """Simulates and writes."""
+        """Simulate and writes."""
         check_target(self.out, LOG_FILE)
         with progress("driving"):
             log = simulate(self._track(), self.settings, self.seed)
@@ -74,14 +74,14 @@ class Simulate:
 
 
 def generated_track(seed: int, settings: TrackGeneratorSettings | None = None) -> Track:
-    """Returns the generated track of a seed."""
+    """Return the generated track of a seed."""
     if seed < 0:
         raise SettingsError(f"seed of a generated track: expected at least 0, found {seed}")
     return generate_track(np.random.default_rng(seed), settings)
 
 
 def describe(log: Log) -> str:
-    """Returns the length of the log in words."""
+    """Return the length of the log in words."""
     detections = sum(len(cycle.labels) for cycle in log.cycles)
     seconds = log.odometry.t[-1] - log.odometry.t[0]
     return f"{seconds:.1f} s, {len(log.cycles)} perception cycles, {detections} detections"

@@ -43,7 +43,7 @@ class StudyCommand:
     """This number of laps replaces the study's own."""
 
     def execute(self, study: Study, write: Callable[[Study, pd.DataFrame, Path], str]) -> None:
-        """Checks, runs, writes and reports a study; the exit code is 3 where cells failed.
+        """Check, runs, writes and reports a study; the exit code is 3 where cells failed.
 
         `write` writes the results to the folder, and returns the text that is printed.
         """
@@ -61,7 +61,7 @@ class StudyCommand:
 
 
 def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], laps: int | None) -> Study:
-    """Returns the study with other tracks, seeds and laps, where any are given.
+    """Return the study with other tracks, seeds and laps, where any are given.
 
     A track is a file, or the seed of a generated track.
     """
@@ -74,7 +74,7 @@ def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], l
 
 
 def report_failures(frame: pd.DataFrame, cells: int) -> None:
-    """Says on standard error how many cells failed, and exits with code 3 where any did."""
+    """Say on standard error how many cells failed, and exits with code 3 where any did."""
     failures = frame[frame["failure"] != ""]
     if len(failures):
         line = f"{len(failures)} of {cells} cells failed, the first of {failures.iloc[0]['failure']}"

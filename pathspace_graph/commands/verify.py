@@ -19,7 +19,7 @@ class Verify:
     """The folder is a log, a map, or the result of another command, with its subfolders."""
 
     def run(self) -> None:
-        """Checks and reports; a file that is missing or has changed ends it."""
+        """Check and reports; a file that is missing or has changed ends it."""
         count = verify_all(self.folder)
         line = f"{self.folder}: {count} files are as they were written"
         Console().print(line, highlight=False, soft_wrap=True, markup=False)

@@ -97,17 +97,17 @@ class TrackAhead:
 
     @property
     def closed(self) -> bool:
-        """Returns false: what is ahead is a stretch, also of a closed track."""
+        """Return false: what is ahead is a stretch, also of a closed track."""
         return False
 
     @property
     def length(self) -> float:
-        """Returns how far the centre line is known, in m."""
+        """Return how far the centre line is known, in m."""
         return float(self.arc_length[-1]) if len(self.arc_length) else 0.0
 
 
 def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, step: float) -> TrackAhead:
-    """Returns the next `distance` metres of a track from a pose (x, y, theta), at points `step` (m) apart.
+    """Return the next `distance` metres of a track from a pose (x, y, theta), at points `step` (m) apart.
 
     `curves` are the boundaries by label, as far as they are known. SettingsError is raised where a length is
     out of its range.
@@ -153,13 +153,13 @@ class _Samples:
     """A sample (n,) is confirmed, or may be taken back."""
 
     def beside(self, distance: float) -> Array:
-        """Returns the points (k, 2) from beside the vehicle on, along a distance (m)."""
+        """Return the points (k, 2) from beside the vehicle on, along a distance (m)."""
         wanted = (self.station >= -_SETTLED) & (self.station <= distance + _SETTLED)
         return self.points[wanted][::_ACROSS]
 
 
 def _sampled(curve: CurveAhead, distance: float) -> _Samples:
-    """Returns samples from behind the vehicle to where the curve is no longer needed."""
+    """Return samples from behind the vehicle to where the curve is no longer needed."""
     tables = curve.tables
     begin, end = curve.beside - _BEHIND, curve.beside + _OUTER * distance + _BEHIND
     if tables.periodic:
@@ -193,7 +193,7 @@ def _sampled(curve: CurveAhead, distance: float) -> _Samples:
 
 
 def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Returns the positions and two derivatives (n, 2) of a cubic from an end (2,) through points (k, 2).
+    """Return the positions and two derivatives (n, 2) of a cubic from an end (2,) through points (k, 2).
 
     It begins with the slope of the curve (2,), and has the slopes of Catmull and Rom at the points.
     """
@@ -228,7 +228,7 @@ class _Line:
 
 
 def _first_line(left: _Samples, right: _Samples) -> _Line:
-    """Returns the middles between samples of the left boundary and those across, in the order of travel."""
+    """Return the middles between samples of the left boundary and those across, in the order of travel."""
     of = slice(None, None, _ACROSS)
     lefts, rights = left.points[of], right.points[of]
     stations = left.station[of], right.station[of]
@@ -243,7 +243,7 @@ def _first_line(left: _Samples, right: _Samples) -> _Line:
 
 
 def _from_beside(line: _Line, position: Array, distance: float, step: float) -> _Line:
-    """Returns the line at even steps, from the point beside a position (2,) on."""
+    """Return the line at even steps, from the point beside a position (2,) on."""
     edges = np.diff(line.points, axis=0)
     squares = _dot(edges, edges)
     offset = position - line.points[:-1]
@@ -264,7 +264,7 @@ def _from_beside(line: _Line, position: Array, distance: float, step: float) -> 
 def _settled(
     left: _Samples, right: _Samples, line: _Line, pose: Array, step: float, sides: Sequence[Array]
 ) -> TrackAhead:
-    """Returns the track ahead at the points of the line, moved along its normals to equal distances."""
+    """Return the track ahead at the points of the line, moved along its normals to equal distances."""
     points, feet = line.points, [_Feet(left, line.left), _Feet(right, line.right)]
     for _ in range(_SETTLING_STEPS):
         for foot in feet:
@@ -309,7 +309,7 @@ class _Feet:
         self._normals = left_of(samples.tangents)
 
     def find(self, points: Array) -> None:
-        """Finds the foot points of points (n, 2), and goes on to the sample that is nearest to each."""
+        """Find the foot points of points (n, 2), and goes on to the sample that is nearest to each."""
         samples, last = self._samples, len(self._samples.station) - 1
         self._frame(points)
         ahead = self.a / self.spread
@@ -340,12 +340,12 @@ class _Feet:
 
     @property
     def offset_curvature(self) -> Array:
-        """Returns k / (1 - k d) (n,), the curvature of the parallel curve through each point."""
+        """Return k / (1 - k d) (n,), the curvature of the parallel curve through each point."""
         spread = 1.0 - self.k * self.distance
         return np.asarray(self.k / np.where(np.abs(spread) > _SETTLED, spread, _SETTLED))
 
     def width(self, points: Array, way: Array) -> Array:
-        """Returns how far (n,) the circle is from points (n, 2) along unit vectors (n, 2).
+        """Return how far (n,) the circle is from points (n, 2) along unit vectors (n, 2).
 
         The distance w solves `k w^2 + 2 w (k (a s + b t) - t) + k (a^2 + b^2) - 2 b = 0` for the way (s, t).
         """
@@ -361,12 +361,12 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _distances(points: Array) -> Array:
-    """Returns the distance (n,) of each point from the one before, and 0 for the first."""
+    """Return the distance (n,) of each point from the one before, and 0 for the first."""
     edges = np.diff(points, axis=0, prepend=points[:1])
     return np.asarray(np.hypot(edges[:, 0], edges[:, 1]))
 
 
 def _lengths(points: Array, heading: Array) -> Array:
-    """Returns the arc length (n,) at points (n, 2), which are joined by circular arcs."""
+    """Return the arc length (n,) at points (n, 2), which are joined by circular arcs."""
     half = 0.5 * wrap_angle(np.diff(heading, prepend=heading[:1]))
     return np.asarray(np.cumsum(_distances(points) / np.sinc(half / np.pi)))
