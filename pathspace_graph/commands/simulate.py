@@ -25,26 +25,26 @@ from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate:
-    """Drives a track and writes the log of it, with truth; a seed gives the same log to the byte."""
+    """Drive a track and write the log of it, with truth; a seed gives the same log to the byte."""
 
     out: Path
-    """The log is written to this folder; an earlier log there is kept as a numbered backup."""
+    """Folder for the log; an earlier log there is kept as a numbered backup."""
     track: Path | None = None
-    """The track is read from this file: PacSim or fssim YAML, EUFS or TUM CSV."""
+    """Track file: PacSim or fssim YAML, EUFS or TUM CSV."""
     generate: int | None = None
-    """Where no track file is given, a Formula Student track is generated from this seed."""
+    """Seed of a generated Formula Student track, where no track file is given."""
     event: Literal["skidpad", "acceleration"] | None = None
-    """Or else the drive is this event, on the track that the rules describe."""
+    """Event that is driven instead, on the track that the rules describe."""
     seed: int = 0
-    """The drive's wander and all noise are drawn from this seed."""
+    """Seed of the drive's wander and of all noise."""
     sensor: Literal["plain", "camera"] = "plain"
     """Preset of `--sensor.*` and `--faults.sensor.*`, each of which can still be set."""
     odometry: Literal["plain", "ins"] = "plain"
     """Preset of `--odometry.*` and `--vehicle.rate`, each of which can still be set."""
     settings: Annotated[SimulationSettings, arg(name="")] = field(default_factory=SimulationSettings)
-    """These settings describe the drive."""
+    """Settings of the drive."""
     generator: TrackGeneratorSettings = field(default_factory=TrackGeneratorSettings)
-    """These settings are the rules of a generated track."""
+    """Rules of a generated track."""
 
     @classmethod
     def start(cls, arguments: Sequence[str]) -> Simulate:
@@ -56,7 +56,6 @@ class Simulate:
         return cls(out=MISSING, settings=preset(names))
 
     def run(self) -> None:
-        """Simulate and writes."""
         check_target(self.out, LOG_FILE)
         with progress("driving"):
             log = simulate(self._track(), self.settings, self.seed)

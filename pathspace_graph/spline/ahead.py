@@ -25,42 +25,42 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 _SAMPLE_STEP: Final = 0.5
-"""The boundaries are sampled at about this distance (m). The circle at a sample is right to a millimetre."""
+"""Approximate distance of boundary samples (m). The circle at a sample is right to a millimetre."""
 _ACROSS: Final = 2
-"""The points across are searched among every so-manyth sample."""
+"""Stride of the samples among which the points across are searched."""
 _BEHIND: Final = 3.0
-"""The samples begin this far behind the vehicle (m), since it may stand askew."""
+"""Distance behind the vehicle at which the samples begin (m), since it may stand askew."""
 _OUTER: Final = 1.8
-"""The outer boundary of a turn is at most this number of times as long as the centre line."""
+"""Largest ratio of the length of a turn's outer boundary to that of the centre line."""
 _SETTLING_STEPS: Final = 8
-"""The stations are settled by at most this number of Newton steps; mostly two are enough."""
+"""Largest number of Newton steps that settle the stations; mostly two are enough."""
 _SETTLED: Final = 1e-3
-"""A station is on the line where its distances from both boundaries differ by at most this (m)."""
+"""Largest difference of a point's distances from both boundaries where it is on the line (m)."""
 _LARGEST_GAP: Final = 2.0
-"""Neighbours are at most this many steps apart."""
+"""Largest number of steps between neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
 class CurveAhead:
-    """Holds a boundary in the direction of travel, and where the vehicle is on it."""
+    """A boundary in the direction of travel, and the vehicle's place on it."""
 
     tables: SpanPolynomials
-    """The parameter is about a length in m."""
+    """Basis, whose parameter is about a length in m."""
     control_points: Array
-    """(n, 2) These are its control points in m, map frame; those of a closed curve repeat."""
+    """(n, 2) Control points in m, map frame; those of a closed curve repeat."""
     beside: float
-    """The vehicle's foot point is at about this parameter."""
+    """Parameter of about the vehicle's foot point."""
     until: float = np.inf
-    """An open curve is confirmed up to this parameter, where it ends."""
+    """Parameter up to which an open curve is confirmed, where it ends."""
     tentative: Array | None = None
-    """(k, 2) From its end the boundary leads on through these points (m, map frame), as far as is known."""
+    """(k, 2) Points through which the boundary leads on from its end, as far as is known (m, map frame)."""
     confirmed: bool = True
-    """The curve itself may be taken back where this is false."""
+    """Whether the curve itself is sure not to be taken back."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackAhead:
-    """Holds the next stretch of the track in the vehicle's frame (x forward, y left, m and rad).
+    """The next stretch of the track in the vehicle's frame (x forward, y left, m and rad).
 
     The centre line has n points: n is 0 where only one boundary is known, and smaller than what was asked for
     where the map ends. Each point is equally far from both boundaries.
@@ -77,23 +77,23 @@ class TrackAhead:
     }
 
     points: Array
-    """These are the points (n, 2) in m; the first one is beside the vehicle."""
+    """Points (n, 2) in m; the first one is beside the vehicle."""
     heading: Array
-    """This is the direction of travel (n,) in rad from that of the vehicle, in (-pi, pi]."""
+    """Direction of travel (n,) in rad from that of the vehicle, in (-pi, pi]."""
     curvature: Array
-    """This is the curvature (n,) in 1/m, positive in a left turn."""
+    """Curvature (n,) in 1/m, positive in a left turn."""
     arc_length: Array
-    """This is the length (n,) of the line from its first point, in m."""
+    """Length (n,) of the line from its first point, in m."""
     width_left: Array
-    """This is the distance (n,) along the normal to the left boundary, in m."""
+    """Distance (n,) along the normal to the left boundary, in m."""
     width_right: Array
-    """This is the distance (n,) along the normal to the right boundary, in m."""
+    """Distance (n,) along the normal to the right boundary, in m."""
     confirmed: Bools
-    """A point (n,) is confirmed where both boundaries are; another one may be taken back."""
+    """Whether both boundaries are confirmed at each point (n,); another one may be taken back."""
     left: Array
-    """These are points (k, 2) of the left boundary from beside the vehicle on, in m."""
+    """Points (k, 2) of the left boundary from beside the vehicle on, in m."""
     right: Array
-    """These are points (h, 2) of the right boundary from beside the vehicle on, in m."""
+    """Points (h, 2) of the right boundary from beside the vehicle on, in m."""
 
     @property
     def closed(self) -> bool:
@@ -139,18 +139,18 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Holds a boundary at n places."""
+    """A boundary at n places."""
 
     points: Array
-    """These are the points (n, 2) in m, map frame."""
+    """Points (n, 2) in m, map frame."""
     tangents: Array
-    """These are the unit tangents (n, 2)."""
+    """Unit tangents (n, 2)."""
     curvature: Array
-    """This is the curvature (n,) in 1/m."""
+    """Curvature (n,) in 1/m."""
     station: Array
-    """This is the length (n,) along the boundary, from beside the vehicle, in m."""
+    """Length (n,) along the boundary, from beside the vehicle, in m."""
     confirmed: Bools
-    """A sample (n,) is confirmed, or may be taken back."""
+    """Whether each sample (n,) is confirmed, or may be taken back."""
 
     def beside(self, distance: float) -> Array:
         """Return the points (k, 2) from beside the vehicle on, along a distance (m)."""
@@ -220,7 +220,7 @@ def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Arra
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """Holds points (n, 2) near the centre line, with the stations (n,) of their foot points."""
+    """Points (n, 2) near the centre line, with the stations (n,) of their foot points."""
 
     points: Array
     left: Array
@@ -296,7 +296,7 @@ def _settled(
 
 
 class _Feet:
-    """Finds the foot points (n,) of stations on a boundary, by the circle that osculates it at a sample.
+    """Foot points (n,) of stations on a boundary, by the circle that osculates it at a sample.
 
     In the frame of the sample, with a point at (a, b), a along and b to the left, and the curvature k, the
     circle has its centre at (0, 1 / k). With q = |(k a, 1 - k b)| the distance is
@@ -309,7 +309,7 @@ class _Feet:
         self._normals = left_of(samples.tangents)
 
     def find(self, points: Array) -> None:
-        """Find the foot points of points (n, 2), and goes on to the sample that is nearest to each."""
+        """Find the foot points of points (n, 2), and go on to the sample that is nearest to each."""
         samples, last = self._samples, len(self._samples.station) - 1
         self._frame(points)
         ahead = self.a / self.spread

@@ -37,17 +37,17 @@ class SampledLine(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SpeedProfile:
-    """Holds the speed at the n points of a line."""
+    """Speed at the n points of a line."""
 
     speed: Array
-    """This is the speed (n,) in m/s."""
+    """Speed (n,) in m/s."""
     acceleration: Array
-    """This is the acceleration along the line (n,) from each point to the next one, in m/s^2; it is 0 at the
-    last point of an open line."""
+    """Acceleration along the line (n,) from each point to the next one, in m/s^2; 0 at the last point of an
+    open line."""
     time: Array
-    """This is the time (n,) since the first point, in s."""
+    """Time (n,) since the first point, in s."""
     duration: float
-    """The whole line takes this time (s): the lap time of a closed one."""
+    """Time for the whole line (s): the lap time of a closed one."""
 
 
 def speed_profile(
