@@ -11,7 +11,7 @@ from typing import Any, Final
 
 
 class PathspaceError(Exception):
-    """This is the base of all errors that a user can mend.
+    """Base of all errors that a user can mend.
 
     Its text is one line that says what was expected and what was found.
     """
@@ -42,7 +42,7 @@ class ReadingError(PathspaceError):
     ) -> None:
         self.field, self.expected, self.found, self.row = field, expected, found, row
         self.t = t
-        """This is the stamp of the cycle (s), where it has one."""
+        """Stamp of the cycle (s), where it has one."""
         when = "" if t is None else f"cycle at {t:.12g} s: "
         where = field if row is None else f"{field}, row {row}"
         value = f"{found:g}" if isinstance(found, float) else str(found)
@@ -102,7 +102,7 @@ NUMBERS: Final[dict[str, Callable[[Any], bool]]] = {
     "a number of at least 0": lambda value: 0 <= value < inf,
     "a number in [0, 1]": lambda value: 0 <= value <= 1,
 }
-"""A number is checked against one of these, by the words of the message."""
+"""Checks of numbers, by the words of the message."""
 
 
 def check_numbers(settings: object, group: str, names: Iterable[str], expected: str) -> None:

@@ -45,9 +45,7 @@ class Lane:
     """An estimator that is to map a log."""
 
     estimator: str
-    """Name of the estimator."""
     log: Log
-    """Log to map."""
     readings: int = 0
     """Number of detections in each cycle of the log, where they are varied."""
 

@@ -55,7 +55,7 @@ class CurveGauge:
         return residual, heading, np.column_stack([-heading, by_theta])
 
     def beside(self, control_points: Array, poses: Array) -> Rows:
-        """Return the same as rows on [control point | pose], from all poses (P, 3)."""
+        """Return `terms` as rows on [control point | pose], from all poses (P, 3)."""
         residual, by_point, by_pose = self.terms(control_points, poses[self.cycle])
         jacobian = np.column_stack([by_point, by_pose])
         return Rows(self._keys_beside, jacobian, residual, owners(self.cycle, self.label))
@@ -79,7 +79,7 @@ class CurveGauge:
         return residual, by_control.reshape(len(residual), POINT, -1), by_pose
 
     def smooth(self, control_points: Array, poses: Array) -> Rows:
-        """Return the same as rows on [three control points | pose], two rows for each second difference."""
+        """Return `bending` as rows on [three control points | pose], two rows for each second difference."""
         residual, by_control, by_pose = self.bending(control_points, poses)
         keys = np.column_stack([self.keys[self.neighbours], pose_keys(self.middle_cycle)])
         return Rows(

@@ -52,10 +52,10 @@ GAP: Final = 25.0
 OVERLAP: Final = 15.0
 """Least length that has been driven again (m)."""
 SIGMA: Final = 0.3
-"""The detections after the first lap hold their drive beside the curves by this standard deviation at most
+"""Largest standard deviation by which the detections after the first lap hold their drive beside the curves
 (m), in every direction."""
 WIDER: Final = 2.5
-"""No point of a boundary is farther from the road driven than this number of times its distance beside it."""
+"""Largest ratio of a boundary point's distance from the road driven to the drive's distance beside it."""
 MOSTLY: Final = 95.0
 """Percentile of the poses' distances: the drive may begin or end off the track."""
 FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, knot_passes=1, tolerance=10.0)
@@ -92,7 +92,7 @@ class OpenLap:
     first_kept: int
     """The poses from this cycle on stay variables of the window."""
     start: ClosedMap | Recurrence
-    """The search begins at a map, or at odometry alone, where the path driven recurs after a lap."""
+    """Start of the search: a map, or odometry alone, where the path driven recurs after a lap."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class LapMarginal:
     poses: Array
     """(P, 3) Poses of all cycles of the lap, map frame."""
     first_kept: int
-    """The marginal has all measurements of the poses before this cycle, and none of later ones."""
+    """Cycle before whose pose all measurements are in the marginal, and no later ones."""
     mean: Array
     """(n,) Mean of the marginal."""
     information: Array
@@ -227,7 +227,7 @@ class Evidence:
     """What speaks for or against a closed result."""
 
     closed: bool
-    """True where both boundaries are closed."""
+    """Whether both boundaries are closed."""
     used: float
     """Share of the coloured detections of the first lap that lies on the curves."""
     used_again: float

@@ -76,9 +76,9 @@ class Projected:
     sigma: Array
     """Standard deviations (m,) across the curve in m."""
     inside: BoolArray
-    """Set (m,) where the foot point was inside the curve when the round began."""
+    """Whether each foot point (m,) was inside the curve when the round began."""
     by: SensorRows
-    """How the residuals depend on the calibration of the sensor."""
+    """Derivatives of the residuals by the calibration of the sensor."""
 
     @property
     def whitened(self) -> Array:
@@ -88,7 +88,7 @@ class Projected:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The problem at one state."""
+    """Problem at one state."""
 
     state: State
     projected: dict[int, Projected]
@@ -100,7 +100,7 @@ class Evaluation:
 
 
 class BatchSystem:
-    """The problem is to minimize `sum rho(detections) + 1/2 |odometry, gauge, calibration, first pose|^2`."""
+    """Problem of minimizing `sum rho(detections) + 1/2 |odometry, gauge, calibration, first pose|^2`."""
 
     def __init__(
         self, detections: DetectionTable, chain: LogOdometry, settings: MapperSettings, kernel: Biweight

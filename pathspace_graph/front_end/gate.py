@@ -44,7 +44,8 @@ MIN_SIGMA: Final = 1e-6
 MAX_SIGMA: Final = 100.0
 """Least and largest standard deviation of a detection in any direction, m."""
 MIN_DETERMINANT: Final = 1e-12
-"""A covariance with det <= this * xx * yy is singular to double precision, so not positive definite."""
+"""Least det of a covariance over xx * yy; a smaller one is singular to double precision, so not positive
+definite."""
 MAX_ASYMMETRY: Final = 1e-6
 """Largest difference of the entries xy and yx of a covariance, by its larger eigenvalue."""
 
@@ -117,7 +118,7 @@ def admit(
 
 
 class Gate:
-    """Counts what was refused, and remembers which late cycles were used."""
+    """Counter of refused cycles, which remembers the late cycles that were used."""
 
     def __init__(self, limits: LimitSettings) -> None:
         self.limits = limits

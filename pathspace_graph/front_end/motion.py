@@ -76,7 +76,7 @@ SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)
 
 
 class MotionCheck:
-    """Integrates the odometry of each cycle, and checks it against the detections of the newest cycles.
+    """Odometry of each cycle, checked against the detections of the newest cycles.
 
     The frame of this check is that of the motion so far. It drifts, and only its newest part is used.
     """
@@ -144,7 +144,7 @@ class MotionCheck:
 
     @property
     def newest(self) -> Newest:
-        """What the readings of the next cycle go on from."""
+        """Stamp and twist of the last accepted cycle."""
         t, twist = self._reading
         return Newest(self._t, twist if t > -np.inf else None)
 
@@ -302,7 +302,7 @@ class MotionCheck:
 
 
 class Rest:
-    """Tells from the odometry whether the vehicle stands, and averages the yaw rate meanwhile."""
+    """Judge of whether the vehicle stands, by the odometry; it averages the yaw rate meanwhile."""
 
     def __init__(self, sigma: Array) -> None:
         """Keep the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""

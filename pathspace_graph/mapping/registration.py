@@ -108,10 +108,10 @@ class Matches:
 
 @dataclass(frozen=True, eq=False)
 class RefinedMotion:
-    """A motion that the registration has ended with."""
+    """Motion at the end of the registration."""
 
     motion: Motion
-    """The motion moves the detections onto their curves."""
+    """Motion of the detections onto their curves."""
     matches: Matches
     """Detections at the last iteration."""
     covariance: Array
@@ -236,7 +236,7 @@ def _match(
     stretches: Mapping[int, tuple[float, float]],
     reach: float,
 ) -> Matches:
-    """Match moved detections with a stretch of each curve, and linearizes those within `reach` (m)."""
+    """Match moved detections with a stretch of each curve, and linearize those within `reach` (m)."""
     moved = motion.apply(seen.points)
     hessian, negative_gradient = np.zeros((3, 3)), np.zeros(3)
     matched, u, inlier = [np.zeros(0, np.intp)], [np.zeros(0)], [np.zeros(0, bool)]

@@ -10,15 +10,14 @@ Start = Literal["online", "odometry"]
 
 @dataclass(frozen=True)
 class AssociationSettings(Positive, group="batch.association"):
-    """How poses and detections are placed along the curves."""
+    """Places of poses and detections along the curves."""
 
     step: float = 1.0
     """Step at which nearest points of a curve are first searched for (m along the curve)."""
     direction_penalty: float = 100.0
-    """A stretch of curve that runs against a pose's heading counts as this much farther away (m)."""
+    """Distance added in quadrature to a stretch of curve that runs against a pose's heading (m)."""
     room: float = 2.0
-    """Along an open curve, the place of a pose is at most this farther from that of the pose before than was
-    driven between them (m)."""
+    """Most by which two poses may be farther apart along an open curve than was driven between them (m)."""
 
 
 @dataclass(frozen=True)
@@ -36,34 +35,32 @@ class ClosureSettings(Positive, group="batch.closure"):
 
 @dataclass(frozen=True)
 class OpenLapSettings(Positive, group="open_lap"):
-    """How the open lap is solved as a batch when the loop closes online."""
+    """Batch over the open lap when the loop closes online."""
 
     UNLIMITED = ("max_cycles", "max_cones")
 
     prior: Literal["batch", "window"] = "batch"
-    """After closing, the map goes on from a batch over the open lap, or with `window` from what the window
-    has marginalized."""
+    """Prior after closing: a batch over the open lap, or with `window` what the window has marginalized."""
     cycles: int = 20
-    """The batch replaces the prior this number of cycles after the loop has closed, or as many as the window
-    holds."""
+    """Cycles after closing at which the batch replaces the prior, or as many as the window holds."""
     cycles_share: float = 0.03
-    """A long lap gives its batch more time: this share of its cycles, if that is more than `cycles`. The
+    """Share of a long lap's cycles that replaces `cycles` where it is more, to give its batch more time. The
     window holds more poses until then."""
     late: int = 100
-    """A batch that is not solved by then replaces the prior once it is, and is given up where it is later
-    than this number of cycles, or where the window would hold more than `max_poses` poses."""
+    """Most cycles by which a batch may be late: it replaces the prior once it is solved, and is given up
+    after that, or where the window would hold more than `max_poses` poses."""
     ends: tuple[int, ...] = ()
-    """In a replay, the batches replace the prior in these cycles, one after the other: those that
+    """Cycles in which the batches replace the prior in a replay, one after the other: those that
     `summary.json` has as `batches.ends`. Later ones do so when they are due."""
     retry: float = 20.0
-    """A loop that no registration has closed is tried again after this length of path (m) where the
-    detections were against it."""
+    """Length of path after which a loop that no registration has closed is tried again where the detections
+    were against it (m)."""
     max_cycles: float = 6000.0
-    """Measurements of the open lap are kept up to this number of cycles. After a longer lap the map goes on
-    from what the window has marginalized."""
+    """Most cycles of the open lap whose measurements are kept. After a longer lap the map goes on from what
+    the window has marginalized."""
     max_cones: float = 1500.0
-    """A lap with more cones than this goes on from what the window has marginalized, since its batch would
-    not be in time."""
+    """Most cones of a lap that is solved as a batch. With more the map goes on from what the window has
+    marginalized, since the batch would not be in time."""
 
 
 @dataclass(frozen=True)
@@ -71,13 +68,12 @@ class BatchSettings(Positive):
     """The batch optimization over a whole log."""
 
     start: Start = "online"
-    """The optimization begins at the map of an online run over the log, or at odometry alone."""
+    """Start of the optimization: the map of an online run over the log, or odometry alone."""
     size: int | None = None
-    """Number of control points of both boundaries together; where it is not given, the number of cones
-    decides."""
+    """Number of control points of both boundaries together; by default the number of cones decides."""
     size_share: float = 0.43
-    """The number of control points is at most this share of the number of distinct cones that were detected
-    (the paper has 0.44)."""
+    """Most control points as a share of the number of distinct cones that were detected (the paper has
+    0.44)."""
     dense_share: float = 1.0
     """Control points for each cone of the curves that are solved for, so that they meet the cones. The map's
     own curves have fewer, and are fitted to them in the end."""
@@ -93,8 +89,8 @@ class BatchSettings(Positive):
     """Standard deviation (m) by which a control point slides along its curve from its place beside the pose
     that it began beside."""
     gate: float = 4.0
-    """Width of Tukey's loss: a detection farther from its curve than this number of standard deviations has
-    no weight."""
+    """Width of Tukey's loss: distance from its curve beyond which a detection has no weight, in standard
+    deviations."""
     association: AssociationSettings = field(default_factory=AssociationSettings)
     """Places of poses and detections along the curves."""
     closure: ClosureSettings = field(default_factory=ClosureSettings)

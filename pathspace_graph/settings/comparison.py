@@ -20,8 +20,7 @@ class CkfSettings(Positive):
     """Standard deviation (m) of the distance along the curve between a cone and its foot point; its square is
     added to the covariance of each detection."""
     threshold: float = 4.0
-    """A detection nearer to the end than this growth threshold (m) updates the curve instead of extending
-    it."""
+    """Growth threshold (m): a detection nearer to the end updates the curve instead of extending it."""
     separation: float = 4.0
     """Least distance of an extension from the second-to-last control point (m)."""
     sigma_bend: float = 0.5
@@ -30,11 +29,11 @@ class CkfSettings(Positive):
     prior its uncertainty multiplies with each extension. A large value gives the filter as it is
     published."""
     knots: Knots = "curvature"
-    """The knots of a closed boundary follow its curvature as in the paper, or its cones as in the spline
-    graph."""
+    """What the knots of a closed boundary follow: its curvature as in the paper, or its cones as in the
+    spline graph."""
     sightings: int = 3
-    """A landmark of the baseline filter is made by this number of detections; 1 takes every detection, as the
-    description of the baseline does."""
+    """Detections that make a landmark of the baseline filter; 1 takes every detection, as the description of
+    the baseline does."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +43,8 @@ class LandmarkSettings(Positive):
     match: float = 0.95
     """Probability of the gate inside which a detection may be of a landmark."""
     create: float = 0.99
-    """A detection may be of a new landmark if it lies outside the gate of this probability of every landmark
-    of its colour."""
+    """Probability of the gate outside of which, for every landmark of its colour, a detection may be of a new
+    one."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +56,11 @@ class CenterlineSettings(Positive):
     sigma_width: float = 0.3
     """Standard deviation (m) of the second difference of the half widths at neighbouring control points."""
     room: float = 4.0
-    """Foot points are searched for within this distance (m along the line) of where they are expected."""
+    """Distance from where they are expected within which foot points are searched for (m along the line)."""
     rounds: int = 2
-    """The batch holds the control points beside the poses anew, and is optimized again, in each round."""
+    """Rounds of the batch, in each of which it holds the control points beside the poses anew, and is
+    optimized again."""
     max_iterations: int = 15
-    """Each round takes at most this number of iterations."""
+    """Most iterations of a round."""
     tolerance: float = 1e-5
-    """A round ends where an iteration lowers the error by less than this share."""
+    """Share by which an iteration must lower the error for a round to go on."""

@@ -25,9 +25,9 @@ class GrowthSettings(Positive):
     forget_after: float = 6.0
     """Time without a detection after which a tentative track is dropped (s)."""
     threshold: float = 0.7
-    """A tentative track nearer to the end of the curve than this (m) does not extend it."""
+    """Distance from the end of the curve below which a tentative track does not extend it (m)."""
     max_lateral: float = 10.0
-    """A boundary begins with tentative tracks nearer to the driven path than this (m); circuits are up to 15
+    """Distance from the driven path within which tentative tracks begin a boundary (m); circuits are up to 15
     m wide."""
     max_size: float = 5000.0
     """Number of control points from which on an open curve grows no further."""

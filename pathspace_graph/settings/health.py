@@ -9,7 +9,7 @@ from .checked import Positive
 
 @dataclass(frozen=True)
 class HealthSettings(Positive):
-    """When an estimate is good, degraded or lost.
+    """Limits of a good, a degraded and a lost estimate.
 
     The share of detections that the map explains is taken over the newest `window`. A coloured detection in
     the view of the curves is explained if it is in use, or if it lies on a closed curve of its colour farther
@@ -17,25 +17,24 @@ class HealthSettings(Positive):
     """
 
     window: float = 1.0
-    """Detections that are at most this old are judged together (s)."""
+    """Age up to which detections are judged together (s)."""
     min_offered: int = 12
-    """At least this number of detections is judged; where the window holds fewer, older ones count as
-    well."""
+    """Least number of detections that are judged; where the window holds fewer, older ones count as well."""
     blind: float = 2.0
-    """The estimate is degraded once no detection has come for this time (s)."""
+    """Time without detections from which on the estimate is degraded (s)."""
     share_degraded: float = 0.8
-    """On a closed map, the estimate is degraded where a smaller share of the detections is explained."""
+    """Share of explained detections on a closed map below which the estimate is degraded."""
     share_lost: float = 0.55
-    """On a closed map, the vehicle is lost where a smaller share of the detections is explained."""
+    """Share of explained detections on a closed map below which the vehicle is lost."""
     open_degraded: float = 0.35
-    """While the loop is open, the estimate is degraded below this share. It is low, since detections of
-    stretches that are not mapped yet lie beside the curves."""
+    """Share of explained detections below which the estimate is degraded while the loop is open. It is low,
+    since detections of stretches that are not mapped yet lie beside the curves."""
     innovation: float = 1.2
-    """The estimate is degraded where the mean squared distance of detections in use from their curve, before
-    the update and in units of its variance, is larger than this, and by one sigma of the mean over the cones
-    in view; it is about 1 if the model is right."""
+    """Largest mean squared distance of detections in use from their curve in a good estimate, before the
+    update and in units of its variance, to which one sigma of the mean over the cones in view is added; about
+    1 if the model is right."""
     sigma_degraded: float = 1.0
-    """The estimate is degraded where the standard deviation of the position on a closed map is larger than
-    this in its worst direction (m)."""
+    """Standard deviation of the position on a closed map in its worst direction beyond which the estimate is
+    degraded (m)."""
     sigma_lost: float = 5.0
-    """The vehicle is lost where that standard deviation is larger than this (m)."""
+    """The same standard deviation beyond which the vehicle is lost (m)."""

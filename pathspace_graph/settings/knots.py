@@ -6,7 +6,7 @@ from typing import Literal
 from pathspace_graph.errors import SettingsError
 
 Knots = Literal["cones", "curvature"]
-"""The knots of a closed boundary follow its cones or its curvature."""
+"""What the knots of a closed boundary follow: its cones or its curvature."""
 
 
 @dataclass(frozen=True)
@@ -14,10 +14,10 @@ class BreakSettings:
     """How a curve's knots follow its curvature (paper: Simplification)."""
 
     baseline: float = 0.5
-    """This share in [0, 1] of the knots is spread evenly along the curve, so that straights keep their
+    """Share in [0, 1] of the knots that is spread evenly along the curve, so that straights keep their
     minimum."""
     curvature_max: float = 0.7
-    """Larger curvatures count as this one (1/m), that of the inside of a tight hairpin, so that a kink does
+    """Curvature that larger ones count as (1/m), that of the inside of a tight hairpin, so that a kink does
     not attract all knots."""
 
     def __post_init__(self) -> None:
