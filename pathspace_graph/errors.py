@@ -18,7 +18,7 @@ class PathspaceError(Exception):
 
 
 class InputError(PathspaceError):
-    """A user's file is missing or wrong.
+    """A missing or wrong file of a user.
 
     The text names the file, the row (1 is the first line) and what was expected.
     """
@@ -32,7 +32,7 @@ class InputError(PathspaceError):
 
 
 class ReadingError(PathspaceError):
-    """A perception cycle was handed over that no estimator can use; the estimator is as it was before.
+    """A perception cycle that no estimator can use; the estimator is as it was before.
 
     The text names the field, the row (0 is the first one), what was expected and what was found.
     """
@@ -58,22 +58,22 @@ class ReadingError(PathspaceError):
 
 
 class OutputError(PathspaceError):
-    """An output path cannot be written without losing something that is there already."""
+    """An output path that cannot be written without losing something that is there already."""
 
 
 class SettingsError(PathspaceError):
-    """A setting is out of its range, or names something unknown."""
+    """A setting out of its range, or the name of something unknown."""
 
 
 class SolveError(PathspaceError):
-    """An estimate cannot be computed, though nothing is wrong with the input as such.
+    """An estimate that cannot be computed, though nothing is wrong with the input as such.
 
     The text says what failed; the command line's exit code is 3.
     """
 
 
 class SingularSystemError(SolveError):
-    """The normal equations are not positive definite, since nothing determines some variable."""
+    """Normal equations that are not positive definite, since nothing determines some variable."""
 
 
 @contextmanager

@@ -190,7 +190,7 @@ class RunResult:
     observing: float = 0.0
     """Wall time of the observers, s, which is no part of the estimator's."""
     batches: LapBatches | None = None
-    """When batches of the lap have ended, where the estimator has such."""
+    """Ends of the batches of the lap, where the estimator has such."""
     waited: float = 0.0
     """Wall time for which the run waited for batches between cycles, s."""
     noise: RunNoise | None = None

@@ -23,7 +23,7 @@ MOST_POINTS: Final = 200_000
 _FEWEST: Final = 4
 """Smallest number of points of a line."""
 _NEIGHBOURS: Final = 10
-"""Normals of points up to this number apart do not cross."""
+"""Number of points apart up to which normals must not cross."""
 _SHORT: Final = 0.95
 """Share of the way to where two normals would cross that is left to both widths."""
 
