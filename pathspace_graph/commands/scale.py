@@ -24,7 +24,7 @@ FILE_WIDTH: Final = 160
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """Time every online estimator on ever larger maps and ever more detections, and fit and draw the slopes.
+    """Time every online estimator on ever larger maps and ever more detections, and draw the slopes.
 
     All run in this one process, cycle for cycle in turn, so that other work of the machine slows all of them
     alike. An estimator that takes longer than the budget is stopped there, and the table says so. Memory is
