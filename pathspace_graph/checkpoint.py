@@ -29,7 +29,6 @@ class Recovery:
 
     def __init__(self, failures: int = 0) -> None:
         self.failures = failures
-        """Number of calls that have failed."""
         self._copy: dict[str, Any] | None = None
         self._calls: list[partial[Any]] = []
         self._doubtful: int | None = None  # the first call that may be made in another way yet

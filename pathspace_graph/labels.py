@@ -14,7 +14,6 @@ NAMES: Final = ("left", "right", "unknown", "orange", "big_orange")
 """Words of the file format, indexed by label."""
 
 BOUNDARIES: Final = (LEFT, RIGHT)
-"""Labels of a boundary."""
 
 POINTS: Final = (ORANGE, BIG_ORANGE)
 """Cones with these labels bound no road: they stand at gates, and along lanes that lead to a track."""

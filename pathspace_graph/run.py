@@ -43,7 +43,6 @@ class CycleResult:
     readings: int
     """Number of the cycle's detections that were used."""
     closed: bool
-    """Whether the loop has closed."""
     stages: Mapping[str, float] = field(default_factory=dict)
     """Time of each stage of the update (s), by the stage's name."""
     jump: Array | None = None
@@ -181,7 +180,6 @@ class ObservedCycle:
     """
 
     estimator: OnlineEstimator
-    """Estimator that has processed the cycle."""
     detections: Detections
     """Detections of the cycle, as they were handed over."""
     result: CycleResult

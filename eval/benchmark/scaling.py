@@ -126,7 +126,6 @@ class Scaling:
     """All results of the measurement."""
 
     settings: ScalingSettings
-    """Settings of the measurement."""
     mapper: dict[str, Any]
     """Settings of the estimators, in full."""
     points: pd.DataFrame

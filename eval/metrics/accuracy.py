@@ -128,7 +128,6 @@ _OVERLAP: Final = 3
 _CACHED: Final = 16
 """Number of true curves in the cache, since every map of a log is compared with the same ones."""
 _MIN_CONES: Final = 2
-"""Least number of cones of a curve."""
 
 
 # --- points on curves ------------------------------------------------------------------------------------

@@ -32,7 +32,6 @@ from .trajectory import ate, trajectory_errors
 Array = NDArray[np.float64]
 
 LIBRARIES: Final = ("pathspace-graph", "gtsam", "numpy", "scipy")
-"""Libraries whose versions are recorded."""
 
 
 def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:

@@ -66,7 +66,6 @@ class BatchResult(BatchRun):
     system: BatchSystem
     """Problem that was solved, on curves with about one knot for each cone."""
     optimum: Evaluation
-    """Problem at the optimum."""
 
     @cached_property
     def pose_covariances(self) -> Array:

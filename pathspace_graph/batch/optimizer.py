@@ -75,9 +75,7 @@ class Schedule:
     gate: float
     """Gate of the first round (sigmas)."""
     rounds: int
-    """Most rounds."""
     tolerance: float = 1.0
-    """Factor of every tolerance."""
 
 
 @dataclass(frozen=True)

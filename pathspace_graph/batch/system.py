@@ -72,7 +72,6 @@ class Projected:
     """Rows (m,) of the detections in their table."""
     foot: FootPoints
     projection: ProjectionRows
-    """Residuals and derivatives."""
     sigma: Array
     """Standard deviations (m,) across the curve in m."""
     inside: BoolArray

@@ -150,13 +150,11 @@ class JudgedLog:
     chain: LogOdometry
     """Motion from each cycle to the next."""
     cycles: Sequence[Detections]
-    """Detections of each cycle."""
     orange: Sequence[Detections]
     """Those of orange cones."""
     settings: MapperSettings
     """Settings, with wide priors of the sensor where the readings contradict them."""
     noise: RunNoise
-    """Noise that was used."""
 
 
 def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLog:
@@ -222,7 +220,6 @@ class LateDetections:
     detections: Detections
     """Detections in the vehicle frame of that pose."""
     cycle: int
-    """Perception cycle of the pose."""
     twist: Array
     """(3,) Mean twist of the vehicle then, m/s, m/s and rad/s."""
 

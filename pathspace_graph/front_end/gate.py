@@ -29,7 +29,6 @@ from pathspace_graph.settings.front_end import LimitSettings
 UNITS: Final = "stamps are in seconds"
 """Hint where a stamp looks like one in milliseconds or nanoseconds."""
 TWIST: Final = ("vx", "vy", "wz")
-"""Columns of a twist."""
 MAX_STAMP: Final = 1e11
 """Largest stamp, s: some three thousand years. Stamps in nanoseconds are larger."""
 MIN_INTERVAL: Final = 1e-3
@@ -67,9 +66,7 @@ class Admitted:
     odometry: Odometry
     """Twists in force from the newest cycle in order to this one; a late cycle has none."""
     detections: Detections
-    """The possible detections."""
     dropped: int = 0
-    """Number of detections that were dropped."""
     late: bool = False
     """Whether the cycle is older than the newest one, and is used at its own time."""
     refused: int = 0

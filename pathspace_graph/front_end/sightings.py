@@ -18,7 +18,6 @@ from pathspace_graph.io.log import Detections, Odometry
 MAD: Final = 1.4826
 """Standard deviation of a Gaussian by its median absolute deviation."""
 MOST_TWISTS: Final = 4000
-"""Number of newest twists that are kept."""
 MIN_SPEED_SHARE: Final = 0.3
 """Share of its median speed below which a vehicle says little of noise in motion."""
 MIN_TWISTS: Final = 30

@@ -29,7 +29,6 @@ NoiseSource = Literal["stated", "measured", "assumed"]
 """Where noise comes from: the log's statement, the drive, or a default."""
 
 CYCLES_FILE: Final = "cycles.csv"
-"""File of the cycles in a result folder."""
 _CYCLE_COLUMNS: Final = (
     *("cycle", "t", "seconds", "size_left", "size_right", "readings", "lap"),
     *("offered", "health", "reason", "dropped"),

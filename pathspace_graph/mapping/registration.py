@@ -36,7 +36,6 @@ START_STEP: Final = 2.0
 START_CHI2: Final = 16.3
 """Their largest squared Mahalanobis distance under its uncertainty: 99.9 % of chi-square with 3 degrees."""
 MIN_DETECTIONS: Final = 25
-"""Least number of matched detections."""
 MIN_INLIERS: Final = 5
 """Least number of inliers on each boundary."""
 
@@ -113,7 +112,6 @@ class RefinedMotion:
     motion: Motion
     """Motion of the detections onto their curves."""
     matches: Matches
-    """Detections at the last iteration."""
     covariance: Array
     """(3, 3) Covariance of the motion (m, m, rad)."""
 
