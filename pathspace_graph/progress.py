@@ -26,8 +26,7 @@ def progress(description: str, total: int | None = None, lines: int = 0) -> Iter
 
 
 class Steps:
-    """Counter of the steps of long work, which estimates the time that remains by the mean of those done so
-    far."""
+    """Counter of the steps of long work, which estimates the time that remains by their mean."""
 
     def __init__(self, display: Progress, description: str, total: int | None, lines: int) -> None:
         self._display, self._description = display, description

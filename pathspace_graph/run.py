@@ -122,8 +122,7 @@ class Readings:
     used: BoolArray
     """Whether each detection (k,) was used; otherwise it was gated."""
     feet: Array
-    """Foot point (k, 2) of each used detection on its curve, or its landmark, in m, map frame; NaN for the
-    others."""
+    """Foot point (k, 2) of each used detection on its curve or landmark, in m, map frame; NaN for others."""
 
 
 @runtime_checkable

@@ -119,8 +119,7 @@ CENTRE_STEP: Final = 1.0
 CHORD: Final = 0.25
 """Length of the chords whose crossings are counted (m)."""
 FARTHEST: Final = 3.0
-"""Distance from the mapped boundary beyond which a true one is missed (m), as cones are in the paper's
-table."""
+"""Distance from the mapped boundary beyond which a true one is missed (m), as in the paper's table."""
 ROUND_OFF: Final = 1e-9
 """Share of a step by which a length may exceed whole steps without a further one."""
 _OVERLAP: Final = 3

@@ -245,8 +245,7 @@ def certainty(detections: DetectionTable, rows: IntArray) -> Array:
 
 
 def sharp(rows: IntArray, detections: DetectionTable) -> IntArray:
-    """Return the rows whose detections say where a cone stands; those of far ones are smeared over
-    several."""
+    """Return the rows whose detections say where a cone stands; those of far ones are smeared."""
     sigma = np.sqrt(0.5 * np.trace(detections.covariance[rows], axis1=1, axis2=2))
     certain = rows[sigma < SHARP]
     return certain if len(certain) >= SHARP_SHARE * len(rows) else rows

@@ -46,8 +46,7 @@ class CurveGauge:
     gradient, so it isn't part of the cost."""
 
     def terms(self, control_points: Array, beside: Array) -> tuple[Array, Array, Array]:
-        """Return whitened residuals (m,) of control points (m, 2) beside poses (m, 3), and derivatives by
-        both."""
+        """Return whitened residuals (m,) of control points (m, 2) beside poses (m, 3), and derivatives."""
         heading = _headings(beside) / self.sigma
         arm = control_points - beside[:, :2]
         by_theta = heading[:, 0] * arm[:, 1] - heading[:, 1] * arm[:, 0]
@@ -142,8 +141,7 @@ class CurveGauge:
 
 
 def curve_gauge(state: State, label: int, sigma: float, until: int | None = None) -> CurveGauge:
-    """Return the gauge that holds each control point where it is now, beside a pose of a cycle before
-    `until`."""
+    """Return the gauge that holds each control point where it is, beside a pose of a cycle before `until`."""
     boundary, control_points, poses = state.boundaries[label], state.control_points(label), state.poses
     mean_spacing = boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)
     cycle = _nearest_poses(state, label, until, mean_spacing)

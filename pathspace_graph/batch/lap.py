@@ -43,8 +43,7 @@ from .start import Recurrence, start_odometry
 from .system import BatchSystem, Biweight, Evaluation, own_settings
 
 USED_AGAIN: Final = 0.85
-"""Least share of the detections after the first lap on a closed result, as a part of that of the first
-lap."""
+"""Least share of the detections after the first lap on a closed result, over that of the first lap."""
 MISFIT: Final = 1.5
 """Most distance of detections after the first lap from its curves, in sigmas (root mean square)."""
 GAP: Final = 25.0
@@ -52,8 +51,7 @@ GAP: Final = 25.0
 OVERLAP: Final = 15.0
 """Least length that has been driven again (m)."""
 SIGMA: Final = 0.3
-"""Largest standard deviation by which the detections after the first lap hold their drive beside the curves
-(m), in every direction."""
+"""Largest standard deviation by which later laps' detections hold their drive beside the curves (m)."""
 WIDER: Final = 2.5
 """Largest ratio of a boundary point's distance from the road driven to the drive's distance beside it."""
 MOSTLY: Final = 95.0

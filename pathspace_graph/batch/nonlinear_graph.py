@@ -21,8 +21,7 @@ from .system import BatchSystem, Evaluation
 ROOM: Final = 4.0
 """Distance from its foot points in which a factor searches them (m along the curve)."""
 HALVINGS: Final = 6
-"""Most times that the room is halved while another foot point in it is nearer: where a bend turns about a
-detection."""
+"""Most halvings of the room while another foot point in it is nearer, as in a bend about a detection."""
 SAME: Final = 1e-3
 """Distance below which two foot points are the same (m along the curve)."""
 

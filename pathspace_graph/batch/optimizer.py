@@ -93,8 +93,7 @@ class Effort:
 
 
 class Optimizer:
-    """Levenberg-Marquardt from a state to the minimum of the problem, with a call of `on_round` after each
-    round."""
+    """Levenberg-Marquardt from a state to the minimum; `on_round` is called after each round."""
 
     def __init__(
         self,
@@ -172,8 +171,7 @@ class Optimizer:
         return at, self._report(at, schedule.rounds, self.predicted_decrease(at), False)
 
     def _refreshed(self, state: State, gate: float, strict: bool, held: bool = False) -> Evaluation:
-        """Return the problem of a new round; associations and sigmas are those of the round before if
-        `held`."""
+        """Return the problem of a new round, with the associations and sigmas of the last one if `held`."""
         system = self.system
         if not strict:
             locate_poses(state, self.settings.association)

@@ -60,8 +60,7 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
 
 
 def size_share(cones: Mapping[int, int], batch: BatchSettings) -> float:
-    """Return the control points per cone: the settings' share, or their size over all cones of the
-    boundaries."""
+    """Return the control points per cone: the settings' share, or their size over all cones."""
     total = sum(cones.values())
     return batch.size_share if batch.size is None or total == 0 else batch.size / total
 

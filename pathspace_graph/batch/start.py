@@ -45,8 +45,7 @@ RECURS: Final = 0.7
 """Least correlation of the curvature with itself a lap later. On a track of two loops of which one is wider,
 it is 0.56 at most after one of them."""
 MIN_OVERLAP: Final = 20.0
-"""Least length of the path after a lap, or else the lap isn't found (m): over less, straights agree with
-straights."""
+"""Least length of the path after a lap (m): over less, straights agree with straights."""
 REFERENCE_STEP: Final = 8.0
 """Distance of the reference poses that every lap passes (m)."""
 LAP_SIGMAS: Final = np.array([1.5, 1.5, 0.15])

@@ -232,8 +232,7 @@ class BatchSystem:
 
 
 def seen_from(points: Array, poses: Array, points_after: Array, poses_after: Array) -> Array:
-    """Return points (m, 2) in the frames of poses (m, 3) after a step, to first order; all are in the map
-    frame."""
+    """Return points (m, 2), map frame, in the frames of poses (m, 3) after a step, to first order."""
     arm, change = points - poses[:, :2], points_after - points - poses_after[:, :2] + poses[:, :2]
     turn = (poses_after[:, 2] - poses[:, 2])[:, None]
     return turned(arm + change + turn * np.column_stack([arm[:, 1], -arm[:, 0]]), -poses[:, 2])

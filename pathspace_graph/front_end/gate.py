@@ -43,8 +43,7 @@ MIN_SIGMA: Final = 1e-6
 MAX_SIGMA: Final = 100.0
 """Least and largest standard deviation of a detection in any direction, m."""
 MIN_DETERMINANT: Final = 1e-12
-"""Least det of a covariance over xx * yy; a smaller one is singular to double precision, so not positive
-definite."""
+"""Least det of a covariance over xx * yy; below, it is singular to double precision."""
 MAX_ASYMMETRY: Final = 1e-6
 """Largest difference of the entries xy and yx of a covariance, by its larger eigenvalue."""
 

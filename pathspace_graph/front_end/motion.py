@@ -38,8 +38,7 @@ DOUBT_RATE: Final = 2.0
 MIN_DOUBTING: Final = 4
 """Least number of matched detections of a contradiction."""
 MISFIT: Final = 1.5
-"""Mean-square misfit beyond which detections are worse than they claim: their covariances are multiplied by
-its excess."""
+"""Mean-square misfit beyond which detections are worse than they claim: its excess scales covariances."""
 MISFIT_GAIN: Final = 0.02
 """Smoothing gain of the mean-square misfit."""
 MAX_MISFIT: Final = 3.0

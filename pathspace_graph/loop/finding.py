@@ -69,8 +69,7 @@ SIGMA_MAX: Final = 0.5
 CONFIRMATIONS: Final = 2
 """Attempts, one after the other, that must find the same place."""
 WIDENING: Final = 3.0
-"""Factor of the registration's standard deviations in the prior of the found pose: its detections are used
-again."""
+"""Factor of the registration's sigmas in the prior of the found pose: its detections are used again."""
 STEPS: Final = 2
 """Gauss-Newton steps at the place that was found."""
 

@@ -26,8 +26,7 @@ OVERLAP_STEP: Final = 1.0
 OVERLAP_ROOM: Final = 4.0
 """Room about its expected place in which a point of the overlap is searched for (m along the curve)."""
 SEAM_MARGIN: Final = 0.5
-"""Distance from the seam below which a cone was also detected at the beginning, and is not counted twice
-(m)."""
+"""Distance from the seam below which a cone was also detected at the beginning, and counts once (m)."""
 
 
 @dataclass(frozen=True, eq=False)

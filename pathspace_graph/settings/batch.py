@@ -44,8 +44,7 @@ class OpenLapSettings(Positive, group="open_lap"):
     cycles: int = 20
     """Cycles after closing at which the batch replaces the prior, or as many as the window holds."""
     cycles_share: float = 0.03
-    """Share of a long lap's cycles that replaces `cycles` where it is more, to give its batch more time. The
-    window holds more poses until then."""
+    """Share of a long lap's cycles that replaces `cycles` where it is more; the window grows until then."""
     late: int = 100
     """Most cycles by which a batch may be late: it replaces the prior once it is solved, and is given up
     after that, or where the window would hold more than `max_poses` poses."""
@@ -53,8 +52,7 @@ class OpenLapSettings(Positive, group="open_lap"):
     """Cycles in which the batches replace the prior in a replay, one after the other: those that
     `summary.json` has as `batches.ends`. Later ones do so when they are due."""
     retry: float = 20.0
-    """Length of path after which a loop that no registration has closed is tried again where the detections
-    were against it (m)."""
+    """Length of path to the next attempt at a loop that the detections were against (m)."""
     max_cycles: float = 6000.0
     """Most cycles of the open lap whose measurements are kept. After a longer lap the map goes on from what
     the window has marginalized."""
@@ -72,8 +70,7 @@ class BatchSettings(Positive):
     size: int | None = None
     """Number of control points of both boundaries together; by default the number of cones decides."""
     size_share: float = 0.43
-    """Most control points as a share of the number of distinct cones that were detected (the paper has
-    0.44)."""
+    """Most control points as a share of the distinct cones that were detected (the paper has 0.44)."""
     dense_share: float = 1.0
     """Control points for each cone of the curves that are solved for, so that they meet the cones. The map's
     own curves have fewer, and are fitted to them in the end."""
@@ -86,11 +83,9 @@ class BatchSettings(Positive):
     smaller than online, since a curve between cones that were never detected has many shapes that fit equally
     well, and each start would end in its own."""
     sigma_slide: float = 0.2
-    """Standard deviation (m) by which a control point slides along its curve from its place beside the pose
-    that it began beside."""
+    """Standard deviation of a control point's slide along its curve from beside its first pose (m)."""
     gate: float = 4.0
-    """Width of Tukey's loss: distance from its curve beyond which a detection has no weight, in standard
-    deviations."""
+    """Width of Tukey's loss: distance beyond which a detection has no weight, in standard deviations."""
     association: AssociationSettings = field(default_factory=AssociationSettings)
     """Places of poses and detections along the curves."""
     closure: ClosureSettings = field(default_factory=ClosureSettings)

@@ -11,8 +11,7 @@ class CkfSettings(Positive):
     """The paper's filters."""
 
     ridge: float = 0.05
-    """Lambda of the ridge regression: how strongly control points are held at their places (paper:
-    Update)."""
+    """Lambda of the ridge regression, which holds control points at their places (paper: Update)."""
     sigma_model: float = 0.25
     """Standard deviation (m) of a cone's distance from a smooth curve; its square is added to the covariance
     of each detection."""
@@ -29,11 +28,9 @@ class CkfSettings(Positive):
     prior its uncertainty multiplies with each extension. A large value gives the filter as it is
     published."""
     knots: Knots = "curvature"
-    """What the knots of a closed boundary follow: its curvature as in the paper, or its cones as in the
-    spline graph."""
+    """What the knots of a closed boundary follow: curvature, as in the paper, or cones."""
     sightings: int = 3
-    """Detections that make a landmark of the baseline filter; 1 takes every detection, as the description of
-    the baseline does."""
+    """Detections that make a landmark of the baseline filter; 1, as it is described, takes every one."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +40,7 @@ class LandmarkSettings(Positive):
     match: float = 0.95
     """Probability of the gate inside which a detection may be of a landmark."""
     create: float = 0.99
-    """Probability of the gate outside of which, for every landmark of its colour, a detection may be of a new
-    one."""
+    """Probability of the gates of all landmarks of its colour outside of which a detection may be new."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +54,7 @@ class CenterlineSettings(Positive):
     room: float = 4.0
     """Distance from where they are expected within which foot points are searched for (m along the line)."""
     rounds: int = 2
-    """Rounds of the batch, in each of which it holds the control points beside the poses anew, and is
-    optimized again."""
+    """Rounds of the batch, each of which holds the control points beside the poses anew."""
     max_iterations: int = 15
     """Most iterations of a round."""
     tolerance: float = 1e-5

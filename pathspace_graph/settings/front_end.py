@@ -35,8 +35,7 @@ class MotionSettings(Positive):
     UNLIMITED = ("doubt",)
 
     doubt: float = 5.0
-    """Contradiction from which the odometry is not believed, standard deviations; `inf` to believe it
-    always."""
+    """Contradiction from which the odometry is not believed, standard deviations; `inf` to believe it."""
     acceleration: float = 5.0
     """Growth of the speeds' uncertainty where a twist is held for longer than usual, m/s^2."""
     angular_acceleration: float = 1.5

@@ -27,8 +27,7 @@ class GrowthSettings(Positive):
     threshold: float = 0.7
     """Distance from the end of the curve below which a tentative track does not extend it (m)."""
     max_lateral: float = 10.0
-    """Distance from the driven path within which tentative tracks begin a boundary (m); circuits are up to 15
-    m wide."""
+    """Distance from the driven path at which tracks begin a boundary (m); circuits are up to 15 m wide."""
     max_size: float = 5000.0
     """Number of control points from which on an open curve grows no further."""
     max_unseen: float = 500.0

@@ -34,7 +34,6 @@ class HealthSettings(Positive):
     update and in units of its variance, to which one sigma of the mean over the cones in view is added; about
     1 if the model is right."""
     sigma_degraded: float = 1.0
-    """Standard deviation of the position on a closed map in its worst direction beyond which the estimate is
-    degraded (m)."""
+    """Position's largest standard deviation on a closed map beyond which an estimate is degraded (m)."""
     sigma_lost: float = 5.0
     """The same standard deviation beyond which the vehicle is lost (m)."""

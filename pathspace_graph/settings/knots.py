@@ -14,8 +14,7 @@ class BreakSettings:
     """How a curve's knots follow its curvature (paper: Simplification)."""
 
     baseline: float = 0.5
-    """Share in [0, 1] of the knots that is spread evenly along the curve, so that straights keep their
-    minimum."""
+    """Share in [0, 1] of the knots that is spread evenly, so that straights keep their minimum."""
     curvature_max: float = 0.7
     """Curvature that larger ones count as (1/m), that of the inside of a tight hairpin, so that a kink does
     not attract all knots."""

@@ -26,11 +26,9 @@ class PlausibilitySettings(Positive):
     longest: float = 1.3
     """Longest time between the cycles of a pair (s), if cycles do not come more rarely."""
     reach: float = 0.2
-    """Distance from another detection, as a share of the cones' spacing, at which one counts as the same cone
-    by `exp(-1/2)`."""
+    """Distance from another detection, over the cones' spacing, that counts as the same by `exp(-1/2)`."""
     overlap: float = 0.5
-    """Share of one cycle's detections that the other could have seen by the odometry, from which two are
-    compared."""
+    """Share of a cycle's detections that another could have seen, from which the two are compared."""
     turn: float = 15.0
     """Step of the angles that the frame of the detections is tried at (degrees)."""
     equal: float = 0.02
@@ -78,11 +76,9 @@ class PlausibilitySettings(Positive):
     arm_sigma: float = 0.2
     """Largest standard deviation of its place at which it is told, as a share of the distance."""
     claimed_less: float = 10.0
-    """Ratio of the distances of one cone's detections to those claimed from which covariances are too
-    small."""
+    """Ratio of one cone's scatter to the claimed one from which covariances are too small."""
     claimed_more: float = 30.0
-    """Ratio of the claimed distances to those of one cone's detections from which covariances are too
-    large."""
+    """Ratio of the claimed scatter to one cone's from which covariances are too large."""
     least_scatter: float = 0.02
     """Scatter that detections which scatter less count as (m)."""
     noise_factor: float = 1.5

@@ -45,8 +45,7 @@ class CentreLine:
     arc_length: Array
     """Length (n,) of the line from its first point, in m."""
     width_left: Array
-    """Distance (n,) along the normal to the left boundary (m), or less where the normal would cross a
-    neighbour's."""
+    """Distance (n,) along the normal to the left boundary (m), or less to keep off a neighbour's."""
     width_right: Array
     """Distance (n,) along the normal to the right boundary (m), or less in the same way."""
     closed: bool

@@ -42,8 +42,7 @@ class SpeedProfile:
     speed: Array
     """Speed (n,) in m/s."""
     acceleration: Array
-    """Acceleration along the line (n,) from each point to the next one, in m/s^2; 0 at the last point of an
-    open line."""
+    """Acceleration (n,) from each point to the next, in m/s^2; 0 at the last point of an open line."""
     time: Array
     """Time (n,) since the first point, in s."""
     duration: float
