@@ -102,8 +102,8 @@ class HealthMonitor:
     def _wrong_side(self) -> str:
         """Return which boundary is wrong, where the other one explains its detections, or an empty string.
 
-        It is the map that is wrong then: a vehicle that is lost has both boundaries beside it. A boundary
-        stays wrong while too little of the other one is mapped to say anything.
+        The map is wrong then: a lost vehicle has both boundaries beside it. A boundary stays wrong while too
+        little of the other one is mapped to say anything.
         """
         holds = [self._holds(label) for label in BOUNDARIES]
         if True in holds:

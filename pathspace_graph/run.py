@@ -174,8 +174,8 @@ def outline(estimator: OnlineEstimator) -> Map:
 class ObservedCycle:
     """A cycle that is over, as an observer sees it: its input, its result, and the estimator as it stands.
 
-    The map, the readings and the window are taken when they are first asked for, once for all observers of
-    the cycle. So they must be asked for before the next cycle, and must not be changed.
+    The map, the readings and the window are taken when first asked for, once for all observers: before the
+    next cycle. They must not be changed.
     """
 
     estimator: OnlineEstimator
@@ -307,11 +307,10 @@ def run_online(
     """Feed a log's odometry and cycles to an online estimator, in order of time and never ahead of it.
 
     The truth of the log is not read. For each of the `snapshot_times` (s, ascending) the map is kept as it
-    stood then, after the last cycle that isn't later. Each of the `observers` is shown each cycle once it is
-    over, which does not count in the times of the cycles. `on_cycle` is an observer that takes the record of
-    a cycle only, and `observer` one that takes its result and the outline of the map. BLAS has one thread,
-    since its threads stall small solves. Where an update may take a result from another process, the run
-    waits for it before.
+    stood after the last cycle that isn't later. Each of the `observers` is shown each cycle, outside of its
+    time. `on_cycle` is an observer that takes the record of a cycle only, `observer` one that takes its
+    result and the outline of the map. BLAS has one thread, since its threads stall small solves. Results of
+    another process are waited for between cycles.
     """
     shown = [*observers]
     if on_cycle is not None:

@@ -89,7 +89,7 @@ def run_lanes(
     """Give cycle k to every lane in turn; the lane that is first moves on by one with k.
 
     So none always follows the same other. A lane is stopped where its last updates took more than `budget`
-    (s) each on average. BLAS has one thread.
+    (s) on average. BLAS has one thread.
     """
     times = [LaneTimes(lane) for lane in lanes]
     runners = [own.updates(settings, budget) for own in times]
@@ -105,8 +105,7 @@ def run_lanes(
 def peak_memory(lane: Lane, settings: MapperSettings) -> float:
     """Return the most memory (MB) that Python and numpy held at a time while the lane ran.
 
-    This is what tracemalloc sees; it sees nothing of what GTSAM and LAPACK allocate. Don't time a lane
-    meanwhile: tracing slows everything down.
+    By tracemalloc, which sees nothing of what GTSAM and LAPACK allocate, and slows everything down.
     """
     tracemalloc.start()
     try:

@@ -125,10 +125,7 @@ def _entries(panels: Iterable[Axes]) -> dict[str, Any]:
 
 
 def fit_height(figure: Figure, margin: float = 0.05) -> None:
-    """Make a figure as high as what is drawn on it, plus a margin (in) on both sides.
-
-    This is for figures whose width decides how large the panels are.
-    """
+    """Make a figure as high as what is drawn on it, plus a margin (in) on both sides."""
     for _ in range(_LAYOUT_ROUNDS):
         figure.draw_without_rendering()
         width, _ = figure.get_size_inches()

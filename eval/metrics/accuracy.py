@@ -70,8 +70,7 @@ def capped_rmse(distances: Array, cap: float = MISSED_DISTANCE) -> float:
 def cone_distances(track: Map, truth: Truth) -> Array:
     """Return the distance (K,) in m of each true cone from its own mapped boundary, in the truth's order.
 
-    It is infinite where that boundary isn't mapped. Cones labelled `unknown` belong to no boundary and are
-    left out.
+    Infinite where that boundary isn't mapped. Cones labelled `unknown` are left out.
     """
     distances = np.full(len(truth.cones), np.inf)
     for label in BOUNDARIES:
@@ -94,8 +93,7 @@ def boundary_distances(boundary: MapBoundary, points_map: Array) -> Array:
 def closest_points(spline: BSpline, points_map: Array) -> FootPoints:
     """Return the closest point of the whole curve to each point (k, 2).
 
-    The search is so fine that the result is exact, except where two stretches are equally near to about the
-    sagitta of the grid: then either may be found.
+    Exact, except where two stretches are equally near to about the sagitta of the grid.
     """
     low, high = spline.domain
     step = (high - low) / (GRID_PER_SPAN * (len(spline.breaks) - 1))
@@ -136,10 +134,9 @@ _MIN_CONES: Final = 2
 def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
     """Return points (k, 2) in m, at most `step` apart, on the curve through the true cones of a boundary.
 
-    The curve is Akima's cubic over chord lengths, in driving order. It passes through every cone and, unlike
-    a natural spline, it doesn't overshoot where the spacing of the cones changes. It is closed where the true
-    path completes a lap. One cone gives one point, no cone none. Callers must not write to the array, because
-    it is cached.
+    Akima's cubic over chord lengths, in driving order: it passes through every cone and, unlike a natural
+    spline, doesn't overshoot where their spacing changes. It is closed where the true path completes a lap.
+    The array is cached and must not be written to.
     """
     cones = driving_order(truth, label)
     if len(cones) < _MIN_CONES:
@@ -156,9 +153,8 @@ def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
 def driving_order(truth: Truth, label: int) -> Array:
     """Return the true cones (k, 2) of one boundary in driving order.
 
-    They are sorted by the nearest point of the true path's first lap. The order of the file is kept where it
-    gives the shorter polygon (on the inside of a hairpin several cones have the same nearest point), or where
-    there is no true path.
+    Sorted by the nearest point of the true path's first lap, or as in the file where that gives the shorter
+    polygon (inside a hairpin several cones share a nearest point) or there is no true path.
     """
     cones: Array = truth.cones[truth.cone_labels == label]
     if len(truth.poses) < 2 or len(cones) == 0:
@@ -212,9 +208,9 @@ class CurveDistance:
 def curve_distance(track: Map, truth: Truth) -> CurveDistance:
     """Return mean_p min_q |p - q| over mapped points p, and mean_q min_p |q - p| over true ones q.
 
-    Points of the true curve and of a mapped spline are equal lengths apart. Landmarks are points with nothing
-    in between, so the second distance charges them for the gaps, in contrast to the error at the cones. It is
-    infinite where a boundary isn't mapped. Either is NaN where there is nothing to measure from.
+    Points of curves are equal lengths apart. Landmarks have nothing in between, so the second distance
+    charges them for the gaps. Infinite where a boundary isn't mapped, NaN where there is nothing to measure
+    from.
     """
     forth, back = [np.zeros(0)], [np.zeros(0)]
     for label in BOUNDARIES:
@@ -241,11 +237,7 @@ def two_way_distance(first: MapBoundary, second: MapBoundary) -> float:
 
 
 def crossings(track: Map) -> tuple[int, int]:
-    """Return how often the curves of a map cross each other, and how often they cross themselves.
-
-    No boundary crosses the other one. Where the same cones bound two stretches of a track, a boundary lies on
-    itself.
-    """
+    """Return how often the curves of a map cross each other, and how often they cross themselves."""
     chords, owner = [np.zeros((0, 2, 2))], [np.zeros(0)]
     for label, boundary in track.boundaries.items():
         if isinstance(boundary, SplineBoundary):
@@ -294,8 +286,8 @@ class CentreLineErrors:
 def centre_line_errors(track: Map, truth: Truth, step: float = CENTRE_STEP) -> CentreLineErrors | None:
     """Return the errors of the centre line at points `step` (m) apart; None where the map has no such line.
 
-    The normal of a point crosses the true boundaries at the offsets o_l and o_r. The true centre is at their
-    mean, and half the width is half their difference.
+    The normal of a point crosses the true boundaries at offsets o_l and o_r: the true centre is at their
+    mean, half the width is half their difference.
     """
     try:
         line = track.centre_line(step)

@@ -81,12 +81,11 @@ def _squared(error: Array, covariance: Array) -> float:
 def map_nees(track: Map, truth: Truth) -> NormalizedError:
     """Return the normalized estimation error squared (NEES) of a map, by the covariance that it holds.
 
-    The error of a curve is its signed distance to the true curve, at as many places as the curve has degrees
-    of freedom across itself. The error of landmarks is their offset in the plane. The state of the estimator
-    isn't judged but the map that a user gets, so every estimator is judged alike: the covariance of a batch
-    map includes the scatter of the cones, for example. A map holds no covariance between its two boundaries,
-    so the errors that they share (above all the heading of the whole map) count twice: the mean of `ratio`
-    over many runs is right, but it spreads more widely than its interval says.
+    A curve's error is its signed distance to the true curve, at as many places as it has degrees of freedom
+    across itself; that of landmarks is their offset in the plane. The map that a user gets is judged, so
+    every estimator is judged alike. A map holds no covariance between its boundaries, so errors that they
+    share (above all its heading) count twice: the mean of `ratio` over many runs is right, but it spreads
+    more widely than its interval.
     """
     value, dof = 0.0, 0
     for label, boundary in track.boundaries.items():
@@ -102,10 +101,9 @@ def map_nees(track: Map, truth: Truth) -> NormalizedError:
 def curve_errors(boundary: SplineBoundary, curve_true: Array) -> tuple[Array, Array]:
     """Return e_j = n_j . (q_j - S(u_j)), (k,) in m, and its covariance N B Sigma B' N', (k, k) in m^2.
 
-    There is one row for each control point, at its Greville abscissa u_j. So there are as many rows as the
-    curve has degrees of freedom across itself, and the covariance is regular. Abscissae beyond the ends of an
-    open curve become one row at the end. n_j is the unit normal at u_j, q_j the nearest point of the true
-    curve (n, 2).
+    A row for each control point, at its Greville abscissa u_j, so that the covariance is regular; abscissae
+    beyond the ends of an open curve become one row at the end. n_j is the unit normal at u_j, q_j the nearest
+    point of the true curve (n, 2).
     """
     spline = boundary.spline
     if len(curve_true) == 0:
@@ -123,8 +121,8 @@ def curve_errors(boundary: SplineBoundary, curve_true: Array) -> tuple[Array, Ar
 def landmark_errors(boundary: PointBoundary, cones: Array) -> tuple[Array, Array]:
     """Return cone - landmark, (2 k,) in m over x0, y0, x1, ..., and its covariance (2 k, 2 k) in m^2.
 
-    Landmarks and cones (n, 2) are paired one to one with the smallest total distance. A pair more than 3 m
-    apart is left out: it is a missed cone and a ghost, not an error.
+    Landmarks and cones (n, 2) are paired with the smallest total distance. A pair more than 3 m apart is left
+    out: it is a missed cone and a ghost, not an error.
     """
     distances = cdist(boundary.points, cones) if len(cones) and boundary.size else np.zeros((0, 0))
     landmark, cone = linear_sum_assignment(np.minimum(distances, MISSED_DISTANCE))
@@ -157,7 +155,7 @@ class NormalErrors:
     def mean_squared(self) -> float:
         """Return mean (error / sigma)^2, which is 1 where the band is honest; NaN without cones.
 
-        Every cone is judged alone. In contrast to NEES, correlations between the cones don't count.
+        In contrast to NEES, correlations between the cones don't count.
         """
         if len(self.errors) == 0:
             return float("nan")
@@ -167,7 +165,7 @@ class NormalErrors:
 def normal_errors(track: Map, truth: Truth) -> NormalErrors:
     """Return e = n . (cone - S(u)), sigma^2 = n' B Sigma B' n at the foot point u of each true cone.
 
-    Only boundaries that are splines count. Missed cones count, too, as the large errors that they are.
+    Only splines count. Missed cones count as the large errors that they are.
     """
     errors, sigmas = [np.zeros(0)], [np.zeros(0)]
     for label, boundary in track.boundaries.items():
@@ -183,8 +181,8 @@ def joint_cone_error(result: BatchResult, truth: Truth) -> NormalizedError:
     """Return e' (B Sigma B' + diag(s^2))^-1 e, the errors of both curves at all true cones at once.
 
     In contrast to the NEES of the map, Sigma is the joint covariance of both boundaries from the detections,
-    and s is the scatter of the cones about a smooth curve, at each cone, larger where a cone was never
-    detected. So this judges the batch itself: whether it predicts the true cones.
+    and s the scatter of the cones about a smooth curve: this judges whether the batch itself predicts the
+    true cones.
     """
     errors, sigmas, designs, offset = [np.zeros(0)], [np.zeros(0)], [], 0
     size = len(result.map_covariance)

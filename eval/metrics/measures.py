@@ -126,11 +126,11 @@ def measure(
 ) -> list[Row]:
     """Return a row for each complete lap, and one for the whole run as the last; lengths are over the scale.
 
-    The row of a lap has the map as it stood at its end, and the poses and updates of its cycles. Laps are the
-    true ones where the log has a true path, else the estimator's own. A batch has one map for all laps, and
-    so one row, that of the last lap. `seconds` is the wall time of the whole run. `marginals` asks for the
-    metrics of the paper's squared basis, `yardsticks` for `l`, `f` and `limit`, which take a batch with
-    oracle association and thus a simulated log (ValueError without associations).
+    A lap's row has the map as it stood at its end, and the poses and updates of its cycles. Laps are the true
+    ones where the log has a true path, else the estimator's own. A batch has one map for all laps, and so one
+    row, that of the last lap. `seconds` is the wall time of the whole run. `marginals` asks for the metrics
+    of the paper's squared basis, `yardsticks` for `l`, `f` and `limit`, by a batch with oracle association
+    (ValueError without associations).
     """
     run, log = run.at_scale_one(), scaled(log, 1.0 / run.scale)
     rows = []

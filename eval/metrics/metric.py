@@ -244,7 +244,7 @@ def column_of(text: str) -> Column:
 def slope_of(estimates: np.ndarray, truths: np.ndarray) -> float:
     """Return `sum e t / sum t^2` over the runs (n,) whose estimate and truth are known; NaN without any.
 
-    The line leads through the origin, since estimator and simulator both expect zero.
+    The line leads through the origin, as estimator and simulator both expect zero.
     """
     known = ~(np.isnan(estimates) | np.isnan(truths))
     moment = float(truths[known] @ truths[known])

@@ -61,7 +61,7 @@ def limit(log: Log, track: Map) -> Limit:
 def solve_oracle_landmarks(log: Log, *, with_covariance: bool = False) -> LandmarkSolution:
     """Return the landmark batch with oracle association: each detection knows its true cone.
 
-    It is also told the sensor's constant errors and the true noise, where the log has them. Landmark ids are
+    It also knows the sensor's constant errors and the true noise, where the log has them. Landmark ids are
     indices of true cones.
     """
     truth = _truth(log)
@@ -145,8 +145,8 @@ def landmark_rmse(solution: LandmarkSolution, truth: Truth) -> float:
 def fit_rmse(track: Map, truth: Truth) -> float:
     """Return sqrt(mean d^2) in m, d from true cones to splines of the mapped size that are fitted to them.
 
-    A boundary of points, or with a control point for every cone, can be exact: its distances are 0.
-    Boundaries that aren't mapped don't count.
+    A boundary of points, or with a control point for every cone, has distances of 0. Boundaries that aren't
+    mapped don't count.
     """
     distances = [np.zeros(0)]
     for label, boundary in track.boundaries.items():
@@ -199,8 +199,8 @@ class Gap:
 def from_batch(values: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
     """Return the turn (rad) of a map from that of the batch over the same log, and the rmse by the batch's.
 
-    Both are given by their metrics. Small turns about one point add up, so the turn from the batch is the
-    difference of the turns from the truth. Where either map has no such metric, the result has none.
+    Small turns about one point add up, so the turn from the batch is the difference of the turns from the
+    truth. Where either map lacks the metric, the result does too.
     """
     found: dict[str, Any] = {}
     if {"turn", "rmse"} <= set(values) & set(batch):
@@ -223,8 +223,8 @@ def gap(run: RunResult, reference: RunResult) -> Gap:
 def aligned_distance(track: Map, reference: Map) -> float:
     """Return the mean two-way distance (m) of a map from another one of the same cones, rigidly aligned.
 
-    Each drive has its own map frame. Of the motions that closest points lead to from several starts, the one
-    with the least distance counts. It is infinite where the maps share no boundary.
+    Each drive has its own map frame. The least distance by closest points from several starts counts; it is
+    infinite where the maps share no boundary.
     """
     shared = sorted(set(track.boundaries) & set(reference.boundaries))
     own = [mapped_points(track.boundaries[label], STEP) for label in shared]

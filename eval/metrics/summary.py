@@ -37,7 +37,7 @@ LIBRARIES: Final = ("pathspace-graph", "gtsam", "numpy", "scipy")
 def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
     """Return the estimator, settings, versions, laps and timing, and with truth the paper's metrics.
 
-    What was said of the log before it was mapped is in it, too, where anything was.
+    Hints about the log are in it as well.
     """
     summary: dict[str, Any] = {
         "estimator": result.estimator,
@@ -170,8 +170,8 @@ def lap_times(log: Log) -> Array:
 def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
     """Return the paper's table: a row at the end of each true lap, or that of the end where there is none.
 
-    Without a true path the laps are the estimated ones, without true cones there is no row. The snapshots of
-    `result` are those at `lap_times`. A batch has one map for all laps, and so one row.
+    Without a true path the laps are the estimated ones; without true cones there is no row. The snapshots of
+    `result` are those at `lap_times`. A batch has one row.
     """
     if log.truth is None or not has_cones(log.truth):
         return []

@@ -44,8 +44,8 @@ def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
 def pose_errors(t: Array, poses: Array, reference_t: Array, reference: Array) -> Array:
     """Return [along, across, heading] (k, 3) in m, m, rad: the error of each pose in its reference's frame.
 
-    t is (n,), poses is (n, 3). Nothing is aligned. Stamps outside those of the reference are left out, so
-    k <= n.
+    t is (n,), poses is (n, 3). Nothing is aligned. Stamps outside those of the reference are left out (k <=
+    n).
     """
     inside = (t >= reference_t[0]) & (t <= reference_t[-1])
     expected = interpolate_poses(reference_t, reference, t[inside])
@@ -81,8 +81,7 @@ def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
 def longest_astray(t: Array, poses: Array, truth: Truth, since: float) -> dict[str, float]:
     """Return the longest time (s) and way (m) for which a vehicle was astray, from a stamp (s) on.
 
-    It is counted from the first cycle that is wrong by more than a metre up to the next one that is right, or
-    to the end.
+    Counted from the first cycle that is wrong by more than a metre to the next one that is right, or the end.
     """
     after = (t >= max(since, truth.pose_t[0])) & (t <= truth.pose_t[-1])
     if not after.any():
@@ -178,9 +177,9 @@ class TrueRoad:
 def true_road(truth: Truth) -> TrueRoad:
     """Return the road of a truth that has poses and cones.
 
-    The last lap's cones are passed once more, one lap later, so that the road goes on behind the drive's end.
-    Without a complete lap it doesn't. Then the cones beside the drive's two ends are left out, and cycles
-    less than `MOST` metres before its end don't count.
+    The last lap's cones are passed once more, so that the road goes on behind the drive's end. Without a
+    complete lap, cones beside the drive's two ends and cycles less than `MOST` metres before its end don't
+    count.
     """
     steps = np.linalg.norm(np.diff(truth.poses[:, :2], axis=0), axis=1)
     driven = np.append(0.0, np.cumsum(steps))
@@ -233,8 +232,8 @@ class CycleReach:
 def cycle_reach(road: TrueRoad, station: float, pose_true: Array, pose: Array, track: Map) -> CycleReach:
     """Return the reach of a map at a true station (m), seen from the true and from the estimated pose (3,).
 
-    The cones are placed in the map by `map_T_vehicle * vehicle_T_cones`, with the estimated and with the true
-    pose, so that only what the vehicle would see ahead of itself counts.
+    The cones are placed by `map_T_vehicle * vehicle_T_cones`, with the estimated and with the true pose, so
+    that only what the vehicle would see ahead of itself counts.
     """
     ahead = road.ahead(station)
     cones, labels, away = road.cones[ahead], road.labels[ahead], road.stations[ahead] - station

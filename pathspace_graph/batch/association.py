@@ -60,8 +60,8 @@ def locate_poses(state: State, settings: AssociationSettings) -> None:
     """Set `pose_u`: the parameter of each curve's nearest point that runs in the direction of each pose.
 
     Without the heading, a pose in a hairpin could be put beside the other leg. On a closed curve the
-    parameter goes on from lap to lap. On an open one it goes on with the drive: where the curve has drifted
-    over a stretch of itself, the poses are not put beside that stretch.
+    parameter goes on from lap to lap. An open one may have drifted over a stretch of itself, beside which no
+    pose is put.
     """
     poses = state.poses
     heading = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
@@ -109,10 +109,10 @@ def associate(
     """Associate every detection anew: it is used where it lies within `gate` sigmas of its curve.
 
     A detection is searched for on the stretch of the curve that its pose sees. `strict` means that the curves
-    are about where they belong. Then one that fits nowhere there is searched for on the whole of a closed
-    curve, since the sensor sees across the infield. An open curve has drifted against itself by more than the
-    gate, so a detection that happened to fit far away isn't compared. And one of unknown colour goes to the
-    curve that it fits better, not before, since cones of no boundary stand beside the track.
+    are about where they belong: one that fits nowhere there is then searched for on the whole of a closed
+    curve, since the sensor sees across the infield, but not of an open one, which may have drifted against
+    itself by more than the gate. One of unknown colour goes to the curve that it fits better, and only then,
+    since cones of no boundary stand beside the track.
     """
     boundary_of, u = np.full(len(detections), UNKNOWN), detections.u.copy()
     for whole in (False, True) if strict else (False,):
@@ -204,9 +204,8 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     """Return the cones of a boundary whose curve the state has.
 
     A cone that is often detected beside the curve, but too far from it to be used, belongs to it as well: the
-    curve cuts a corner there. On a closed curve parameters are counted from the beginning of the drive, and
-    the cones are ordered as the vehicle passed them: in a hairpin the curve may have taken two in the wrong
-    order.
+    curve cuts a corner there. The cones of a closed curve are ordered as the vehicle passed them, since in a
+    hairpin the curve may have two in the wrong order.
     """
     boundary, begin = state.boundaries[label], first_parameter(state, label)
     rows = sharp(np.flatnonzero(detections.label == label), detections)

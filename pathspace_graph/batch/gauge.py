@@ -22,10 +22,9 @@ curve in the elimination. The number changes the speed, not the result."""
 class CurveGauge:
     """The residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` and `R_k' D c / sigma_smoothness` of a curve.
 
-    p_k is the position of the pose that control point c_j of the curve began beside, h_k is its heading, and
-    R_k its rotation. D is `smoothness_matrix`. A detection constrains nothing along a curve, so control
-    points would slide along it, by metres in a hundred steps. Held beside a pose they don't, and the map is
-    as free as before: wherever that pose goes, they go with it.
+    p_k is the position of the pose that control point c_j began beside, h_k its heading, R_k its rotation,
+    and D is `smoothness_matrix`. A detection constrains nothing along a curve, so control points would slide
+    along it, by metres in a hundred steps. Held beside a pose they don't, and the map is as free as before.
     """
 
     label: int

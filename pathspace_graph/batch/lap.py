@@ -97,7 +97,7 @@ class OpenLap:
 class LapMarginal:
     """The batch's map on few knots, and what the poses before `first_kept` know about it.
 
-    The marginal is a Gaussian of [calibration | control points, left first | pose of `first_kept`].
+    A Gaussian of [calibration | control points, left first | pose of `first_kept`].
     """
 
     convergence: Convergence

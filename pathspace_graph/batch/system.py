@@ -36,8 +36,7 @@ def own_settings(settings: MapperSettings) -> MapperSettings:
 class Biweight:
     """Tukey's robust loss `rho(z) = g^2 / 6 (1 - (1 - z^2 / g^2)^3)`, which is constant beyond the gate g.
 
-    A detection at the gate has no weight. So nothing moves when one more or one less is used. With Huber's
-    loss and a hard gate it would.
+    A detection at the gate has no weight, so nothing moves when one more or one less is used.
     """
 
     gate: float
@@ -211,8 +210,8 @@ class BatchSystem:
     def retract(self, state: State, step: Array) -> State:
         """Return the state after a step (n,), taken in relative coordinates.
 
-        It changes each pose as seen from the pose before, and each control point as seen from the pose beside
-        it. So a map that swings by a large angle keeps its shape, which map coordinates would stretch.
+        Each pose changes as seen from the pose before, and each control point as seen from the pose beside
+        it. So a map that swings by a large angle keeps its shape.
         """
         linear = moved(state, step)
         after, poses, goal = linear.copy(), state.poses, linear.poses

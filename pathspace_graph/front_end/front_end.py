@@ -160,8 +160,8 @@ class JudgedLog:
 def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLog:
     """Return a log as the front end gives it to an estimator of whole logs.
 
-    Noise that is not known is measured on the whole log first. A cycle that an online estimator would refuse
-    is a ReadingError.
+    Unknown noise is measured on the whole log first. A cycle that an online estimator would refuse is a
+    ReadingError.
     """
     front_end = FrontEnd(settings, noise)
     if front_end.noise.is_learning:

@@ -77,7 +77,7 @@ SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)
 class MotionCheck:
     """Odometry of each cycle, checked against the detections of the newest cycles.
 
-    The frame of this check is that of the motion so far. It drifts, and only its newest part is used.
+    Its frame is that of the motion so far, which drifts; only its newest part is used.
     """
 
     def __init__(self, sigma: Array, settings: MotionSettings) -> None:
@@ -104,8 +104,8 @@ class MotionCheck:
     def believe(self, sigma: Array) -> None:
         """Take other standard deviations (3,) of a twist (m/s, m/s, rad/s) from now on.
 
-        The errors of the sensor are taken out of the detections from now on, so it forgets those that it has
-        learned, and the detections that have them.
+        The errors of the sensor are taken out of the detections from now on, so what was learned of them is
+        forgotten.
         """
         self.sigma = self._rest.sigma = sigma
         self._recent, self.errors = RecentDetections(), SensorErrors(self.settings)
@@ -113,7 +113,7 @@ class MotionCheck:
     def update(self, odometry: Odometry, detections: Detections, may_doubt: bool = True) -> MeasuredMotion:
         """Return the motion since the last cycle.
 
-        Unless it `may_doubt`, odometry that is there is believed: then the detections' noise is not known.
+        Unless it `may_doubt`, odometry is believed: the detections' noise is not known then.
         """
         t, measured = detections.t, detections.points_vehicle
         motion = self._integrate(odometry, t)

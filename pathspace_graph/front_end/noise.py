@@ -70,10 +70,7 @@ class NoiseLearner:
     def observe(
         self, odometry: Odometry, detections: Detections, motion: MeasuredMotion, pose: Array
     ) -> bool:
-        """Learn from a cycle at a pose (3,) of the front end; return whether the noise was measured anew.
-
-        That takes some cycles, with a step in each.
-        """
+        """Learn from a cycle at a pose (3,) of the front end; return whether the noise was measured anew."""
         if not self.is_learning:
             return False
         self._twists.add(odometry)

@@ -67,8 +67,8 @@ def reaches(iterations: int = ITERATIONS) -> list[float]:
 class RecentDetections:
     """Detections of the newest cycles in one frame.
 
-    They are corrected by what is known now of the errors of the sensor, so that a cone stays where it is when
-    more is learned of them.
+    They are corrected by the newest errors of the sensor, so that a cone stays where it is when more is
+    learned.
     """
 
     def __init__(self) -> None:
@@ -275,7 +275,7 @@ class SensorErrors:
     def update(self, difference: Difference, dt: float) -> None:
         """Learn from a match that agrees with the odometry, dt (s) after the last cycle.
 
-        Matches share the remembered detections. So one counts by the share of its own time.
+        Matches share the remembered detections, so one counts by the share of its own time.
         """
         shifts, share = difference.shifts, min(dt / MEMORY, 1.0)
         weighted = share * np.linalg.solve(difference.covariance, shifts).T

@@ -83,8 +83,8 @@ class SeenCycle:
 def follow(cycles: Iterable[SeenCycle], known: MeasuredNoise) -> Sightings:
     """Return the sightings of cones in the cycles, in order of time.
 
-    Sightings are told to be of one cone after the constant errors of the sensor, as far as they are known,
-    are taken out, and by their noise, where that is known. What is returned is as measured.
+    Sightings are matched after known constant errors of the sensor are taken out, and by known noise; they
+    are returned as measured.
     """
     follower = Follower(known)
     return Sightings.stacked([Sightings.none(), *(follower.add(cycle) for cycle in cycles)])
@@ -239,7 +239,7 @@ class TwistRecord:
     def white(self) -> tuple[Array, float] | None:
         """Return the white noise (3,) of a twist, and the time between two twists (s).
 
-        It is the least of `orders`: the higher the order, the less of the motion itself is in it.
+        The least of `orders`: the higher the order, the less of the motion itself is in it.
         """
         orders = self.orders()
         return None if orders is None else (orders.min(axis=0), float(np.median(np.diff(self._newest[0]))))
@@ -247,7 +247,7 @@ class TwistRecord:
     def orders(self) -> Array | None:
         """Return the noise (k, 3) of a twist by differences of second to fourth order; None without enough.
 
-        It is their median absolute value over that of white noise, `sqrt(binomial(2 k, k))`. Where the orders
+        The median absolute difference over that of white noise, `sqrt(binomial(2 k, k))`. Where the orders
         differ, the noise is not white, or the motion itself is in it.
         """
         _, twists = self._newest

@@ -29,8 +29,8 @@ def atomic_folder(target: Path | str, marker: str) -> Iterator[Path]:
     """Yield a temporary folder beside `target` that takes its place on success and is removed on failure.
 
     It is given a manifest. An empty folder at `target` is used. An earlier result, known by the file `marker`
-    in it, is kept as a numbered backup `NAME.~1~`. Anything else there is an OutputError. At each moment the
-    target is the old or the new, also where the process is killed or the power is cut.
+    in it, is kept as a numbered backup `NAME.~1~`; anything else there is an OutputError. At each moment the
+    target is the old or the new, even if the process is killed or the power is cut.
     """
     final = _followed(target)
     with _placed(final, Path.mkdir, lambda: check_target(final, marker)) as temporary:
@@ -84,8 +84,8 @@ def write_text(file: Path, text: str) -> None:
 def to_plain(value: Any) -> Any:
     """Return the value in the types of strict JSON.
 
-    Arrays and tuples become lists, numpy's scalars become numbers, and paths become texts. JSON has no number
-    that is not finite: NaN becomes null, since it is no value, and infinity becomes the text "inf".
+    Arrays and tuples become lists, numpy's scalars numbers, and paths texts. NaN becomes null, and infinity
+    the text "inf".
     """
     if isinstance(value, Mapping):
         return {str(key): to_plain(item) for key, item in value.items()}

@@ -62,8 +62,8 @@ class CurveAhead:
 class TrackAhead:
     """The next stretch of the track in the vehicle's frame (x forward, y left, m and rad).
 
-    The centre line has n points: n is 0 where only one boundary is known, and smaller than what was asked for
-    where the map ends. Each point is equally far from both boundaries.
+    The centre line has n points, each equally far from both boundaries: none where only one boundary is
+    known, and fewer than were asked for where the map ends.
     """
 
     LENGTHS: ClassVar = {

@@ -65,9 +65,8 @@ class Placement:
 class Boundary:
     """A B-spline that grows until the loop closes; its control points are graph variables.
 
-    It holds the knots and what follows from them. An open boundary has uniform, floating (unclamped) knots
-    whose interval is the spacing of its control points, so the parameter is roughly a length in metres. It is
-    0 at the first cone.
+    An open boundary has uniform, floating (unclamped) knots whose interval is the spacing of its control
+    points, so the parameter is roughly a length in metres, 0 at the first cone.
     """
 
     def __init__(
@@ -202,10 +201,10 @@ class Boundary:
     def grow(self, control_points: Array, targets_u: Array, targets: Array) -> Array:
         """Extend the curve through targets (k, 2) at parameters (k,); return its control points (n', 2).
 
-        Knots are appended until the domain holds the last parameter, which becomes `confirmed_end`. No basis
-        function of the old curve changes. The old control points that act only beyond the last cone before
-        `confirmed_end` are placed again with the new ones: the direction at the end was a guess as long as
-        nothing was known beyond it, and over a long gap it would lead the curve astray.
+        Knots are appended until the domain holds the last parameter, which becomes `confirmed_end`. Old basis
+        functions stay. The old control points that act only beyond the last cone before `confirmed_end` are
+        placed again with the new ones: the direction at the end was a guess, which over a long gap would lead
+        the curve astray.
         """
         placement = self.extend(len(control_points), targets_u, self._last_cone_before_end())
         return placement.place(control_points, targets)

@@ -78,8 +78,8 @@ class Ribbon(BSpline):
     def edge_spline(self, label: int) -> tuple[BSpline, Array]:
         """Return an edge as a B-spline of m' control points, and their derivatives (2m', 3m).
 
-        It is the least-squares fit to the edge, on twice the knots, at the same parameters. The derivatives
-        are by the ribbon's control points.
+        The least-squares fit to the edge, on twice the knots, at the same parameters. The derivatives are by
+        the ribbon's control points.
         """
         low, high = self.domain
         count = _EDGE_BREAKS * len(self.tables.starts)
