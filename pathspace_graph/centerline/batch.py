@@ -32,7 +32,13 @@ from .graph import EdgeDetections, edge_factors, ribbon_covariance, ribbon_keys,
 Array = NDArray[np.float64]
 
 NAME: Final = "centerline"
-"""This is the estimator's name on the command line."""
+"""Name of the estimator on the command line."""
+ROUNDS: Final = 2
+"""Number of optimizations; before each, the control points are held beside the poses anew."""
+MAX_ITERATIONS: Final = 15
+"""Largest number of iterations of one of them."""
+TOLERANCE: Final = 1e-5
+"""Share by which an iteration lowers the error at least, or it is the last one."""
 
 
 @log_at_scale
@@ -71,7 +77,7 @@ class CenterlineBatch:
             drive.add(factor)
         for factor in edge_factors(ribbon, detections, settings, state.variables.sensor_key):
             drive.add(factor)
-        for _ in range(settings.centerline.rounds):
+        for _ in range(ROUNDS):
             graph = gtsam.NonlinearFactorGraph(drive)
             poses = _poses(values, len(start.trajectory))
             for factor in shape_factors(ribbon, poses, settings):
@@ -85,7 +91,7 @@ class CenterlineBatch:
             self._run(start),
             map=replace(map_of(ribbon, covariance, settings.spline.sigma_shape, {}), points=start.map.points),
             trajectory=_poses(values, len(start.trajectory)),
-            converged=bool(optimizer.iterations() < settings.centerline.max_iterations),
+            converged=bool(optimizer.iterations() < MAX_ITERATIONS),
             cost=float(optimizer.error()),
         )
 
@@ -108,8 +114,8 @@ class CenterlineBatch:
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
     ) -> gtsam.LevenbergMarquardtOptimizer:
         parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setRelativeErrorTol(self.settings.centerline.tolerance)
-        parameters.setMaxIterations(self.settings.centerline.max_iterations)
+        parameters.setRelativeErrorTol(TOLERANCE)
+        parameters.setMaxIterations(MAX_ITERATIONS)
         return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
 
 

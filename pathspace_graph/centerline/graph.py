@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, MutableSequence
 from dataclasses import dataclass
+from typing import Final
 
 import gtsam
 import numpy as np
@@ -20,6 +21,8 @@ from pathspace_graph.spline.ribbon import Ribbon
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
+ROOM: Final = 4.0
+"""Distance along the line within which a foot point is searched for (m)."""
 RIBBON_LETTER = "a"
 """The keys of a ribbon's control points have this letter; they hold `Point3` (x, y, h)."""
 
@@ -51,7 +54,7 @@ def edge_factors(
     ribbon: Ribbon, detections: EdgeDetections, settings: MapperSettings, sensor_key: int | None
 ) -> Iterator[gtsam.CustomFactor]:
     """Yields a factor for each cycle that has detections."""
-    keys, room = ribbon_keys(ribbon), settings.centerline.room
+    keys, room = ribbon_keys(ribbon), ROOM
     changes = np.flatnonzero(np.diff(detections.cycle)) + 1
     for own in np.split(np.arange(len(detections.cycle)), changes):
         if len(own):

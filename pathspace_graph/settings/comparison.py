@@ -56,11 +56,3 @@ class CenterlineSettings(Positive):
     """Distance of the knots of the centre line (m)."""
     sigma_width: float = 0.3
     """Standard deviation (m) of the second difference of the half widths at neighbouring control points."""
-    room: float = 4.0
-    """Foot points are searched for within this distance (m along the line) of where they are expected."""
-    rounds: int = 2
-    """The batch holds the control points beside the poses anew, and is optimized again, in each round."""
-    max_iterations: int = 15
-    """Each round takes at most this number of iterations."""
-    tolerance: float = 1e-5
-    """A round ends where an iteration lowers the error by less than this share."""

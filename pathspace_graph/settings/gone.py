@@ -41,6 +41,7 @@ open_lap: rough_rounds 8, rounds 20, rounds_from_odometry 24, tolerance 10.0
 ckf: penalty solution, prediction fitted, sigma_kept 0.05, least_basis 1e-3, reach 9.0, stretch 12.0,
  sigma_carry 1.0, sigma_start 0.3, sigma_tie 0.15, sigma_match 0.6, patience 30.0, sigma_patience 1000.0,
  tie_reach 1.0
+centerline: room 4.0, rounds 2, max_iterations 15, tolerance 1e-5, sigma_edge 0.05
 landmark: rough 5.0, max_rounds 10, settled 1e-3, tolerance 1e-6, sigma_merge 0.1, unseen 40.0, min_pairs 4,
  min_lead 2.0
 path: step 0.3, memory 60.0, beginning_step 1.0, max_curvature 0.3, curvature_gain 0.4, min_speed 1.0
