@@ -3,8 +3,6 @@
 Good logs of all kinds are judged: what is unusual about them is no mistake, and none of them may be accused.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """The command line: it finds the command, and turns errors into one line and an exit code."""
 
-from __future__ import annotations
-
 import signal
 import sys
 import threading

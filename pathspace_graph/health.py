@@ -1,7 +1,5 @@
 """Health: how far an online estimate can be trusted, cycle by cycle, with a reason in plain words."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The options of a command, made from its dataclass, their help, and what is wrong with them in one line."""
 
-from __future__ import annotations
-
 import io
 import re
 import sys

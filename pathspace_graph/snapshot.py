@@ -16,8 +16,6 @@ afterwards, circles through objects stay circles, and arrays that overlap in mem
 comes from the file: an object is of a class of the rooms below, and made without its constructor.
 """
 
-from __future__ import annotations
-
 import dis
 import json
 import math

@@ -1,7 +1,5 @@
 """Track files of other simulators and of surveys: PacSim and fssim YAML, EUFS and TUM CSV."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Every estimator on the same logs: their frame, the paper's Table 1, all metrics, and paired differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Studies: the tracks, seeds, noise, estimators and settings to compare, as a TOML file or in Python."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace

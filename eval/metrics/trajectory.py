@@ -1,16 +1,14 @@
 """Errors of a trajectory, and the reach: how far ahead of the vehicle the map is right."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from pathspace_graph.batch.association import path_lengths
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import to_map, to_vehicle, wrap_angle
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
@@ -20,8 +18,6 @@ from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.run import ObservedCycle
 
 from .accuracy import boundary_distances, root_mean_square
-
-Array = NDArray[np.float64]
 
 LOST: Final = 5.0
 """A vehicle is lost where its position is wrong by more than this (m)."""
@@ -127,8 +123,6 @@ def position_rms(errors: Array) -> float:
     return root_mean_square(np.linalg.norm(errors[:, :2], axis=1))
 
 
-IntArray = NDArray[np.intp]
-
 MOST: Final = 35.0
 """A reach is at most this long (m)."""
 ON_CURVE: Final = 0.5
@@ -158,7 +152,7 @@ class TrueRoad:
     cone."""
     cones: Array
     """Each row is the cone (P, 2) in m, map frame, that is passed there."""
-    labels: NDArray[np.int_]
+    labels: IntArray
     """Each cone (P,) that is passed is of this boundary."""
     counted: tuple[float, float]
     """Cycles between these stations (m) count."""

@@ -1,7 +1,5 @@
 """Opens a recording of the live viewer rerun: as a file, in a window, or as both."""
 
-from __future__ import annotations
-
 import os
 import socket
 import sys

@@ -1,7 +1,5 @@
 """All that watches a run of the command line: the live viewer, its recording, and the film."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path

@@ -1,20 +1,18 @@
 """The batch of a centre line with a width: all poses and one ribbon, on GTSAM's own optimizer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.batch.nonlinear_graph import drive_factors
 from pathspace_graph.batch.start import CurveMapper
 from pathspace_graph.errors import SettingsError, solving
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.gtsam_factors import pose_array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.graph.variables import pose_key
@@ -28,8 +26,6 @@ from pathspace_graph.spline.ribbon import SIDE, Ribbon
 
 from .edges import map_of
 from .graph import EdgeDetections, edge_factors, ribbon_covariance, ribbon_keys, shape_factors
-
-Array = NDArray[np.float64]
 
 NAME: Final = "centerline"
 """Name of the estimator on the command line."""

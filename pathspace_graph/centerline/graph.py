@@ -1,15 +1,13 @@
 """The factor graph of a ribbon: the detections of every cycle, and weak priors on what they leave free."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, MutableSequence
 from dataclasses import dataclass
 from typing import Final
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.gtsam_factors import fill, pose_array, ribbon_factor
 from pathspace_graph.factors.residuals import RIBBON
 from pathspace_graph.factors.se2 import rotation
@@ -17,9 +15,6 @@ from pathspace_graph.graph.gaussian import sparse_marginal
 from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.ribbon import Ribbon
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 ROOM: Final = 4.0
 """Distance along the line within which a foot point is searched for (m)."""

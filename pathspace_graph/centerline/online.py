@@ -1,14 +1,10 @@
 """A centre line with a width, online: the ribbon that the fixed-lag posterior of the boundaries tells of."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
@@ -19,8 +15,6 @@ from pathspace_graph.scale.door import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .edges import map_of, ribbon_of
-
-Array = NDArray[np.float64]
 
 NAME: Final = "centerline-fixed-lag"
 """This is the estimator's name on the command line."""

@@ -1,7 +1,5 @@
 """`ablate`: a study over tracks, seeds, noise, estimators and settings, in parallel and resumable."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

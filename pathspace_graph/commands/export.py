@@ -1,7 +1,5 @@
 """`export`: a map in the formats of planners and other tools."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`faults`: the suite of faults, each at three strengths beside the clean run, in parallel and resumable."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 from pathspace_graph.estimators import DEFAULT

@@ -1,7 +1,5 @@
 """`figures`: the paper's isolated tests as figures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

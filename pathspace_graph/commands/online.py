@@ -1,7 +1,5 @@
 """`online`: a log is mapped cycle by cycle, without reading ahead."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """`plot`: the picture of a map folder."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`scale`: the time of an update against the size of the map, its detections and the laps."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Final

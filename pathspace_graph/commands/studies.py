@@ -1,7 +1,5 @@
 """What the commands that run a study share: their options, how a study is run, and what failed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`verify`: whether the files of a folder are as they were written."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A map as GeoJSON (RFC 7946): its boundaries and its centre line, by longitude and latitude."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """The map on the earth: latitude and longitude (WGS84) by a plane that touches the ellipsoid."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final

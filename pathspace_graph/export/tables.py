@@ -1,7 +1,5 @@
 """A map as CSV: its centre line with widths, and its boundaries as points."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
 

@@ -4,8 +4,6 @@ They are generous, since they guard against damage and mistakes. What a certain 
 its estimator.
 """
 
-from __future__ import annotations
-
 from itertools import chain
 from pathlib import Path
 from reprlib import Repr

@@ -1,7 +1,5 @@
 """The manifest of a folder: size and SHA-256 of each file as it was written, verified when a file is read."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable, Iterator

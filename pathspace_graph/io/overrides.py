@@ -1,7 +1,5 @@
 """Dotted fields of a tree of settings, such as `spline.degree`, and overrides of them, also from a file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path

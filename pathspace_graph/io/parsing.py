@@ -1,7 +1,5 @@
 """Text files as plain data: TOML, JSON and YAML within the limits of what is read, and never as code."""
 
-from __future__ import annotations
-
 import json
 import re
 import stat

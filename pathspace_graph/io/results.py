@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Final, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.sensor import SENSOR
@@ -22,8 +22,6 @@ from .log import CALIBRATION
 from .manifest import verified
 from .map import MAP_FILE, Map, map_to_json
 from .trajectory import TRAJECTORY_FILE, write_trajectory
-
-Array = NDArray[np.float64]
 
 NoiseSource = Literal["stated", "measured", "assumed"]
 """Noise is what the log states, what a drive has shown, or a default."""

@@ -1,21 +1,18 @@
 """Trajectories in the TUM format, a row `t tx ty tz qx qy qz qw` for each pose (FORMATS)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pathspace_graph.errors import InputError
+from pathspace_graph.factors.arrays import Array
 
 from .csv_table import is_plain
 from .limits import MAX_COORDINATE, MAX_STAMP, shown
 from .manifest import verified
 from .parsing import read_text
-
-Array = NDArray[np.float64]
 
 TRAJECTORY_FILE: Final = "trajectory.tum"
 _COLUMNS: Final = 8

@@ -1,7 +1,5 @@
 """Logs are read together with the hints about them; where one is refused, its likely cause is told."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """Settings whose numbers are checked where they are made."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from math import inf, isfinite
 from typing import ClassVar

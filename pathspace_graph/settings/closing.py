@@ -1,7 +1,5 @@
 """Settings of loop closing: when the loop may close, and how certain its registration must be."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from .checked import Positive

@@ -1,7 +1,5 @@
 """Settings of growth: how the open ends of the curves grow."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from .checked import Positive

@@ -1,7 +1,5 @@
 """Settings of the monitor of an online estimate."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from .checked import Positive

@@ -4,8 +4,6 @@ A number that nobody changes is a constant: beside its use, or a class variable 
 share it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 

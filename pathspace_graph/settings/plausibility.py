@@ -1,7 +1,5 @@
 """Settings of the hints: when a log is said to have a certain mistake in it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from .checked import Positive

@@ -7,20 +7,19 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import RIBBON
 from pathspace_graph.factors.se2 import left_of
 
 from .bspline import BSpline
 from .ribbon import Ribbon
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
-Bools = NDArray[np.bool_]
+Ints = IntArray
+Bools = BoolArray
 
 SPACING: Final = 3.0
 """Distance of the knots of a planner's line (m); shorter kinks of the boundaries are smoothed."""

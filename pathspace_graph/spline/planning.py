@@ -1,20 +1,16 @@
 """What a planner is given of a track: a centre line with widths and curvature, each with its sigma."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import left_of
 
 from .bspline import BSpline
 from .centre_line import CentreCurve, Crossing, find_line
-
-Array = NDArray[np.float64]
 
 LEAST_STEP: Final = 0.01
 """Least distance of the points of a line (m)."""

@@ -1,21 +1,17 @@
 """A track as a ribbon: one B-spline for its centre line and half its width, and the edges that follow."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.residuals import RIBBON, greville, smoothness_coefficients
 from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.labels import LEFT, RIGHT
 
 from .bspline import BSpline
-
-Array = NDArray[np.float64]
 
 SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}
 """Side of the centre line on which the edge of each label is."""

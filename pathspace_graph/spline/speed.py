@@ -1,18 +1,14 @@
 """The speed profile of a line: as fast as friction and curvature allow, and the time that it takes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import inf, sqrt
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.settings.output import SpeedSettings
-
-Array = NDArray[np.float64]
 
 
 class SampledLine(Protocol):
