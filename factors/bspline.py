@@ -184,7 +184,7 @@ class SpanPolynomials:
 
     @cached_property
     def inverse_widths(self) -> Array:
-        """`1 / (t_{i+1} - t_i)` of each span (n - p,), and zero for an empty span."""
+        """`1 / (t_{i+1} - t_i)` of each span (n - p,), zero for an empty span."""
         widths = np.diff(self.knots[self.degree : len(self.knots) - self.degree])
         return np.where(widths > 0.0, 1.0 / divisors(widths), 0.0)
 

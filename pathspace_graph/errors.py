@@ -49,11 +49,11 @@ class ReadingError(PathspaceError):
         super().__init__(f"{when}{where}: expected {expected}, found {value}")
 
     def at(self, t: float) -> ReadingError:
-        """Returns the same error of the cycle with this stamp (s)."""
+        """Return the same error of the cycle with this stamp (s)."""
         return type(self)(self.field, self.expected, self.found, self.row, t)
 
     def __reduce__(self) -> tuple[type[ReadingError], tuple[object, ...]]:
-        """Returns how to make the error again: it comes back from worker processes."""
+        """Return how to make the error again: it comes back from worker processes."""
         return type(self), (self.field, self.expected, self.found, self.row, self.t)
 
 
@@ -78,7 +78,7 @@ class SingularSystemError(SolveError):
 
 @contextmanager
 def solving(what: str) -> Iterator[None]:
-    """Turns whatever numerics raise within the context into a SolveError about `what`."""
+    """Turn whatever numerics raise within the context into a SolveError about `what`."""
     try:
         yield
     except PathspaceError:
@@ -88,7 +88,7 @@ def solving(what: str) -> Iterator[None]:
 
 
 def check_name(name: Any, known: Iterable[str], expected: str) -> None:
-    """Raises a SettingsError that names the nearest known name, unless `name` is known."""
+    """Raise a SettingsError that names the nearest known name, unless `name` is known."""
     known = list(known)
     if name in known:
         return
@@ -106,7 +106,7 @@ NUMBERS: Final[dict[str, Callable[[Any], bool]]] = {
 
 
 def check_numbers(settings: object, group: str, names: Iterable[str], expected: str) -> None:
-    """Raises a SettingsError for the first of these settings that is not as `expected`, a key of NUMBERS."""
+    """Raise a SettingsError for the first of these settings that is not as `expected`, a key of NUMBERS."""
     for name in names:
         value = getattr(settings, name)
         if not NUMBERS[expected](value):

@@ -48,7 +48,7 @@ def _centerline(settings: MapperSettings, noise: KnownNoise) -> BatchEstimator:
 
 
 def _installed(group: str) -> dict[str, Callable[[MapperSettings, KnownNoise], Any]]:
-    """Returns the estimators that other packages add; each is imported when it is made."""
+    """Return the estimators that other packages add; each is imported when it is made."""
     return {point.name: _loading(point) for point in entry_points(group=group)}
 
 
@@ -81,17 +81,17 @@ given the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
 
 
 def check_online(name: str) -> None:
-    """Raises a SettingsError that names the known online estimators, unless the name is one of them."""
+    """Raise a SettingsError that names the known online estimators, unless the name is one of them."""
     _check(name, ONLINE, "online")
 
 
 def check_batch(name: str) -> None:
-    """Raises a SettingsError that names the known batch estimators, unless the name is one of them."""
+    """Raise a SettingsError that names the known batch estimators, unless the name is one of them."""
     _check(name, BATCH, "batch")
 
 
 def for_map(name: str, kind: MapKind) -> str:
-    """Returns the estimator that maps a track as asked for, in place of a default one.
+    """Return the estimator that maps a track as asked for, in place of a default one.
 
     SettingsError is raised where the named estimator has no such map.
     """
@@ -111,12 +111,12 @@ def _check(name: str, known: dict[str, Any], kind: str) -> None:
 
 
 def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimator:
-    """Returns a new online estimator for a log, of which it is given the noise only."""
+    """Return a new online estimator for a log, of which it is given the noise only."""
     check_online(name)
     return ONLINE[name](settings, log.noise)
 
 
 def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:
-    """Returns a new batch estimator for a log, of which it is given the noise only."""
+    """Return a new batch estimator for a log, of which it is given the noise only."""
     check_batch(name)
     return BATCH[name](settings, log.noise)

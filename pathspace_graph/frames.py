@@ -47,7 +47,7 @@ DIMENSIONS: Final = KEYS[1:]
 
 
 def read_cycles(folder: Path | str) -> pd.DataFrame:
-    """Returns the cycles of a run from the folder of its map, a row for each, with the cycle as its index.
+    """Return the cycles of a run from the folder of its map, a row for each, with the cycle as its index.
 
     Times are in s. Columns that the estimator does not write are not there. InputError on a wrong file.
     """
@@ -69,7 +69,7 @@ def _column(table: Table, name: str, kind: str) -> pd.Series:
 
 
 def read_study(folder: Path | str) -> pd.DataFrame:
-    """Returns the runs of a study from the folder that `ablate` wrote: a tidy row for each run and lap.
+    """Return the runs of a study from the folder that `ablate` wrote: a tidy row for each run and lap.
 
     The metrics come with the wall times. A run that failed has one row without a lap or metrics, and its
     `failure`. InputError on a wrong file.
@@ -84,7 +84,7 @@ def read_study(folder: Path | str) -> pd.DataFrame:
 
 
 def _table(file: Path) -> pd.DataFrame:
-    """Returns a file of a study; empty texts stay empty, and empty numbers are NaN."""
+    """Return a file of a study; empty texts stay empty, and empty numbers are NaN."""
     read_table(file, KEYS)  # which says what is wrong with it
     frame = pd.read_csv(file, dtype=dict.fromkeys(TEXTS, "str"), keep_default_na=False, na_values=[""])
     flags = [name for name in frame if name not in TEXTS and frame[name].dropna().isin([True, False]).all()]
@@ -94,7 +94,7 @@ def _table(file: Path) -> pd.DataFrame:
 
 
 def to_dataset(study: pd.DataFrame) -> xarray.Dataset:
-    """Returns the numbers of a study as a Dataset with the dimensions DIMENSIONS; what is true is 1.
+    """Return the numbers of a study as a Dataset with the dimensions DIMENSIONS; what is true is 1.
 
     Where a run failed or was not made its values are NaN. Texts that are the same in every row, such as the
     versions, are attributes. SettingsError where xarray is not installed.

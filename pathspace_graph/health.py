@@ -18,49 +18,48 @@ CONDITIONS: Final = (GOOD, DEGRADED, LOST)
 
 @dataclass(frozen=True)
 class Health:
-    """Says how far the estimate of a cycle can be trusted."""
+    """How far the estimate of a cycle can be trusted."""
 
     LENGTHS: ClassVar = {"reason": 1}
 
     condition: str = ""
-    """The estimate is good, degraded or lost; this is empty for an estimator without a monitor."""
+    """Good, degraded or lost; empty for an estimator without a monitor."""
     reason: str = ""
-    """This says why the condition is not good."""
+    """Why the condition is not good."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Holds what a cycle's detections say about the estimate, before they change it."""
+    """What a cycle's detections say about the estimate, before they change it."""
 
     t: float
-    """This is the stamp of the cycle (s)."""
+    """Stamp of the cycle (s)."""
     offered: int = 0
-    """This number of coloured detections lies in the view of the curves."""
+    """Number of coloured detections in the view of the curves."""
     explained: int = 0
-    """This number of them lies on a curve of its colour."""
+    """Number of them on a curve of their colour."""
     used: int = 0
-    """This number of them is in use."""
+    """Number of them in use."""
     innovations: float = 0.0
-    """This is the sum of squared normalized innovations of those in use."""
+    """Sum of squared normalized innovations of those in use."""
     closed: bool = False
-    """This says whether the loop has closed."""
+    """Whether the loop has closed."""
     sigma: float = nan
-    """This is the standard deviation (m) of the position in its worst direction on a closed map, where it is
-    known."""
+    """Standard deviation (m) of the position in its worst direction on a closed map, where it is known."""
     offered_by: tuple[int, int] = (0, 0)
-    """These numbers of the offered detections are of the left and of the right boundary of a closed map."""
+    """Numbers of offered detections of the left and of the right boundary of a closed map."""
     explained_by: tuple[int, int] = (0, 0)
-    """These numbers of the explained detections are."""
+    """Numbers of explained ones."""
     unmapped: tuple[int, int] = (0, 0)
-    """These numbers of other coloured detections, left and right, lie beside a gap of a closed map."""
+    """Numbers of other coloured detections, left and right, beside a gap of a closed map."""
     rests: bool = False
     """Whether the vehicle stands, and so has no need of detections."""
     odometry: str = ""
-    """This says what is wrong with the odometry since the cycle before; it is empty where nothing is."""
+    """What is wrong with the odometry since the cycle before; empty where nothing is."""
 
 
 class HealthMonitor:
-    """Judges the evidence of the newest cycles together."""
+    """Judge of the newest cycles' evidence together."""
 
     def __init__(self, settings: HealthSettings | None = None) -> None:
         self.settings = settings or HealthSettings()
@@ -70,12 +69,12 @@ class HealthMonitor:
         self._wrong: int | None = None  # this boundary is wrong, as long as it explains too little
 
     def restart(self) -> None:
-        """Forgets the evidence so far, because the map or the pose was replaced."""
+        """Forget the evidence so far, because the map or the pose was replaced."""
         self._recent.clear()
         self._offered, self._last_offered, self._wrong = 0, None, None
 
     def update(self, evidence: Evidence) -> Health:
-        """Returns the health at a cycle."""
+        """Return the health at a cycle."""
         if self._recent and self._recent[-1].closed != evidence.closed:
             self.restart()
         self._remember(evidence)
@@ -92,7 +91,7 @@ class HealthMonitor:
         return self._beside_gap(offered) if health == Health(GOOD) else health
 
     def _beside_gap(self, offered: int) -> Health:
-        """Returns the health where nothing is wrong, but the map may have a gap of a boundary."""
+        """Return the health where nothing is wrong, but the map may have a gap of a boundary."""
         unmapped = [sum(one.unmapped[label] for one in self._recent) for label in BOUNDARIES]
         most = (1.0 - self.settings.share_degraded) * (offered + sum(unmapped))
         names = [NAMES[label] for label in BOUNDARIES if unmapped[label] > most]
@@ -101,7 +100,7 @@ class HealthMonitor:
         return Health(DEGRADED, f"the {names[0]} boundary is not mapped here") if names else Health(GOOD)
 
     def _wrong_side(self) -> str:
-        """Returns which boundary is wrong, where the other one explains its detections, or an empty string.
+        """Return which boundary is wrong, where the other one explains its detections, or an empty string.
 
         It is the map that is wrong then: a vehicle that is lost has both boundaries beside it. A boundary
         stays wrong while too little of the other one is mapped to say anything.
@@ -114,7 +113,7 @@ class HealthMonitor:
         return "" if self._wrong is None else f"the {NAMES[self._wrong]} boundary is not where the map has it"
 
     def _holds(self, label: int) -> bool | None:
-        """Returns whether a boundary explains its detections, or None if there are too few of them."""
+        """Return whether a boundary explains its detections, or None if there are too few of them."""
         offered = sum(one.offered_by[label] for one in self._recent)
         explained = sum(one.explained_by[label] for one in self._recent)
         if offered < self.settings.min_offered / len(BOUNDARIES):
@@ -122,7 +121,7 @@ class HealthMonitor:
         return explained >= self.settings.share_degraded * offered
 
     def _remember(self, evidence: Evidence) -> None:
-        """Adds the evidence of a cycle, and drops what is too old and not needed for `min_offered`."""
+        """Add the evidence of a cycle, and drop what is too old and not needed for `min_offered`."""
         recent = self._recent
         recent.append(evidence)
         self._offered += evidence.offered
@@ -134,7 +133,7 @@ class HealthMonitor:
             self._offered -= recent.popleft().offered
 
     def _judge(self, newest: Evidence, share: float, innovation: float, most: float) -> Health:
-        """Returns the health by the share of explained detections, and by the innovation and its limit."""
+        """Return the health by the share of explained detections, and by the innovation and its limit."""
         settings = self.settings
         lost = settings.share_lost if newest.closed else 0.0  # on an open map it goes on by dead reckoning
         degraded = settings.share_degraded if newest.closed else settings.open_degraded
@@ -162,20 +161,19 @@ class HealthMonitor:
 
 @dataclass(frozen=True)
 class Stretch:
-    """A stretch is a run of cycles of one condition that is not good."""
+    """A run of cycles of one condition that is not good."""
 
     health: str
-    """The cycles have this condition."""
     begin: float
-    """This is the stamp of its first cycle (s)."""
+    """Stamp of its first cycle (s)."""
     end: float
-    """This is the stamp of its last cycle (s)."""
+    """Stamp of its last cycle (s)."""
     reason: str
-    """This is the reason that its first cycle gives."""
+    """Reason that its first cycle gives."""
 
 
 def stretches(t: Sequence[float], healths: Sequence[Health]) -> list[Stretch]:
-    """Returns the stretches of a run that were not good, from the stamps and the health of its cycles."""
+    """Return the stretches of a run that were not good, from the stamps and the health of its cycles."""
     found = []
     for condition, group in groupby(zip(t, healths, strict=True), key=lambda cycle: cycle[1].condition):
         cycles = list(group)
@@ -185,6 +183,6 @@ def stretches(t: Sequence[float], healths: Sequence[Health]) -> list[Stretch]:
 
 
 def counts(healths: Sequence[Health]) -> dict[str, int]:
-    """Returns the number of cycles of each condition."""
+    """Return the number of cycles of each condition."""
     number = Counter(health.condition for health in healths)
     return {condition: number[condition] for condition in CONDITIONS}

@@ -10,31 +10,31 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class LapSettings:
-    """Describes what counts as passing the start line, the y axis of the map frame at the first pose."""
+    """What counts as passing the start line, the y axis of the map frame at the first pose."""
 
     min_path: float = 25.0
-    """A lap is at least this long (m along the path); jitter or an overlap may cross the line sooner."""
+    """Least length of a lap (m along the path); jitter or an overlap may cross the line sooner."""
 
     min_distance: float = 7.0
-    """A lap leads at least this far away from the start (m)."""
+    """Least distance from the start that a lap leads to (m)."""
 
     gate_half_width: float = 5.0
-    """This is half the length of the start line (m), with room for the racing line and for the drift of one
-    lap."""
+    """Half the length of the start line (m), with room for the racing line and for the drift of one lap."""
 
     gate_depth: float = 10.0
-    """A crossing is still noticed up to this far past the line (m), where an estimate jumped over it."""
+    """Distance past the line up to which a crossing is still noticed (m), where an estimate jumped over
+    it."""
 
     max_heading: float = np.pi / 3
-    """The heading differs from the start's by less than this (rad) where the line is crossed."""
+    """Largest difference of the heading from the start's where the line is crossed (rad)."""
 
     end_tolerance: float = 5.0
-    """A last lap that ends at most this far before the line (m) counts as complete."""
+    """Largest distance before the line at which a last lap counts as complete (m)."""
 
 
 class LapCounter:
-    """Counts laps pose by pose: a lap ends where the start line is crossed forward after a lap's length of
-    path.
+    """Counter of laps pose by pose: a lap ends where the start line is crossed forward after a lap's length
+    of path.
 
     Poses are [x, y, theta] in the map frame, whose origin and x axis are the start. An online estimate may
     jump when a loop closes, so a pose just behind the line that heads forward ends the lap as well.
@@ -43,13 +43,13 @@ class LapCounter:
     def __init__(self, settings: LapSettings | None = None) -> None:
         self.settings = settings or LapSettings()
         self.lap = 1
-        """This is the current lap, counted from 1."""
+        """Current lap, counted from 1."""
         self._path = 0.0
         self._farthest = 0.0
         self._last: tuple[float, float, float] | None = None
 
     def update(self, pose: ArrayLike) -> int:
-        """Returns the lap, counted from 1, that the next `pose` (3,) [x, y, theta] belongs to."""
+        """Return the lap, counted from 1, that the next `pose` (3,) [x, y, theta] belongs to."""
         x, y, theta = (float(value) for value in np.asarray(pose, dtype=float))
         if self._last is not None:
             self._path += float(np.hypot(x - self._last[0], y - self._last[1]))
@@ -62,7 +62,7 @@ class LapCounter:
 
     @property
     def last_lap_is_complete(self) -> bool:
-        """Says whether the current lap has come back to within `end_tolerance` of the start line."""
+        """Say whether the current lap has come back to within `end_tolerance` of the start line."""
         if self._last is None or not self._has_driven_a_lap():
             return False
         x, y, theta = self._last
@@ -70,7 +70,7 @@ class LapCounter:
 
     @property
     def completed(self) -> int:
-        """Returns the number of complete laps, with a last one that ends just before the line."""
+        """Return the number of complete laps, with a last one that ends just before the line."""
         return self.lap - 1 + int(self.last_lap_is_complete)
 
     def _has_driven_a_lap(self) -> bool:
@@ -90,7 +90,7 @@ class LapCounter:
 
 
 def lap_end_indices(poses: Array, settings: LapSettings | None = None) -> NDArray[np.intp]:
-    """Returns the index of the pose (k,) at which each complete lap ends, of poses (N, 3) in the map frame.
+    """Return the index of the pose (k,) at which each complete lap ends, of poses (N, 3) in the map frame.
 
     A last lap that ends within `end_tolerance` of the line is complete, and ends with the last pose. A lap
     that the log breaks off is not listed.

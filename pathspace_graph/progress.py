@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 @contextmanager
 def progress(description: str, total: int | None = None, lines: int = 0) -> Iterator[Steps]:
-    """Shows a bar on a terminal, or a spinner where the total isn't known, and yields what counts the steps.
+    """Show a bar on a terminal, or a spinner where the total isn't known, and yields what counts the steps.
 
     Without a terminal nothing is shown, unless `lines` asks for about that many lines over the whole work.
     """
@@ -35,7 +35,7 @@ class Steps:
         self._task = display.add_task(description, total=total, remaining="")
 
     def __call__(self, done: int | None = None, total: int | None = None) -> None:
-        """Counts one more step, or sets how many steps of how many are done."""
+        """Count one more step, or sets how many steps of how many are done."""
         self._done = self._done + 1 if done is None else done
         self._total = self._total if total is None else total
         remaining = ""
@@ -54,7 +54,7 @@ class Steps:
 
 
 def time_remaining(elapsed: float, done: int, total: int) -> str:
-    """Returns `elapsed * (total - done) / done` (s) in words."""
+    """Return `elapsed * (total - done) / done` (s) in words."""
     if not done:
         return "time left unknown"
     return f"{timedelta(seconds=round(elapsed * (total - done) / done))} left"

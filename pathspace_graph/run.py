@@ -28,172 +28,171 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class CycleResult:
-    """Holds what an online estimator found in one perception cycle."""
+    """Result of an online estimator in one perception cycle."""
 
     LENGTHS: ClassVar = {"pose": POSE, "jump": POSE, "notice": 1, "health": 0}
 
     t: float
-    """This is the stamp of the cycle (s)."""
+    """Stamp of the cycle (s)."""
     pose: Array
-    """The vehicle has this pose [x, y, theta] (3,), m and rad, map frame; theta isn't wrapped."""
+    """Pose [x, y, theta] (3,) of the vehicle, m and rad, map frame; theta isn't wrapped."""
     sizes: tuple[int, int]
-    """These are the numbers of control points, or of landmarks, of the left and of the right boundary."""
+    """Numbers of control points, or of landmarks, of the left and of the right boundary."""
     readings: int
-    """This is the number of the cycle's detections that were used."""
+    """Number of the cycle's detections that were used."""
     closed: bool
-    """This says whether the loop has closed."""
+    """Whether the loop has closed."""
     stages: Mapping[str, float] = field(default_factory=dict)
-    """Each stage of the update took this time (s), by the stage's name."""
+    """Time of each stage of the update (s), by the stage's name."""
     jump: Array | None = None
-    """The newest pose jumped by this (3,) [m, m, rad] in the map frame, where the map was replaced in this
-    cycle by one that was solved as a batch."""
+    """Jump (3,) [m, m, rad] of the newest pose in the map frame, where the map was replaced in this cycle by
+    one that was solved as a batch."""
     notice: str = ""
-    """This says what a user should know of the cycle; it is empty if there is nothing."""
+    """What a user should know of the cycle; empty if there is nothing."""
     health: Health = field(default_factory=Health)
-    """This says how far the estimate can be trusted; it is empty for an estimator without a monitor."""
+    """How far the estimate can be trusted; empty for an estimator without a monitor."""
     dropped: int = 0
-    """This is the number of the cycle's detections that were dropped, since they are impossible."""
+    """Number of the cycle's detections that were dropped as impossible."""
     late: bool = False
-    """The flag is set where the cycle was handed over after a newer one, and was used at its own time."""
+    """Whether the cycle was handed over after a newer one, and was used at its own time."""
     refused: int = 0
-    """This number of cycles was refused since the last one that was used."""
+    """Number of cycles that were refused since the last one that was used."""
 
 
 class OnlineEstimator(Protocol):
-    """Describes what every online estimator has."""
+    """Interface of every online estimator."""
 
     @property
     def settings(self) -> Any:
-        """Returns a frozen dataclass with all settings of the estimator."""
+        """Return a frozen dataclass with all settings of the estimator."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Processes one perception cycle: the twists since the last one, and the detections of this one."""
+        """Process one perception cycle: the twists since the last one, and the detections of this one."""
 
     def map(self) -> Map:
-        """Returns a copy of the map as it stands."""
+        """Return a copy of the map as it stands."""
 
 
 class BatchEstimator(Protocol):
-    """Describes what every batch estimator has."""
+    """Interface of every batch estimator."""
 
     @property
     def settings(self) -> Any:
-        """Returns a frozen dataclass with all settings of the estimator."""
+        """Return a frozen dataclass with all settings of the estimator."""
 
     def solve(self, log: Log) -> BatchRun:
-        """Returns the optimum over a whole log, whose truth is not read."""
+        """Return the optimum over a whole log, whose truth is not read."""
 
 
 @runtime_checkable
 class OutliningEstimator(Protocol):
-    """Describes an online estimator whose map is cheap to look at in every cycle."""
+    """An online estimator whose map is cheap to look at in every cycle."""
 
     def outline(self) -> Map:
-        """Returns a copy of the map as it stands, without covariances, which are empty (0, 0)."""
+        """Return a copy of the map as it stands, without covariances, which are empty (0, 0)."""
 
 
 @runtime_checkable
 class VehicleEstimator(Protocol):
-    """Describes an online estimator that says how well it knows the vehicle's pose and its calibration."""
+    """An online estimator that knows the uncertainty of the vehicle's pose and its calibration."""
 
     def vehicle_state(self) -> VehicleState:
-        """Returns the newest pose and the calibration, with their joint covariance."""
+        """Return the newest pose and the calibration, with their joint covariance."""
 
 
 @runtime_checkable
 class NoiseEstimator(Protocol):
-    """Describes an online estimator that says which noise it uses."""
+    """An online estimator that says which noise it uses."""
 
     def noise_used(self) -> RunNoise:
-        """Returns the noise that is used now, and what was measured so far."""
+        """Return the noise that is used now, and what was measured so far."""
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Holds the detections of the newest cycle as the estimator took them, seen from its newest pose."""
+    """Detections of the newest cycle as the estimator took them, seen from its newest pose."""
 
     LENGTHS: ClassVar = {"points": 1, "feet": 1}
 
     points: Array
-    """Each row is a detected position (k, 2) in m, map frame, corrected as the estimator corrects it."""
+    """Detected positions (k, 2) in m, map frame, corrected as the estimator corrects them."""
     labels: IntArray
-    """Each detection (k,) belongs to this boundary, LEFT or RIGHT, or is UNKNOWN."""
+    """Boundary (k,) of each detection, LEFT, RIGHT or UNKNOWN."""
     used: BoolArray
-    """The flag (k,) is set when the detection was used, and cleared when it was gated."""
+    """Whether each detection (k,) was used; otherwise it was gated."""
     feet: Array
-    """Each row is the foot point (k, 2) of a used detection on its curve, or its landmark, in m, map frame;
-    it is NaN for the others."""
+    """Foot point (k, 2) of each used detection on its curve, or its landmark, in m, map frame; NaN for the
+    others."""
 
 
 @runtime_checkable
 class ReadingEstimator(Protocol):
-    """Describes an online estimator that says which detections of the newest cycle it used, and where."""
+    """An online estimator that says which detections of the newest cycle it used, and where."""
 
     def readings(self) -> Readings:
-        """Returns the detections of the newest cycle as they were used or gated."""
+        """Return the detections of the newest cycle as they were used or gated."""
 
 
 @runtime_checkable
 class WindowEstimator(Protocol):
-    """Describes an online estimator that keeps a window of poses."""
+    """An online estimator that keeps a window of poses."""
 
     def window_poses(self) -> Array:
-        """Returns a copy of the poses (P, 3) in the window, the oldest first, map frame."""
+        """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
 
 
 @runtime_checkable
 class LookedAtEstimator(Protocol):
-    """Describes an online estimator that has to be told that it is looked at only."""
+    """An online estimator that has to be told that it is looked at only."""
 
     def looked_at(self) -> AbstractContextManager[None]:
-        """Returns a context in which nothing that is asked for changes the estimate."""
+        """Return a context in which nothing that is asked for changes the estimate."""
 
 
 @runtime_checkable
 class BatchingEstimator(Protocol):
-    """Describes an online estimator that has batches solved by another process while it goes on."""
+    """An online estimator that has batches solved by another process while it goes on."""
 
     def wait(self) -> None:
-        """Waits for the batch whose result the next update may take, however long that takes."""
+        """Wait for the batch whose result the next update may take, however long that takes."""
 
     def batches(self) -> LapBatches:
-        """Returns the cycles in which batches have ended."""
+        """Return the cycles in which batches have ended."""
 
 
 def scale(estimator: OnlineEstimator) -> float:
-    """Returns the scale of the scene as an estimator knows it; 1 where it takes every scene as it is."""
+    """Return the scale of the scene as an estimator knows it; 1 where it takes every scene as it is."""
     return float(getattr(estimator, "scale", 1.0))
 
 
 def outline(estimator: OnlineEstimator) -> Map:
-    """Returns the present map, without covariances where the estimator can give it so."""
+    """Return the present map, without covariances where the estimator can give it so."""
     return estimator.outline() if isinstance(estimator, OutliningEstimator) else estimator.map()
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedCycle:
-    """Shows an observer a cycle that is over: what went in, what came out, and the estimator as it stands.
+    """A cycle that is over, as an observer sees it: its input, its result, and the estimator as it stands.
 
     The map, the readings and the window are taken when they are first asked for, once for all observers of
     the cycle. So they must be asked for before the next cycle, and must not be changed.
     """
 
     estimator: OnlineEstimator
-    """The estimator has processed the cycle."""
+    """Estimator that has processed the cycle."""
     detections: Detections
-    """These are the detections of the cycle, as they were handed over."""
+    """Detections of the cycle, as they were handed over."""
     result: CycleResult
-    """The estimator said this."""
     number: int = 0
-    """This is the number of the cycle, from 0."""
+    """Number of the cycle, from 0."""
     seconds: float = nan
-    """The whole update took this wall time (s), where it was measured."""
+    """Wall time of the whole update (s), where it was measured."""
     lap: int = 1
-    """The estimated trajectory is in this lap, counted from 1."""
+    """Lap of the estimated trajectory, counted from 1."""
 
     @cached_property
     def record(self) -> CycleRecord:
-        """Returns the cycle as a row of `cycles.csv` has it."""
+        """Return the cycle as a row of `cycles.csv` has it."""
         result = self.result
         return CycleRecord(
             cycle=self.number,
@@ -217,54 +216,54 @@ class ObservedCycle:
 
     @cached_property
     def outline(self) -> Map:
-        """Returns the map as it stands, without covariances where the estimator can give it so."""
+        """Return the map as it stands, without covariances where the estimator can give it so."""
         return outline(self.estimator)
 
     @cached_property
     def map(self) -> Map:
-        """Returns the map as it stands, with its covariances, which takes much longer than the outline."""
+        """Return the map as it stands, with its covariances, which takes much longer than the outline."""
         estimator = self.estimator
         with estimator.looked_at() if isinstance(estimator, LookedAtEstimator) else nullcontext():
             return estimator.map()
 
     @cached_property
     def readings(self) -> Readings | None:
-        """Returns which detections were used; it is None where the estimator does not say it."""
+        """Return which detections were used; None where the estimator does not say it."""
         return self.estimator.readings() if isinstance(self.estimator, ReadingEstimator) else None
 
     @cached_property
     def window(self) -> Array:
-        """Returns the poses (P, 3) in the window, the oldest first; a filter has none."""
+        """Return the poses (P, 3) in the window, the oldest first; a filter has none."""
         estimator = self.estimator
         return estimator.window_poses() if isinstance(estimator, WindowEstimator) else np.zeros((0, 3))
 
 
 Observer = Callable[[ObservedCycle], None]
-"""It is called after each cycle, and its time is not the estimator's."""
+"""Function that is called after each cycle, whose time is not the estimator's."""
 
 
 class Stopwatch:
-    """Measures how long each stage of an update takes, from the moment that it is made."""
+    """Times of the stages of an update, from the moment that it is made."""
 
     def __init__(self) -> None:
         self.laps: dict[str, float] = {}
-        """Each stage took this time (s)."""
+        """Time of each stage (s)."""
         self._last = time.perf_counter()
 
     @property
     def spent(self) -> float:
-        """Returns the time (s) of all stages so far."""
+        """Return the time (s) of all stages so far."""
         return sum(self.laps.values())
 
     def lap(self, name: str) -> None:
-        """Assigns the time since the last call to the stage `name`."""
+        """Assign the time since the last call to the stage `name`."""
         now = time.perf_counter()
         self.laps[name] = now - self._last
         self._last = now
 
 
 def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
-    """Yields each perception cycle with the twists since the cycle before it, none later than its stamp.
+    """Yield each perception cycle with the twists since the cycle before it, none later than its stamp.
 
     The rows tile the time without a gap, row i being in force during [t_i, t_(i+1)). The first row begins at
     the stamp of the cycle before with the twist that was held then. The last row is held until the cycle.
@@ -276,7 +275,7 @@ def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
 
 
 def timed_wait(estimator: OnlineEstimator) -> float:
-    """Waits for what the next update may take from another process, and returns the wall time (s) of that.
+    """Wait for what the next update may take from another process; return the wall time (s) of that.
 
     So the update itself waits for nothing, and a replay depends on no other process's speed.
     """
@@ -290,7 +289,7 @@ def timed_wait(estimator: OnlineEstimator) -> float:
 def timed_update(
     estimator: OnlineEstimator, odometry: Odometry, detections: Detections
 ) -> tuple[CycleResult, float]:
-    """Does one update, and returns the estimate and the wall time (s) that the update took."""
+    """Do one update; return the estimate and the wall time (s) that the update took."""
     begin = time.perf_counter()
     estimate = estimator.update(odometry, detections)
     return estimate, time.perf_counter() - begin
@@ -306,7 +305,7 @@ def run_online(
     on_cycle: Callable[[CycleRecord], None] | None = None,
     observer: Callable[[CycleResult, Map], None] | None = None,
 ) -> RunResult:
-    """Feeds a log's odometry and cycles to an online estimator, in order of time and never ahead of it.
+    """Feed a log's odometry and cycles to an online estimator, in order of time and never ahead of it.
 
     The truth of the log is not read. For each of the `snapshot_times` (s, ascending) the map is kept as it
     stood then, after the last cycle that isn't later. Each of the `observers` is shown each cycle once it is
@@ -328,7 +327,7 @@ def run_online(
 
 
 class _Run:
-    """Collects the results of a run in progress."""
+    """Results of a run in progress."""
 
     def __init__(
         self, estimator: OnlineEstimator, snapshot_times: list[float], observers: Sequence[Observer]
@@ -344,7 +343,7 @@ class _Run:
         self._records: list[CycleRecord] = []
 
     def cycle(self, odometry: Odometry, detections: Detections) -> None:
-        """Runs and times one update, records it, and shows it to the observers."""
+        """Run and time one update, record it, and show it to the observers."""
         self._take_snapshots(before=detections.t)
         self._waited += timed_wait(self._estimator)
         result, seconds = timed_update(self._estimator, odometry, detections)
@@ -362,7 +361,7 @@ class _Run:
             self._observing += time.perf_counter() - begin
 
     def result(self, name: str) -> RunResult:
-        """Returns the results after the last cycle."""
+        """Return the results after the last cycle."""
         self._take_snapshots(before=float("inf"))
         track = self._estimator.map()
         if self._laps.last_lap_is_complete:
@@ -397,5 +396,5 @@ def _vehicle_state(estimator: OnlineEstimator) -> VehicleState | None:
 
 
 def settings_dict(settings: Any) -> dict[str, Any]:
-    """Returns a settings dataclass with all nested ones as dictionaries; it is empty for anything else."""
+    """Return a settings dataclass with all nested ones as dictionaries, empty for anything else."""
     return asdict(settings) if is_dataclass(settings) and not isinstance(settings, type) else {}

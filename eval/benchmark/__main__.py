@@ -30,20 +30,21 @@ BAD_INPUT: Final = 2
 
 @dataclass(frozen=True, kw_only=True)
 class Benchmark:
-    """Times the online mapper on a generated track of 200 cones, and GTSAM's own solver on its windows."""
+    """Time the online mapper on a generated track of 200 cones, and GTSAM's own solver on its windows."""
 
     laps: int = 5
-    """The track is driven for this many laps."""
+    """Laps that are driven."""
     seed: int = 0
-    """The track, the drive and its noise have this seed."""
+    """Seed of the track, the drive and its noise."""
     json: Path | None = None
-    """The figures are written to this file."""
+    """File for the figures."""
     compare: bool = False
-    """The table says what is worse than the baseline by more than its tolerance; the exit code is 1 then."""
+    """Mark in the table what is worse than the baseline by more than its tolerance; the exit code is 1
+    then."""
     write_baseline: bool = False
-    """The ratios of this run become the baseline."""
+    """Make the ratios of this run the baseline."""
     baseline: Path = BASELINE
-    """The baseline is in this file; by default it is the one that comes with the package."""
+    """File of the baseline; by default the one that comes with the package."""
 
     def check(self) -> None:
         """Raise OutputError or InputError, before anything runs, where a file can't be written or read."""

@@ -22,16 +22,16 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 
 @dataclass(frozen=True, eq=False)
 class LinearWindow:
-    """Holds a window with the whole map, linearized at its estimate."""
+    """A window with the whole map, linearized at its estimate."""
 
     graph: gtsam.GaussianFactorGraph
-    """The graph has a factor for each cycle, and one for prior, weak priors and damping together."""
+    """A factor for each cycle, and one for prior, weak priors and damping together."""
     layout: Layout
-    """These are the variables of the graph."""
+    """Variables of the graph."""
 
 
 def linear_window(mapper: FixedLagMapper) -> LinearWindow:
-    """Returns the window of a mapper between two cycles; the mapper stays as it is."""
+    """Return the window of a mapper between two cycles; the mapper stays as it is."""
     smoother = mapper.smoother
     smoother.refresh()
     factors = factors_of(smoother.linear_graph(whole=True))
@@ -43,20 +43,20 @@ def linear_window(mapper: FixedLagMapper) -> LinearWindow:
 
 
 def _is_of_cycle(factor: gtsam.GaussianFactor) -> bool:
-    """Returns whether a factor holds the rows of a cycle; else it is the prior or holds weak priors."""
+    """Return whether a factor holds the rows of a cycle; else it is the prior or holds weak priors."""
     has_rows = isinstance(factor, gtsam.JacobianFactor)
     return has_rows and bool(are_poses(np.array(list(factor.keys()), np.intp)).any())
 
 
 def _damping(mapper: FixedLagMapper) -> gtsam.GaussianFactor:
-    """Returns the damping of the control points in a step as a factor."""
+    """Return the damping of the control points in a step as a factor."""
     keys, variables = mapper.smoother.map.state.map_keys, mapper.smoother.variables
     now, sigma = variables.change(variables.layout.entries(keys)), mapper.settings.sigma_step
     return jacobian_factor(keys, np.eye(len(now)) / sigma, now / sigma)
 
 
 def orderings(window: LinearWindow) -> dict[str, gtsam.Ordering | None]:
-    """Returns the orderings that `optimize` may be given: none, COLAMD's, or poses before the rest."""
+    """Return the orderings that `optimize` may be given: none, COLAMD's, or poses before the rest."""
     keys = window.layout.keys
     shared = ~are_poses(keys)
     return {
@@ -67,7 +67,7 @@ def orderings(window: LinearWindow) -> dict[str, gtsam.Ordering | None]:
 
 
 def marginal_keys(window: LinearWindow) -> list[int]:
-    """Returns what the marginal prior is on when the oldest pose leaves: map, calibration, next pose."""
+    """Return what the marginal prior is on when the oldest pose leaves: map, calibration, next pose."""
     keys = window.layout.keys
     poses = are_poses(keys)
     staying: list[int] = np.append(keys[~poses], keys[poses][1:2]).tolist()
@@ -75,7 +75,7 @@ def marginal_keys(window: LinearWindow) -> list[int]:
 
 
 def time_gtsam(window: LinearWindow) -> dict[str, tuple[float, float]]:
-    """Returns the wall times (s) of (`optimize`, `marginal`) by ordering, once each."""
+    """Return the wall times (s) of (`optimize`, `marginal`) by ordering, once each."""
     graph, staying = window.graph, gtsam.KeyVector(marginal_keys(window))
     marginal = _seconds(partial(graph.marginal, staying))
     return {
@@ -85,7 +85,7 @@ def time_gtsam(window: LinearWindow) -> dict[str, tuple[float, float]]:
 
 
 def _seconds(call: Callable[[], object]) -> float:
-    """Returns the wall time (s) of the second of two calls."""
+    """Return the wall time (s) of the second of two calls."""
     call()
     begin = time.perf_counter()
     call()

@@ -65,7 +65,7 @@ class Gtsam:
     """GTSAM's times in its fastest ordering."""
 
     ordering: str
-    """Ordering that was fastest on average; empty where nothing was sampled."""
+    """Fastest ordering on average; empty where nothing was sampled."""
     optimize: float
     """Mean time of `optimize` (s)."""
     marginal: float
@@ -76,7 +76,7 @@ class Gtsam:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What one run gave."""
+    """Result of one run."""
 
     cycles: tuple[CycleRecord, ...]
     """Cycles of the mapper."""
@@ -85,7 +85,6 @@ class Measurement:
     closing: int | None
     """Cycle that closed the loop; None where the loop stayed open."""
     gtsam: Gtsam
-    """Times of GTSAM."""
     rival: tuple[float, ...]
     """Time of each update of the landmark graph (s)."""
     swap: int | None = None
@@ -97,7 +96,7 @@ class Measurement:
 
 
 class _Sampler:
-    """Time GTSAM and the landmark graph between cycles, and notes the cycle that closes the loop."""
+    """Timer of GTSAM and the landmark graph between cycles, which notes the cycle that closes the loop."""
 
     def __init__(self, mapper: FixedLagMapper, log: Log, every: int, advance: Callable[[], None]) -> None:
         self._mapper, self._every, self._advance = mapper, every, advance
@@ -222,11 +221,9 @@ def _ahead_figures(measurement: Measurement) -> Iterator[tuple[str, float, str]]
 
 
 def _lap_means(cycles: Sequence[CycleRecord], laps: int) -> list[float]:
-    """Return the mean time (s) of a cycle in each complete lap."""
     return [_mean([c.seconds for c in cycles if c.lap == lap]) for lap in range(1, laps + 1)]
 
 
 def _mean(values: Iterable[float]) -> float:
-    """Return the mean, or NaN where there are no values."""
     array = np.asarray(list(values))
     return float(array.mean()) if len(array) else float("nan")

@@ -25,53 +25,53 @@ class RoadSettings(Positive):
     gap: float = 5.0
     """Distance of the cones of a row (m)."""
     dense_gap: float = 1.0
-    """The cones of a row are this far apart on the dense road, where detections are counted (m)."""
+    """Distance of the cones of a row on the dense road, where detections are counted (m)."""
     dense_range: float = 30.0
-    """The sensor has this range on the dense road (m)."""
+    """Range of the sensor on the dense road (m)."""
     width: float = 4.0
-    """The rows are this far apart (m)."""
+    """Distance of the rows (m)."""
     swing: float = 0.9
-    """An open road turns by at most this angle from its general direction (rad)."""
+    """Largest turn of an open road from its general direction (rad)."""
     wavelength: float = 300.0
-    """The swings of an open road are this far apart along it (m)."""
+    """Distance of the swings of an open road along it (m)."""
     dent: float = 0.12
-    """A closed road leaves its circle by this share of the radius."""
+    """Share of the radius by which a closed road leaves its circle."""
     dents: int = 3
-    """A closed road has this many dents."""
+    """Number of dents of a closed road."""
     speed: float = 20.0
-    """The vehicle drives at this speed (m/s)."""
+    """Speed of the vehicle (m/s)."""
     acceleration_lateral: float = 9.0
-    """The lateral acceleration in corners is at most this (m/s^2)."""
+    """Largest lateral acceleration in corners (m/s^2)."""
 
 
 @dataclass(frozen=True)
 class ScalingSettings(Positive):
-    """Describes what is measured of how time scales."""
+    """What is measured of how time scales."""
 
     cones_min: float = 50.0
-    """A point of the sweep over cones has at least this many cones seen."""
+    """Least number of cones seen of a point of the sweep over cones."""
     cones_max: float = 2000.0
-    """The sweep over cones ends when this many cones have been seen."""
+    """Number of cones seen at which the sweep over cones ends."""
     bins: int = 16
-    """The sweep over cones has this many points, evenly spaced on a logarithmic axis."""
+    """Number of points of the sweep over cones, evenly spaced on a logarithmic axis."""
     fit_from: float = 200.0
-    """The slope against cones is fitted from this number of cones on."""
+    """Number of cones from which on the slope against cones is fitted."""
     readings: tuple[int, ...] = (2, 4, 8, 14, 20, 28, 40)
-    """Updates with each of these numbers of detections are timed."""
+    """Numbers of detections of the updates that are timed."""
     readings_cones: int = 300
-    """The dense road, where these updates are timed, has this many cones."""
+    """Number of cones of the dense road, where these updates are timed."""
     warm_up: int = 30
-    """This many cycles at the beginning of the dense road are not counted."""
+    """Cycles at the beginning of the dense road that are not counted."""
     laps: int = 20
-    """The closed road is driven for this many laps."""
+    """Laps of the closed road."""
     laps_cones: int = 100
-    """The closed road has this many cones."""
+    """Cones of the closed road."""
     budget: float = 0.5
-    """An estimator is stopped where a mean update takes longer than this (s)."""
+    """Mean update at which an estimator is stopped (s)."""
     seed: int = 1
-    """The drives and the choice of detections have this seed."""
+    """Seed of the drives and of the choice of detections."""
     road: RoadSettings = field(default_factory=RoadSettings)
-    """These settings describe the roads and the drives on them."""
+    """Roads and the drives on them."""
 
     def __post_init__(self) -> None:
         """Raise SettingsError as well where a range is empty."""
@@ -93,7 +93,7 @@ QUICK: Final = ScalingSettings(
     laps_cones=60,
     budget=0.1,
 )
-"""This preset takes less than a minute and shows that everything works; its slopes mean little."""
+"""Preset that takes less than a minute and shows that everything works; its slopes mean little."""
 
 
 STEP: Final = 0.25

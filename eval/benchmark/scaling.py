@@ -53,7 +53,6 @@ class LaneTimes:
     """What was measured in a lane, an entry for each cycle until it ended or was stopped."""
 
     lane: Lane
-    """The lane."""
     seconds: list[float] = field(default_factory=list)
     """Wall time of each update, s."""
     sizes: list[int] = field(default_factory=list)
@@ -122,10 +121,10 @@ def peak_memory(lane: Lane, settings: MapperSettings) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """Everything that was measured."""
+    """All results of the measurement."""
 
     settings: ScalingSettings
-    """What was asked for."""
+    """Settings of the measurement."""
     mapper: dict[str, Any]
     """Settings of the estimators, in full."""
     points: pd.DataFrame
@@ -147,7 +146,7 @@ class Scaling:
 
     @property
     def estimators(self) -> tuple[str, ...]:
-        """Names of the estimators, in order."""
+        """Name of the estimators, in order."""
         return tuple(self.memory)
 
     def seconds_at(self, cones: float, estimator: str) -> float:
@@ -236,7 +235,6 @@ def measure_scaling(
 
 
 def _joined(points: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    """Return the points of all frames that have some."""
     return pd.concat([of for of in points if len(of)] or points[:1], ignore_index=True)
 
 

@@ -50,17 +50,17 @@ class Uncertainty:
     boundary: SplineBoundary
     """Curve with the joint covariance of its control points."""
     cones: Array
-    """Each row holds the position (x, y) of a seen cone (m)."""
+    """(k, 2) Positions of the seen cones (m)."""
     u: Array
-    """Parameters (n,) that everything below is computed at."""
+    """Parameters (n,) of all that follows."""
     length: Array
     """Lengths (n,) along the curve at the parameters (m)."""
     joint: Array
-    """The joint covariance, B Sigma B', gives these standard deviations (n,), m."""
+    """Standard deviations (n,) by the joint covariance, B Sigma B' (m)."""
     marginals: Array
-    """The paper's formula, the sum of beta_j^2 Sigma_j, gives these standard deviations (n,), m."""
+    """Standard deviations (n,) by the paper's formula, the sum of beta_j^2 Sigma_j (m)."""
     sampled: Array
-    """The splines drawn at random have these standard deviations (n,), m."""
+    """Standard deviations (n,) of the splines drawn at random (m)."""
     curves: Array
     """Points (s, n, 2) of the splines drawn at random (m)."""
 
@@ -112,9 +112,9 @@ def posterior(
 # --- figure ----------------------------------------------------------------------------------------------
 
 _SHOWN: Final = 40
-"""This many of the splines drawn at random are shown."""
+"""Number of the splines drawn at random that are shown."""
 _EVERY: Final = 6
-"""The spread of the samples is marked at every sixth parameter."""
+"""Stride of the parameters at which the spread of the samples is marked."""
 
 
 def plot_uncertainty(data: Uncertainty) -> Figure:
@@ -170,7 +170,6 @@ class Simplified:
     """Curve on fewer knots and its distance from the old one."""
 
     curve: BSpline
-    """New curve."""
     errors: Array
     """Distances (n,) of points of the old curve, at equal lengths, from the new one (m)."""
 
@@ -187,13 +186,13 @@ class Simplification:
     old: BSpline
     """Curve of many control points."""
     length: Array
-    """The errors are taken at these lengths (n,) along the old curve (m)."""
+    """Lengths (n,) along the old curve at which the errors are taken (m)."""
     curvature: Array
     """Old curve's curvature (n,) there (1/m)."""
     weighted: Simplified
-    """This curve has curvature-weighted knots."""
+    """Curve on curvature-weighted knots."""
     uniform: Simplified
-    """This curve has as many knots at equal lengths."""
+    """Curve on as many knots at equal lengths."""
 
 
 def simplification() -> Simplification:

@@ -15,19 +15,19 @@ from .style import save_figures
 from .updates import expansion, fit, plot_expansion, plot_fit
 
 MARKER: Final = "captions.md"
-"""A folder of these figures is known by this file."""
+"""File by which a folder of these figures is known."""
 _SEED: Final = 0
-"""The splines that are drawn at random have this seed."""
+"""Seed of the splines that are drawn at random."""
 
 
 @dataclass(frozen=True)
 class IsolatedFigure:
-    """A figure has a name and a caption."""
+    """Figure with a name and a caption."""
 
     name: str
-    """The figure's files have this name."""
+    """Name of the figure's files."""
     make: Callable[[], tuple[Figure, str]]
-    """This computes and draws the figure, and gives the caption with its numbers."""
+    """Function that computes and draws the figure, and returns its caption with its numbers."""
 
 
 def _uncertainty() -> tuple[Figure, str]:
@@ -77,11 +77,11 @@ FIGURES: Final = (
     IsolatedFigure("fit", _fit),
     IsolatedFigure("simplification", _simplification),
 )
-"""These are all figures, in the paper's order."""
+"""All figures, in the paper's order."""
 
 
 def write_figures(out: Path, on_figure: Callable[[], None] = lambda: None) -> None:
-    """Writes every figure and the captions, or nothing; `on_figure` is called after each figure."""
+    """Write every figure and the captions, or nothing; `on_figure` is called after each figure."""
     captions = []
     with atomic_folder(out, MARKER) as folder:
         for isolated in FIGURES:

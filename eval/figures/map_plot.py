@@ -38,45 +38,44 @@ from .style import (
 )
 
 MARGIN: Final = 3.0
-"""There is this much free space around what is drawn (m)."""
+"""Free space around what is drawn (m)."""
 TRUTH_COLOR: Final = DARK
-"""Everything that is true rather than estimated has this colour."""
+"""Colour of everything that is true rather than estimated."""
 
 _MAX_HEIGHT: Final = 7.5
-"""A figure is at most this high (in); a track that is narrower than it is long is drawn smaller."""
+"""Greatest height of a figure (in); a track that is narrower than it is long is drawn smaller."""
 _LABELS_HEIGHT: Final = 0.85
-"""The tick labels and the legend take this height (in)."""
+"""Height of the tick labels and the legend (in)."""
 BOUNDARY_COLORS: Final = {LEFT: BLUE, RIGHT: ORANGE}
-"""Boundaries have their cones' colours; yellow is amber, which can be seen on white paper."""
+"""Colours of the boundaries, those of their cones; yellow is amber, which can be seen on white paper."""
 TRAJECTORY_COLOR: Final = GREEN
-"""The estimated trajectory has this colour."""
 HEALTH_COLORS: Final = {DEGRADED: PURPLE, LOST: RED}
-"""The trajectory has these colours where it is not good."""
+"""Colours of the trajectory where it is not good."""
 BAND_ALPHA: Final = 0.35
-"""The uncertainty band has this opacity."""
+"""Opacity of the uncertainty band."""
 
 TENTATIVE_DASHES: Final = (0, (4, 2))
-"""The stretch of a curve that is not confirmed has these dashes."""
+"""Dashes of the stretch of a curve that is not confirmed."""
 
 
 @dataclass(frozen=True, slots=True)
 class MapStyle:
-    """Holds line widths and marker sizes (pt), which depend on how much of a track a panel shows."""
+    """Line widths and marker sizes (pt), which depend on how much of a track a panel shows."""
 
     curve_width: float = 0.7
-    """A boundary has this width."""
+    """Width of a boundary."""
     path_width: float = 0.6
-    """The trajectory has this width; the true path is thinner."""
+    """Width of the trajectory; the true path is thinner."""
     marker_size: float = 2.6
-    """Cones and control points have this size."""
+    """Size of cones and control points."""
     landmark_size: float = 1.4
-    """Landmarks have this size, small enough for their ellipses to be seen."""
+    """Size of landmarks, small enough for their ellipses to be seen."""
     widest_band: float = np.inf
-    """A band is drawn at most this wide (m) on either side of its curve."""
+    """Greatest width of a band on either side of its curve (m)."""
 
 
 WHOLE_TRACK: Final = MapStyle()
-"""This is the style of a panel that shows a whole track."""
+"""Style of a panel that shows a whole track."""
 
 
 def plot_map(
@@ -88,7 +87,7 @@ def plot_map(
     band_scale: float = 1.0,
     title: str | None = None,
 ) -> Figure:
-    """Draws the map in metres, with equal scales and the band S(u) +- 2 band_scale sigma(u) n(u).
+    """Draw the map in metres, with equal scales and the band S(u) +- 2 band_scale sigma(u) n(u).
 
     `log` adds the true cones and the true path where it has truth; trajectory (n, 3) or (n, 2), map frame.
     It is drawn in another colour where the `health` of its n cycles is not good.
@@ -117,7 +116,7 @@ def plot_map(
 def draw_boundary(
     axes: Axes, boundary: MapBoundary, label: int, style: MapStyle, band_scale: float = 1.0
 ) -> None:
-    """Draws a curve with its band and control points, or landmarks with their ellipses, in the map frame."""
+    """Draw a curve with its band and control points, or landmarks with their ellipses, in the map frame."""
     if isinstance(boundary, PointBoundary):
         _draw_landmarks(axes, boundary, label, style, band_scale)
     else:
@@ -156,7 +155,7 @@ def _draw_landmarks(
 
 
 def draw_orange(axes: Axes, points: Array, label: int, style: MapStyle) -> None:
-    """Draws orange cones (n, 2) as triangles, those of gates larger, map frame (m)."""
+    """Draw orange cones (n, 2) as triangles, those of gates larger, map frame (m)."""
     size = (2.0 if label == BIG_ORANGE else 1.2) * style.landmark_size
     name = NAMES[label].replace("_", " ")
     draw_points(axes, points, "^", RED, f"{name} cones", markersize=size, zorder=4.5)
@@ -168,13 +167,13 @@ def _band_name(scale: float, shape: str = "band") -> str:
 
 
 def draw_trajectory(axes: Axes, trajectory: Array, style: MapStyle) -> None:
-    """Draws poses (n, 3) or positions (n, 2) as a line, map frame (m)."""
+    """Draw poses (n, 3) or positions (n, 2) as a line, map frame (m)."""
     line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": style.path_width, "zorder": 3}
     axes.plot(*trajectory[:, :2].T, label="trajectory", **line)
 
 
 def draw_unhealthy(axes: Axes, trajectory: Array, health: Sequence[str], style: MapStyle) -> None:
-    """Draws the parts of the trajectory again that were degraded or lost, each in its colour."""
+    """Draw the parts of the trajectory again that were degraded or lost, each in its colour."""
     for condition, color in HEALTH_COLORS.items():
         chosen = np.array([word == condition for word in health], bool)
         if len(chosen) != len(trajectory) or not chosen.any():
@@ -185,7 +184,7 @@ def draw_unhealthy(axes: Axes, trajectory: Array, health: Sequence[str], style: 
 
 
 def draw_truth(axes: Axes, truth: Truth, style: MapStyle) -> None:
-    """Draws the true path dashed and the true cones as crosses, as far as they are known, map frame (m)."""
+    """Draw the true path dashed and the true cones as crosses, as far as they are known, map frame (m)."""
     if len(truth.poses):
         line: dict[str, Any] = {"linewidth": 0.6 * style.path_width, "linestyle": (0, (5, 3)), "zorder": 3.5}
         axes.plot(*truth.poses[:, :2].T, color=TRUTH_COLOR, label="true path", **line)
@@ -195,13 +194,13 @@ def draw_truth(axes: Axes, truth: Truth, style: MapStyle) -> None:
 
 
 def draw_start(axes: Axes, style: MapStyle) -> None:
-    """Marks the origin of the map frame, where the vehicle stood first, heading along x."""
+    """Mark the origin of the map frame, where the vehicle stood first, heading along x."""
     size = 2.0 * style.marker_size
     draw_points(axes, np.zeros((1, 2)), ">", "black", "start", markersize=size, zorder=7)
 
 
 def _finish(figure: Figure, axes: Axes, title: str | None) -> None:
-    """Adds frame, axis titles and legend, and gives the figure the map's shape."""
+    """Add frame, axis titles and legend, and give the figure the map's shape."""
     axes.margins(0.0)
     axes.autoscale_view()
     drawn = np.array([axes.get_xlim(), axes.get_ylim()])

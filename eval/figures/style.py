@@ -24,19 +24,19 @@ from pathspace_graph.sim.curves import left_normals
 from pathspace_graph.spline.bspline import BSpline
 
 WIDTH: Final = 7.0
-"""A figure is this wide (in): two columns of a paper."""
+"""Width of a figure (in): two columns of a paper."""
 FONT_SIZE: Final = 8.0
-"""Text has this size (pt)."""
+"""Size of text (pt)."""
 LEGEND_SIZE: Final = 7.5
-"""The text of a legend has this size (pt)."""
+"""Size of the text of a legend (pt)."""
 CURVE_WIDTH: Final = 1.3
-"""A curve has this width (pt)."""
+"""Width of a curve (pt)."""
 THIN_WIDTH: Final = 0.5
-"""The line of one sample among many has this width (pt)."""
+"""Width of the line of one sample among many (pt)."""
 MARKER_SIZE: Final = 4.0
-"""A control point or a detection has this size (pt)."""
+"""Size of a control point or a detection (pt)."""
 ALPHA: Final = 0.25
-"""A filled area has this opacity."""
+"""Opacity of a filled area."""
 
 BLUE: Final = "#0067A9"
 ORANGE: Final = "#D98200"
@@ -48,9 +48,9 @@ GREY: Final = "#8C8C8C"
 LIGHT: Final = "#B0B0B0"
 # every kind of colour vision tells blue from orange, and so does a print without colours
 PALETTE: Final = (BLUE, ORANGE, RED, PURPLE, GREEN, DARK)
-"""Things that are compared have these colours, one after the other."""
+"""Colours of things that are compared, in order."""
 MARKERS: Final = "os^Dv*<>PXphd"
-"""Things that are compared have these shapes, one after the other."""
+"""Shapes of things that are compared, in order."""
 
 _RC: Final = {
     "font.size": FONT_SIZE,
@@ -70,19 +70,19 @@ _RC: Final = {
     "legend.columnspacing": 1.4,
 }
 _LAYOUT_ROUNDS: Final = 2
-"""The height is fitted this many times, since the layout moves a little when the height changes."""
+"""Rounds in which the height is fitted, since the layout moves a little when it changes."""
 _SIDES: Final = tuple(NAMES[label] for label in BOUNDARIES)
 
 
 @contextmanager
 def figure_context() -> Iterator[None]:
-    """Sets the fonts and lines that all figures share."""
+    """Set the fonts and lines that all figures share."""
     with mpl.rc_context(_RC):
         yield
 
 
 def set_frame(axes: Axes, low: Array, high: Array) -> None:
-    """Shows the rectangle between two corners (2,), m, with equal scales."""
+    """Show the rectangle between two corners (2,), m, with equal scales."""
     axes.set_aspect("equal")
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
@@ -96,13 +96,13 @@ def label_logarithms(axes: Axes) -> None:
 
 
 def shared_legend(figure: Figure, columns: int = 1, loc: str = "outside lower center") -> None:
-    """Adds one legend for all panels, below them by default, with each entry once."""
+    """Add one legend for all panels, below them by default, with each entry once."""
     entries = _entries(figure.axes)
     figure.legend(entries.values(), entries.keys(), loc=loc, ncols=columns)
 
 
 def grouped_legend(figure: Figure) -> None:
-    """Adds a legend below all panels: a column for the left boundary, one for the right, then the rest."""
+    """Add a legend below all panels: a column for the left boundary, one for the right, then the rest."""
     entries = _entries(figure.axes)
     sides = [[label for label in entries if label.startswith(side)] for side in _SIDES]
     rest = [label for label in entries if not label.startswith(_SIDES)]
@@ -115,7 +115,7 @@ def grouped_legend(figure: Figure) -> None:
 
 
 def _entries(panels: Iterable[Axes]) -> dict[str, Any]:
-    """Returns the first artist of each label."""
+    """Return the first artist of each label."""
     entries: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -124,7 +124,7 @@ def _entries(panels: Iterable[Axes]) -> dict[str, Any]:
 
 
 def fit_height(figure: Figure, margin: float = 0.05) -> None:
-    """Makes a figure as high as what is drawn on it, plus a margin (in) on both sides.
+    """Make a figure as high as what is drawn on it, plus a margin (in) on both sides.
 
     This is for figures whose width decides how large the panels are.
     """
@@ -135,13 +135,13 @@ def fit_height(figure: Figure, margin: float = 0.05) -> None:
 
 
 SIGMAS: Final = 2.0
-"""A band reaches this many standard deviations across its curve, and an ellipse this many along its axes."""
+"""Standard deviations to the edge of a band across its curve, and of an ellipse along its axes."""
 SAMPLES_PER_SPAN: Final = 24
-"""Each span of a spline is drawn as this many lines."""
+"""Lines that each span of a spline is drawn as."""
 
 
 def curve_parameters(spline: BSpline, samples_per_span: int = SAMPLES_PER_SPAN) -> Array:
-    """Returns parameters (k,) at equal steps on each span, both ends of the domain included."""
+    """Return parameters (k,) at equal steps on each span, both ends of the domain included."""
     breaks = spline.breaks
     fractions = np.arange(samples_per_span) / samples_per_span
     inner = breaks[:-1, None] + np.diff(breaks)[:, None] * fractions
@@ -149,14 +149,14 @@ def curve_parameters(spline: BSpline, samples_per_span: int = SAMPLES_PER_SPAN) 
 
 
 def normals(spline: BSpline, u: Array) -> Array:
-    """Returns the unit normals (k, 2) at parameters u (k,), to the left of the direction of travel."""
+    """Return the unit normals (k, 2) at parameters u (k,), to the left of the direction of travel."""
     return left_normals(spline.tangent_unit(u))
 
 
 def uncertainty_band(
     boundary: SplineBoundary, u: Array, scale: float = 1.0, widest: float = np.inf
 ) -> tuple[Array, Array]:
-    """Returns S(u) +- 2 scale sigma(u) n(u), the band's left and right edge (k, 2), m, at u (k,).
+    """Return S(u) +- 2 scale sigma(u) n(u), the band's left and right edge (k, 2), m, at u (k,).
 
     The edges are at most `widest` (m) away from the curve.
     """
@@ -168,7 +168,7 @@ def uncertainty_band(
 
 
 def point_blocks(covariance: Array) -> Array:
-    """Returns each point's covariance (m, 2, 2) from the joint one (2m, 2m) over x0, y0, x1, y1 and so on."""
+    """Return each point's covariance (m, 2, 2) from the joint one (2m, 2m) over x0, y0, x1, y1 and so on."""
     m = len(covariance) // 2
     index = np.arange(m)
     return np.asarray(covariance.reshape(m, 2, m, 2)[index, :, index, :])
@@ -183,7 +183,7 @@ def draw_curve(
     stretch: tuple[float, float] = (-np.inf, np.inf),
     **line: Any,
 ) -> None:
-    """Draws a spline over its whole domain, or over a stretch of it, from one parameter to another."""
+    """Draw a spline over its whole domain, or over a stretch of it, from one parameter to another."""
     u = curve_parameters(spline)
     low, high = np.clip(stretch, u[0], u[-1])
     points = spline.evaluate(np.concatenate([[low], u[(u > low) & (u < high)], [high]]))
@@ -193,7 +193,7 @@ def draw_curve(
 def draw_points(
     axes: Axes, points: Array, marker: str, color: str, label: str | None = None, **options: Any
 ) -> None:
-    """Draws a marker at each point (k, 2)."""
+    """Draw a marker at each point (k, 2)."""
     options = {"markersize": MARKER_SIZE, "zorder": 6, **options}
     axes.plot(*points.T, linestyle="none", marker=marker, color=color, label=label, **options)
 
@@ -201,7 +201,7 @@ def draw_points(
 def draw_control_points(
     axes: Axes, points: Array, color: str, label: str | None = None, polygon: bool = True, **options: Any
 ) -> None:
-    """Draws a square at each control point (k, 2), and the control polygon as a thin line if asked to."""
+    """Draw a square at each control point (k, 2), and the control polygon as a thin line if asked to."""
     if polygon:
         axes.plot(*points.T, color=color, linewidth=THIN_WIDTH, linestyle=(0, (4, 3)), zorder=2)
     shape = {"markerfacecolor": "white", "markeredgewidth": 0.8, "zorder": 4}
@@ -218,7 +218,7 @@ def draw_band(
     zorder: float = 2,
     widest: float = np.inf,
 ) -> None:
-    """Fills the 2-sigma band around a curve, `scale` times as wide as it is, up to `widest` (m) on a side."""
+    """Fill the 2-sigma band around a curve, `scale` times as wide as it is, up to `widest` (m) on a side."""
     left, right = uncertainty_band(boundary, curve_parameters(boundary.spline), scale, widest)
     outline = _band_outline(left, right, boundary.spline.periodic)
     look: dict[str, Any] = {"alpha": alpha, "linewidth": 0.0, "zorder": zorder}
@@ -226,14 +226,14 @@ def draw_band(
 
 
 def _band_outline(left: Array, right: Array, closed: bool) -> Outline:
-    """Returns a polygon around an open band, or a ring with edges in opposite directions for a closed one."""
+    """Return a polygon around an open band, or a ring with edges in opposite directions for a closed one."""
     if not closed:
         return Outline(np.concatenate([left, right[::-1], left[:1]]), closed=True)
     return Outline.make_compound_path(Outline(left, closed=True), Outline(right[::-1], closed=True))
 
 
 def ellipse_outlines(points: Array, joint: Array, corners: int = 16) -> Array:
-    """Returns the 2-sigma ellipse of each point (m, 2) as a closed line (m, corners + 1, 2).
+    """Return the 2-sigma ellipse of each point (m, 2) as a closed line (m, corners + 1, 2).
 
     The joint covariance (2m, 2m) is over x0, y0, x1, y1 and so on.
     """
@@ -247,7 +247,7 @@ def ellipse_outlines(points: Array, joint: Array, corners: int = 16) -> Array:
 def draw_ellipses(
     axes: Axes, centres: Array, covariances: Array, color: str, scale: float = 1.0, **options: Any
 ) -> None:
-    """Draws the 2-sigma ellipses of points (k, 2) with covariances (k, 2, 2), `scale` times as large."""
+    """Draw the 2-sigma ellipses of points (k, 2) with covariances (k, 2, 2), `scale` times as large."""
     variances, vectors = np.linalg.eigh(covariances)
     widths, heights = 2.0 * SIGMAS * scale * np.sqrt(np.maximum(variances, 0.0)).T
     angles = np.degrees(np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0]))
@@ -266,9 +266,9 @@ DPI: Final = 200.0
 """Resolution of a png (dots per inch)."""
 
 _METADATA: Final = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
-"""Metadata that would differ from one run to the next is left out."""
+"""Metadata that is left out, since it would differ from one run to the next."""
 _FILE_RC: Final = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "pathspace"}
-"""Text stays text in vector formats, and identifiers don't change from run to run."""
+"""Settings by which text stays text in vector formats, and identifiers don't change from run to run."""
 
 
 def check_plot_file(file: Path | str) -> None:
@@ -278,7 +278,7 @@ def check_plot_file(file: Path | str) -> None:
 
 
 def save_plot(figure: Figure, file: Path | str, dpi: float = DPI) -> None:
-    """Write a .png, .pdf or .svg, whole or not at all. Raises SettingsError for any other suffix."""
+    """Write a .png, .pdf or .svg, whole or not at all; raise SettingsError for any other suffix."""
     check_plot_file(file)
     with atomic_file(Path(file)) as temporary:
         render(figure, temporary, Path(file).suffix.lower(), dpi)

@@ -60,11 +60,11 @@ class Expansion:
     """The three steps."""
 
     detections: Array
-    """Each row holds the position (x, y) of a detection (m)."""
+    """(m, 2) Positions of the detections (m)."""
     sigma: float
-    """Each detection has this standard deviation (m)."""
+    """Standard deviation of each detection (m)."""
     expands: Bools
-    """In step (a) these detections (m,) mark an expansion of the curve."""
+    """(m,) Detections that mark an expansion of the curve in step (a)."""
     order: IntArray
     """Proximity chain of those detections; the curve is extended to the last one."""
     before: SplineBoundary
@@ -195,13 +195,13 @@ class Fit:
     curve: BSpline
     """S_mu, the state's curve."""
     detections: Array
-    """Each row holds the position (x, y) of a detection z (m)."""
+    """(m, 2) Positions z of the detections (m)."""
     covariances: Array
     """Detections' covariances (m, 2, 2), m^2."""
     foot_u: Array
     """Parameters (m,) of the closest points."""
     basis: Array
-    """This is B (m, n), the basis functions at the closest points."""
+    """B (m, n), the basis functions at the closest points."""
     sigma_points: Array
     """Sigma points X (4 m, m, 2) of the detections (m)."""
     fitted_points: Array
@@ -250,7 +250,7 @@ def _sigma_points(detections: Array, covariances: Array) -> Array:
 # --- figure ----------------------------------------------------------------------------------------------
 
 _INVISIBLE: Final = 1e-3
-"""A basis function below this can't be seen."""
+"""Value of a basis function below which it can't be seen."""
 _DETECTIONS: Final = "detections $z$ (a: 2σ)"
 _DIAMOND: Final = 0.8 * MARKER_SIZE
 
@@ -308,7 +308,7 @@ def _draw_fitted(axes: Axes, data: Fit) -> None:
 
 
 def _draw_basis(axes: Axes, data: Fit) -> None:
-    """Draw the basis functions over the parameter, and marks their values at the detections."""
+    """Draw the basis functions over the parameter, and mark their values at the detections."""
     u = np.linspace(*data.curve.domain, 400)
     for j, values in enumerate(data.curve.basis_matrix(u).T):
         color = PURPLE if data.basis[:, j].sum() > _INVISIBLE else LIGHT

@@ -19,10 +19,10 @@ from pathspace_graph.settings.checked import Positive
 from pathspace_graph.spline.bspline import BSpline
 
 MISSED_DISTANCE = 3.0
-"""A true cone farther than this (m) from its mapped boundary is missed (paper, Table 1)."""
+"""Distance from its mapped boundary beyond which a true cone is missed (m; paper, Table 1)."""
 
 GRID_PER_SPAN = 64
-"""Closest points are searched from this many grid points on each span, about every 0.1 m of a track."""
+"""Grid points on each span from which closest points are searched, about every 0.1 m of a track."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,16 +30,16 @@ class LapMetrics:
     """One row of the paper's Table 1."""
 
     lap: int
-    """Laps count from 1; the map is taken as it stood at the end of this lap."""
+    """Number of the lap, from 1; the map is taken as it stood at its end."""
 
     rmse: float
-    """Rmse (m) over the cones that aren't missed; it is NaN where all are missed."""
+    """Rmse (m) over the cones that aren't missed; NaN where all are."""
 
     missed: float
-    """This share (0 to 1) of all true cones is missed; it is NaN without true cones."""
+    """Share (0 to 1) of all true cones that is missed; NaN without true cones."""
 
     size: int
-    """Both boundaries together have this many control points or landmarks."""
+    """Number of control points or landmarks of both boundaries."""
 
 
 def lap_metrics(track: Map, truth: Truth, lap: int) -> LapMetrics:
@@ -105,25 +105,26 @@ def root_mean_square(values: Array) -> float:
 
 
 PATH_STEP: Final = 0.1
-"""The cones are ordered along points of the true path that are at most this far (m) apart."""
+"""Largest distance of the points of the true path by which cones are ordered (m)."""
 TRUE_STEP: Final = 0.02
-"""Points of a true curve are at most this far (m) apart: a distance of 0.1 m is at most 0.5 mm too long."""
+"""Largest distance of points of a true curve (m): a distance of 0.1 m is at most 0.5 mm too long."""
 MAPPED_STEP: Final = 0.1
-"""Distances are measured from points of a curve that are at most this far (m) apart."""
+"""Largest distance of the points of a mapped curve from which distances are measured (m)."""
 CENTRE_STEP: Final = 1.0
-"""The centre line is compared with the true one at points that are this far (m) apart."""
+"""Distance of the points at which the centre line is compared with the true one (m)."""
 CHORD: Final = 0.25
-"""Crossings are those of chords of this length (m)."""
+"""Length of the chords whose crossings are counted (m)."""
 FARTHEST: Final = 3.0
-"""A true boundary farther than this (m) from the mapped one is missed, as cones are in the paper's table."""
+"""Distance from the mapped boundary beyond which a true one is missed (m), as cones are in the paper's
+table."""
 ROUND_OFF: Final = 1e-9
-"""A length that exceeds whole steps by less than this share of a step gets no further step."""
+"""Share of a step by which a length may exceed whole steps without a further one."""
 _OVERLAP: Final = 3
-"""Akima's tangents of a closed curve need this many cones beyond the seam."""
+"""Cones beyond the seam that Akima's tangents of a closed curve need."""
 _CACHED: Final = 16
-"""This many true curves are cached, since every map of a log is compared with the same ones several times."""
+"""Number of true curves in the cache, since every map of a log is compared with the same ones."""
 _MIN_CONES: Final = 2
-"""A curve needs at least this many cones."""
+"""Least number of cones of a curve."""
 
 
 # --- points on curves ------------------------------------------------------------------------------------
@@ -175,7 +176,6 @@ def _first_lap(truth: Truth) -> Array:
 
 
 def _perimeter(points: Array) -> float:
-    """Return the length (m) of the closed polygon through the points."""
     return float(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
 
 
@@ -197,9 +197,9 @@ class CurveDistance:
     """Mean distances (m) between the mapped and the true boundaries, both boundaries together."""
 
     mapped_to_truth: float
-    """This distance, from the mapped curve to the true one, is large where something false is mapped."""
+    """Distance from the mapped curve to the true one; large where something false is mapped."""
     truth_to_mapped: float
-    """This distance, from the true curve to the mapped one, is large where something true isn't mapped."""
+    """Distance from the true curve to the mapped one; large where something true isn't mapped."""
 
     @property
     def two_way(self) -> float:
@@ -280,13 +280,13 @@ class CentreLineErrors:
     """
 
     across: Array
-    """(n,) The true centre is this far to the left of the mapped one."""
+    """(n,) Distance of the true centre to the left of the mapped one."""
     across_sigma: Array
-    """(n,) The map claims this standard deviation of it."""
+    """(n,) Its claimed standard deviation."""
     width: Array
-    """(n,) The true track is this much wider to each side than the mapped one."""
+    """(n,) By how much the true track is wider to each side than the mapped one."""
     width_sigma: Array
-    """(n,) The map claims this standard deviation of it: the mean of both sides."""
+    """(n,) Its claimed standard deviation: the mean of both sides."""
 
 
 def centre_line_errors(track: Map, truth: Truth, step: float = CENTRE_STEP) -> CentreLineErrors | None:
@@ -339,11 +339,11 @@ def _mean(distances: Array) -> float:
 
 @dataclass(frozen=True)
 class GhostSettings(Positive):
-    """What counts as a ghost."""
+    """Definition of a ghost."""
 
     distance: float = 2.0
-    """A mapped point farther than this (m) from the true boundary of its own colour is a ghost. The default
-    exceeds the drift of a map whose loop is closed, but not the width of the narrowest lane (3 m)."""
+    """Distance from the true boundary of its own colour beyond which a mapped point is a ghost (m). The
+    default exceeds the drift of a map whose loop is closed, but not the width of the narrowest lane (3 m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,13 +351,13 @@ class Ghosts:
     """What is mapped but doesn't exist, on both boundaries together."""
 
     landmarks: int
-    """This many landmarks have no true boundary near."""
+    """Number of landmarks without a true boundary near."""
     metres: float
-    """Mapped curves have no true boundary near over this length (m)."""
+    """Length of mapped curves without a true boundary near (m)."""
     share: float
-    """Ghosts are this share of all landmarks and points of curves; it is NaN where nothing is mapped."""
+    """Share of ghosts among all landmarks and points of curves; NaN where nothing is mapped."""
     duplicates: int
-    """This many landmarks are nearest to a true cone that already has one."""
+    """Number of landmarks nearest to a true cone that already has one."""
 
 
 def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> Ghosts:
@@ -380,7 +380,6 @@ def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> G
 
 
 def _is_ghost(points: Array, curve_true: Array, distance: float) -> BoolArray:
-    """Return which points (k, 2) are ghosts."""
     if len(curve_true) == 0 or len(points) == 0:
         return np.ones(len(points), dtype=bool)
     return np.asarray(KDTree(curve_true).query(points)[0] > distance)

@@ -22,7 +22,7 @@ from pathspace_graph.labels import BOUNDARIES
 from .accuracy import MISSED_DISTANCE, closest_points, true_curve
 
 LEVEL: Final = 0.95
-"""An honest map's NEES lies in the interval with this probability."""
+"""Probability with which an honest map's NEES lies in the interval."""
 
 
 # --- squared errors ---------------------------------------------------------------------------------------
@@ -37,9 +37,9 @@ class NormalizedError:
     """
 
     value: float
-    """This is e' P^-1 e; it is NaN where P is singular."""
+    """`e' P^-1 e`; NaN where P is singular."""
     dof: int
-    """The chi-squared distribution has this many degrees of freedom."""
+    """Degrees of freedom of the chi-squared distribution."""
 
     @property
     def ratio(self) -> float:
@@ -139,11 +139,10 @@ class NormalErrors:
     """Errors of a map's curves at the true cones, and the standard deviations that they claim."""
 
     errors: Array
-    """Each entry (k,) is the signed distance (m) of a true cone along the normal at its foot point, left
-    positive."""
+    """(k,) Signed distance (m) of each true cone along the normal at its foot point, left positive."""
 
     sigmas: Array
-    """Each entry (k,) is the standard deviation (m) of the curve along that normal."""
+    """(k,) Standard deviation (m) of the curve along that normal."""
 
     def share_inside(self, factor: float = 2.0) -> float:
         """Return the share of the cones with |error| <= factor * sigma; NaN without cones."""
@@ -218,20 +217,19 @@ def with_marginals(track: Map) -> Map:
 
 
 MOST_ROUNDS: Final = 50
-"""The points are paired with the map at most this often."""
+"""Most rounds in which points are paired with the map."""
 TOLERANCE: Final = 1e-9
-"""The turn is found where a round changes it by less than this (rad)."""
+"""Change of the turn in a round below which it is found (rad)."""
 
 
 @dataclass(frozen=True)
 class Turn:
-    """How far a map is turned about the start."""
+    """Rotation of a map about the start."""
 
     angle: float
-    """The map is turned to the left by this angle (rad); it is NaN where nothing of it can be compared."""
+    """Angle by which the map is turned to the left (rad); NaN where nothing of it can be compared."""
     sigma: float
-    """The map's joint covariance claims this standard deviation (rad) of it; it is NaN where the map has
-    none."""
+    """Its standard deviation by the map's joint covariance (rad); NaN where the map has none."""
 
     @property
     def nees(self) -> float:

@@ -40,7 +40,7 @@ from .trajectory import (
 )
 
 WHOLE: Final = "whole"
-"""The whole cycle has this name among its stages."""
+"""Name of the whole cycle among its stages."""
 _TAIL: Final = 0.99
 
 
@@ -49,15 +49,15 @@ class StageTime:
     """Wall time (s) of one stage over many cycles; every figure is NaN without cycles."""
 
     stage: str
-    """The stage has this name; the whole cycle is called `whole`."""
+    """Name of the stage; the whole cycle is called `whole`."""
     mean: float
     """Mean over the cycles (s)."""
     median: float
-    """Half of the cycles take longer than this (s)."""
+    """Median over the cycles (s)."""
     p99: float
-    """One cycle in a hundred takes longer than this (s)."""
+    """99th percentile over the cycles (s)."""
     share: float
-    """The stage's mean is this share of the whole cycle's mean."""
+    """Its mean as a share of the whole cycle's."""
 
 
 def stage_times(cycles: Sequence[CycleRecord]) -> list[StageTime]:
@@ -77,7 +77,6 @@ def _stage(name: str, values: Sequence[float], whole: Sequence[float]) -> StageT
 
 
 DOUBLE_BYTES: Final = 8
-"""A double has this many bytes."""
 
 
 def map_bytes(track: Map) -> int:
@@ -98,20 +97,20 @@ def covariance_bytes(track: Map) -> int:
 
 
 EARLY: Final = 30.0
-"""A loop may close this far before the true drive is back at the start (m), which the sensor sees ahead."""
+"""How far before the true drive is back at the start a loop may close (m), as the sensor sees ahead."""
 UNHEALTHY: Final = ("degraded", "lost")
-"""An estimator that judges its health calls cycles so (FORMATS) where they are not good."""
+"""Conditions of cycles that are not good (FORMATS)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What was measured of one lap, or of a whole run."""
+    """Metrics of one lap, or of a whole run."""
 
     lap: int | None
-    """The lap counts from 1; it is None for the whole run."""
+    """Number of the lap, from 1; None for the whole run."""
     values: dict[str, float]
-    """Values by the metric's key, counts as whole numbers and `closed` as a truth value. What
-    isn't known, for example without truth, is absent."""
+    """Values by the metric's key, counts as whole numbers and `closed` as a truth value. Unknown ones, for
+    example without truth, are absent."""
 
 
 def measure(

@@ -18,18 +18,18 @@ FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3, "°": float(np.ra
 MEAN_DIGITS: Final = 2
 """Least number of digits after the decimal point of a mean with its interval."""
 UNKNOWN: Final = "–"
-"""Text of a value that isn't known."""
+"""Text of an unknown value."""
 EVERY_LAP: Final = "all"
-"""A column `rmse@all` is the average over all laps."""
+"""Suffix of a column that is the average over all laps, such as `rmse@all`."""
 LATER_LAPS: Final = "later"
-"""A column `rmse@later` is the average over the laps from the second on."""
+"""Suffix of a column that is the average over the laps from the second on, such as `rmse@later`."""
 _SLOPE: Final = re.compile(r"slope\((\w+), (\w+)\)")
 _SLOPE_DIGITS: Final = 2
 
 
 @dataclass(frozen=True)
 class Metric:
-    """One number that is measured of every lap or of every run."""
+    """A number that is measured of every lap or of every run."""
 
     key: str
     """Name of its column in every file."""

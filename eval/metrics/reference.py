@@ -173,19 +173,19 @@ def _truth(log: Log) -> Truth:
 
 
 STEP: Final = 0.5
-"""Maps are aligned by points of their curves that are this far apart (m)."""
+"""Distance of the points of curves by which maps are aligned (m)."""
 STARTS: Final = (0.0, -4.0, -2.0, 2.0, 4.0)
-"""The vehicle started this much farther ahead (m) in one of two maps, or less."""
+"""Distances by which the vehicle may have started farther ahead in one of two maps (m)."""
 ROUNDS: Final = 30
-"""Their points are paired this often."""
+"""Rounds in which their points are paired."""
 
 
 @dataclass(frozen=True)
 class Gap:
-    """How far one run is from another."""
+    """Distance of one run from another."""
 
     curves: dict[str, float]
-    """Each boundary that both runs have mapped has the two-way distance (m) of its two curves."""
+    """Two-way distance (m) of the two curves of each boundary that both runs have mapped."""
     along: float
     """Root mean square distance (m) of the poses along the reference's heading."""
     across: float

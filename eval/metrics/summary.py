@@ -28,7 +28,7 @@ from .consistency import normal_errors
 from .trajectory import ate, trajectory_errors
 
 LIBRARIES: Final = ("pathspace-graph", "gtsam", "numpy", "scipy")
-"""The versions of these libraries are recorded."""
+"""Libraries whose versions are recorded."""
 
 
 def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
@@ -148,7 +148,7 @@ def stretches_of(result: RunResult) -> list[Stretch]:
 
 
 def health_of(record: CycleRecord) -> Health:
-    """Return the health that a cycle's record holds."""
+    """Return the health in a cycle's record."""
     return Health(record.health, record.reason)
 
 

@@ -20,11 +20,11 @@ from pathspace_graph.run import ObservedCycle
 from .accuracy import boundary_distances, root_mean_square
 
 LOST: Final = 5.0
-"""A vehicle is lost where its position is wrong by more than this (m)."""
+"""Position error beyond which a vehicle is lost (m)."""
 ASTRAY: Final = 1.0
-"""A vehicle is astray where its position is wrong by more than this (m)."""
+"""Position error beyond which a vehicle is astray (m)."""
 END: Final = 1.0
-"""The end of a log is this long (s)."""
+"""Length of the end of a log (s)."""
 
 
 def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
@@ -124,15 +124,15 @@ def position_rms(errors: Array) -> float:
 
 
 MOST: Final = 35.0
-"""A reach is at most this long (m)."""
+"""Greatest length of a reach (m)."""
 ON_CURVE: Final = 0.5
-"""The reach ends at the first true cone that is farther than this (m) from the mapped boundary."""
+"""Distance of a true cone from the mapped boundary at which the reach ends (m)."""
 SHORT: Final = 4.0
-"""A reach of less than this (m) is too short for any planner."""
+"""Reach below which no planner can work (m)."""
 STARTING: Final = 0.03
-"""On this first share of lap 1 the map has only begun, and cycles don't count."""
+"""Share of lap 1 on which the map has only begun, and cycles don't count."""
 NOT_COUNTED: Final = (np.nan, 0.0, 0.0)
-"""A cycle that doesn't count has this in place of `CycleReach`."""
+"""Row of a cycle that doesn't count, in place of `CycleReach`."""
 
 
 # --- the true road ---------------------------------------------------------------------------------------
@@ -145,17 +145,16 @@ class TrueRoad:
     t: Array
     """Stamps (N,) in s of the true poses."""
     drive: Array
-    """Each row is [station, x, y, theta] (N, 4) in m and rad: the length driven so far, and the true pose,
-    whose heading isn't wrapped."""
+    """(N, 4) Rows [station, x, y, theta] in m and rad: length driven so far, and true pose; theta isn't
+    wrapped."""
     stations: Array
-    """The drive passes a true cone at each of these lengths (P,) in m, ascending; every lap passes every
-    cone."""
+    """(P,) Lengths at which the drive passes a true cone in m, ascending; every lap passes every cone."""
     cones: Array
-    """Each row is the cone (P, 2) in m, map frame, that is passed there."""
+    """(P, 2) Cone passed at each station in m, map frame."""
     labels: IntArray
-    """Each cone (P,) that is passed is of this boundary."""
+    """(P,) Boundary of each cone that is passed."""
     counted: tuple[float, float]
-    """Cycles between these stations (m) count."""
+    """Stations (m) between which cycles count."""
 
     def at(self, t: float) -> tuple[float, Array]:
         """Return the station (m) and the true pose (3,) at a stamp (s)."""
@@ -217,15 +216,14 @@ def _passes(path: Array, driven: Array, cones: Array, ends: Array) -> tuple[Arra
 
 @dataclass(frozen=True, slots=True)
 class CycleReach:
-    """How far the map reaches in one cycle."""
+    """Reach of the map in one cycle."""
 
     reach: float
-    """The road is mapped on both sides for this far ahead of the vehicle (m)."""
+    """Length ahead of the vehicle (m) over which the road is mapped on both sides."""
     squares: float
-    """The squared distances of the true cones on that stretch from the mapped boundaries sum up to this
-    (m^2)."""
+    """Sum of squared distances (m^2) of the true cones on that stretch from the mapped boundaries."""
     cones: int
-    """This number of true cones is on that stretch."""
+    """Number of true cones on that stretch."""
 
 
 def cycle_reach(road: TrueRoad, station: float, pose_true: Array, pose: Array, track: Map) -> CycleReach:
@@ -257,7 +255,7 @@ def _distances(boundary: MapBoundary, points: Array) -> Array:
 
 
 class ReachObserver:
-    """Measure the reach in every cycle of a run, which it is shown by `run.run_online`."""
+    """Observer that measures the reach in every cycle of `run.run_online`."""
 
     def __init__(self, truth: Truth) -> None:
         self._road = true_road(truth)

@@ -34,7 +34,7 @@ SHARP_SHARE: Final = 0.1
 MIN_SHARE: Final = 0.1
 """A cluster with fewer detections than this share of the median cluster's is no cone."""
 MIN_SHARE_BESIDE: Final = 0.3
-"""The same for a cluster beside a curve, whose detections aren't used."""
+"""`MIN_SHARE` of a cluster beside a curve, whose detections aren't used."""
 MIN_CONES: Final = 4
 """A curve is fitted to no fewer cones than this, and no cone is removed where there are fewer."""
 FOLD_COSINE: Final = 0.5

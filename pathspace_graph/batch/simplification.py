@@ -205,7 +205,7 @@ class Scatter:
     seen: float
     """Root mean square distance of the detected cones from the curves (m)."""
     unseen: float
-    """The same from curves that are fitted without them (m)."""
+    """Root mean square distance of the same cones from curves that are fitted without them (m)."""
     places: dict[int, Array]
     """Parameters (k,) of the detected cones of each boundary (m)."""
     lengths: dict[int, float]

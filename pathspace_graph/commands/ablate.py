@@ -13,10 +13,10 @@ from .studies import StudyCommand
 
 @dataclass(frozen=True, kw_only=True)
 class Ablate(StudyCommand):
-    """Runs a study, or what remains of it, and writes its results, its summary and its figures."""
+    """Run a study, or what remains of it, and write its results, its summary and its figures."""
 
     study: Positional[Path]
-    """The study is read from this TOML file, or is one that comes with the package, by its name."""
+    """TOML file of the study, or name of one that comes with the package."""
 
     def run(self) -> None:
         """Check, run, write and report the study; the exit code is 3 where cells failed."""

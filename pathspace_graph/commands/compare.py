@@ -25,14 +25,14 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .online import tell
 
 FAILED: Final = 3
-"""This is the exit code of a comparison that is written, but in which an estimator failed."""
+"""Exit code of a comparison that is written, but in which an estimator failed."""
 FILE_WIDTH: Final = 160
-"""A line of a table that is not printed on a terminal has this number of characters."""
+"""Characters in a line of a table that is not printed on a terminal."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Compare:
-    """Runs every estimator on a log, or on a folder of logs, and writes tables, figures and all maps.
+    """Run every estimator on a log, or on a folder of logs, and write tables, figures and all maps.
 
     For several logs the tables have means, and differences from the reference, paired over the logs, with
     their 95 % confidence interval. An estimator that fails is reported and does not stop the others; the exit
@@ -40,24 +40,23 @@ class Compare:
     """
 
     log: Positional[Path]
-    """The log is read from this folder, or each log from a folder in it."""
+    """Folder of the log, or of several logs."""
     out: Path
-    """Tables, figures and maps are written to this folder; an earlier comparison there is kept as a numbered
-    backup."""
+    """Folder for tables, figures and maps; an earlier comparison there is kept as a numbered backup."""
     estimators: tuple[str, ...] = ()
-    """These are the names of the estimators, online and batch ones; all of them run where none is named."""
+    """Names of the estimators, online and batch ones; by default all."""
     reference: str | None = None
-    """The others are compared with this estimator: fixed-lag where it runs, otherwise the first."""
+    """Estimator that the others are compared with: fixed-lag where it runs, otherwise the first."""
     jobs: int = 1
-    """This number of runs goes on at a time, -1 being one for each core. The times of updates are comparable
-    with 1 job only."""
+    """Number of runs at a time, -1 for one on each core. The times of updates are comparable with 1 job
+    only."""
     ghosts: GhostSettings = field(default_factory=GhostSettings)
-    """These settings say what counts as a ghost."""
+    """Definition of a ghost."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
-    """These settings hold for every estimator."""
+    """Settings of every estimator."""
 
     def run(self) -> None:
-        """Checks everything, runs, writes and reports; the exit code is 3 where an estimator failed."""
+        """Check, run, write and report; the exit code is 3 where an estimator failed."""
         estimators = choose(self.estimators)
         reference = choose_reference(self.reference, estimators)
         check_jobs(self.jobs)

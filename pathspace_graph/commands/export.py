@@ -22,39 +22,38 @@ from pathspace_graph.spline.planning import LEAST_STEP, MOST_POINTS
 
 Format = Literal["centerline", "tum", "geojson", "points", "lanelet2", "profile"]
 ON_EARTH = ("geojson", "lanelet2")
-"""These formats have latitude and longitude."""
+"""Formats that have latitude and longitude."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Writes a map in a format that planners and other tools read."""
+    """Write a map in a format that planners and other tools read."""
 
     map: Positional[Path]
-    """The map is read from this folder. With `tum` it may also be a log, whose true path is written."""
+    """Folder of the map. With `tum` it may also be a log, whose true path is written."""
     format: Annotated[Format, arg(name="as")]
-    """The format is the centre line with widths as TUM raceline CSV (`centerline`), the trajectory in the TUM
-    format (`tum`), boundaries and centre line as GeoJSON (`geojson`), both boundaries as CSV with the columns
-    x, y and label (`points`), both boundaries with lanelets as OSM XML (`lanelet2`), or the centre line
-    with the speed that friction and curvature allow as CSV (`profile`)."""
+    """Format of the file: the centre line with widths as TUM raceline CSV (`centerline`), the trajectory in
+    the TUM format (`tum`), boundaries and centre line as GeoJSON (`geojson`), both boundaries as CSV with the
+    columns x, y and label (`points`), both boundaries with lanelets as OSM XML (`lanelet2`), or the centre
+    line with the speed that friction and curvature allow as CSV (`profile`)."""
     out: Path
-    """The result is written to this file, or to standard output (`-`); an earlier file is kept as a numbered
-    backup."""
+    """File for the result, or standard output (`-`); an earlier file is kept as a numbered backup."""
     step: float = 1.0
-    """Points are this far apart along a curve (m)."""
+    """Distance of the points along a curve (m)."""
     origin: tuple[float, float, float] | None = None
-    """The origin of the map has this latitude and longitude (degrees, WGS84). Its x axis, which is the way
-    that the vehicle faced at the start, has this heading (degrees, clockwise from north). `geojson` and
-    `lanelet2` need them."""
+    """Latitude and longitude of the map's origin (degrees, WGS84), and heading of its x axis, which is the
+    way that the vehicle faced at the start (degrees, clockwise from north). `geojson` and `lanelet2` need
+    them."""
     speed: SpeedSettings = field(default_factory=SpeedSettings)
-    """These settings describe the vehicle of a `profile`."""
+    """Vehicle of a `profile`."""
     start_speed: float | None = None
-    """The `profile` of an open track begins at this speed (m/s), by default as fast as its curvature
+    """Speed at which the `profile` of an open track begins (m/s), by default as fast as its curvature
     allows."""
     stop: bool = False
-    """The `profile` of an open track ends at a standstill."""
+    """End the `profile` of an open track at a standstill."""
 
     def run(self) -> None:
-        """Reads the map and writes the file."""
+        """Read the map and write the file."""
         check_file_target(self.out)
         if not LEAST_STEP <= self.step < np.inf:
             raise SettingsError(
@@ -98,7 +97,7 @@ class Export:
 
 
 def write_true_path(folder: Path, out: Path) -> None:
-    """Writes the true poses of a log in the TUM format; InputError where they are not known."""
+    """Write the true poses of a log in the TUM format; InputError where they are not known."""
     truth = read_log(folder).truth
     if truth is None or len(truth.poses) == 0:
         raise InputError(folder, f"expected a log with {TRUTH_POSES_FILE}, or a map, found neither")
@@ -107,13 +106,13 @@ def write_true_path(folder: Path, out: Path) -> None:
 
 
 def copy_trajectory(source: Path, target: Path) -> None:
-    """Copies the trajectory of a map, which is in the TUM format already, once it is found right."""
+    """Copy the trajectory of a map, which is in the TUM format already, once it is found right."""
     read_trajectory(source)
     shutil.copyfile(source, target)
 
 
 def check_length(track: Map, step: float, file: Path) -> None:
-    """Raises an InputError where a curve has too many points at this step (m)."""
+    """Raise an InputError where a curve has too many points at this step (m)."""
     most = MOST_POINTS * step
     for boundary in track.boundaries.values():
         if isinstance(boundary, SplineBoundary) and boundary.spline.length() > most:

@@ -13,14 +13,12 @@ from pathspace_graph.progress import progress
 
 @dataclass(frozen=True, kw_only=True)
 class Figures:
-    """Draws the paper's isolated tests: uncertainty, expansion, the fit of S_z and simplification."""
+    """Draw the paper's isolated tests: uncertainty, expansion, the fit of S_z and simplification."""
 
     out: Path
-    """The figures and their captions are written to this folder; earlier ones there are kept as a numbered
-    backup."""
+    """Folder for the figures and their captions; earlier ones there are kept as a numbered backup."""
 
     def run(self) -> None:
-        """Computes, draws, writes and reports."""
         check_target(self.out, MARKER)
         with progress("drawing", len(FIGURES)) as advance, threadpool_limits(limits=1):
             write_figures(self.out, advance)

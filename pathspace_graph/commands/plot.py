@@ -18,22 +18,20 @@ from pathspace_graph.io.trajectory import TRAJECTORY_FILE, read_trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class Plot:
-    """Draws a map: both boundaries with their 2-sigma band, control points, trajectory and any truth."""
+    """Draw a map: both boundaries with their 2-sigma band, control points, trajectory and any truth."""
 
     map: Positional[Path]
-    """The map is read from this folder."""
+    """Folder of the map."""
     out: Path
-    """The picture is written to this file (.png, .pdf or .svg); an earlier one is kept as a numbered
-    backup."""
+    """File for the picture (.png, .pdf or .svg); an earlier one is kept as a numbered backup."""
     log: Path | None = None
-    """The truth of the log in this folder is drawn as well."""
+    """Folder of the log whose truth is drawn as well."""
     band_scale: float = 1.0
-    """The band is drawn this many times as wide as it is, which the legend says."""
+    """Factor by which the band is drawn wider than it is, which the legend says."""
     title: str | None = None
-    """The picture has this title."""
+    """Title of the picture."""
 
     def run(self) -> None:
-        """Reads, draws and writes."""
         check_plot_file(self.out)
         check_file_target(self.out)
         if not 0.0 < self.band_scale < np.inf:

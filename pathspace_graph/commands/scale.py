@@ -17,13 +17,12 @@ from pathspace_graph.progress import progress
 from pathspace_graph.settings.mapper import MapperSettings
 
 FILE_WIDTH: Final = 160
-"""A line of a table that is not printed on a terminal has this number of characters."""
+"""Characters in a line of a table that is not printed on a terminal."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """Times every online estimator on ever larger maps and ever more detections, and fits and draws the
-    slopes.
+    """Time every online estimator on ever larger maps and ever more detections, and fit and draw the slopes.
 
     All run in this one process, cycle for cycle in turn, so that other work of the machine slows all of them
     alike. An estimator that takes longer than the budget is stopped there, and the table says so. Memory is
@@ -31,20 +30,19 @@ class Scale:
     """
 
     out: Path
-    """Points, slopes and figures are written to this folder; earlier ones there are kept as a numbered
-    backup."""
+    """Folder for points, slopes and figures; earlier ones there are kept as a numbered backup."""
     estimators: tuple[str, ...] = ()
-    """These are the names of the online estimators; all of them run where none is named."""
+    """Names of the online estimators; by default all."""
     quick: bool = False
-    """The measurement takes less than a minute, with small maps and few laps, to see that everything works.
-    It goes with no other `scaling` option."""
+    """Take less than a minute, with small maps and few laps, to see that everything works. It goes with no
+    other `scaling` option."""
     scaling: ScalingSettings = field(default_factory=ScalingSettings)
-    """These settings describe what is measured."""
+    """What is measured."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
-    """These settings hold for every estimator."""
+    """Settings of every estimator."""
 
     def run(self) -> None:
-        """Checks everything, simulates, times, writes and reports."""
+        """Check, simulate, time, write and report."""
         names = tuple(dict.fromkeys(self.estimators or ONLINE))
         for name in names:
             check_online(name)

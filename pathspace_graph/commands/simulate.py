@@ -25,30 +25,30 @@ from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate:
-    """Drives a track and writes the log of it, with truth; a seed gives the same log to the byte."""
+    """Drive a track and write the log of it, with truth; a seed gives the same log to the byte."""
 
     out: Path
-    """The log is written to this folder; an earlier log there is kept as a numbered backup."""
+    """Folder for the log; an earlier log there is kept as a numbered backup."""
     track: Path | None = None
-    """The track is read from this file: PacSim or fssim YAML, EUFS or TUM CSV."""
+    """Track file: PacSim or fssim YAML, EUFS or TUM CSV."""
     generate: int | None = None
-    """Where no track file is given, a Formula Student track is generated from this seed."""
+    """Seed of a generated Formula Student track, where no track file is given."""
     event: Literal["skidpad", "acceleration"] | None = None
-    """Or else the drive is this event, on the track that the rules describe."""
+    """Event that is driven instead, on the track that the rules describe."""
     seed: int = 0
-    """The drive's wander and all noise are drawn from this seed."""
+    """Seed of the drive's wander and of all noise."""
     sensor: Literal["plain", "camera"] = "plain"
     """Preset of `--sensor.*` and `--faults.sensor.*`, each of which can still be set."""
     odometry: Literal["plain", "ins"] = "plain"
     """Preset of `--odometry.*` and `--vehicle.rate`, each of which can still be set."""
     settings: Annotated[SimulationSettings, arg(name="")] = field(default_factory=SimulationSettings)
-    """These settings describe the drive."""
+    """Settings of the drive."""
     generator: TrackGeneratorSettings = field(default_factory=TrackGeneratorSettings)
-    """These settings are the rules of a generated track."""
+    """Rules of a generated track."""
 
     @classmethod
     def start(cls, arguments: Sequence[str]) -> Simulate:
-        """Returns the command with the presets among its arguments, before any other option is set."""
+        """Return the command with the presets among its arguments, before any other option is set."""
         words = [word for argument in arguments for word in argument.split("=", 1)]
         pairs = ((word.removeprefix("--"), value) for word, value in pairwise(words))
         # a wrong name is refused with the other options
@@ -56,7 +56,6 @@ class Simulate:
         return cls(out=MISSING, settings=preset(names))
 
     def run(self) -> None:
-        """Simulates and writes."""
         check_target(self.out, LOG_FILE)
         with progress("driving"):
             log = simulate(self._track(), self.settings, self.seed)
@@ -74,14 +73,14 @@ class Simulate:
 
 
 def generated_track(seed: int, settings: TrackGeneratorSettings | None = None) -> Track:
-    """Returns the generated track of a seed."""
+    """Return the generated track of a seed."""
     if seed < 0:
         raise SettingsError(f"seed of a generated track: expected at least 0, found {seed}")
     return generate_track(np.random.default_rng(seed), settings)
 
 
 def describe(log: Log) -> str:
-    """Returns the length of the log in words."""
+    """Return the length of the log in words."""
     detections = sum(len(cycle.labels) for cycle in log.cycles)
     seconds = log.odometry.t[-1] - log.odometry.t[0]
     return f"{seconds:.1f} s, {len(log.cycles)} perception cycles, {detections} detections"

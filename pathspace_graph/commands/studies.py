@@ -16,32 +16,32 @@ from pathspace_graph.io.files import write_manifest
 from pathspace_graph.progress import progress
 
 CELLS_FAILED: Final = 3
-"""This is the exit code of a study that is written, but some of whose cells failed."""
+"""Exit code of a study that is written, but some of whose cells failed."""
 LINES: Final = 20
-"""A whole study writes about this many lines of progress where there is no terminal."""
+"""About the number of lines of progress of a whole study where there is no terminal."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StudyCommand:
-    """Holds the options of every command that runs a study."""
+    """Options of every command that runs a study."""
 
     out: Path
-    """Everything is written to this folder; a study that was begun there is continued."""
+    """Folder for everything; a study that was begun there is continued."""
     jobs: int = -1
-    """This number of processes runs at a time, -1 being one for each core."""
+    """Number of processes at a time, -1 for one on each core."""
     cluster: str | None = None
-    """The study runs on the workers of the Dask scheduler with this address (tcp://HOST:8786) instead."""
+    """Address of a Dask scheduler (tcp://HOST:8786) on whose workers the study runs instead."""
     retry_failed: bool = False
-    """Runs that failed before are run again."""
+    """Run again what failed before."""
     tracks: tuple[str, ...] = ()
-    """These track files, and seeds of generated tracks, replace the study's own."""
+    """Track files, and seeds of generated tracks, in place of the study's own."""
     seeds: tuple[int, ...] = ()
-    """These seeds replace the study's own."""
+    """Seeds in place of the study's own."""
     laps: int | None = None
-    """This number of laps replaces the study's own."""
+    """Number of laps in place of the study's own."""
 
     def execute(self, study: Study, write: Callable[[Study, pd.DataFrame, Path], str]) -> None:
-        """Checks, runs, writes and reports a study; the exit code is 3 where cells failed.
+        """Check, run, write and report a study; the exit code is 3 where cells failed.
 
         `write` writes the results to the folder, and returns the text that is printed.
         """
@@ -59,7 +59,7 @@ class StudyCommand:
 
 
 def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], laps: int | None) -> Study:
-    """Returns the study with other tracks, seeds and laps, where any are given.
+    """Return the study with other tracks, seeds and laps, where any are given.
 
     A track is a file, or the seed of a generated track.
     """
@@ -72,7 +72,7 @@ def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], l
 
 
 def report_failures(frame: pd.DataFrame, cells: int) -> None:
-    """Says on standard error how many cells failed, and exits with code 3 where any did."""
+    """Say on standard error how many cells failed, and exit with code 3 where any did."""
     failures = frame[frame["failure"] != ""]
     if len(failures):
         line = f"{len(failures)} of {cells} cells failed, the first of {failures.iloc[0]['failure']}"

@@ -19,7 +19,7 @@ from . import disk
 from .manifest import MANIFEST_FILE, manifest_of
 
 STDOUT: Final = Path("-")
-"""A single file at this path is written to standard output."""
+"""Path at which a single file is written to standard output."""
 
 
 @contextmanager

@@ -49,20 +49,21 @@ COLUMNS: Final[dict[str, dict[str, Column]]] = {
 FILES: Final = (LOG_FILE, *COLUMNS)
 
 CALIBRATION: Final = ("scale", "bias")
-"""The true calibration of the odometry has these names in the log's header."""
+"""Names of the true calibration of the odometry in the log's header."""
 
 SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")
-"""The true constant errors of the sensor have these names in the log's header."""
+"""Names of the true constant errors of the sensor in the log's header."""
 NOISE: Final = ("sigma_vx", "sigma_vy", "sigma_wz", "slow_range", "slow_bearing", "slow_time")
-"""The true noise has these names in the log's header, where it is not white as the log states it."""
+"""Names of the true noise in the log's header, where it is not white as the log states it."""
 _TRUE_ERRORS: Final = {"calibration": CALIBRATION, "sensor": SENSOR, "noise": NOISE}
-"""These fields of the truth are in the log's header, by the names of their entries."""
+"""Fields of the truth that are in the log's header, by the names of their entries."""
 _SENSOR_INFO: Final = ("range_max", "fov", "rate")
 
 MAX_HOLD: Final = 1.0
-"""The last twist may be held for this time (s); a perception cycle later than that has no odometry."""
+"""Longest time for which the last twist is held (s); a perception cycle later than that has no odometry."""
 MIN_RELATIVE_DETERMINANT: Final = 1e-12
-"""A covariance with det <= this * xx * yy is singular to double precision, so not positive definite."""
+"""Least det of a covariance over xx * yy; a smaller one is singular to double precision, so not positive
+definite."""
 
 
 @dataclass(frozen=True, eq=False)

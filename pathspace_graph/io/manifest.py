@@ -15,9 +15,9 @@ from .parsing import parse_json, read_text
 FORMAT: Final = "pathspace-manifest/1"
 MANIFEST_FILE: Final = "manifest.json"
 _MARK: Final = "pathspace"
-"""A manifest holds this word more than once, so that a damaged one is not taken for another program's."""
+"""Word that a manifest holds more than once, so that a damaged one is not taken for another program's."""
 _DIGEST: Final = "pathspace_digest"
-"""The manifest's own SHA-256, without this key, stands under it."""
+"""Key of the manifest's own SHA-256, taken without this key."""
 
 
 def manifest_of(folder: Path) -> str:
@@ -84,7 +84,7 @@ def verify(folder: Path, names: Iterable[str]) -> None:
 
 
 def verify_all(folder: Path) -> int:
-    """Verify every listed file, also by the manifests of subfolders, and returns their number.
+    """Verify every listed file, also by the manifests of subfolders, and return their number.
 
     An InputError names the first file that is missing or differs, or the folder where it has no manifest.
     """

@@ -25,7 +25,7 @@ FORMAT = "pathspace-map/1"
 MAP_FILE = "map.json"
 
 NO_COVARIANCE: Final[Array] = np.zeros((0, 0))
-"""A boundary whose covariance wasn't asked for has this one, and can't be written."""
+"""Covariance of a boundary for which none was asked; it can't be written."""
 
 _SYMMETRY_TOLERANCE = 1e-9
 """A covariance is symmetric to rounding where |P - P^T| <= tolerance * max|P|."""
@@ -40,7 +40,7 @@ class SplineBoundary:
     LENGTHS: ClassVar = {"spline": 0, "covariance": 2, "confirmed_until": 1}
 
     spline: BSpline
-    """The curve is in the map frame, in the direction of travel."""
+    """Curve in the map frame, in the direction of travel."""
 
     covariance: Array
     """Joint covariance (2m, 2m) in m^2 of the distinct control points, in the order x0, y0, x1 and so on."""
@@ -77,7 +77,7 @@ MapBoundary = SplineBoundary | PointBoundary
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """What was mapped of a track."""
+    """Map of a track."""
 
     LENGTHS: ClassVar = {"boundaries": 0, "joint_covariance": 2, "points": 0}
 

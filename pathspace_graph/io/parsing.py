@@ -18,7 +18,7 @@ from .limits import MAX_DEPTH, MAX_FILE_BYTES, check_content, too_deep
 _YAML_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _MERGE: Final = "tag:yaml.org,2002:merge"
 _ERRORS: Final = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError)
-"""Parsers raise these, that of YAML for values that do not fit their tags, such as `2020-99-99`."""
+"""Errors of the parsers, that of YAML for values that do not fit their tags, such as `2020-99-99`."""
 
 
 def read_text(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) -> str:
@@ -90,7 +90,7 @@ def parse_toml(text: str, file: Path) -> dict[str, Any]:
 
 
 class _Loader(_YAML_LOADER):  # type: ignore[misc]
-    """Make plain values of YAML, but for merge keys, by which a short text can stand for a huge one."""
+    """YAML loader of plain values without merge keys, by which a short text can stand for a huge one."""
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         for key, _ in node.value:

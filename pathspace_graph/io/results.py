@@ -24,10 +24,10 @@ from .map import MAP_FILE, Map, map_to_json
 from .trajectory import TRAJECTORY_FILE, write_trajectory
 
 NoiseSource = Literal["stated", "measured", "assumed"]
-"""Noise is what the log states, what a drive has shown, or a default."""
+"""Where noise comes from: the log's statement, the drive, or a default."""
 
 CYCLES_FILE: Final = "cycles.csv"
-"""A result folder holds its cycles in this file."""
+"""File of the cycles in a result folder."""
 _CYCLE_COLUMNS: Final = (
     *("cycle", "t", "seconds", "size_left", "size_right", "readings", "lap"),
     *("offered", "health", "reason", "dropped"),
@@ -148,7 +148,7 @@ class RunNoise:
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """What a run of an estimator over a log gives."""
+    """Result of an estimator's run over a log."""
 
     LENGTHS: ClassVar = {
         "map": 0,
@@ -203,7 +203,7 @@ class RunResult:
 
 @dataclass(frozen=True, eq=False)
 class BatchRun(RunResult):
-    """What a batch estimator gives; its maps of the laps are all the one of the whole log."""
+    """Result of a batch estimator; its maps of the laps are all the one of the whole log."""
 
     converged: bool = True
     """Whether the optimization ended at an optimum."""

@@ -41,9 +41,9 @@ INTERVAL: Final = 0.5
 MEMORY: Final = 60.0
 """Length of the newest path whose detections are compared with the map (m)."""
 MOST_DETECTIONS: Final = 200
-"""Detections, evenly chosen, that are compared with the map at most ..."""
+"""Largest number of detections, evenly chosen, that are compared with the map."""
 MIN_DETECTIONS: Final = 40
-"""... and at least."""
+"""Least number of detections that are compared with the map."""
 STEP: Final = 2.0
 """Distance of the places along the loop (m)."""
 LEAD: Final = 4.0
@@ -61,9 +61,9 @@ SIGMAS_PLACE: Final = (3.0, 3.0, 0.2)
 SIGMA_FIT: Final = 0.3
 """A detection at a distance d from a curve of its colour scores `exp(-d^2 / (2 SIGMA_FIT^2))` (m)."""
 MIN_SCORE: Final = 0.6
-"""Least score of the place that is accepted; the true one has about 0.85 ..."""
+"""Least score of the place that is accepted; the true one has about 0.85."""
 MARGIN: Final = 0.1
-"""... and that of every other place is smaller by this."""
+"""Least lead of its score over that of every other place."""
 SIGMA_MAX: Final = 0.5
 """Largest standard deviation of the position there in its worst direction (m)."""
 CONFIRMATIONS: Final = 2

@@ -44,9 +44,9 @@ BESIDE: Final = 0.5
 ROW: Final = 11.0
 """Largest distance of neighbours in a row (m): two regular gaps, since a cone may never be detected."""
 SETTLE: Final = 1.5
-"""Time without detections of its cones after which the vehicle has passed a stretch (s) ..."""
+"""Time without detections of its cones after which the vehicle has passed a stretch (s)."""
 MOST: Final = 20
-"""... or enough of it, where it has passed this number of contradictions."""
+"""Number of contradictions passed after which enough of a stretch is seen, whatever the time."""
 INTERVAL: Final = 0.5
 """Time after which contradictions are looked for again (s)."""
 ATTEMPTS: Final = 8

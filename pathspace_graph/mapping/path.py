@@ -166,9 +166,9 @@ def crosses(begin: Array, ends: Array, line: Array) -> BoolArray:
 # --- cones that come next --------------------------------------------------------------------------------
 
 LATERAL_CHANGE: Final = 1.5
-"""How much farther from the path the next cone may be than the newest ones of the curve (m) ..."""
+"""How much farther from the path the next cone may be than the newest ones of the curve (m)."""
 LATERAL_RATE: Final = 0.2
-"""... and how much more of it for each metre along the path (m/m)."""
+"""Growth of `LATERAL_CHANGE` with the distance along the path (m/m)."""
 BESIDE: Final = 2.0
 """Cones less than this apart along the path stand beside each other (m)."""
 LATERAL_GAP: Final = 0.8
@@ -179,13 +179,13 @@ END_BEHIND: Final = 5.0
 """Farthest that the end of a curve is behind the vehicle (m along the path): a stranded end is carried on,
 and an older stretch of the path across the infield may be nearer to it, which means nothing."""
 STRANDED: Final = 2.0
-"""An end farther behind the vehicle than this, with nothing that extends it, is carried on (m) ..."""
+"""An end farther behind the vehicle than this, with nothing that extends it, is carried on (m)."""
 CARRIED_TO: Final = 1.0
-"""... to this distance behind the vehicle (m) ..."""
+"""Distance behind the vehicle to which a stranded end is carried on (m)."""
 MIN_LATERAL: Final = 0.5
-"""... at least at this distance from the path (m) ..."""
+"""Least distance from the path of an end that is carried on (m)."""
 MIN_CARRY: Final = 0.5
-"""... by at least this length (m), or not at all."""
+"""Least length by which an end is carried on (m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +210,7 @@ class Candidates:
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """Where the confirmed part of a curve ends."""
+    """End of the confirmed part of a curve."""
 
     position: Array
     """(2,) Position (x, y) in m, map frame."""

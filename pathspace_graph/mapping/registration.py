@@ -17,28 +17,28 @@ from .state import State
 HEADING: Final = 0.8
 """Largest angle between the heading and that of the beginning where the loop may close (rad)."""
 START_LATERAL: Final = 5.0
-"""Largest distance from the place of the start at which the vehicle crosses its line again (m) ..."""
+"""Largest distance from the start at which the vehicle crosses its line, without which no loop closes (m)."""
 START_HEADING: Final = 0.5
-"""... and largest angle between both directions there (rad). The loop closes only after that."""
+"""Largest angle between the directions of the start and of that crossing (rad)."""
 WINDOW: Final = 2.0
 """Age of the oldest detections that are registered (s)."""
 BEGINNING: Final = 60.0
-"""Length of the curves that counts as their beginning (m) ..."""
+"""Length of the curves that counts as their beginning (m)."""
 BEGINNING_SHARE: Final = 0.6
-"""... and its largest share of a short curve."""
+"""Largest share of a short curve that counts as its beginning."""
 REACH: Final = 3.0
-"""Distance from the curves of detections that the first iteration uses (m) ..."""
+"""Largest distance from the curves of detections that the first iteration uses (m)."""
 SHRINK: Final = 0.7
-"""... and its factor for each further iteration, down to `closing.inlier_distance`."""
+"""Factor on `REACH` for each further iteration, down to `closing.inlier_distance`."""
 ITERATIONS: Final = 7
 START_STEP: Final = 2.0
 """Distance of the poses of the beginning from which the registration starts where the vehicle is lost (m)."""
 START_CHI2: Final = 16.3
 """Their largest squared Mahalanobis distance under its uncertainty: 99.9 % of chi-square with 3 degrees."""
 MIN_DETECTIONS: Final = 25
-"""Least number of matched detections ..."""
+"""Least number of matched detections."""
 MIN_INLIERS: Final = 5
-"""... and of inliers on each boundary."""
+"""Least number of inliers on each boundary."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,9 +18,9 @@ from .registration import BEGINNING
 EXTRAPOLATED: Final = 2
 """Knot intervals past the confirmed end whose parameters are mapped to the closed curve."""
 JOIN_MARGIN: Final = 10.0
-"""The seam lies within the last `BEGINNING` plus this length of a curve (m) ..."""
+"""The seam lies within the last `BEGINNING` plus this length of a curve (m)."""
 JOIN_SHARE: Final = 0.5
-"""... and past this share of a short one."""
+"""Share of a short curve past which the seam lies."""
 OVERLAP_STEP: Final = 1.0
 """Step at which points of the overlap are placed on the beginning (m)."""
 OVERLAP_ROOM: Final = 4.0

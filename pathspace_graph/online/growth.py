@@ -32,9 +32,9 @@ NEWEST: Final = 3
 RECALL: Final = 25.0
 """Length at the end of a curve whose cones are checked to be in the order in which they were passed (m)."""
 LENGTH_FREE: Final = 50.0
-"""An open curve grows no further once it is longer than this (m) ..."""
+"""Length of an open curve that is allowed whatever the path driven (m)."""
 LENGTH_DRIVEN: Final = 2.0
-"""... plus this number of times the path driven: one that zigzags between false cones gets longer."""
+"""Further length allowed for each metre driven (m/m): a curve that zigzags between false cones exceeds it."""
 
 
 class Growth:

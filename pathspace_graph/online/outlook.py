@@ -32,21 +32,21 @@ MEMORY: Final = 0.35
 GAP: Final = 11.0
 """Largest distance of neighbouring tracks of a row (m): two regular gaps, as a cone may never be detected."""
 TURN: Final = 2.0
-"""Largest turn of a row from one track to the next (rad) ..."""
+"""Largest turn of a row from one track to the next where both coincide (rad)."""
 TURN_RATE: Final = 0.1
-"""... less this for each metre to it (rad/m)."""
+"""Decrease of `TURN` with the distance to the next track (rad/m)."""
 TURN_COST: Final = 1.0
 """The next track of a row has the least `distance (1 + TURN_COST turn^2)` (rad^-2)."""
 MIN_WIDTH: Final = 1.5
 """Least distance of a row from the other boundary (m)."""
 WIDTH_RATIO: Final = 1.8
-"""The next track is at most this number of times as far from the other boundary as the one before ..."""
+"""Largest ratio of successive tracks' distances from the other boundary."""
 WIDTH_SLACK: Final = 1.0
-"""... and this (m)."""
+"""Further growth allowed of that distance (m)."""
 TAIL: Final = 20.0
-"""Length at the end of the confirmed curves that tells where the track leads and how wide it is (m) ..."""
+"""Length at the end of the confirmed curves that tells where the track leads and how wide it is (m)."""
 TAIL_STEP: Final = 1.0
-"""... and its step (m)."""
+"""Step of the points along that length (m)."""
 BEGIN_LATERAL: Final = 1.5
 """Distance beside the vehicle from which the row of a boundary that has not begun is searched (m)."""
 SIGMA_CONE: Final = 0.1

@@ -16,9 +16,9 @@ class ClosingSettings(Positive):
     check_interval: float = 2.0
     """Least distance of two attempts to close the loop (m along the path)."""
     radius: float = 8.0
-    """Distance from the first stretch of the drive within which the loop may close (m) ..."""
+    """Distance from the first stretch of the drive within which the loop may close (m)."""
     drift: float = 0.03
-    """... and its growth for each metre driven (m/m)."""
+    """Growth of `radius` with the path driven (m/m)."""
     overlap: float = 8.0
     """Length of the beginning that must have been driven again (m)."""
     inlier_distance: float = 0.4

@@ -22,42 +22,42 @@ from .planning import LEAST_STEP, MOST_POINTS
 Bools = BoolArray
 
 _SAMPLE_STEP: Final = 0.5
-"""The boundaries are sampled at about this distance (m). The circle at a sample is right to a millimetre."""
+"""Approximate distance of boundary samples (m). The circle at a sample is right to a millimetre."""
 _ACROSS: Final = 2
-"""The points across are searched among every so-manyth sample."""
+"""Stride of the samples among which the points across are searched."""
 _BEHIND: Final = 3.0
-"""The samples begin this far behind the vehicle (m), since it may stand askew."""
+"""Distance behind the vehicle at which the samples begin (m), since it may stand askew."""
 _OUTER: Final = 1.8
-"""The outer boundary of a turn is at most this number of times as long as the centre line."""
+"""Largest ratio of the length of a turn's outer boundary to that of the centre line."""
 _SETTLING_STEPS: Final = 8
-"""The stations are settled by at most this number of Newton steps; mostly two are enough."""
+"""Largest number of Newton steps that settle the stations; mostly two are enough."""
 _SETTLED: Final = 1e-3
-"""A station is on the line where its distances from both boundaries differ by at most this (m)."""
+"""Largest difference of a point's distances from both boundaries where it is on the line (m)."""
 _LARGEST_GAP: Final = 2.0
-"""Neighbours are at most this many steps apart."""
+"""Largest number of steps between neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
 class CurveAhead:
-    """Holds a boundary in the direction of travel, and where the vehicle is on it."""
+    """A boundary in the direction of travel, and the vehicle's place on it."""
 
     tables: SpanPolynomials
-    """The parameter is about a length in m."""
+    """Basis, whose parameter is about a length in m."""
     control_points: Array
-    """(n, 2) These are its control points in m, map frame; those of a closed curve repeat."""
+    """(n, 2) Control points in m, map frame; those of a closed curve repeat."""
     beside: float
-    """The vehicle's foot point is at about this parameter."""
+    """Parameter of about the vehicle's foot point."""
     until: float = np.inf
-    """An open curve is confirmed up to this parameter, where it ends."""
+    """Parameter up to which an open curve is confirmed, where it ends."""
     tentative: Array | None = None
-    """(k, 2) From its end the boundary leads on through these points (m, map frame), as far as is known."""
+    """(k, 2) Points through which the boundary leads on from its end, as far as is known (m, map frame)."""
     confirmed: bool = True
-    """The curve itself may be taken back where this is false."""
+    """Whether the curve itself is sure not to be taken back."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackAhead:
-    """Holds the next stretch of the track in the vehicle's frame (x forward, y left, m and rad).
+    """The next stretch of the track in the vehicle's frame (x forward, y left, m and rad).
 
     The centre line has n points: n is 0 where only one boundary is known, and smaller than what was asked for
     where the map ends. Each point is equally far from both boundaries.
@@ -74,37 +74,37 @@ class TrackAhead:
     }
 
     points: Array
-    """These are the points (n, 2) in m; the first one is beside the vehicle."""
+    """Points (n, 2) in m; the first one is beside the vehicle."""
     heading: Array
-    """This is the direction of travel (n,) in rad from that of the vehicle, in (-pi, pi]."""
+    """Direction of travel (n,) in rad from that of the vehicle, in (-pi, pi]."""
     curvature: Array
-    """This is the curvature (n,) in 1/m, positive in a left turn."""
+    """Curvature (n,) in 1/m, positive in a left turn."""
     arc_length: Array
-    """This is the length (n,) of the line from its first point, in m."""
+    """Length (n,) of the line from its first point, in m."""
     width_left: Array
-    """This is the distance (n,) along the normal to the left boundary, in m."""
+    """Distance (n,) along the normal to the left boundary, in m."""
     width_right: Array
-    """This is the distance (n,) along the normal to the right boundary, in m."""
+    """Distance (n,) along the normal to the right boundary, in m."""
     confirmed: Bools
-    """A point (n,) is confirmed where both boundaries are; another one may be taken back."""
+    """Whether both boundaries are confirmed at each point (n,); another one may be taken back."""
     left: Array
-    """These are points (k, 2) of the left boundary from beside the vehicle on, in m."""
+    """Points (k, 2) of the left boundary from beside the vehicle on, in m."""
     right: Array
-    """These are points (h, 2) of the right boundary from beside the vehicle on, in m."""
+    """Points (h, 2) of the right boundary from beside the vehicle on, in m."""
 
     @property
     def closed(self) -> bool:
-        """Returns false: what is ahead is a stretch, also of a closed track."""
+        """Return false: what is ahead is a stretch, also of a closed track."""
         return False
 
     @property
     def length(self) -> float:
-        """Returns how far the centre line is known, in m."""
+        """Return how far the centre line is known, in m."""
         return float(self.arc_length[-1]) if len(self.arc_length) else 0.0
 
 
 def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, step: float) -> TrackAhead:
-    """Returns the next `distance` metres of a track from a pose (x, y, theta), at points `step` (m) apart.
+    """Return the next `distance` metres of a track from a pose (x, y, theta), at points `step` (m) apart.
 
     `curves` are the boundaries by label, as far as they are known. SettingsError is raised where a length is
     out of its range.
@@ -136,27 +136,27 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Holds a boundary at n places."""
+    """A boundary at n places."""
 
     points: Array
-    """These are the points (n, 2) in m, map frame."""
+    """Points (n, 2) in m, map frame."""
     tangents: Array
-    """These are the unit tangents (n, 2)."""
+    """Unit tangents (n, 2)."""
     curvature: Array
-    """This is the curvature (n,) in 1/m."""
+    """Curvature (n,) in 1/m."""
     station: Array
-    """This is the length (n,) along the boundary, from beside the vehicle, in m."""
+    """Length (n,) along the boundary, from beside the vehicle, in m."""
     confirmed: Bools
-    """A sample (n,) is confirmed, or may be taken back."""
+    """Whether each sample (n,) is confirmed, or may be taken back."""
 
     def beside(self, distance: float) -> Array:
-        """Returns the points (k, 2) from beside the vehicle on, along a distance (m)."""
+        """Return the points (k, 2) from beside the vehicle on, along a distance (m)."""
         wanted = (self.station >= -_SETTLED) & (self.station <= distance + _SETTLED)
         return self.points[wanted][::_ACROSS]
 
 
 def _sampled(curve: CurveAhead, distance: float) -> _Samples:
-    """Returns samples from behind the vehicle to where the curve is no longer needed."""
+    """Return samples from behind the vehicle to where the curve is no longer needed."""
     tables = curve.tables
     begin, end = curve.beside - _BEHIND, curve.beside + _OUTER * distance + _BEHIND
     if tables.periodic:
@@ -190,7 +190,7 @@ def _sampled(curve: CurveAhead, distance: float) -> _Samples:
 
 
 def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Returns the positions and two derivatives (n, 2) of a cubic from an end (2,) through points (k, 2).
+    """Return the positions and two derivatives (n, 2) of a cubic from an end (2,) through points (k, 2).
 
     It begins with the slope of the curve (2,), and has the slopes of Catmull and Rom at the points.
     """
@@ -217,7 +217,7 @@ def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Arra
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """Holds points (n, 2) near the centre line, with the stations (n,) of their foot points."""
+    """Points (n, 2) near the centre line, with the stations (n,) of their foot points."""
 
     points: Array
     left: Array
@@ -225,7 +225,7 @@ class _Line:
 
 
 def _first_line(left: _Samples, right: _Samples) -> _Line:
-    """Returns the middles between samples of the left boundary and those across, in the order of travel."""
+    """Return the middles between samples of the left boundary and those across, in the order of travel."""
     of = slice(None, None, _ACROSS)
     lefts, rights = left.points[of], right.points[of]
     stations = left.station[of], right.station[of]
@@ -240,7 +240,7 @@ def _first_line(left: _Samples, right: _Samples) -> _Line:
 
 
 def _from_beside(line: _Line, position: Array, distance: float, step: float) -> _Line:
-    """Returns the line at even steps, from the point beside a position (2,) on."""
+    """Return the line at even steps, from the point beside a position (2,) on."""
     edges = np.diff(line.points, axis=0)
     squares = _dot(edges, edges)
     offset = position - line.points[:-1]
@@ -261,7 +261,7 @@ def _from_beside(line: _Line, position: Array, distance: float, step: float) -> 
 def _settled(
     left: _Samples, right: _Samples, line: _Line, pose: Array, step: float, sides: Sequence[Array]
 ) -> TrackAhead:
-    """Returns the track ahead at the points of the line, moved along its normals to equal distances."""
+    """Return the track ahead at the points of the line, moved along its normals to equal distances."""
     points, feet = line.points, [_Feet(left, line.left), _Feet(right, line.right)]
     for _ in range(_SETTLING_STEPS):
         for foot in feet:
@@ -293,7 +293,7 @@ def _settled(
 
 
 class _Feet:
-    """Finds the foot points (n,) of stations on a boundary, by the circle that osculates it at a sample.
+    """Foot points (n,) of stations on a boundary, by the circle that osculates it at a sample.
 
     In the frame of the sample, with a point at (a, b), a along and b to the left, and the curvature k, the
     circle has its centre at (0, 1 / k). With q = |(k a, 1 - k b)| the distance is
@@ -306,7 +306,7 @@ class _Feet:
         self._normals = left_of(samples.tangents)
 
     def find(self, points: Array) -> None:
-        """Finds the foot points of points (n, 2), and goes on to the sample that is nearest to each."""
+        """Find the foot points of points (n, 2), and go on to the sample that is nearest to each."""
         samples, last = self._samples, len(self._samples.station) - 1
         self._frame(points)
         ahead = self.a / self.spread
@@ -337,12 +337,12 @@ class _Feet:
 
     @property
     def offset_curvature(self) -> Array:
-        """Returns k / (1 - k d) (n,), the curvature of the parallel curve through each point."""
+        """Return k / (1 - k d) (n,), the curvature of the parallel curve through each point."""
         spread = 1.0 - self.k * self.distance
         return np.asarray(self.k / np.where(np.abs(spread) > _SETTLED, spread, _SETTLED))
 
     def width(self, points: Array, way: Array) -> Array:
-        """Returns how far (n,) the circle is from points (n, 2) along unit vectors (n, 2).
+        """Return how far (n,) the circle is from points (n, 2) along unit vectors (n, 2).
 
         The distance w solves `k w^2 + 2 w (k (a s + b t) - t) + k (a^2 + b^2) - 2 b = 0` for the way (s, t).
         """
@@ -358,12 +358,12 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _distances(points: Array) -> Array:
-    """Returns the distance (n,) of each point from the one before, and 0 for the first."""
+    """Return the distance (n,) of each point from the one before, and 0 for the first."""
     edges = np.diff(points, axis=0, prepend=points[:1])
     return np.asarray(np.hypot(edges[:, 0], edges[:, 1]))
 
 
 def _lengths(points: Array, heading: Array) -> Array:
-    """Returns the arc length (n,) at points (n, 2), which are joined by circular arcs."""
+    """Return the arc length (n,) at points (n, 2), which are joined by circular arcs."""
     half = 0.5 * wrap_angle(np.diff(heading, prepend=heading[:1]))
     return np.asarray(np.cumsum(_distances(points) / np.sinc(half / np.pi)))

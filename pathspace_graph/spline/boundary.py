@@ -16,9 +16,9 @@ from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 from .bspline import BSpline
 
 ROUND_OFF = 1e-9
-"""Parameters that differ from a knot by no more than this (m) lie on the knot."""
+"""Largest difference from a knot of parameters that lie on it (m)."""
 SAME_DIRECTION = 0.5
-"""The curve beside a vehicle has a tangent whose cosine with the vehicle's heading is at least this."""
+"""Least cosine of the angle between the curve beside a vehicle and the vehicle's heading."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +30,11 @@ class Gauge:
     pairs: IntArray
     """(r, 2) Each row is a control point and the next one."""
     nominal: Array
-    """(r,) Each pair has this nominal distance (m)."""
+    """(r,) Nominal distance of each pair (m)."""
     triples: IntArray
-    """(t, 3) Each row holds three control points that follow one another."""
+    """(t, 3) Three control points in a row that follow one another."""
     bending: Array
-    """(t, 3) These coefficients give the second difference of a triple in sigmas (1/m)."""
+    """(t, 3) Coefficients of a triple's second difference in sigmas (1/m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +46,9 @@ class Placement:
     """
 
     first: int
-    """The fit depends on the known control points from this index on."""
+    """Index from which on the fit depends on the known control points."""
     kept: int
-    """The control points before this index stay where they are."""
+    """Index before which the control points stay where they are."""
     by_known: Array
     """(f, n - first) Derivative of the placed control points by the known ones."""
     by_target: Array
@@ -63,7 +63,7 @@ class Placement:
 
 
 class Boundary:
-    """A boundary is a B-spline that grows until the loop closes; its control points are graph variables.
+    """A B-spline that grows until the loop closes; its control points are graph variables.
 
     It holds the knots and what follows from them. An open boundary has uniform, floating (unclamped) knots
     whose interval is the spacing of its control points, so the parameter is roughly a length in metres. It is
@@ -74,31 +74,31 @@ class Boundary:
         self, knots: Array, periodic: bool, settings: SplineSettings, gauge: GaugeSettings, first: int = 0
     ) -> None:
         self.first = first
-        """The first control point's key has this number; new knots have keys with new numbers."""
+        """Number of the first control point's key; new knots have keys with new numbers."""
         self.settings = settings
         self.gauge = gauge
         self.degree = settings.degree
         self.periodic = periodic
         self.confirmed_end = 0.0
-        """Confirmed cones support the curve up to this parameter (m); beyond, it is extrapolated."""
+        """Parameter up to which confirmed cones support the curve (m); beyond, it is extrapolated."""
         self.observed: list[Array] = []
-        """The curve was extended through these cones (2,) in m, map frame, as they were placed then."""
+        """Cones (2,) that the curve was extended through, in m, map frame, as they were placed then."""
         self.cone_parameters: list[float] = []
-        """Each of the `observed` cones has this parameter (m) on the curve."""
+        """Parameter of each of the `observed` cones on the curve (m)."""
         self._set_tables(SpanPolynomials(knots, self.degree, periodic))
 
     def _set_tables(self, tables: SpanPolynomials) -> None:
         self.tables, knots = tables, tables.knots
         n = len(knots) - self.degree - 1
         self.size = n - self.degree if self.periodic else n
-        """The curve has this number of distinct control points."""
+        """Number of distinct control points."""
         self.abscissae = greville(knots, self.degree)[: self.size]
-        """(m,) Each control point has this Greville abscissa: the parameter about which it acts (m)."""
+        """(m,) Greville abscissae of the control points: the parameters about which they act (m)."""
         following = self.abscissae[1:]
         if self.periodic:
             following = np.append(following, self.abscissae[0] + self.length)
         self.nominal = following - self.abscissae[: len(following)]
-        """Each control point has this nominal distance to the next one (m)."""
+        """Nominal distance of each control point to the next one (m)."""
         self.everything = np.arange(self.size)
         self._gauge: Gauge | None = None
 
@@ -126,7 +126,7 @@ class Boundary:
 
     @property
     def numbers(self) -> IntArray:
-        """Return (m,) the numbers of the control points' keys."""
+        """Numbers (m,) of the control points' keys."""
         return self.first + self.everything
 
     @property
@@ -200,7 +200,7 @@ class Boundary:
         return boundary
 
     def grow(self, control_points: Array, targets_u: Array, targets: Array) -> Array:
-        """Extend the curve through targets (k, 2) at parameters (k,) and returns its control points (n', 2).
+        """Extend the curve through targets (k, 2) at parameters (k,); return its control points (n', 2).
 
         Knots are appended until the domain holds the last parameter, which becomes `confirmed_end`. No basis
         function of the old curve changes. The old control points that act only beyond the last cone before

@@ -22,19 +22,19 @@ from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.se2 import left_of
 
 _PERIODIC_TOLERANCE: Final = 1e-9
-"""A periodic spline repeats if |difference| <= tolerance * (1 + largest value)."""
+"""Largest difference of repeated values of a periodic spline, over (1 + largest value)."""
 _GRID_PER_SPAN: Final = 8
-"""A foot-point search over the whole curve has this number of grid points on each span."""
+"""Grid points on each span of a foot-point search over the whole curve."""
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(12)
 _ARC_NEWTON_STEPS: Final = 4
-"""The arc length is inverted by this number of Newton steps, from a table with the same grid."""
+"""Newton steps that invert the arc length, from a table with the same grid."""
 _SHORTEST_EXTENSION: Final = 1e-3
-"""An extension's knot interval is at least this share of the mean one, even if the point is the old end."""
+"""Least knot interval of an extension over the mean one, even if the point is the old end."""
 
 
 @dataclass(frozen=True, eq=False)
 class BSpline:
-    """A B-spline is the curve S(u) = sum_j N_j^p(u) c_j in the map frame, u in [knots[p], knots[n]].
+    """Curve S(u) = sum_j N_j^p(u) c_j in the map frame, u in [knots[p], knots[n]].
 
     Knots and control points are laid out as in scipy's `BSpline`.
     """
@@ -43,12 +43,12 @@ class BSpline:
     DIMENSION: ClassVar = 2
 
     knots: Array
-    """(n + p + 1,) The knots never decrease."""
+    """(n + p + 1,) Knots, never decreasing."""
     control_points: Array
     """(n, 2) Control points in m, map frame; a periodic curve's last p repeat the first p."""
     degree: int = 3
     periodic: bool = False
-    """A periodic curve is closed: its parameters are taken modulo the length of the domain."""
+    """Whether the curve is closed: its parameters are taken modulo the length of the domain."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "knots", np.array(self.knots, dtype=np.float64))

@@ -14,13 +14,13 @@ from .bspline import BSpline
 from .knots import energy_rows
 
 EVEN: Final = 1e-9
-"""The square of the interval (m^2) that a removal leaves is weighed by this against the cost of the removal
-(m^2): among knots that cost nothing, the one that leaves the shortest interval is removed."""
+"""Weight of the square of the interval (m^2) that a removal leaves against the cost of the removal (m^2):
+among knots that cost nothing, the one that leaves the shortest interval is removed."""
 MARGIN: Final = 0.1
-"""A smaller curve must have a sum of squares that is smaller by this share to be chosen."""
+"""Least share by which the sum of squares of a smaller curve must be smaller for it to be chosen."""
 COINCIDENT: Final = 1e-9
-"""Cones whose parameters differ by no more than this (m) share one knot. Two knots so close to each other
-impose the same constraint up to rounding, and the cost of the second one would be 0 / 0."""
+"""Largest difference of parameters of cones that share one knot (m). Two knots so close to each other impose
+the same constraint up to rounding, and the cost of the second one would be 0 / 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +31,9 @@ class Thinned:
     """(b + 1,) Knots that remain, in the parameter of the points (m)."""
     size: int
     residual: Array
-    """(k, 2) Each row is the offset from the spline to a point, at the point's parameter (m)."""
+    """(k, 2) Offset from the spline to each point, at the point's parameter (m)."""
     leverage: Array
-    """(k,) Each entry is the share of its own point in the curve there: the diagonal of the hat matrix."""
+    """(k,) Share of each point in the curve there: the diagonal of the hat matrix."""
 
     @property
     def rss(self) -> float:
@@ -47,7 +47,7 @@ class Thinned:
 
 
 def chosen_breaks(points: Array, periodic: bool, fit: FitSettings, least: int, most: int) -> Thinned:
-    """Chooses, among the curves of `thin` with `least` to `most` control points, by cross-validation.
+    """Choose, among the curves of `thin` with `least` to `most` control points, by cross-validation.
 
     The largest curve is chosen, unless a smaller one predicts a point left out better by `MARGIN`: which of
     nearly equal curves is best is chance. The other criterion, `n log(rss / n) + p log(n)` (BIC), took a knot

@@ -15,13 +15,13 @@ from pathspace_graph.settings.knots import BreakSettings, FitSettings
 from .bspline import BSpline
 
 _SAMPLES_PER_BREAK: Final = 40
-"""The curvature is sampled at this number of equally spaced places for each requested break."""
+"""Equally spaced samples of the curvature for each requested break."""
 _SAMPLES_PER_SPAN: Final = 8
-"""A refit has this number of least-squares samples on each span: enough for any degree up to 7."""
+"""Least-squares samples of a refit on each span: enough for any degree up to 7."""
 _BRIDGE: Final = 1e-3
-"""Second derivatives have this weight beside the samples of a refit, on spans that have too few samples."""
+"""Weight of second derivatives beside the samples of a refit, on spans that have too few samples."""
 _BENDING_PER_SPAN: Final = 3
-"""The second derivative is taken at this number of places on each such span."""
+"""Places on each such span at which the second derivative is taken."""
 
 
 def quantile_breaks(u: Array, curvature: Array, count: int, settings: BreakSettings) -> Array:
@@ -81,9 +81,9 @@ class Refit:
     """Change of basis between an old and a new spline; it is the same for both coordinates."""
 
     new_from_old: Array
-    """(m_new, m_old) The matrix F fits the new curve to samples of the old one: C_new = F C_old."""
+    """(m_new, m_old) Matrix F that fits the new curve to samples of the old one: C_new = F C_old."""
     old_from_new: Array
-    """(m_old, m_new) The matrix E fits the old curve to samples of the new one: C_old ~ E C_new."""
+    """(m_old, m_new) Matrix E that fits the old curve to samples of the new one: C_old ~ E C_new."""
 
 
 def refit(
@@ -186,7 +186,7 @@ def _chord_lengths(points: Array, periodic: bool) -> tuple[Array, float]:
 def _fit_on(
     points: Array, u: Array, breaks: Array, periodic: bool, settings: FitSettings
 ) -> tuple[BSpline, Array, float]:
-    """Fit on given breaks and refreshes foot points; returns spline, parameters (k,) and rmse (m)."""
+    """Fit on given breaks and refresh foot points; return spline, parameters (k,) and rmse (m)."""
     p = settings.degree
     count = len(breaks) - 1
     build = BSpline.periodic_from if periodic else BSpline.clamped_from

@@ -26,43 +26,43 @@ _SHORT: Final = 0.95
 
 @dataclass(frozen=True, eq=False)
 class CentreLine:
-    """Holds the centre line of a track at n points, evenly spaced, in the map frame.
+    """Centre line of a track at n points, evenly spaced, in the map frame.
 
     The line is in the middle between the boundaries, and smooth (`find_line`). A standard deviation is that
     of the quantity where the line crosses its normal at the point; it is NaN where the map has no covariance.
     """
 
     points: Array
-    """These are the points (n, 2) in m; a closed line doesn't repeat the first one."""
+    """Points (n, 2) in m; a closed line doesn't repeat the first one."""
     heading: Array
-    """This is the direction of travel (n,) in rad, in (-pi, pi]."""
+    """Direction of travel (n,) in rad, in (-pi, pi]."""
     curvature: Array
-    """This is the curvature (n,) in 1/m, positive in a left turn."""
+    """Curvature (n,) in 1/m, positive in a left turn."""
     arc_length: Array
-    """This is the length (n,) of the line from its first point, in m."""
+    """Length (n,) of the line from its first point, in m."""
     width_left: Array
     """Distance (n,) along the normal to the left boundary (m), or less where the normal would cross a
     neighbour's."""
     width_right: Array
     """Distance (n,) along the normal to the right boundary (m), or less in the same way."""
     closed: bool
-    """The line is a loop where this is true."""
+    """Whether the line is a loop."""
     length: float
-    """The whole line has this length (m), the way back to the first point included where it is closed."""
+    """Length of the whole line (m), the way back to the first point included where it is closed."""
     points_sigma: Array
-    """This is the standard deviation (n,) across the line, in m."""
+    """Standard deviation (n,) across the line, in m."""
     heading_sigma: Array
-    """This is the standard deviation (n,) of the heading, in rad."""
+    """Standard deviation (n,) of the heading, in rad."""
     curvature_sigma: Array
-    """This is the standard deviation (n,) of the curvature, in 1/m."""
+    """Standard deviation (n,) of the curvature, in 1/m."""
     arc_length_sigma: Array
-    """This is the standard deviation (n,) of the arc length, in m; the first one is 0."""
+    """Standard deviation (n,) of the arc length, in m; the first one is 0."""
     width_left_sigma: Array
-    """This is the standard deviation (n,) of the width to the left, in m."""
+    """Standard deviation (n,) of the width to the left, in m."""
     width_right_sigma: Array
-    """This is the standard deviation (n,) of the width to the right, in m."""
+    """Standard deviation (n,) of the width to the right, in m."""
     length_sigma: float
-    """This is the standard deviation of the whole length, in m."""
+    """Standard deviation of the whole length, in m."""
 
 
 def centre_line(

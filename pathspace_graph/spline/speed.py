@@ -16,34 +16,34 @@ class SampledLine(Protocol):
 
     @property
     def curvature(self) -> Array:
-        """Returns the curvature (n,) in 1/m."""
+        """Return the curvature (n,) in 1/m."""
 
     @property
     def arc_length(self) -> Array:
-        """Returns the length (n,) of the line from its first point, in m."""
+        """Return the length (n,) of the line from its first point, in m."""
 
     @property
     def length(self) -> float:
-        """Returns the whole length in m, with the way back to the first point where the line is closed."""
+        """Return the whole length in m, with the way back to the first point where the line is closed."""
 
     @property
     def closed(self) -> bool:
-        """Returns whether the line is a loop."""
+        """Return whether the line is a loop."""
 
 
 @dataclass(frozen=True, eq=False)
 class SpeedProfile:
-    """Holds the speed at the n points of a line."""
+    """Speed at the n points of a line."""
 
     speed: Array
-    """This is the speed (n,) in m/s."""
+    """Speed (n,) in m/s."""
     acceleration: Array
-    """This is the acceleration along the line (n,) from each point to the next one, in m/s^2; it is 0 at the
-    last point of an open line."""
+    """Acceleration along the line (n,) from each point to the next one, in m/s^2; 0 at the last point of an
+    open line."""
     time: Array
-    """This is the time (n,) since the first point, in s."""
+    """Time (n,) since the first point, in s."""
     duration: float
-    """The whole line takes this time (s): the lap time of a closed one."""
+    """Time for the whole line (s): the lap time of a closed one."""
 
 
 def speed_profile(
@@ -52,7 +52,7 @@ def speed_profile(
     begin: float | None = None,
     end: float | None = None,
 ) -> SpeedProfile:
-    """Returns the largest speeds with v <= v_top that obey the friction ellipse,
+    """Return the largest speeds with v <= v_top that obey the friction ellipse,
 
         (v^2 k / a_lateral)^2 + (a / a_long)^2 <= 1,
 
@@ -97,7 +97,7 @@ def speed_profile(
 
 
 def _accelerated(squares: Array, steps: Array, bend: Array, most: float) -> Array:
-    """Returns the squares (n,) of the speeds that the acceleration `most` (m/s^2) can reach, going along."""
+    """Return the squares (n,) of the speeds that the acceleration `most` (m/s^2) can reach, going along."""
     reached, now = squares.tolist(), float(squares[0])
     for i, (step, turn) in enumerate(zip(steps.tolist(), bend[:-1].tolist(), strict=True), 1):
         share = sqrt(max(1.0 - (now * turn) ** 2, 0.0))
@@ -106,7 +106,7 @@ def _accelerated(squares: Array, steps: Array, bend: Array, most: float) -> Arra
 
 
 def _square(speed: float | None) -> float:
-    """Returns the square of a speed (m/s), which is unbounded where none is given."""
+    """Return the square of a speed (m/s), which is unbounded where none is given."""
     if speed is None:
         return inf
     if not 0.0 <= speed < inf:
