@@ -30,8 +30,8 @@ from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.plausibility.reading import read_plausible_log
 from pathspace_graph.progress import progress
 from pathspace_graph.run import run_online
-from pathspace_graph.settings.front_end import LimitSettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import LimitSettings
 from pathspace_graph.sim.faults import Faults, OdometryFaults, SensorFaults, VehicleFaults
 from pathspace_graph.sim.mistakes import MISTAKES
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Final
 import pandas as pd
 
 from pathspace_graph.io.csv_table import Table, read_table
-from pathspace_graph.io.limits import MAX_STAMP
 from pathspace_graph.io.manifest import verified
+from pathspace_graph.io.parsing import MAX_STAMP
 from pathspace_graph.io.results import CYCLES_FILE
 
 from .errors import InputError, SettingsError

@@ -7,8 +7,9 @@ from itertools import groupby
 from math import nan
 from typing import ClassVar, Final
 
+from pathspace_graph.settings.online import HealthSettings
+
 from .labels import BOUNDARIES, NAMES
-from .settings.health import HealthSettings
 
 GOOD: Final = "good"
 DEGRADED: Final = "degraded"

@@ -20,8 +20,8 @@ from pathspace_graph.io.log import LOG_FILE
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.io.results import BatchRun, RunResult
 from pathspace_graph.plausibility.reading import read_plausible_log
-from pathspace_graph.settings.front_end import LimitSettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import LimitSettings
 
 from .cells import Cell, NamedLog, Outcome, run_cell
 from .frame import add_batch, difference

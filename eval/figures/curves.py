@@ -11,7 +11,7 @@ from pathspace_graph.eval.metrics.accuracy import closest_points, root_mean_squa
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.residuals import greville, smoothness_matrix
 from pathspace_graph.io.map import SplineBoundary
-from pathspace_graph.settings.knots import BreakSettings
+from pathspace_graph.settings.batch import BreakSettings
 from pathspace_graph.sim.curves import ring
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 from pathspace_graph.spline.bspline import BSpline

@@ -14,8 +14,8 @@ from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.landmark.batch import LandmarkSolution, solve_landmarks
+from pathspace_graph.settings.batch import FitSettings
 from pathspace_graph.settings.calibration import CalibrationSettings
-from pathspace_graph.settings.knots import FitSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import fit_spline

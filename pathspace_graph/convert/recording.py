@@ -12,7 +12,6 @@ import numpy as np
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import relative, rotation
-from pathspace_graph.io.limits import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 from pathspace_graph.io.log import (
     MAX_HOLD,
     MIN_RELATIVE_DETERMINANT,
@@ -22,6 +21,7 @@ from pathspace_graph.io.log import (
     Truth,
     covariances_of,
 )
+from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
 from .messages import Points
 from .settings import SIGMA_ODOMETRY, Frames, NoiseSettings, Window

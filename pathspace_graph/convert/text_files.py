@@ -12,9 +12,8 @@ import numpy as np
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.io.csv_table import Table, read_table
-from pathspace_graph.io.limits import MAX_STAMP, shown
 from pathspace_graph.io.log import covariances_of
-from pathspace_graph.io.parsing import read_text
+from pathspace_graph.io.parsing import MAX_STAMP, read_text, shown
 from pathspace_graph.labels import UNKNOWN
 
 from .messages import Points

@@ -14,9 +14,8 @@ import numpy as np
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.io.limits import shown
 from pathspace_graph.io.log import Truth, covariances_of
-from pathspace_graph.io.parsing import read_text
+from pathspace_graph.io.parsing import read_text, shown
 from pathspace_graph.labels import LEFT
 
 from .messages import Points

@@ -22,7 +22,7 @@ from pathspace_graph.lengths import scaled
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.scale.door import in_scene
 from pathspace_graph.scale.scene import scale_of
-from pathspace_graph.settings.front_end import LimitSettings
+from pathspace_graph.settings.online import LimitSettings
 
 UNITS: Final = "stamps are in seconds"
 """Hint where a stamp looks like one in milliseconds or nanoseconds."""

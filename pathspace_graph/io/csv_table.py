@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.io.parsing import MAX_COORDINATE, MAX_FILE_BYTES, shown
 
-from .limits import MAX_COORDINATE, MAX_FILE_BYTES, shown
 from .parsing import read_text
 
 

@@ -12,8 +12,8 @@ from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.io.parsing import MAX_HEADER_BYTES, MAX_NOISE, shown
 
-from .limits import MAX_HEADER_BYTES, MAX_NOISE, shown
 from .parsing import parse_toml, read_text
 
 FORMAT: Final = "pathspace-log/1"

@@ -13,10 +13,10 @@ import numpy as np
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
+from pathspace_graph.io import parsing as limits
 from pathspace_graph.labels import NAMES, label_from_name
 from pathspace_graph.lengths import POSE
 
-from . import limits
 from .csv_table import Column, Table, read_table, write_table
 from .files import atomic_folder
 from .header import POSITIVE, Header, noise_sections, to_toml, toml_text

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from pathspace_graph.errors import InputError
+from pathspace_graph.io.parsing import shown
 
-from .limits import shown
 from .parsing import parse_json, read_text
 
 FORMAT: Final = "pathspace-manifest/1"

@@ -357,7 +357,7 @@ def test_an_interrupt_leaves_nothing_half_written(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pathspace_graph.io.results._write_cycles", interrupt)
+    monkeypatch.setattr("pathspace_graph.io.results.write_table", interrupt)
     assert main(["online", str(log_folder), "--out", str(tmp_path / "deep" / "map")]) == 130
     assert capsys.readouterr().err == "pathspace-graph: interrupted\n"
     assert names(tmp_path) == set()
@@ -374,7 +374,7 @@ def test_help_explains_the_command(command: str, capsys: pytest.CaptureFixture[s
 def test_help_explains_the_options_that_commands_share(capsys: pytest.CaptureFixture[str]) -> None:
     for command in ("ablate", "faults"):
         assert main([command, "--help"]) == 0
-        assert "This number of processes runs at a time" in capsys.readouterr().out
+        assert "Number of processes at a time" in capsys.readouterr().out
 
 
 def test_help_shows_each_text_as_one_paragraph(capsys: pytest.CaptureFixture[str]) -> None:
