@@ -3,8 +3,6 @@
 Good logs of all kinds are judged: what is unusual about them is no mistake, and none of them may be accused.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,8 +30,8 @@ from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.plausibility.reading import read_plausible_log
 from pathspace_graph.progress import progress
 from pathspace_graph.run import run_online
-from pathspace_graph.settings.front_end import LimitSettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import LimitSettings
 from pathspace_graph.sim.faults import Faults, OdometryFaults, SensorFaults, VehicleFaults
 from pathspace_graph.sim.mistakes import MISTAKES
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings

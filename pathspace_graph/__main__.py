@@ -1,7 +1,5 @@
 """`python -m pathspace_graph` is the command line."""
 
-from __future__ import annotations
-
 import sys
 
 from .cli import main

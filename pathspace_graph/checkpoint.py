@@ -5,8 +5,6 @@ arrays that cannot be written, and GTSAM's factors. All else is copied, so that 
 to it is forgotten with it.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from functools import partial

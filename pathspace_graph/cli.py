@@ -1,7 +1,5 @@
 """The command line: it finds the command, and turns errors into one line and an exit code."""
 
-from __future__ import annotations
-
 import signal
 import sys
 import threading
@@ -44,17 +42,17 @@ COMMANDS: Final = {
     "compare": Command(
         "compare", "Compare", "runs every estimator on one log or many, and gives the paper's table"
     ),
-    "ablate": Command("ablate", "Ablate", "runs a study of estimators and settings over many drives"),
+    "ablate": Command("studies", "Ablate", "runs a study of estimators and settings over many drives"),
     "faults": Command(
-        "faults", "FaultSuite", "measures what each fault of a car costs, and what is said of it"
+        "studies", "FaultSuite", "measures what each fault of a car costs, and what is said of it"
     ),
-    "figures": Command("figures", "Figures", "draws the paper's isolated tests"),
+    "figures": Command("plot", "Figures", "draws the paper's isolated tests"),
     "scale": Command(
-        "scale", "Scale", "measures the time of an update against map size, detections and laps"
+        "studies", "Scale", "measures the time of an update against map size, detections and laps"
     ),
     "plot": Command("plot", "Plot", "draws a map with its uncertainty band"),
     "export": Command("export", "Export", "writes a map in a format that planners and other tools read"),
-    "verify": Command("verify", "Verify", "checks that the files of a folder are as they were written"),
+    "verify": Command("plot", "Verify", "checks that the files of a folder are as they were written"),
 }
 
 

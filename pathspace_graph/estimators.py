@@ -4,8 +4,6 @@ An installed package adds an estimator by an entry point in the group `pathspace
 `pathspace_graph.batch`. The entry point has the estimator's name, and refers to what makes it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final, Literal

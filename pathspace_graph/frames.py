@@ -10,6 +10,7 @@ import pandas as pd
 
 from pathspace_graph.io.csv_table import Table, read_table
 from pathspace_graph.io.manifest import verified
+from pathspace_graph.io.parsing import MAX_STAMP
 from pathspace_graph.io.results import CYCLES_FILE
 
 from .errors import InputError, SettingsError
@@ -61,7 +62,7 @@ def read_cycles(folder: Path | str) -> pd.DataFrame:
 def _column(table: Table, name: str, kind: str) -> pd.Series:
     if kind == "str":
         return pd.Series(table.columns[name], dtype="str")
-    values = table.numbers(name)
+    values = table.numbers(name, MAX_STAMP if name == "t" else None)
     if kind == "int64":
         table.require(values == values.round(), f"expected whole numbers in column '{name}'")
     return pd.Series(values).astype(kind)

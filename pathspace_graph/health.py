@@ -1,7 +1,5 @@
 """Health: how far an online estimate can be trusted, cycle by cycle, with a reason in plain words."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,8 +7,9 @@ from itertools import groupby
 from math import nan
 from typing import ClassVar, Final
 
+from pathspace_graph.settings.online import HealthSettings
+
 from .labels import BOUNDARIES, NAMES
-from .settings.health import HealthSettings
 
 GOOD: Final = "good"
 DEGRADED: Final = "degraded"

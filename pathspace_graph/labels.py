@@ -1,7 +1,5 @@
 """Boundary labels: the side of the track that a detected cone marks."""
 
-from __future__ import annotations
-
 from typing import Final
 
 LEFT: Final = 0

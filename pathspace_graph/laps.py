@@ -1,7 +1,5 @@
 """Laps: they are counted online from poses, in the same way for an estimate and for the truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Records of a scene of another size, by the power of a length that each of their fields has."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The options of a command, made from its dataclass, their help, and what is wrong with them in one line."""
 
-from __future__ import annotations
-
 import io
 import re
 import sys
@@ -19,8 +17,8 @@ import docstring_parser
 import tyro
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.limits import MAX_INTEGER, shown
 from pathspace_graph.io.overrides import check_gone, leaves, read_settings
+from pathspace_graph.io.parsing import MAX_INTEGER, shown
 from pathspace_graph.settings.mapper import MapperSettings
 
 HELP: Final = ("-h", "--help")

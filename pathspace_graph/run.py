@@ -1,7 +1,5 @@
 """The interface of estimators, and the loop that feeds a log to an online one cycle by cycle."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext

@@ -16,8 +16,6 @@ afterwards, circles through objects stay circles, and arrays that overlap in mem
 comes from the file: an object is of a class of the rooms below, and made without its constructor.
 """
 
-from __future__ import annotations
-
 import dis
 import json
 import math
@@ -44,8 +42,7 @@ from scipy.spatial import KDTree
 from pathspace_graph.factors import linear as linear_arrays
 from pathspace_graph.graph.variables import sizes
 from pathspace_graph.io.files import atomic_file
-from pathspace_graph.io.limits import shown
-from pathspace_graph.io.parsing import parse_json, read_bytes
+from pathspace_graph.io.parsing import parse_json, read_bytes, shown
 
 from .checkpoint import Recovery
 from .errors import InputError, PathspaceError, SettingsError

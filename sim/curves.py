@@ -1,7 +1,5 @@
 """Sampled curves in the plane, and the middle of a track: a smooth curve between two rows of cones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """The driving order of unordered cones: a walk along the lane, triangle by triangle."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The faults of a real car that white noise does not have, off by default, and what they do to a drive."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Literal
 

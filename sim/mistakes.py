@@ -4,8 +4,6 @@ A fault is what a vehicle does; a mistake is in the file only. Each takes a good
 and leaves the truth as it is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The vehicle's sensors: noisy odometry and detected cones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Final
 

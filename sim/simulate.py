@@ -1,7 +1,5 @@
 """A drive on a track: track, vehicle and sensors give a log with truth; and sensors of a real car by name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Final

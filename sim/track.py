@@ -1,7 +1,5 @@
 """A track: two rows of cones in driving order, and the pose that the vehicle starts from; and the events."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Track files of other simulators and of surveys: PacSim and fssim YAML, EUFS and TUM CSV."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -14,15 +12,16 @@ from scipy.interpolate import CubicSpline
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.io.csv_table import Table, read_table
-from pathspace_graph.io.limits import (
+from pathspace_graph.io.parsing import (
     MAX_CONES,
     MAX_COORDINATE,
     MAX_TRACK_BYTES,
     MAX_TRACK_LENGTH,
     MAX_TRACK_WIDTH,
+    parse_yaml,
+    read_text,
     shown,
 )
-from pathspace_graph.io.parsing import parse_yaml, read_text
 from pathspace_graph.labels import BIG_ORANGE, POINTS, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 

@@ -1,7 +1,5 @@
 """Random tracks by the rules of Formula Student: straights, hairpins, slaloms, chicanes, no crossing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final

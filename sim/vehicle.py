@@ -1,7 +1,5 @@
 """A vehicle that follows the middle of a track: true poses and the true twist of its body."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

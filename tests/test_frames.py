@@ -50,6 +50,11 @@ def test_cycles_have_their_types_and_the_cycle_as_index(tmp_path: Path) -> None:
     assert frame.reason.tolist() == ["", "no cones, for long"]
 
 
+def test_stamps_since_1970_are_read(tmp_path: Path) -> None:
+    (tmp_path / "cycles.csv").write_text(CYCLES.replace("0,0.5", "0,1700000000.5", 1))
+    assert read_cycles(tmp_path).t.tolist() == [1700000000.5, 0.6]
+
+
 def test_optional_columns_of_cycles_may_be_missing(tmp_path: Path) -> None:
     lines = [",".join(line.split(",")[:7]) for line in CYCLES.splitlines()]
     (tmp_path / "cycles.csv").write_text("\n".join(lines))

@@ -17,7 +17,7 @@ from pathspace_graph.health import (
     counts,
     stretches,
 )
-from pathspace_graph.settings.health import HealthSettings
+from pathspace_graph.settings.online import HealthSettings
 
 PERIOD = 0.1
 """Perception cycles are this far apart (s)."""

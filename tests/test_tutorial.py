@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.trajectory import read_trajectory
+from pathspace_graph.io.results import read_trajectory
 
 from .scenes.paths import ROOT
 

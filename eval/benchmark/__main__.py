@@ -5,8 +5,6 @@ it says what is worse than the committed baseline (the exit code is 1 then), and
 that baseline.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final

@@ -7,8 +7,6 @@ factor. The window is solved in each of several orderings, and the time to find 
 Each call is made once untimed before it is timed.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ From closing until the map is replaced by one that was solved as a batch, the cy
 since another process solves meanwhile.
 """
 
-from __future__ import annotations
-
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,10 +15,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.measures import stage_times
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -30,8 +28,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .gtsam_window import linear_window, time_gtsam
 from .ratios import Metric
-
-Array = NDArray[np.float64]
 
 AHEAD: Final = 20.0
 """Distance ahead (m) at which the track is looked at after every cycle, as a controller does."""

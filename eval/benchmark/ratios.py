@@ -3,8 +3,6 @@
 Only ratios are in the baseline, since times depend on the machine.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

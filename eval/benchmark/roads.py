@@ -1,16 +1,14 @@
 """Roads and drives to measure time by: ever more cones, ever more detections, and lap after lap."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.metrics.summary import lap_times
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.settings.checked import Positive
 from pathspace_graph.sim.curves import along_polyline, arc_lengths, left_normals, unit
@@ -97,9 +95,6 @@ QUICK: Final = ScalingSettings(
 )
 """Preset that takes less than a minute and shows that everything works; its slopes mean little."""
 
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int_]
 
 STEP: Final = 0.25
 """Distance of the samples of a road's middle (m)."""

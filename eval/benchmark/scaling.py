@@ -4,8 +4,6 @@ All estimators run in one process: every cycle goes to each in turn, so that wha
 slows all alike.
 """
 
-from __future__ import annotations
-
 import tracemalloc
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
@@ -13,18 +11,16 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.stats import linregress
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.estimators import make_online
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry, timed_update, timed_wait
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .roads import Drives, ScalingSettings, first_cycles
-
-Array = NDArray[np.float64]
 
 Sweep = Literal["cones", "readings", "laps"]
 """What is varied: the cones seen, the detections of an update (readings), or the lap."""

@@ -1,7 +1,5 @@
 """The results of a scaling measurement: a table to print, and points, slopes and figures on disk."""
 
-from __future__ import annotations
-
 import math
 import platform
 import resource

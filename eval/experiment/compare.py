@@ -1,7 +1,5 @@
 """Every estimator on the same logs: their frame, the paper's Table 1, all metrics, and paired differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,8 +20,8 @@ from pathspace_graph.io.log import LOG_FILE
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.io.results import BatchRun, RunResult
 from pathspace_graph.plausibility.reading import read_plausible_log
-from pathspace_graph.settings.front_end import LimitSettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import LimitSettings
 
 from .cells import Cell, NamedLog, Outcome, run_cell
 from .frame import add_batch, difference

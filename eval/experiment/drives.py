@@ -1,7 +1,5 @@
 """Drives: tracks by name, the logs that are simulated on them, and the files that keep those exactly."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

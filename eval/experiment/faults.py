@@ -1,7 +1,5 @@
 """The suite of faults: a study whose noises are single faults, `fault: strength`, each beside a clean run."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Sequence

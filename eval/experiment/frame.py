@@ -1,27 +1,24 @@
 """The one frame: results with a row for each run and lap, its views, and paired statistics of it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from pathspace_graph.estimators import DEFAULT_BATCH
 from pathspace_graph.eval.metrics.metric import METRICS
 from pathspace_graph.eval.metrics.reference import from_batch
 from pathspace_graph.eval.metrics.summary import versions
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.overrides import leaves
 
 from .cells import Cell, Record
 from .drives import Drive
 from .study import Study
-
-Array = NDArray[np.float64]
 
 COMBINATION: Final = ("noise", "estimator", "variant")
 """Columns that name a combination, which is compared with others."""

@@ -1,7 +1,5 @@
 """Maps side by side over the truth, and the stretch where landmarks miss cones that a spline passes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -9,7 +7,6 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from pathspace_graph.eval.figures.map_plot import (
@@ -31,13 +28,12 @@ from pathspace_graph.eval.figures.style import (
 )
 from pathspace_graph.eval.metrics.accuracy import MISSED_DISTANCE, cone_distances, mapped_points
 from pathspace_graph.eval.metrics.metric import PAPER
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.labels import BOUNDARIES
 
 from .cells import Outcome
-
-Array = NDArray[np.float64]
 
 DISTANCES: Final = (MISSED_DISTANCE, 2.0, 1.0)
 """Distances (m) within which nothing is mapped at a missed cone, in the order in which they are tried."""

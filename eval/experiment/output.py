@@ -1,7 +1,5 @@
 """The files of studies, of the suite of faults and of comparisons: tables, tidy results, figures and maps."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from pathlib import Path

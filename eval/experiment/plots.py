@@ -1,7 +1,5 @@
 """Figures of a study, differences from the baseline and accuracy against size and time, and of the faults."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import groupby
 from typing import Any, Final

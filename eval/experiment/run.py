@@ -1,7 +1,5 @@
 """Studies run in parallel; every finished cell is kept at once, so that one that was killed goes on."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """Studies: the tracks, seeds, noise, estimators and settings to compare, as a TOML file or in Python."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -12,9 +10,8 @@ from typing import Any, Final
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError, check_name
 from pathspace_graph.eval.metrics.metric import METRICS, column_of
-from pathspace_graph.io.limits import MAX_HEADER_BYTES, MAX_VARIANTS, shown
 from pathspace_graph.io.overrides import Overrides, flatten, override
-from pathspace_graph.io.parsing import parse_toml, read_text
+from pathspace_graph.io.parsing import MAX_HEADER_BYTES, MAX_VARIANTS, parse_toml, read_text, shown
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import PLAIN, PRESETS, SimulationSettings, preset
 

@@ -1,7 +1,5 @@
 """Work is spread over processes or a cluster, and goes on when a worker dies."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -1,19 +1,17 @@
 """The uncertainty along a spline, with what its formula leaves out, and the simplification of a curve."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.accuracy import closest_points, root_mean_square
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.residuals import greville, smoothness_matrix
 from pathspace_graph.io.map import SplineBoundary
-from pathspace_graph.settings.knots import BreakSettings
+from pathspace_graph.settings.batch import BreakSettings
 from pathspace_graph.sim.curves import ring
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 from pathspace_graph.spline.bspline import BSpline
@@ -37,8 +35,6 @@ from .style import (
     set_frame,
     uncertainty_band,
 )
-
-Array = NDArray[np.float64]
 
 # a curve swings to either side, and cones along it were seen but between two shares of its length (m)
 _CONTROL_POINTS, _SPACING, _SWING = 13, 5.5, 6.0

@@ -1,7 +1,5 @@
 """The paper's isolated tests as figures, each with a caption that says what it shows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A picture of a map: boundaries with their 2-sigma band, control points, trajectory, truth if known."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -11,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
@@ -38,8 +36,6 @@ from .style import (
     point_blocks,
     set_frame,
 )
-
-Array = NDArray[np.float64]
 
 MARGIN: Final = 3.0
 """Free space around what is drawn (m)."""

@@ -1,7 +1,5 @@
 """How all figures look: sizes, colours, legends, the marks they are drawn with, and their files."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,16 +14,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.files import atomic_file, replacing
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.sim.curves import left_normals
 from pathspace_graph.spline.bspline import BSpline
-
-Array = NDArray[np.float64]
 
 WIDTH: Final = 7.0
 """Width of a figure (in): two columns of a paper."""

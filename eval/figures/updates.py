@@ -1,21 +1,19 @@
 """The paper's expansion of a curve in three steps, and its fit of detections, as figures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pathspace_graph.ckf.expansion import beyond_end, proximity_chain
 from pathspace_graph.ckf.update import SplineMeasurement, fit_detections
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.mapping.belief import cubature_points, square_root
-from pathspace_graph.settings.comparison import CkfSettings
+from pathspace_graph.settings.batch import CkfSettings
 from pathspace_graph.sim.curves import left_normals, unit
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 from pathspace_graph.spline.knots import fit_spline
@@ -45,8 +43,7 @@ from .style import (
     shared_legend,
 )
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+Bools = BoolArray
 
 # a curve ends at the origin, on a left bend that it leaves to the outside by a share of its length (m)
 _RADIUS, _DRIFT = 30.0, 0.03
@@ -68,7 +65,7 @@ class Expansion:
     """Standard deviation of each detection (m)."""
     expands: Bools
     """(m,) Detections that mark an expansion of the curve in step (a)."""
-    order: NDArray[np.intp]
+    order: IntArray
     """Proximity chain of those detections; the curve is extended to the last one."""
     before: SplineBoundary
     """Curve of step (a), with the joint covariance of its control points."""

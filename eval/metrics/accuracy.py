@@ -1,17 +1,15 @@
 """How far a map is from the truth: the paper's Table 1, true boundaries as curves, crossings, ghosts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator
 from scipy.spatial import KDTree
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
@@ -19,8 +17,6 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.settings.checked import Positive
 from pathspace_graph.spline.bspline import BSpline
-
-Array = NDArray[np.float64]
 
 MISSED_DISTANCE = 3.0
 """Distance from its mapped boundary beyond which a true cone is missed (m; paper, Table 1)."""
@@ -159,7 +155,7 @@ def driving_order(truth: Truth, label: int) -> Array:
     cones: Array = truth.cones[truth.cone_labels == label]
     if len(truth.poses) < 2 or len(cones) == 0:
         return cones
-    nearest: NDArray[np.intp] = np.asarray(KDTree(_first_lap(truth)).query(cones)[1])
+    nearest: IntArray = np.asarray(KDTree(_first_lap(truth)).query(cones)[1])
     by_path: Array = cones[np.argsort(nearest, kind="stable")]
     return by_path if _perimeter(by_path) < _perimeter(cones) else cones
 
@@ -255,7 +251,7 @@ def crossings(track: Map) -> tuple[int, int]:
     return other, own
 
 
-def _apart(begin: Array, end: Array, a: Array, b: Array) -> NDArray[np.bool_]:
+def _apart(begin: Array, end: Array, a: Array, b: Array) -> BoolArray:
     """Return whether points a and b lie on different sides of the lines through begin and end."""
     way, first, second = end - begin, a - begin, b - begin
     sides = way[..., 0] * first[..., 1] - way[..., 1] * first[..., 0]
@@ -373,13 +369,13 @@ def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> G
     return Ghosts(landmarks, metres, _share(all_ghosts), duplicates)
 
 
-def _is_ghost(points: Array, curve_true: Array, distance: float) -> NDArray[np.bool_]:
+def _is_ghost(points: Array, curve_true: Array, distance: float) -> BoolArray:
     if len(curve_true) == 0 or len(points) == 0:
         return np.ones(len(points), dtype=bool)
     return np.asarray(KDTree(curve_true).query(points)[0] > distance)
 
 
-def _share(all_ghosts: list[NDArray[np.bool_]]) -> float:
+def _share(all_ghosts: list[BoolArray]) -> float:
     pooled = np.concatenate([np.zeros(0, dtype=bool), *all_ghosts])
     return float(np.mean(pooled)) if len(pooled) else float("nan")
 

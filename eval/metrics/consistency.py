@@ -1,13 +1,10 @@
 """Whether a covariance is honest: NEES of the map, errors at the true cones, and the turn about the start."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
@@ -15,6 +12,7 @@ from scipy.spatial.distance import cdist
 from scipy.stats import chi2
 
 from pathspace_graph.batch.mapper import BatchResult
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.residuals import greville
 from pathspace_graph.factors.se2 import left_of, rotation
 from pathspace_graph.io.log import Truth
@@ -22,8 +20,6 @@ from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBounda
 from pathspace_graph.labels import BOUNDARIES
 
 from .accuracy import MISSED_DISTANCE, closest_points, true_curve
-
-Array = NDArray[np.float64]
 
 LEVEL: Final = 0.95
 """Probability with which an honest map's NEES lies in the interval."""

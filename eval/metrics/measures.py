@@ -1,7 +1,5 @@
 """What is measured of a run: one function measures all metrics, lap by lap and of the whole."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """The metrics: their names, units and averages, and columns of tables of several runs."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What a run is held against: the least error to be expected of its log, and another run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -9,14 +7,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import inverse, left_of, to_map
 from pathspace_graph.io.log import Detections, Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.landmark.batch import LandmarkSolution, solve_landmarks
+from pathspace_graph.settings.batch import FitSettings
 from pathspace_graph.settings.calibration import CalibrationSettings
-from pathspace_graph.settings.knots import FitSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import fit_spline
@@ -32,7 +31,6 @@ from .accuracy import (
 from .consistency import near_pairs
 from .trajectory import pose_errors
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 

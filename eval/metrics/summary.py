@@ -1,7 +1,5 @@
 """The content of a run's `summary.json` (docs/formats.md)."""
 
-from __future__ import annotations
-
 import platform
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -9,9 +7,9 @@ from importlib.metadata import version
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchResult
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import ray_sigmas
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import Health, Stretch, counts, stretches
@@ -28,8 +26,6 @@ from pathspace_graph.scale.scene import scale_of
 from .accuracy import LapMetrics, lap_metrics, root_mean_square
 from .consistency import normal_errors
 from .trajectory import ate, trajectory_errors
-
-Array = NDArray[np.float64]
 
 LIBRARIES: Final = ("pathspace-graph", "gtsam", "numpy", "scipy")
 

@@ -1,16 +1,14 @@
 """Errors of a trajectory, and the reach: how far ahead of the vehicle the map is right."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from pathspace_graph.batch.association import path_lengths
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import to_map, to_vehicle, wrap_angle
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
@@ -20,8 +18,6 @@ from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.run import ObservedCycle
 
 from .accuracy import boundary_distances, root_mean_square
-
-Array = NDArray[np.float64]
 
 LOST: Final = 5.0
 """Position error beyond which a vehicle is lost (m)."""
@@ -125,8 +121,6 @@ def position_rms(errors: Array) -> float:
     return root_mean_square(np.linalg.norm(errors[:, :2], axis=1))
 
 
-IntArray = NDArray[np.intp]
-
 MOST: Final = 35.0
 """Greatest length of a reach (m)."""
 ON_CURVE: Final = 0.5
@@ -154,7 +148,7 @@ class TrueRoad:
     """(P,) Lengths at which the drive passes a true cone in m, ascending; every lap passes every cone."""
     cones: Array
     """(P, 2) Cone passed at each station in m, map frame."""
-    labels: NDArray[np.int_]
+    labels: IntArray
     """(P,) Boundary of each cone that is passed."""
     counted: tuple[float, float]
     """Stations (m) between which cycles count."""

@@ -1,7 +1,5 @@
 """The film of a run: the map as it grows, the vehicle, its window and readings, and what is known by then."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -11,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
-from numpy.typing import NDArray
 
 from pathspace_graph.eval.figures.map_plot import (
     BAND_ALPHA,
@@ -37,6 +34,7 @@ from pathspace_graph.eval.figures.style import (
 )
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.eval.metrics.summary import has_cones, lap_times
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, PointBoundary
@@ -45,8 +43,6 @@ from pathspace_graph.run import ObservedCycle, Readings
 from pathspace_graph.settings.output import FilmSettings
 
 from .film import Film
-
-Array = NDArray[np.float64]
 
 DPI: Final = 100.0
 """A frame has this resolution (dots per inch), which decides how large the text is."""

@@ -1,7 +1,5 @@
 """What the live viewer shows without anything being arranged: map, times, sizes, health and messages."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 from .entities import HEALTH, MAP, MESSAGES, READING_COUNTS, SIZES, TIMELINE, TIMELINES, TRAJECTORY, UPDATE

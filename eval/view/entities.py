@@ -1,7 +1,5 @@
 """The names of what a recording holds: its timelines, and the paths of its entities."""
 
-from __future__ import annotations
-
 from typing import Final
 
 TIMELINE: Final = "cycle"

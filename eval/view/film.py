@@ -1,7 +1,5 @@
 """Films on disk: .gif by Pillow, and .mp4 by ffmpeg."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager

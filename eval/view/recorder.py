@@ -1,12 +1,9 @@
 """The recorder: an observer that shows each cycle of a run to the live viewer rerun."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np
 from matplotlib.colors import to_hex, to_rgb
-from numpy.typing import NDArray
 
 from pathspace_graph.eval.figures.map_plot import BOUNDARY_COLORS, HEALTH_COLORS, TRAJECTORY_COLOR
 from pathspace_graph.eval.figures.style import (
@@ -21,6 +18,7 @@ from pathspace_graph.eval.figures.style import (
     ellipse_outlines,
     uncertainty_band,
 )
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import CONDITIONS, LOST, Health
 from pathspace_graph.io.log import Truth
@@ -31,8 +29,6 @@ from pathspace_graph.run import ObservedCycle
 from pathspace_graph.settings.output import RecordingSettings
 
 from . import entities
-
-Array = NDArray[np.float64]
 
 WIDEST_BAND: Final = 5.0
 """Largest width of a band on either side of its curve, m."""

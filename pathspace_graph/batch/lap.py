@@ -32,8 +32,7 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.registration import by_motion, sigma_of_information
 from pathspace_graph.mapping.state import SAMPLE, State
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.crossing import boundaries_cross, polylines_cross, sampled
+from pathspace_graph.spline.bspline import BSpline, boundaries_cross, polylines_cross, sampled
 
 from .association import add_drive
 from .gauge import curve_gauge

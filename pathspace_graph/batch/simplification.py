@@ -14,13 +14,11 @@ from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.graph.variables import CONTROL_LETTERS, POINT, Layout
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.batch import BatchSettings
-from pathspace_graph.settings.knots import FitSettings
+from pathspace_graph.settings.batch import BatchSettings, FitSettings
 from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.cone_knots import chosen_breaks
-from pathspace_graph.spline.knots import fit_spline, refit
+from pathspace_graph.spline.knots import chosen_breaks, fit_spline, refit
 
 from .association import MIN_CONES, associate, cones_of_curve, find_anywhere, first_parameter, locate_poses
 

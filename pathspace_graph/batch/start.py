@@ -26,8 +26,8 @@ from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
 from pathspace_graph.mapping.registration import HEADING
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import OnlineEstimator, run_online
-from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import Boundary
 
 from .association import MIN_CONES, add_drive, certainty, cluster, path_lengths

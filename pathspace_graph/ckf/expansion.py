@@ -22,7 +22,7 @@ from pathspace_graph.mapping.path import (
     chain,
 )
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
-from pathspace_graph.settings.comparison import CkfSettings
+from pathspace_graph.settings.batch import CkfSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .state import CurveState

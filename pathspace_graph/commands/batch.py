@@ -1,7 +1,5 @@
 """`batch`: a whole log is optimized at once, as the ground reference."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`compare`: every estimator on one log or many, the paper's table, and all further metrics."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Final

@@ -1,7 +1,5 @@
 """`demo`: the main job with no argument, on a simulated Formula Student track."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`export`: a map in the formats of planners and other tools."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,14 +9,13 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.export.geojson import write_geojson
+from pathspace_graph.export.geojson import LocalPlane, write_geojson
 from pathspace_graph.export.lanelet2 import write_lanelet2
-from pathspace_graph.export.local_plane import LocalPlane
 from pathspace_graph.export.tables import write_centre_line, write_points, write_profile
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE, read_log
 from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map
-from pathspace_graph.io.trajectory import TRAJECTORY_FILE, read_trajectory, write_trajectory
+from pathspace_graph.io.results import TRAJECTORY_FILE, read_trajectory, write_trajectory
 from pathspace_graph.settings.output import SpeedSettings
 from pathspace_graph.spline.planning import LEAST_STEP, MOST_POINTS
 

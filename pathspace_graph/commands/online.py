@@ -1,7 +1,5 @@
 """`online`: a log is mapped cycle by cycle, without reading ahead."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -24,7 +22,7 @@ from pathspace_graph.eval.metrics.summary import (
     summarize,
     vehicle_of,
 )
-from pathspace_graph.eval.view.watch import check_watchers, watchers
+from pathspace_graph.eval.view.recording import check_watchers, watchers
 from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import Log

@@ -1,21 +1,23 @@
 """`plot`: the picture of a map folder."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
+from threadpoolctl import threadpool_limits
 from tyro.conf import Positional
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.figures.isolated import FIGURES, MARKER, write_figures
 from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import check_plot_file, save_plot
-from pathspace_graph.io.files import check_file_target
+from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import read_log
+from pathspace_graph.io.manifest import verify_all
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.results import CYCLES_FILE, read_health
-from pathspace_graph.io.trajectory import TRAJECTORY_FILE, read_trajectory
+from pathspace_graph.io.results import CYCLES_FILE, TRAJECTORY_FILE, read_health, read_trajectory
+from pathspace_graph.progress import progress
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,3 +55,38 @@ class Plot:
             title=self.title,
         )
         save_plot(figure, self.out)
+
+
+# --- figures -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figures:
+    """Draw the paper's isolated tests: uncertainty, expansion, the fit of S_z and simplification."""
+
+    out: Path
+    """Folder for the figures and their captions; earlier ones there are kept as a numbered backup."""
+
+    def run(self) -> None:
+        check_target(self.out, MARKER)
+        with progress("drawing", len(FIGURES)) as advance, threadpool_limits(limits=1):
+            write_figures(self.out, advance)
+        names = ", ".join(figure.name for figure in FIGURES)
+        Console().print(f"{names}: {self.out}", highlight=False, soft_wrap=True, markup=False)
+
+
+# --- verify --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verify:
+    """Check every file of a folder against its manifest, which each command writes beside its files."""
+
+    folder: Positional[Path]
+    """Folder of a log, a map, or the result of another command, with its subfolders."""
+
+    def run(self) -> None:
+        """Check and report; a file that is missing or has changed ends it."""
+        count = verify_all(self.folder)
+        line = f"{self.folder}: {count} files are as they were written"
+        Console().print(line, highlight=False, soft_wrap=True, markup=False)

@@ -1,21 +1,27 @@
 """What the commands that run a study share: their options, how a study is run, and what failed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import pandas as pd
 from rich.console import Console
+from tyro.conf import Positional, arg
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.estimators import DEFAULT, ONLINE, check_online
+from pathspace_graph.eval.benchmark.roads import QUICK, ScalingSettings, make_drives
+from pathspace_graph.eval.benchmark.scaling import measure_scaling
+from pathspace_graph.eval.benchmark.scaling_output import MARKER, scaling_table, stops, write_scaling
+from pathspace_graph.eval.experiment.faults import only, strongest, suite
+from pathspace_graph.eval.experiment.output import write_study, write_suite
 from pathspace_graph.eval.experiment.run import make_plan, run_plan
-from pathspace_graph.eval.experiment.study import Study
+from pathspace_graph.eval.experiment.study import Study, find_study, read_study
 from pathspace_graph.eval.experiment.workers import check_jobs
-from pathspace_graph.io.files import write_manifest
+from pathspace_graph.io.files import check_target, write_manifest
 from pathspace_graph.progress import progress
+from pathspace_graph.settings.mapper import MapperSettings
 
 CELLS_FAILED: Final = 3
 """Exit code of a study that is written, but some of whose cells failed."""
@@ -80,3 +86,92 @@ def report_failures(frame: pd.DataFrame, cells: int) -> None:
         line = f"{len(failures)} of {cells} cells failed, the first of {failures.iloc[0]['failure']}"
         Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(line)
         raise SystemExit(CELLS_FAILED)
+
+
+# --- ablate --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ablate(StudyCommand):
+    """Run a study, or what remains of it, and write its results, its summary and its figures."""
+
+    study: Positional[Path]
+    """TOML file of the study, or name of one that comes with the package."""
+
+    def run(self) -> None:
+        """Check, run, write and report the study; the exit code is 3 where cells failed."""
+        self.execute(read_study(find_study(self.study)), write_study)
+
+
+# --- faults --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class FaultSuite(StudyCommand):
+    """Run the suite of faults, or what remains of it, and write a table and a figure of what each costs.
+
+    The suite is the shipped study `faults`. Each run is compared with the clean run on the same track and
+    with the same seed.
+    """
+
+    estimator: str = DEFAULT
+    """Name of the estimator, an online or a batch one."""
+    only: tuple[str, ...] = ()
+    """Names of the faults to run, as in the table."""
+    quick: bool = False
+    """Run each fault at its greatest strength only."""
+
+    def run(self) -> None:
+        """Check, run, write and report the suite; the exit code is 3 where runs failed."""
+        chosen = replace(only(suite(), self.only), estimators=(self.estimator,))
+        self.execute(strongest(chosen) if self.quick else chosen, write_suite)
+
+
+# --- scale ---------------------------------------------------------------------------------------------
+
+
+FILE_WIDTH: Final = 160
+"""Characters in a line of a table that is not printed on a terminal."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """Time every online estimator on ever larger maps and more and more detections, and draw the slopes.
+
+    All run in this one process, cycle for cycle in turn, so that other work of the machine slows all of them
+    alike. An estimator that takes longer than the budget is stopped there, and the table says so. Memory is
+    measured by tracemalloc, for Python and numpy, while the first lap of the closed road is mapped.
+    """
+
+    out: Path
+    """Folder for points, slopes and figures; earlier ones there are kept as a numbered backup."""
+    estimators: tuple[str, ...] = ()
+    """Names of the online estimators; by default all."""
+    quick: bool = False
+    """Take less than a minute, with small maps and few laps, to see that everything works. It goes with no
+    other `scaling` option."""
+    scaling: ScalingSettings = field(default_factory=ScalingSettings)
+    """What is measured."""
+    settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
+    """Settings of every estimator."""
+
+    def run(self) -> None:
+        """Check, simulate, time, write and report."""
+        names = tuple(dict.fromkeys(self.estimators or ONLINE))
+        for name in names:
+            check_online(name)
+        if self.quick and self.scaling != ScalingSettings():
+            raise SettingsError("--quick: expected no other --scaling options with it, found some")
+        check_target(self.out, MARKER)
+        measured = QUICK if self.quick else self.scaling
+        with progress("simulating"):
+            drives = make_drives(measured)
+        with progress("timing", drives.cycles) as advance:
+            scaling = measure_scaling(names, drives, measured, self.settings, advance)
+        write_scaling(self.out, scaling)
+        console = Console()
+        if not console.is_terminal:
+            console = Console(width=FILE_WIDTH)
+        console.print(scaling_table(scaling).rich())
+        for line in (*stops(scaling), f"written to {self.out}"):
+            console.print(line, highlight=False, soft_wrap=True, markup=False)

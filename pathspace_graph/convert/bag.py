@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError
+from pathspace_graph.factors.arrays import Array
 
 from .messages import MessageError, Points, frame_of, points_of, pose_of, stamp_of, twist_of, yaw_rate_of
 from .recording import Recording, twists_between
 from .settings import LabelRule
-
-Array = NDArray[np.float64]
 
 INSTALL: Final = "pip install 'pathspace-graph[ros]'"
 """Installs the package that reads bags."""

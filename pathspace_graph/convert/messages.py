@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import PathspaceError
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
 from .settings import LabelRule
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int_]
 
 LIST_NAMES: Final = {
     "big_orange": BIG_ORANGE,
@@ -57,7 +55,7 @@ class Points:
     labels: IntArray
     """(m,) Labels."""
 
-    def where(self, chosen: NDArray[np.bool_]) -> "Points":
+    def where(self, chosen: BoolArray) -> "Points":
         """Return some of the points."""
         return Points(self.points[chosen], self.covariances[chosen], self.labels[chosen])
 

@@ -8,11 +8,10 @@ from typing import Final
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import relative, rotation
-from pathspace_graph.io.limits import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 from pathspace_graph.io.log import (
     MAX_HOLD,
     MIN_RELATIVE_DETERMINANT,
@@ -22,12 +21,10 @@ from pathspace_graph.io.log import (
     Truth,
     covariances_of,
 )
+from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
 from .messages import Points
 from .settings import SIGMA_ODOMETRY, Frames, NoiseSettings, Window
-
-Array = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 MAX_ASYMMETRY: Final = 1e-3
 """Largest difference of the entries xy and yx of a covariance, by the larger variance; messages may have

@@ -8,20 +8,17 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.io.csv_table import Table, read_table
-from pathspace_graph.io.limits import MAX_STAMP, shown
 from pathspace_graph.io.log import covariances_of
-from pathspace_graph.io.parsing import read_text
+from pathspace_graph.io.parsing import MAX_STAMP, read_text, shown
 from pathspace_graph.labels import UNKNOWN
 
 from .messages import Points
 from .recording import Recording
 from .settings import LabelRule
-
-Array = NDArray[np.float64]
 
 ODOMETRY: Final = "odometry"
 DETECTIONS: Final = "detections"
@@ -241,7 +238,7 @@ def _covariances(file: _File) -> Array:
     return covariances_of(xx, xy, yy)
 
 
-def _labels(file: _File, rule: LabelRule) -> NDArray[np.int_]:
+def _labels(file: _File, rule: LabelRule) -> IntArray:
     if not file.has("label"):
         return np.full(len(file.table), UNKNOWN)
     return rule.of_all(np.array(file.table.columns[file.column("label").name]))

@@ -11,19 +11,15 @@ from typing import Any, Final
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.io.limits import shown
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.io.log import Truth, covariances_of
-from pathspace_graph.io.parsing import read_text
+from pathspace_graph.io.parsing import read_text, shown
 from pathspace_graph.labels import LEFT
 
 from .messages import Points
 from .recording import Recording, twists_of
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int_]
 
 EXAMPLE: Final = "victoria_park.txt"
 """GTSAM brings the file under this name."""

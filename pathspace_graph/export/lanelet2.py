@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.export.geojson import LocalPlane
 from pathspace_graph.io.map import Map
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.centre_line import find_line
-
-from .local_plane import LocalPlane
 
 Array = NDArray[np.float64]
 

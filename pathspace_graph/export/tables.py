@@ -1,7 +1,5 @@
 """A map as CSV: its centre line with widths, and its boundaries as points."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
 
@@ -13,7 +11,7 @@ from pathspace_graph.io.map import Map, MapBoundary, PointBoundary
 from pathspace_graph.labels import NAMES
 from pathspace_graph.settings.output import SpeedSettings
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.speed import speed_profile
+from pathspace_graph.spline.planning import speed_profile
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import POINTS, UNKNOWN
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.run import split_odometry
-from pathspace_graph.settings.front_end import MotionSettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import MotionSettings
 
 from .gate import Admitted, Gate
 from .log_odometry import LogOdometry, chained

@@ -5,8 +5,6 @@ impossible is dropped, and the others are used: a detector may fail for one cone
 label or twist makes the whole cycle useless.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
@@ -17,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError, ReadingError
-from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, read_log
 from pathspace_graph.labels import LEFT, NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.scale.door import in_scene
 from pathspace_graph.scale.scene import scale_of
-from pathspace_graph.settings.front_end import LimitSettings
+from pathspace_graph.settings.online import LimitSettings
 
 UNITS: Final = "stamps are in seconds"
 """Hint where a stamp looks like one in milliseconds or nanoseconds."""
@@ -312,7 +310,7 @@ def _has_covariance(covariances: Array) -> BoolArray:
     return np.asarray(good)
 
 
-def _labels(values: Any, count: int) -> NDArray[np.int_]:
+def _labels(values: Any, count: int) -> IntArray:
     field = "detections.labels"
     labels = _array(values, field, (count,))
     if count and labels.dtype.kind not in "iu":

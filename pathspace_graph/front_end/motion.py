@@ -11,7 +11,7 @@ from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometr
 from pathspace_graph.factors.se2 import compose, relative, rotation, to_map
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion, integrate_odometry
-from pathspace_graph.settings.front_end import MotionSettings
+from pathspace_graph.settings.online import MotionSettings
 
 from .gate import Newest
 from .scan_matching import (

@@ -20,7 +20,7 @@ from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotation, to_map
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.settings.calibration import CalibrationSettings
-from pathspace_graph.settings.front_end import MotionSettings
+from pathspace_graph.settings.online import MotionSettings
 
 ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]
 """Errors of a sensor that are learned, as indices of its calibration."""

@@ -20,7 +20,7 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.path import SIDES, DrivenPath, PathAhead, in_front_row
 from pathspace_graph.mapping.tentative import nearest_within, newest_of
-from pathspace_graph.settings.front_end import SidesSettings
+from pathspace_graph.settings.online import SidesSettings
 
 REACH: Final = 8.0
 """Length of the predicted path beside which coloured cones say what the colours mean, m."""

@@ -1,7 +1,5 @@
 """CSV tables with a header: columns by name, and errors that name row and column."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,14 +8,13 @@ from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pathspace_graph.errors import InputError
+from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.io.parsing import MAX_COORDINATE, MAX_FILE_BYTES, shown
 
-from .limits import MAX_COORDINATE, MAX_FILE_BYTES, shown
 from .parsing import read_text
-
-FloatArray = NDArray[np.float64]
 
 
 class Column(NamedTuple):
@@ -45,12 +42,12 @@ class Table:
         """Raise the InputError of the row with this index."""
         raise InputError(self.file, message, self.lines[index])
 
-    def require(self, good: NDArray[np.bool_], message: str) -> None:
+    def require(self, good: BoolArray, message: str) -> None:
         """Raise an InputError for the first row that is not good; `good` is (rows,)."""
         if not good.all():
             self.fail(int(np.argmin(good)), message)
 
-    def numbers(self, name: str, largest: float | None = None) -> FloatArray:
+    def numbers(self, name: str, largest: float | None = None) -> Array:
         """Return the column as numbers (rows,), at most as large as declared, or as `largest`.
 
         A word, NaN, infinity or a larger number is an InputError.
@@ -75,7 +72,7 @@ class Table:
             found = shown(self.columns[name][index].strip())
             self.fail(index, f"expected {expected} in column '{name}', found {found}")
 
-    def stack(self, names: Sequence[str], largest: float | None = None) -> FloatArray:
+    def stack(self, names: Sequence[str], largest: float | None = None) -> Array:
         """Return the named columns side by side (rows, names), see `numbers`."""
         return np.column_stack([self.numbers(name, largest) for name in names])
 

@@ -4,8 +4,6 @@ Python announces most changes of the disk to audit hooks (`sys.addaudithook`). T
 know announce themselves in the same way, so that a test can end the process before any of them.
 """
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import fcntl

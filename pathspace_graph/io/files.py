@@ -1,7 +1,5 @@
 """Output that appears as a whole or not at all, and never costs an earlier result."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """The header of a log: sections of texts and numbers in TOML, among them where its noise comes from."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping
@@ -9,16 +7,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.io.parsing import MAX_HEADER_BYTES, MAX_NOISE, shown
 
-from .limits import MAX_HEADER_BYTES, MAX_NOISE, shown
 from .parsing import parse_toml, read_text
-
-Array = NDArray[np.float64]
 
 FORMAT: Final = "pathspace-log/1"
 POSITIVE: Final = math.ulp(0.0)

@@ -9,20 +9,18 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
+from pathspace_graph.io import parsing as limits
 from pathspace_graph.labels import NAMES, label_from_name
 from pathspace_graph.lengths import POSE
 
-from . import limits
-from .csv_table import Column, FloatArray, Table, read_table, write_table
+from .csv_table import Column, Table, read_table, write_table
 from .files import atomic_folder
 from .header import POSITIVE, Header, noise_sections, to_toml, toml_text
 from .manifest import verified
-
-IntArray = NDArray[np.int_]
 
 LOG_FILE: Final = "log.toml"
 ODOMETRY_FILE: Final = "odometry.csv"
@@ -73,9 +71,9 @@ class Odometry:
 
     LENGTHS: ClassVar = {"twist": POSE}
 
-    t: FloatArray
+    t: Array
     """Stamps (N,) in s, strictly increasing."""
-    twist: FloatArray
+    twist: Array
     """Twists [vx, vy, wz] (N, 3) in m/s, m/s, rad/s, vehicle frame."""
 
     def between(self, start: float, end: float) -> Odometry:
@@ -102,14 +100,14 @@ class Detections:
 
     t: float
     """Stamp of the cycle, s."""
-    points_vehicle: FloatArray
+    points_vehicle: Array
     """Detected points (m, 2) in m, vehicle frame."""
-    covariances: FloatArray
+    covariances: Array
     """Their covariances (m, 2, 2) in m^2, vehicle frame."""
     labels: IntArray
     """Their labels (m,): LEFT, RIGHT, UNKNOWN, ORANGE or BIG_ORANGE."""
 
-    def where(self, chosen: NDArray[np.bool_]) -> Detections:
+    def where(self, chosen: BoolArray) -> Detections:
         """Return the chosen detections of the cycle."""
         if chosen.all():
             return self
@@ -136,22 +134,22 @@ class Truth:
 
     LENGTHS: ClassVar = {"poses": POSE, "cones": 1, "sensor": (0, 1, 0, 0, 1), "noise": (1, 1, 0, 0, 0, 0)}
 
-    pose_t: FloatArray
+    pose_t: Array
     """Stamps of the true poses (N,) in s."""
-    poses: FloatArray
+    poses: Array
     """True poses [x, y, theta] (N, 3) in m, m, rad, map frame."""
-    cones: FloatArray
+    cones: Array
     """True cones (M, 2) in m, map frame."""
     cone_labels: IntArray
     """Their labels (M,)."""
     associations: IntArray | None = None
     """Index of the true cone of each detection in file order (R,), -1 for none."""
-    calibration: FloatArray | None = None
+    calibration: Array | None = None
     """Calibration of the odometry (2,): scale error of the speeds (-), bias of the yaw rate (rad/s)."""
-    sensor: FloatArray | None = None
+    sensor: Array | None = None
     """Constant errors of the sensor (5,): yaw (rad), lateral offset (m), age of detections at their stamps
     (s), scale error (-) and bias (m) of ranges."""
-    noise: FloatArray | None = None
+    noise: Array | None = None
     """Noise that is not white (6,): the sigmas of white noise of a twist that drifts as much (m/s, m/s,
     rad/s), the shares of a range's and a bearing's variance that stay with a cone (-), and the correlation
     time of those (s)."""
@@ -173,7 +171,7 @@ class Log:
     odometry: Odometry
     cycles: tuple[Detections, ...]
     """Perception cycles in order of time."""
-    odometry_sigma: FloatArray
+    odometry_sigma: Array
     """Standard deviations (3,) of a twist in m/s, m/s, rad/s, white from sample to sample."""
     sensor: SensorInfo = SensorInfo()
     source: Mapping[str, str] = field(default_factory=dict)
@@ -240,7 +238,7 @@ def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
             _read_log(target)
 
 
-def _true_errors(header: Header) -> dict[str, FloatArray]:
+def _true_errors(header: Header) -> dict[str, Array]:
     """Return the true calibration, errors of the sensor and noise, those of them that the header has."""
     section = header.section("truth")
     return {
@@ -262,7 +260,7 @@ def _read_odometry(table: Table) -> Odometry:
     return Odometry(t, np.column_stack([speeds, table.numbers("wz")]))
 
 
-def _increasing_times(table: Table) -> FloatArray:
+def _increasing_times(table: Table) -> Array:
     t = table.numbers("t")
     good = np.append(True, np.diff(t) > 0) if len(t) else np.ones(0, dtype=bool)
     table.require(good, "expected a time later than the row before")
@@ -287,7 +285,7 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
 
 
 def cycles_of(
-    t: FloatArray, points_vehicle: FloatArray, covariances: FloatArray, labels: IntArray
+    t: Array, points_vehicle: Array, covariances: Array, labels: IntArray
 ) -> tuple[Detections, ...]:
     """Return the perception cycles of detections (m,): neighbours with the same stamp (s) are one cycle."""
     starts = np.flatnonzero(np.diff(t, prepend=-np.inf))
@@ -295,12 +293,12 @@ def cycles_of(
     return tuple(Detections(float(t[s.start]), points_vehicle[s], covariances[s], labels[s]) for s in spans)
 
 
-def covariances_of(xx: FloatArray, xy: FloatArray, yy: FloatArray) -> FloatArray:
+def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:
     """Return covariances (m, 2, 2) from their entries (m,)."""
     return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
 
 
-def _covariances(table: Table) -> FloatArray:
+def _covariances(table: Table) -> Array:
     xx, xy, yy = table.stack(("xx", "xy", "yy")).T
     with np.errstate(over="ignore", invalid="ignore"):
         good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
@@ -312,7 +310,7 @@ def _labels(table: Table) -> IntArray:
     return np.array([label_from_name(name) for name in table.columns["label"]], dtype=int)
 
 
-def _read_truth(folder: Path, detection_count: int, errors: dict[str, FloatArray]) -> Truth | None:
+def _read_truth(folder: Path, detection_count: int, errors: dict[str, Array]) -> Truth | None:
     names = (TRUTH_POSES_FILE, TRUTH_CONES_FILE, TRUTH_ASSOCIATIONS_FILE)
     poses, cones, associations = (
         _table(folder, name) if (folder / name).exists() else None for name in names

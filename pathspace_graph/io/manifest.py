@@ -1,7 +1,5 @@
 """The manifest of a folder: size and SHA-256 of each file as it was written, verified when a file is read."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable, Iterator
@@ -10,8 +8,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from pathspace_graph.errors import InputError
+from pathspace_graph.io.parsing import shown
 
-from .limits import shown
 from .parsing import parse_json, read_text
 
 FORMAT: Final = "pathspace-manifest/1"

@@ -9,19 +9,17 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.io.parsing import MAX_COORDINATE, MAX_DEGREE, MAX_INTEGER, shown
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, POINTS
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
-from .limits import MAX_COORDINATE, MAX_DEGREE, MAX_INTEGER, shown
 from .manifest import verified
 from .parsing import read_json
-
-Array = NDArray[np.float64]
 
 FORMAT = "pathspace-map/1"
 MAP_FILE = "map.json"

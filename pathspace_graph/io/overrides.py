@@ -1,7 +1,5 @@
 """Dotted fields of a tree of settings, such as `spline.degree`, and overrides of them, also from a file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -9,9 +7,8 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
-from pathspace_graph.io.limits import MAX_HEADER_BYTES, shown
-from pathspace_graph.io.parsing import parse_json, parse_toml, read_text
-from pathspace_graph.settings.gone import successor
+from pathspace_graph.io.parsing import MAX_HEADER_BYTES, parse_json, parse_toml, read_text, shown
+from pathspace_graph.settings.checked import successor
 
 T = TypeVar("T")
 Overrides = Mapping[str, Any]

@@ -23,10 +23,9 @@ from pathspace_graph.mapping.path import along_and_across
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label
-from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.crossing import sampled
+from pathspace_graph.settings.online import GrowthSettings
+from pathspace_graph.spline.bspline import BSpline, sampled
 
 from .finding import KnownLoop, Loop
 

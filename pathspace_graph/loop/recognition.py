@@ -26,7 +26,7 @@ from pathspace_graph.mapping.registration import (
 )
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.closing import ClosingSettings
+from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import Boundary
 
 STRETCH: Final = 150.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import rotation, wrap_angle
-from pathspace_graph.settings.closing import ClosingSettings
+from pathspace_graph.settings.online import ClosingSettings
 
 from .curve_map import CurveMap
 from .path import DrivenPath

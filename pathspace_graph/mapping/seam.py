@@ -6,12 +6,11 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.settings.knots import BreakSettings, FitSettings, Knots
+from pathspace_graph.settings.batch import BreakSettings, FitSettings, Knots
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.cone_knots import thin
-from pathspace_graph.spline.knots import curvature_weighted_breaks, refit
+from pathspace_graph.spline.knots import curvature_weighted_breaks, refit, thin
 
 from .registration import BEGINNING
 

@@ -13,7 +13,7 @@ from pathspace_graph.factors.se2 import compose, move_points, rotated, to_map
 from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import PointBoundary
-from pathspace_graph.settings.growth import GrowthSettings
+from pathspace_graph.settings.online import GrowthSettings
 
 MERGE_CHI: Final = 2.5
 """Gate of a smeared detection about a track, in sigmas of both together."""

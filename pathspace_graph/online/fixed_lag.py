@@ -81,7 +81,7 @@ class FixedLagMapper(MapperEstimate):
         """Process one perception cycle: the twists since the last cycle, and its detections.
 
         The call is refused as a ReadingError, and nothing has changed, where it holds anything that cannot be
-        used (`front_end.gate`, `settings.front_end`). Impossible detections are dropped and counted in the
+        used (`front_end.gate`, `settings.online`). Impossible detections are dropped and counted in the
         result. The next call goes on from the newest cycle that was used. The twists are a stream: each is
         held until the next one, and those in force before the newest cycle are left out. So a caller hands
         over the twists since the last call in order, and where some are lost, the last one is held.

@@ -1,7 +1,5 @@
 """What a run has found about the vehicle, in words: the constant errors, and the noise that was measured."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """A hint: what is odd about a log, where it is, its likely cause, and what to do; and the table of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final, Literal

@@ -5,27 +5,21 @@ of nearby cycles on each other. One that explains far more of them than the log 
 truth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import binom
 
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, UNKNOWN
-from pathspace_graph.settings.plausibility import PlausibilitySettings
+from pathspace_graph.settings.output import PlausibilitySettings
 
 from .pairs import DEGREE, Meaning, Pairs, motions
-
-Array = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
 
 QUARTER: Final = 90.0
 """This is a quarter turn in degrees."""
@@ -192,7 +186,7 @@ class Trials:
         return float((((points @ matrix.T)[:, 1] > 0.0) == (labels == LEFT)).mean())
 
     @cached_property
-    def _labelled(self) -> tuple[Array, NDArray[np.int_]]:
+    def _labelled(self) -> tuple[Array, IntArray]:
         """Returns the near detections (m, 2) of some cycles that have a label, and the labels (m,)."""
         some = self.log.cycles[:: max(1, len(self.log.cycles) // self.settings.cycles)]
         points = np.concatenate([cycle.points_vehicle for cycle in some])

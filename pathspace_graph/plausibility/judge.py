@@ -1,25 +1,21 @@
 """`hints`: a log is judged before it is mapped, and its likely mistakes are told."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.lengths import scaled
 from pathspace_graph.scale.scene import scale_of
-from pathspace_graph.settings.plausibility import PlausibilitySettings
+from pathspace_graph.settings.output import PlausibilitySettings
 
 from .hint import Hint, told
 from .hypotheses import Frame, Mounting, Trial, Trials, Verdict, best_lateness, mounting_of, verdict
 from .noise import noise_hints
 from .pairs import DEGREE, Meaning, Pairs, motions, pairs_of
-
-Array = NDArray[np.float64]
 
 TIMES: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
 """Units of stamps by their size in s."""

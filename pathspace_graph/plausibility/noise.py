@@ -1,23 +1,19 @@
 """Noise that a log states, held against what its own readings show."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import RayNoise, ray_sigmas
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.measurement import DRIFT, LEAST
 from pathspace_graph.front_end.sightings import GATE, MAX_RANGE, TwistRecord
 from pathspace_graph.io.log import Log
-from pathspace_graph.settings.plausibility import PlausibilitySettings
+from pathspace_graph.settings.output import PlausibilitySettings
 
 from .hint import Hint, told
-
-Array = NDArray[np.float64]
 
 TWIST: Final = (("vx", "m/s"), ("vy", "m/s"), ("wz", "rad/s"))
 

@@ -1,7 +1,5 @@
 """Logs are read together with the hints about them; where one is refused, its likely cause is told."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Final
@@ -11,10 +9,10 @@ import numpy as np
 from pathspace_graph.errors import InputError
 from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.io.csv_table import Table, read_table
-from pathspace_graph.io.limits import shown
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry, covariances_of, cycles_of
+from pathspace_graph.io.parsing import shown
 from pathspace_graph.labels import UNKNOWN, label_from_name
-from pathspace_graph.settings.front_end import LimitSettings
+from pathspace_graph.settings.online import LimitSettings
 
 from .hint import Hint, because, told
 from .judge import hints

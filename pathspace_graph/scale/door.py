@@ -1,7 +1,5 @@
 """The front door of estimators: inside, every scene has the size of a Formula Student track."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace

@@ -3,7 +3,47 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from .checked import Positive
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.settings.checked import Positive
+
+Knots = Literal["cones", "curvature"]
+"""What the knots of a closed boundary follow: its cones or its curvature."""
+
+
+@dataclass(frozen=True)
+class BreakSettings:
+    """How a curve's knots follow its curvature (paper: Simplification)."""
+
+    baseline: float = 0.5
+    """Share in [0, 1] of the knots that is spread evenly, so that straights keep their minimum."""
+    curvature_max: float = 0.7
+    """Curvature that larger ones count as (1/m), that of the inside of a tight hairpin, so that a kink does
+    not attract all knots."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.baseline <= 1.0:
+            raise SettingsError(f"baseline: expected a share in [0, 1], found {self.baseline}")
+        if not self.curvature_max > 0.0:
+            raise SettingsError(f"curvature_max: expected a positive number, found {self.curvature_max}")
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How a spline is fitted to ordered points."""
+
+    degree: int = 3
+    """Degree p of the curve."""
+    smoothness: float = 1e-3
+    """Weight (m^3) of the bending integral of |S''|^2 beside the sum of squared distances."""
+    rounds: int = 4
+    """Times that the knots are placed anew by curvature, after a first fit on evenly spaced ones."""
+    refits: int = 4
+    """Least-squares fits on each set of knots, with refreshed foot points."""
+    breaks: BreakSettings = BreakSettings()
+
+
+# --- batch ---------------------------------------------------------------------------------------------
+
 
 Start = Literal["online", "odometry"]
 
@@ -90,3 +130,53 @@ class BatchSettings(Positive):
     """Places of poses and detections along the curves."""
     closure: ClosureSettings = field(default_factory=ClosureSettings)
     """Loops that no registration has closed."""
+
+
+# --- comparison ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CkfSettings(Positive):
+    """The paper's filters."""
+
+    ridge: float = 0.05
+    """Lambda of the ridge regression, which holds control points at their places (paper: Update)."""
+    sigma_model: float = 0.25
+    """Standard deviation (m) of a cone's distance from a smooth curve; its square is added to the covariance
+    of each detection."""
+    sigma_along: float = 1.0
+    """Standard deviation (m) of the distance along the curve between a cone and its foot point; its square is
+    added to the covariance of each detection."""
+    threshold: float = 4.0
+    """Growth threshold (m): a detection nearer to the end updates the curve instead of extending it."""
+    separation: float = 4.0
+    """Least distance of an extension from the second-to-last control point (m)."""
+    sigma_bend: float = 0.5
+    """Standard deviation of the second difference of the control points that an extension moves or adds, as a
+    share of their spacing. The bending of the end is known from the detections on it only, and without a
+    prior its uncertainty multiplies with each extension. A large value gives the filter as it is
+    published."""
+    knots: Knots = "curvature"
+    """What the knots of a closed boundary follow: curvature, as in the paper, or cones."""
+    sightings: int = 3
+    """Detections that make a landmark of the baseline filter; 1, as it is described, takes every one."""
+
+
+@dataclass(frozen=True)
+class LandmarkSettings(Positive):
+    """The Hungarian landmark graph."""
+
+    match: float = 0.95
+    """Probability of the gate inside which a detection may be of a landmark."""
+    create: float = 0.99
+    """Probability of the gates of all landmarks of its colour outside of which a detection may be new."""
+
+
+@dataclass(frozen=True)
+class CenterlineSettings(Positive):
+    """The estimators that map a track as one centre line with a width."""
+
+    spacing: float = 3.0
+    """Distance of the knots of the centre line (m)."""
+    sigma_width: float = 0.3
+    """Standard deviation (m) of the second difference of the half widths at neighbouring control points."""

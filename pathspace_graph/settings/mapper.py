@@ -4,20 +4,22 @@ A number that nobody changes is a constant: beside its use, or a class variable 
 share it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
+
+from pathspace_graph.settings.batch import CenterlineSettings, CkfSettings, Knots, LandmarkSettings
+from pathspace_graph.settings.online import (
+    ClosingSettings,
+    GrowthSettings,
+    HealthSettings,
+    LimitSettings,
+    MotionSettings,
+    SidesSettings,
+)
 
 from .batch import BatchSettings, OpenLapSettings
 from .calibration import CalibrationSettings, OdometrySettings
 from .checked import Positive
-from .closing import ClosingSettings
-from .comparison import CenterlineSettings, CkfSettings, LandmarkSettings
-from .front_end import LimitSettings, MotionSettings, SidesSettings
-from .growth import GrowthSettings
-from .health import HealthSettings
-from .knots import Knots
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,14 @@ It is the line of `centre_line`, but only its next stretch, and a hundred times 
 sampled once, and near a sample it is taken as the circle that osculates it there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.se2 import left_of, to_vehicle, wrap_angle
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
@@ -21,8 +19,7 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from .centre_line import points_across
 from .planning import LEAST_STEP, MOST_POINTS
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+Bools = BoolArray
 
 _SAMPLE_STEP: Final = 0.5
 """Approximate distance of boundary samples (m). The circle at a sample is right to a millimetre."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Final, Literal, Self
 
 import numpy as np
 from scipy.interpolate import BSpline as ScipyBSpline
+from scipy.spatial import KDTree
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, IntArray
@@ -20,6 +22,7 @@ from pathspace_graph.factors.bspline import (
 )
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.se2 import left_of
+from pathspace_graph.labels import LEFT, RIGHT
 
 _PERIODIC_TOLERANCE: Final = 1e-9
 """Largest difference of repeated values of a periodic spline, over (1 + largest value)."""
@@ -351,3 +354,35 @@ def _blossom(knots: Array, degree: int, span: int, arguments: Array) -> Array:
         share = ((x - lower) / (upper - lower))[:, None]
         weights = (1.0 - share) * weights[:-1] + share * weights[1:]
     return np.asarray(weights[0])
+
+
+# --- crossing ------------------------------------------------------------------------------------------
+
+
+def sampled(spline: BSpline, step: float) -> Array:
+    """Return points (n, 2) of a spline, from its beginning to its end, about this step (m) apart."""
+    low, high = spline.domain
+    return spline.evaluate(np.linspace(low, high, max(int((high - low) / step), 1) + 1))
+
+
+def boundaries_cross(splines: Mapping[int, BSpline], step: float) -> bool:
+    """Return whether the left and the right boundary cross, sampled at this step (m)."""
+    return polylines_cross(sampled(splines[LEFT], step), sampled(splines[RIGHT], step))
+
+
+def polylines_cross(a: Array, b: Array) -> bool:
+    """Return whether a segment of the polyline a (n, 2) crosses one of the polyline b (m, 2)."""
+    middle_a, middle_b = 0.5 * (a[1:] + a[:-1]), 0.5 * (b[1:] + b[:-1])
+    reach = 0.5 * (np.hypot(*np.diff(a, axis=0).T).max() + np.hypot(*np.diff(b, axis=0).T).max())
+    near = KDTree(middle_a).query_ball_tree(KDTree(middle_b), reach)
+    i = np.repeat(np.arange(len(near)), [len(own) for own in near])
+    j = np.array([k for own in near for k in own], np.intp)
+    (p, q), (r, s) = (a[i], a[i + 1]), (b[j], b[j + 1])
+    apart = _side(p, q, r) * _side(p, q, s) < 0.0
+    return bool((apart & (_side(r, s, p) * _side(r, s, q) < 0.0)).any())
+
+
+def _side(p: Array, q: Array, point: Array) -> Array:
+    """Return on which side of the lines from p to q (k, 2) the points (k, 2) lie: positive on the left."""
+    along, to = q - p, point - p
+    return np.asarray(along[:, 0] * to[:, 1] - along[:, 1] * to[:, 0])

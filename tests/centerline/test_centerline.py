@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.centerline.batch import NAME, CenterlineBatch
-from pathspace_graph.centerline.edges import map_of, ribbon_of
-from pathspace_graph.centerline.graph import ribbon_keys, shape_factors
-from pathspace_graph.centerline.online import CenterlineMapper
+from pathspace_graph.centerline.batch import NAME, CenterlineBatch, ribbon_keys, shape_factors
+from pathspace_graph.centerline.online import CenterlineMapper, map_of, ribbon_of
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import for_map
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
@@ -23,8 +21,7 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.centre_line import find_line
-from pathspace_graph.spline.ribbon import Ribbon
+from pathspace_graph.spline.centre_line import Ribbon, find_line
 
 from ..scenes.drives import bean_track, lap_log, noisy
 from ..scenes.maps import SIGMA, ring_map

@@ -15,7 +15,7 @@ from pathspace_graph.ckf.state import CurveState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
 from pathspace_graph.mapping.path import CARRIED_TO, DrivenPath, PathAhead
-from pathspace_graph.settings.comparison import CkfSettings
+from pathspace_graph.settings.batch import CkfSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .scenes import detections_of, straight_rows

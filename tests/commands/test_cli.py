@@ -357,7 +357,7 @@ def test_an_interrupt_leaves_nothing_half_written(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pathspace_graph.io.results._write_cycles", interrupt)
+    monkeypatch.setattr("pathspace_graph.io.results.write_table", interrupt)
     assert main(["online", str(log_folder), "--out", str(tmp_path / "deep" / "map")]) == 130
     assert capsys.readouterr().err == "pathspace-graph: interrupted\n"
     assert names(tmp_path) == set()

@@ -10,7 +10,7 @@ import pytest
 
 from pathspace_graph.cli import main
 from pathspace_graph.io.map import Map, map_to_json
-from pathspace_graph.io.trajectory import write_trajectory
+from pathspace_graph.io.results import write_trajectory
 
 from ..scenes.maps import open_map, point_map, ring_map
 

@@ -12,7 +12,7 @@ from pathspace_graph.cli import main, parse_command
 from pathspace_graph.io.files import write_json
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.options import ESSENTIAL
-from pathspace_graph.settings.gone import GONE, successor
+from pathspace_graph.settings.checked import GONE, successor
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 
 SCREEN = 50

@@ -18,7 +18,7 @@ from pathspace_graph.io.log import Detections, Log, read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online
-from pathspace_graph.settings.front_end import LimitSettings
+from pathspace_graph.settings.online import LimitSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 

@@ -13,16 +13,15 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.export.geojson import write_geojson
+from pathspace_graph.export.geojson import LocalPlane, write_geojson
 from pathspace_graph.export.lanelet2 import write_lanelet2
-from pathspace_graph.export.local_plane import LocalPlane
 from pathspace_graph.export.tables import sampled, write_centre_line, write_points, write_profile
 from pathspace_graph.io.csv_table import read_table
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT
 from pathspace_graph.settings.output import SpeedSettings
 from pathspace_graph.sim.track_files import read_track
-from pathspace_graph.spline.speed import speed_profile
+from pathspace_graph.spline.planning import speed_profile
 
 from ..scenes.maps import open_map, point_map, ring_map
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.export.local_plane import FLATTENING, SEMI_MAJOR_AXIS, LocalPlane
+from pathspace_graph.export.geojson import FLATTENING, SEMI_MAJOR_AXIS, LocalPlane
 
 SQUARE = FLATTENING * (2.0 - FLATTENING)
 

@@ -17,7 +17,7 @@ from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.front_end.gate import Admitted, Gate, Newest, admit, read_usable_log
 from pathspace_graph.io.log import Detections, Odometry, write_log
-from pathspace_graph.settings.front_end import LimitSettings
+from pathspace_graph.settings.online import LimitSettings
 
 from ..scenes.drives import ahead, corridor, exact_log
 

@@ -12,7 +12,7 @@ from pathspace_graph.front_end.front_end import LateDetections, at_nearest_pose
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.front_end import MotionSettings
+from pathspace_graph.settings.online import MotionSettings
 
 from ..scenes.drives import ahead, bean_track, corridor, detections, exact_log, lap_log, map_log, noisy
 

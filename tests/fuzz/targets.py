@@ -19,7 +19,7 @@ from pathspace_graph.eval.experiment.study import read_study
 from pathspace_graph.io.log import read_log
 from pathspace_graph.io.manifest import verify_all
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.trajectory import read_trajectory
+from pathspace_graph.io.results import read_trajectory
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.snapshot import FORMAT, archive

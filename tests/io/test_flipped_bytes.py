@@ -18,8 +18,7 @@ from pathspace_graph.eval.experiment.drives import Drive, NamedTrack
 from pathspace_graph.io.log import FILES, read_log, write_log
 from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.results import read_health, write_result
-from pathspace_graph.io.trajectory import read_trajectory
+from pathspace_graph.io.results import read_health, read_trajectory, write_result
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pathspace_graph.errors import InputError, OutputError
-from pathspace_graph.io.limits import MAX_HELD, MAX_RANGE
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth, read_log, write_log
+from pathspace_graph.io.parsing import MAX_HELD, MAX_RANGE
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
 

@@ -10,9 +10,17 @@ from typing import Any
 import pytest
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.io import limits
-from pathspace_graph.io.limits import MAX_DEPTH, MAX_INTEGER, check_content, shown
-from pathspace_graph.io.parsing import parse_json, parse_toml, parse_yaml, read_text
+from pathspace_graph.io import parsing as limits
+from pathspace_graph.io.parsing import (
+    MAX_DEPTH,
+    MAX_INTEGER,
+    check_content,
+    parse_json,
+    parse_toml,
+    parse_yaml,
+    read_text,
+    shown,
+)
 
 FILE = Path("file")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.io.trajectory import read_trajectory, write_trajectory
+from pathspace_graph.io.results import read_trajectory, write_trajectory
 
 
 def test_a_trajectory_comes_back_as_it_was_written(tmp_path: Path) -> None:

@@ -24,8 +24,8 @@ from pathspace_graph.landmark.association import (
     squared_mahalanobis,
 )
 from pathspace_graph.landmark.landmark_map import AMBIGUOUS, UNASSOCIATED
-from pathspace_graph.settings.comparison import LandmarkSettings
-from pathspace_graph.settings.growth import GrowthSettings
+from pathspace_graph.settings.batch import LandmarkSettings
+from pathspace_graph.settings.online import GrowthSettings
 
 from ..scenes.drives import detections
 from .scenes import SPEED, drive_on, driven, with_covariance

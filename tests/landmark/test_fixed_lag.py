@@ -17,8 +17,8 @@ from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.run import run_online, split_odometry
-from pathspace_graph.settings.front_end import SidesSettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import SidesSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from ..scenes.drives import ahead, bean_track, corridor, exact_log, lap_log

@@ -14,7 +14,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.landmark.association import compatible_pairs, find_duplicates, merge, pairs_within
 from pathspace_graph.landmark.batch import remove_rare
 from pathspace_graph.landmark.landmark_map import LandmarkState
-from pathspace_graph.settings.comparison import LandmarkSettings
+from pathspace_graph.settings.batch import LandmarkSettings
 from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
 
 from .scenes import QUADRATIC, driven, oracle_system

@@ -19,9 +19,9 @@ from pathspace_graph.mapping.registration import RefinedMotion, near_start, regi
 from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.closing import ClosingSettings
-from pathspace_graph.settings.knots import Knots
+from pathspace_graph.settings.batch import Knots
 from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
+from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import relocate
 
 from ..scenes.drives import (

@@ -13,8 +13,8 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.recognition import RecognizedPlace, find_place, may_tell_place
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import ClosingSettings
 
 from ..scenes.maps import boundary_through
 

@@ -26,8 +26,8 @@ from pathspace_graph.mapping.registration import (
     register,
 )
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.closing import ClosingSettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import ClosingSettings
 
 from ..scenes.drives import detections
 from ..scenes.maps import boundary_through

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.mapping.seam import Overlap, find_overlap, make_periodic
-from pathspace_graph.settings.knots import Knots
+from pathspace_graph.settings.batch import Knots
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 

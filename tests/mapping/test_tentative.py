@@ -11,7 +11,7 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BIG_ORANGE, ORANGE
 from pathspace_graph.mapping import tentative as tentative_module
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting, TentativeTracks
-from pathspace_graph.settings.growth import GrowthSettings
+from pathspace_graph.settings.online import GrowthSettings
 
 Array = NDArray[np.float64]
 

@@ -17,9 +17,8 @@ from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, OutliningEstimator, VehicleEstimator, split_odometry
-from pathspace_graph.settings.front_end import SidesSettings
-from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.settings.mapper import GaugeSettings, MapperSettings
+from pathspace_graph.settings.online import GrowthSettings, SidesSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 from pathspace_graph.sim.vehicle import integrate

@@ -16,8 +16,8 @@ from pathspace_graph.mapping.path import END_BEHIND, Candidates, End, PathAhead
 from pathspace_graph.online import growth
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.online.growth import count_in_order, undisputed
-from pathspace_graph.settings.growth import GrowthSettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import GrowthSettings
 
 from ..scenes.drives import DT, ahead, corridor, detections, exact_log, map_log, true_poses
 from ..scenes.maps import boundary_through

@@ -12,7 +12,7 @@ from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError
 from pathspace_graph.io.log import Log, write_log
 from pathspace_graph.plausibility.reading import read_plausible_log, refused_hints
-from pathspace_graph.settings.front_end import LimitSettings
+from pathspace_graph.settings.online import LimitSettings
 from pathspace_graph.sim.mistakes import MISTAKES
 
 from ..scenes.drives import short_drive

@@ -7,10 +7,9 @@ import pytest
 
 from pathspace_graph.eval.metrics.accuracy import closest_points
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.settings.knots import FitSettings
+from pathspace_graph.settings.batch import FitSettings
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.cone_knots import chosen_breaks, thin
-from pathspace_graph.spline.knots import energy_rows, fit_spline
+from pathspace_graph.spline.knots import chosen_breaks, energy_rows, fit_spline, thin
 
 FIT = FitSettings(rounds=1)
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.crossing import boundaries_cross, polylines_cross, sampled
+from pathspace_graph.spline.bspline import BSpline, boundaries_cross, polylines_cross, sampled
 
 STEP = 0.25
 """Curves are sampled at this step (m)."""

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.settings.knots import BreakSettings, FitSettings
+from pathspace_graph.settings.batch import BreakSettings, FitSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import curvature_weighted_breaks, fit_spline, quantile_breaks, refit
 

@@ -10,8 +10,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.centre_line import CentreCurve, find_line
-from pathspace_graph.spline.ribbon import SIDE
+from pathspace_graph.spline.centre_line import SIDE, CentreCurve, find_line
 
 from ..scenes.jacobians import assert_jacobians
 from ..scenes.maps import open_map, ring_map

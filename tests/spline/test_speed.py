@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.settings.output import SpeedSettings
-from pathspace_graph.spline.speed import speed_profile
+from pathspace_graph.spline.planning import speed_profile
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from pathspace_graph.eval.figures.isolated import FIGURES, MARKER
 from pathspace_graph.eval.figures.updates import RIDGE, SIGMA_DETECTION, expansion, extend, fit
 from pathspace_graph.io.manifest import MANIFEST_FILE
 from pathspace_graph.mapping.belief import cubature_points, square_root
-from pathspace_graph.settings.comparison import CkfSettings
+from pathspace_graph.settings.batch import CkfSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit
 

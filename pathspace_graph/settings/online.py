@@ -1,0 +1,166 @@
+"""Settings of growth: how the open ends of the curves grow."""
+
+from dataclasses import dataclass
+
+from pathspace_graph.settings.checked import Positive
+
+
+@dataclass(frozen=True)
+class GrowthSettings(Positive):
+    """How the open end of a curve grows, and what a tentative track is."""
+
+    UNLIMITED = ("forget_after",)
+
+    reach: float = 7.0
+    """Farthest ahead of the vehicle that a boundary is extended (m along the predicted path)."""
+    sightings: int = 3
+    """Detections within `merge_radius` that confirm a tentative track."""
+    sigma: float = 0.4
+    """Standard deviation in every direction (m) to which a track must be known before a curve is extended
+    through it: a far, uncertain one waits until it was seen near."""
+    merge_radius: float = 1.0
+    """Distance within which detections of one label belong to one tentative track (m)."""
+    forget_after: float = 6.0
+    """Time without a detection after which a tentative track is dropped (s)."""
+    threshold: float = 0.7
+    """Distance from the end of the curve below which a tentative track does not extend it (m)."""
+    max_lateral: float = 10.0
+    """Distance from the driven path at which tracks begin a boundary (m); circuits are up to 15 m wide."""
+    max_size: float = 5000.0
+    """Number of control points from which on an open curve grows no further."""
+    max_unseen: float = 500.0
+    """Longest stretch of an open curve without any cone (m): it is not carried on any farther behind the
+    vehicle, and not led on to a cone beyond that."""
+
+
+# --- closing -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ClosingSettings(Positive):
+    """When the loop may close, and how certain its registration must be."""
+
+    UNLIMITED = ("gauge_laps",)
+
+    min_path: float = 60.0
+    """Least length of a lap (m)."""
+    check_interval: float = 2.0
+    """Least distance of two attempts to close the loop (m along the path)."""
+    radius: float = 8.0
+    """Distance from the first stretch of the drive within which the loop may close (m)."""
+    drift: float = 0.03
+    """Growth of `radius` with the path driven (m/m)."""
+    overlap: float = 8.0
+    """Length of the beginning that must have been driven again (m)."""
+    inlier_distance: float = 0.4
+    """Distance from the beginning's curve within which a detection is an inlier (m)."""
+    inlier_share: float = 0.8
+    """Least share of inliers among the matched detections."""
+    prior_scale: float = 1.5
+    """Factor of the vehicle's own standard deviations in the prior of the registration."""
+    sigma_reading: float = 0.5
+    """Standard deviation of a detection in the registration (m), large since many are of one cone."""
+    sigma_max: float = 0.4
+    """Largest standard deviation of the registered position along its worst direction (m)."""
+    patience: float = 40.0
+    """Length of the beginning driven again after which `sigma_patience` replaces `sigma_max` (m)."""
+    sigma_patience: float = 0.85
+    """After `patience`, the standard deviation of the registered position must be below this (m): detections
+    on a straight leave the position along it free, however much of it is driven again. Where the vehicle is
+    lost, `sigma_max` stays in force."""
+    iterations: int = 2
+    """Gauss-Newton steps after the loop is found, and again after simplification."""
+    gauge_laps: float = 4.0
+    """Laps on the closed map after which its position and heading as a whole are held, and no more is claimed
+    of it than is known then. Infinite where they never are."""
+
+
+# --- health --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class HealthSettings(Positive):
+    """Limits of a good, a degraded and a lost estimate.
+
+    The share of detections that the map explains is taken over the newest `window`. A coloured detection in
+    the view of the curves is explained if it is in use, or if it lies on a closed curve of its colour farther
+    along: in a hairpin the sensor sees the next stretch across the infield.
+    """
+
+    window: float = 1.0
+    """Age up to which detections are judged together (s)."""
+    min_offered: int = 12
+    """Least number of detections that are judged; where the window holds fewer, older ones count as well."""
+    blind: float = 2.0
+    """Time without detections from which on the estimate is degraded (s)."""
+    share_degraded: float = 0.8
+    """Share of explained detections on a closed map below which the estimate is degraded."""
+    share_lost: float = 0.55
+    """Share of explained detections on a closed map below which the vehicle is lost."""
+    open_degraded: float = 0.35
+    """Share of explained detections below which the estimate is degraded while the loop is open. It is low,
+    since detections of stretches that are not mapped yet lie beside the curves."""
+    innovation: float = 1.2
+    """Largest mean squared distance of detections in use from their curve in a good estimate, before the
+    update and in units of its variance, to which one sigma of the mean over the cones in view is added; about
+    1 if the model is right."""
+    sigma_degraded: float = 1.0
+    """Position's largest standard deviation on a closed map beyond which an estimate is degraded (m)."""
+    sigma_lost: float = 5.0
+    """The same standard deviation beyond which the vehicle is lost (m)."""
+
+
+# --- front end -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LimitSettings(Positive, group="limits"):
+    """What a vehicle and its sensors can do at most, at scale 1.
+
+    A cycle beyond that is refused; a single detection beyond the range is dropped instead.
+    """
+
+    UNLIMITED = ("silence",)
+
+    speed: float = 100.0
+    """Largest speed ahead or to a side, m/s."""
+    yaw_rate: float = 10.0
+    """Largest yaw rate, rad/s."""
+    silence: float = 30.0
+    """Longest time without a twist or a cycle, s. A vehicle may be anywhere after a longer one: one cycle is
+    refused then, and the next that agrees with it is used."""
+    range_max: float = 300.0
+    """Largest distance of a detection from the vehicle, m."""
+
+
+@dataclass(frozen=True)
+class MotionSettings(Positive):
+    """The check of the odometry against the detections of the newest cycles.
+
+    Where they contradict it, the wheels slip or the readings fail, and their motion takes its place.
+    """
+
+    UNLIMITED = ("doubt",)
+
+    doubt: float = 5.0
+    """Contradiction from which the odometry is not believed, standard deviations; `inf` to believe it."""
+    acceleration: float = 5.0
+    """Growth of the speeds' uncertainty where a twist is held for longer than usual, m/s^2."""
+    angular_acceleration: float = 1.5
+    """Growth of the yaw rate's uncertainty there, rad/s^2."""
+
+    @property
+    def accelerations(self) -> tuple[float, float, float]:
+        """How fast the twist of a vehicle changes (m/s^2, m/s^2, rad/s^2)."""
+        return self.acceleration, self.acceleration, self.angular_acceleration
+
+
+@dataclass(frozen=True)
+class SidesSettings(Positive):
+    """How the side of a cone is told from the way driven."""
+
+    min_votes: int = 3
+    """Least number of cones on the side of the other colour from which the colours are swapped."""
+    colourless: float = 0.7
+    """Share of detections without a colour from which sides are told from the rows of cones; at 1, they
+    never are."""
