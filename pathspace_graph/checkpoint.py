@@ -20,14 +20,13 @@ Copier = Callable[[Any, Memo], Any]
 
 
 class Recovery:
-    """Takes an estimator back to what it was before its newest call, by a copy and the calls since then."""
+    """Return of an estimator to what it was before its newest call, by a copy and the calls since then."""
 
     EVERY: Final = 20
-    """A copy is made anew after this number of calls, so that its time hardly counts."""
+    """Number of calls from one copy to the next, so that its time hardly counts."""
 
     def __init__(self, failures: int = 0) -> None:
         self.failures = failures
-        """Number of calls that have failed."""
         self._copy: dict[str, Any] | None = None
         self._calls: list[partial[Any]] = []
         self._doubtful: int | None = None  # the first call that may be made in another way yet
@@ -96,7 +95,6 @@ def copied(value: Any, memo: Memo) -> Any:
 
 
 def is_shared(value: object) -> bool:
-    """Return whether copies share a value."""
     return all(map(is_shared, value)) if isinstance(value, tuple) else _copier_of(value) is None
 
 

@@ -11,14 +11,14 @@ from typing import Any, Final
 
 
 class PathspaceError(Exception):
-    """This is the base of all errors that a user can mend.
+    """Base of all errors that a user can mend.
 
     Its text is one line that says what was expected and what was found.
     """
 
 
 class InputError(PathspaceError):
-    """A user's file is missing or wrong.
+    """A missing or wrong file of a user.
 
     The text names the file, the row (1 is the first line) and what was expected.
     """
@@ -32,7 +32,7 @@ class InputError(PathspaceError):
 
 
 class ReadingError(PathspaceError):
-    """A perception cycle was handed over that no estimator can use; the estimator is as it was before.
+    """A perception cycle that no estimator can use; the estimator is as it was before.
 
     The text names the field, the row (0 is the first one), what was expected and what was found.
     """
@@ -42,7 +42,7 @@ class ReadingError(PathspaceError):
     ) -> None:
         self.field, self.expected, self.found, self.row = field, expected, found, row
         self.t = t
-        """This is the stamp of the cycle (s), where it has one."""
+        """Stamp of the cycle (s), where it has one."""
         when = "" if t is None else f"cycle at {t:.12g} s: "
         where = field if row is None else f"{field}, row {row}"
         value = f"{found:g}" if isinstance(found, float) else str(found)
@@ -58,22 +58,22 @@ class ReadingError(PathspaceError):
 
 
 class OutputError(PathspaceError):
-    """An output path cannot be written without losing something that is there already."""
+    """An output path that cannot be written without losing something that is there already."""
 
 
 class SettingsError(PathspaceError):
-    """A setting is out of its range, or names something unknown."""
+    """A setting out of its range, or the name of something unknown."""
 
 
 class SolveError(PathspaceError):
-    """An estimate cannot be computed, though nothing is wrong with the input as such.
+    """An estimate that cannot be computed, though nothing is wrong with the input as such.
 
     The text says what failed; the command line's exit code is 3.
     """
 
 
 class SingularSystemError(SolveError):
-    """The normal equations are not positive definite, since nothing determines some variable."""
+    """Normal equations that are not positive definite, since nothing determines some variable."""
 
 
 @contextmanager
@@ -102,7 +102,7 @@ NUMBERS: Final[dict[str, Callable[[Any], bool]]] = {
     "a number of at least 0": lambda value: 0 <= value < inf,
     "a number in [0, 1]": lambda value: 0 <= value <= 1,
 }
-"""A number is checked against one of these, by the words of the message."""
+"""Checks of numbers, by the words of the message."""
 
 
 def check_numbers(settings: object, group: str, names: Iterable[str], expected: str) -> None:

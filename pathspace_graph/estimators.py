@@ -27,16 +27,16 @@ MakeOnline = Callable[[MapperSettings, KnownNoise], OnlineEstimator]
 MakeBatch = Callable[[MapperSettings, KnownNoise], BatchEstimator]
 
 MapKind = Literal["boundaries", "centerline"]
-"""A track is mapped as two boundaries, or as one centre line with a width."""
+"""Kind of map: two boundaries, or one centre line with a width."""
 
 DEFAULT: Final = "fixed-lag"
-"""This online estimator runs where none is named."""
+"""Online estimator where none is named."""
 DEFAULT_BATCH: Final = "spline"
-"""This batch estimator runs where none is named."""
+"""Batch estimator where none is named."""
 ONLINE_GROUP: Final = "pathspace_graph.online"
-"""Entry points of this group add online estimators."""
+"""Group of entry points that add online estimators."""
 BATCH_GROUP: Final = "pathspace_graph.batch"
-"""Entry points of this group add batch estimators."""
+"""Group of entry points that add batch estimators."""
 
 
 def _spline(settings: MapperSettings, noise: KnownNoise) -> BatchEstimator:
@@ -67,8 +67,8 @@ ONLINE: Final[dict[str, MakeOnline]] = {
     "landmark-ckf": LandmarkCkf,
     centerline_online.NAME: centerline_online.CenterlineMapper,
 }
-"""Each online estimator is made from its settings and what is known of the noise; one of another package is
-given the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
+"""Makers of online estimators, from settings and what is known of the noise; one of another package is given
+the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
 
 BATCH: Final[dict[str, MakeBatch]] = {
     **_installed(BATCH_GROUP),
@@ -76,8 +76,8 @@ BATCH: Final[dict[str, MakeBatch]] = {
     "landmark-batch": LandmarkBatch,
     centerline_batch.NAME: _centerline,
 }
-"""Each batch estimator is made from its settings and what is known of the noise; one of another package is
-given the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
+"""Makers of batch estimators, from settings and what is known of the noise; one of another package is given
+the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
 
 
 def check_online(name: str) -> None:

@@ -31,19 +31,19 @@ CYCLE_TYPES: Final = {
     "reason": "str",
     "dropped": "int64",
 }
-"""The columns of `cycles.csv` have these types; any further column is text."""
+"""Types of the columns of `cycles.csv`; any further column is text."""
 OPTIONAL: Final = ("offered", "health", "reason", "dropped")
-"""These columns of `cycles.csv` may be missing."""
+"""Columns of `cycles.csv` that may be missing."""
 RESULTS_FILE: Final = "results.csv"
-"""A study has its metrics in this file, a row for each run and lap."""
+"""File of a study's metrics, a row for each run and lap."""
 TIMES_FILE: Final = "times.csv"
-"""A study has its wall times in this file, in the same rows."""
+"""File of a study's wall times, in the same rows."""
 KEYS: Final = ("study", "track", "seed", "noise", "estimator", "variant", "lap")
-"""These columns tell the rows of a study apart."""
+"""Columns that tell the rows of a study apart."""
 TEXTS: Final = ("study", "track", "noise", "estimator", "variant", "failure", "said")
-"""These columns of a study are text, also where it looks like a number."""
+"""Columns of a study that are text, also where it looks like a number."""
 DIMENSIONS: Final = KEYS[1:]
-"""The metrics of a study have these dimensions."""
+"""Dimensions of a study's metrics."""
 
 
 def read_cycles(folder: Path | str) -> pd.DataFrame:

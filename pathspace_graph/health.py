@@ -40,11 +40,9 @@ class Evidence:
     explained: int = 0
     """Number of them on a curve of their colour."""
     used: int = 0
-    """Number of them in use."""
     innovations: float = 0.0
     """Sum of squared normalized innovations of those in use."""
     closed: bool = False
-    """Whether the loop has closed."""
     sigma: float = nan
     """Standard deviation (m) of the position in its worst direction on a closed map, where it is known."""
     offered_by: tuple[int, int] = (0, 0)

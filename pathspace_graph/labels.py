@@ -9,10 +9,9 @@ ORANGE: Final = 3
 BIG_ORANGE: Final = 4
 
 NAMES: Final = ("left", "right", "unknown", "orange", "big_orange")
-"""These are the words of the file format, indexed by label."""
+"""Words of the file format, indexed by label."""
 
 BOUNDARIES: Final = (LEFT, RIGHT)
-"""These labels name a boundary."""
 
 POINTS: Final = (ORANGE, BIG_ORANGE)
 """Cones with these labels bound no road: they stand at gates, and along lanes that lead to a track."""

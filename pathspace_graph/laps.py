@@ -22,8 +22,7 @@ class LapSettings:
     """Half the length of the start line (m), with room for the racing line and for the drift of one lap."""
 
     gate_depth: float = 10.0
-    """Distance past the line up to which a crossing is still noticed (m), where an estimate jumped over
-    it."""
+    """Distance past the line at which a crossing is still noticed (m), where an estimate jumped."""
 
     max_heading: float = np.pi / 3
     """Largest difference of the heading from the start's where the line is crossed (rad)."""

@@ -191,7 +191,6 @@ def _description(command: type[Any]) -> str:
 
 
 def _texts(settings: type[Any]) -> dict[str, str]:
-    """Return the text of each field as one paragraph."""
     return {
         text.arg_name: " ".join((text.description or "").split())
         for home in reversed(settings.__mro__)

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 @contextmanager
 def progress(description: str, total: int | None = None, lines: int = 0) -> Iterator[Steps]:
-    """Show a bar on a terminal, or a spinner where the total isn't known, and yields what counts the steps.
+    """Show a bar on a terminal, or a spinner where the total isn't known, and yield what counts the steps.
 
     Without a terminal nothing is shown, unless `lines` asks for about that many lines over the whole work.
     """
@@ -26,7 +26,7 @@ def progress(description: str, total: int | None = None, lines: int = 0) -> Iter
 
 
 class Steps:
-    """Counts the steps of long work, and estimates the time that remains by the mean of those done so far."""
+    """Counter of the steps of long work, which estimates the time that remains by their mean."""
 
     def __init__(self, display: Progress, description: str, total: int | None, lines: int) -> None:
         self._display, self._description = display, description
@@ -35,7 +35,7 @@ class Steps:
         self._task = display.add_task(description, total=total, remaining="")
 
     def __call__(self, done: int | None = None, total: int | None = None) -> None:
-        """Count one more step, or sets how many steps of how many are done."""
+        """Count one more step, or set how many steps of how many are done."""
         self._done = self._done + 1 if done is None else done
         self._total = self._total if total is None else total
         remaining = ""

@@ -41,7 +41,6 @@ class CycleResult:
     readings: int
     """Number of the cycle's detections that were used."""
     closed: bool
-    """Whether the loop has closed."""
     stages: Mapping[str, float] = field(default_factory=dict)
     """Time of each stage of the update (s), by the stage's name."""
     jump: Array | None = None
@@ -121,8 +120,7 @@ class Readings:
     used: BoolArray
     """Whether each detection (k,) was used; otherwise it was gated."""
     feet: Array
-    """Foot point (k, 2) of each used detection on its curve, or its landmark, in m, map frame; NaN for the
-    others."""
+    """Foot point (k, 2) of each used detection on its curve or landmark, in m, map frame; NaN for others."""
 
 
 @runtime_checkable
@@ -179,7 +177,6 @@ class ObservedCycle:
     """
 
     estimator: OnlineEstimator
-    """Estimator that has processed the cycle."""
     detections: Detections
     """Detections of the cycle, as they were handed over."""
     result: CycleResult

@@ -39,8 +39,7 @@ class Benchmark:
     json: Path | None = None
     """File for the figures."""
     compare: bool = False
-    """Mark in the table what is worse than the baseline by more than its tolerance; the exit code is 1
-    then."""
+    """Mark what is worse than the baseline by more than its tolerance; the exit code is 1 then."""
     write_baseline: bool = False
     """Make the ratios of this run the baseline."""
     baseline: Path = BASELINE

@@ -27,7 +27,6 @@ class LinearWindow:
     graph: gtsam.GaussianFactorGraph
     """A factor for each cycle, and one for prior, weak priors and damping together."""
     layout: Layout
-    """Variables of the graph."""
 
 
 def linear_window(mapper: FixedLagMapper) -> LinearWindow:

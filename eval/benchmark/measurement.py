@@ -79,7 +79,6 @@ class Measurement:
     """Result of one run."""
 
     cycles: tuple[CycleRecord, ...]
-    """Cycles of the mapper."""
     laps: int
     """Number of complete laps."""
     closing: int | None

@@ -18,7 +18,6 @@ from pathspace_graph.io.parsing import read_json
 
 FORMAT: Final = "pathspace-benchmark-baseline/1"
 BASELINE: Final = Path(__file__).with_name("baseline.json")
-"""Baseline that comes with the package."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,6 @@ class Metric:
     unit: str
     """Unit of the value; empty for a ratio."""
     direction: Literal["lower", "higher"] = "lower"
-    """Direction in which the figure is better."""
     bound: float | None = None
     """Worst value allowed, if any value is not."""
     tolerance: float | None = None
@@ -59,7 +57,6 @@ class Compared:
     metric: Metric
     """Figure of this run, NaN where the run has none."""
     baseline: float | None
-    """Value of the baseline, if it has one."""
 
     @property
     def worse(self) -> bool:

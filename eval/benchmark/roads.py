@@ -113,7 +113,6 @@ class Drives:
     readings: dict[int, Log]
     """A short dense road, by the number of detections in a cycle."""
     laps: Log
-    """Laps of a closed road."""
     lap_ends: Array
     """Stamps at which the laps end (m,), s."""
 

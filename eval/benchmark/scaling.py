@@ -41,9 +41,7 @@ class Lane:
     """An estimator that is to map a log."""
 
     estimator: str
-    """Name of the estimator."""
     log: Log
-    """Log to map."""
     readings: int = 0
     """Number of detections in each cycle of the log, where they are varied."""
 
@@ -124,7 +122,6 @@ class Scaling:
     """All results of the measurement."""
 
     settings: ScalingSettings
-    """Settings of the measurement."""
     mapper: dict[str, Any]
     """Settings of the estimators, in full."""
     points: pd.DataFrame

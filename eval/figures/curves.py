@@ -190,7 +190,6 @@ class Simplification:
     curvature: Array
     """Old curve's curvature (n,) there (1/m)."""
     weighted: Simplified
-    """Curve on curvature-weighted knots."""
     uniform: Simplified
     """Curve on as many knots at equal lengths."""
 

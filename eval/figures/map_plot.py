@@ -52,7 +52,6 @@ TRAJECTORY_COLOR: Final = GREEN
 HEALTH_COLORS: Final = {DEGRADED: PURPLE, LOST: RED}
 """Colours of the trajectory where it is not good."""
 BAND_ALPHA: Final = 0.35
-"""Opacity of the uncertainty band."""
 
 TENTATIVE_DASHES: Final = (0, (4, 2))
 """Dashes of the stretch of a curve that is not confirmed."""
@@ -63,7 +62,7 @@ class MapStyle:
     """Line widths and marker sizes (pt), which depend on how much of a track a panel shows."""
 
     curve_width: float = 0.7
-    """Width of a boundary."""
+    """Width of boundaries."""
     path_width: float = 0.6
     """Width of the trajectory; the true path is thinner."""
     marker_size: float = 2.6

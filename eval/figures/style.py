@@ -36,7 +36,6 @@ THIN_WIDTH: Final = 0.5
 MARKER_SIZE: Final = 4.0
 """Size of a control point or a detection (pt)."""
 ALPHA: Final = 0.25
-"""Opacity of a filled area."""
 
 BLUE: Final = "#0067A9"
 ORANGE: Final = "#D98200"
@@ -48,9 +47,7 @@ GREY: Final = "#8C8C8C"
 LIGHT: Final = "#B0B0B0"
 # every kind of colour vision tells blue from orange, and so does a print without colours
 PALETTE: Final = (BLUE, ORANGE, RED, PURPLE, GREEN, DARK)
-"""Colours of things that are compared, in order."""
 MARKERS: Final = "os^Dv*<>PXphd"
-"""Shapes of things that are compared, in order."""
 
 _RC: Final = {
     "font.size": FONT_SIZE,

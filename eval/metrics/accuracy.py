@@ -115,8 +115,7 @@ CENTRE_STEP: Final = 1.0
 CHORD: Final = 0.25
 """Length of the chords whose crossings are counted (m)."""
 FARTHEST: Final = 3.0
-"""Distance from the mapped boundary beyond which a true one is missed (m), as cones are in the paper's
-table."""
+"""Distance from the mapped boundary beyond which a true one is missed (m), as in the paper's table."""
 ROUND_OFF: Final = 1e-9
 """Share of a step by which a length may exceed whole steps without a further one."""
 _OVERLAP: Final = 3
@@ -124,7 +123,6 @@ _OVERLAP: Final = 3
 _CACHED: Final = 16
 """Number of true curves in the cache, since every map of a log is compared with the same ones."""
 _MIN_CONES: Final = 2
-"""Least number of cones of a curve."""
 
 
 # --- points on curves ------------------------------------------------------------------------------------

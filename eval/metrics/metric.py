@@ -18,7 +18,6 @@ FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3, "°": float(np.ra
 MEAN_DIGITS: Final = 2
 """Least number of digits after the decimal point of a mean with its interval."""
 UNKNOWN: Final = "–"
-"""Text of an unknown value."""
 EVERY_LAP: Final = "all"
 """Suffix of a column that is the average over all laps, such as `rmse@all`."""
 LATER_LAPS: Final = "later"

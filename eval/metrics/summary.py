@@ -28,7 +28,6 @@ from .consistency import normal_errors
 from .trajectory import ate, trajectory_errors
 
 LIBRARIES: Final = ("pathspace-graph", "gtsam", "numpy", "scipy")
-"""Libraries whose versions are recorded."""
 
 
 def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:

@@ -61,8 +61,7 @@ def ate(t: Array, poses: Array, truth: Truth) -> float:
 
 
 def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
-    """Return the largest position error (m), its rms in the last second (m), and whether that is a vehicle
-    that is lost."""
+    """Return the largest position error (m), its rms in the last second (m), and whether that is lost."""
     errors = trajectory_errors(t, poses, truth)
     if len(errors) == 0:
         return {}
@@ -145,8 +144,7 @@ class TrueRoad:
     t: Array
     """Stamps (N,) in s of the true poses."""
     drive: Array
-    """(N, 4) Rows [station, x, y, theta] in m and rad: length driven so far, and true pose; theta isn't
-    wrapped."""
+    """(N, 4) Rows [station, x, y, theta] (m, rad): length driven and true pose; theta isn't wrapped."""
     stations: Array
     """(P,) Lengths at which the drive passes a true cone in m, ascending; every lap passes every cone."""
     cones: Array

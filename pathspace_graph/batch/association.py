@@ -21,7 +21,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary
 
 DENSITY_STEP: Final = 0.1
-"""Cones are peaks of the density of detections along a curve, which is sampled at this step (m)."""
+"""Step at which the density of detections along a curve is sampled (m); cones are its peaks."""
 SEPARATION: Final = 0.6
 """Least distance of two cones along a curve, as a share of `growth.merge_radius`. It is less than 1, as the
 inner curve of a bend is shorter than the distances of its cones add up to."""
@@ -30,17 +30,17 @@ BANDWIDTH: Final = 0.4
 SHARP: Final = 0.6
 """Largest standard deviation of detections that say where a cone stands, m."""
 SHARP_SHARE: Final = 0.1
-"""All detections say it where fewer than this share of them is that certain."""
+"""Share of so certain detections below which all of them say it."""
 MIN_SHARE: Final = 0.1
-"""A cluster with fewer detections than this share of the median cluster's is no cone."""
+"""Least size of a cone's cluster as a share of the median cluster's."""
 MIN_SHARE_BESIDE: Final = 0.3
 """`MIN_SHARE` of a cluster beside a curve, whose detections aren't used."""
 MIN_CONES: Final = 4
-"""A curve is fitted to no fewer cones than this, and no cone is removed where there are fewer."""
+"""Least number of cones of a curve, below which none is removed."""
 FOLD_COSINE: Final = 0.5
 """The row of cones folds back at a cone where the cosine of its turn is less than minus this value."""
 FOLD_DISTANCE: Final = 1.5
-"""A cone at which the row folds back is a duplicate if its nearer neighbour is closer than this (m)."""
+"""Distance to its nearer neighbour below which a cone at which the row folds back is a duplicate (m)."""
 
 
 # --- poses along the curves ------------------------------------------------------------------------------
@@ -245,8 +245,7 @@ def certainty(detections: DetectionTable, rows: IntArray) -> Array:
 
 
 def sharp(rows: IntArray, detections: DetectionTable) -> IntArray:
-    """Return the rows whose detections say where a cone stands; those of far ones are smeared over
-    several."""
+    """Return the rows whose detections say where a cone stands; those of far ones are smeared."""
     sigma = np.sqrt(0.5 * np.trace(detections.covariance[rows], axis1=1, axis2=2))
     certain = rows[sigma < SHARP]
     return certain if len(certain) >= SHARP_SHARE * len(rows) else rows

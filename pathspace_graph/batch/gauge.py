@@ -46,8 +46,7 @@ class CurveGauge:
     gradient, so it isn't part of the cost."""
 
     def terms(self, control_points: Array, beside: Array) -> tuple[Array, Array, Array]:
-        """Return whitened residuals (m,) of control points (m, 2) beside poses (m, 3), and derivatives by
-        both."""
+        """Return whitened residuals (m,) of control points (m, 2) beside poses (m, 3), and derivatives."""
         heading = _headings(beside) / self.sigma
         arm = control_points - beside[:, :2]
         by_theta = heading[:, 0] * arm[:, 1] - heading[:, 1] * arm[:, 0]
@@ -55,7 +54,7 @@ class CurveGauge:
         return residual, heading, np.column_stack([-heading, by_theta])
 
     def beside(self, control_points: Array, poses: Array) -> Rows:
-        """Return the same as rows on [control point | pose], from all poses (P, 3)."""
+        """Return `terms` as rows on [control point | pose], from all poses (P, 3)."""
         residual, by_point, by_pose = self.terms(control_points, poses[self.cycle])
         jacobian = np.column_stack([by_point, by_pose])
         return Rows(self._keys_beside, jacobian, residual, owners(self.cycle, self.label))
@@ -79,7 +78,7 @@ class CurveGauge:
         return residual, by_control.reshape(len(residual), POINT, -1), by_pose
 
     def smooth(self, control_points: Array, poses: Array) -> Rows:
-        """Return the same as rows on [three control points | pose], two rows for each second difference."""
+        """Return `bending` as rows on [three control points | pose], two rows for each second difference."""
         residual, by_control, by_pose = self.bending(control_points, poses)
         keys = np.column_stack([self.keys[self.neighbours], pose_keys(self.middle_cycle)])
         return Rows(
@@ -142,8 +141,7 @@ class CurveGauge:
 
 
 def curve_gauge(state: State, label: int, sigma: float, until: int | None = None) -> CurveGauge:
-    """Return the gauge that holds each control point where it is now, beside a pose of a cycle before
-    `until`."""
+    """Return the gauge that holds each control point where it is, beside a pose of a cycle before `until`."""
     boundary, control_points, poses = state.boundaries[label], state.control_points(label), state.poses
     mean_spacing = boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)
     cycle = _nearest_poses(state, label, until, mean_spacing)

@@ -42,8 +42,7 @@ from .start import Recurrence, start_odometry
 from .system import BatchSystem, Biweight, Evaluation, own_settings
 
 USED_AGAIN: Final = 0.85
-"""Least share of the detections after the first lap on a closed result, as a part of that of the first
-lap."""
+"""Least share of the detections after the first lap on a closed result, over that of the first lap."""
 MISFIT: Final = 1.5
 """Most distance of detections after the first lap from its curves, in sigmas (root mean square)."""
 GAP: Final = 25.0
@@ -51,10 +50,9 @@ GAP: Final = 25.0
 OVERLAP: Final = 15.0
 """Least length that has been driven again (m)."""
 SIGMA: Final = 0.3
-"""The detections after the first lap hold their drive beside the curves by this standard deviation at most
-(m), in every direction."""
+"""Largest standard deviation by which later laps' detections hold their drive beside the curves (m)."""
 WIDER: Final = 2.5
-"""No point of a boundary is farther from the road driven than this number of times its distance beside it."""
+"""Largest ratio of a boundary point's distance from the road driven to the drive's distance beside it."""
 MOSTLY: Final = 95.0
 """Percentile of the poses' distances: the drive may begin or end off the track."""
 FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, knot_passes=1, tolerance=10.0)
@@ -91,7 +89,7 @@ class OpenLap:
     first_kept: int
     """The poses from this cycle on stay variables of the window."""
     start: ClosedMap | Recurrence
-    """The search begins at a map, or at odometry alone, where the path driven recurs after a lap."""
+    """Start of the search: a map, or odometry alone, where the path driven recurs after a lap."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +107,7 @@ class LapMarginal:
     poses: Array
     """(P, 3) Poses of all cycles of the lap, map frame."""
     first_kept: int
-    """The marginal has all measurements of the poses before this cycle, and none of later ones."""
+    """Cycle before whose pose all measurements are in the marginal, and no later ones."""
     mean: Array
     """(n,) Mean of the marginal."""
     information: Array
@@ -226,7 +224,7 @@ class Evidence:
     """What speaks for or against a closed result."""
 
     closed: bool
-    """True where both boundaries are closed."""
+    """Whether both boundaries are closed."""
     used: float
     """Share of the coloured detections of the first lap that lies on the curves."""
     used_again: float

@@ -56,7 +56,7 @@ class BatchResult(BatchRun):
     """Joint covariance (2m, 2m) of the control points of both boundaries, left first, in m^2. It comes from
     the measurements alone: the scatter of the cones isn't added."""
     scatter: Scatter
-    """How far cones lie from the map's curves, which have too few control points to follow them."""
+    """Distance of the cones from the map's curves, which have too few control points to follow them."""
     calibration: Array
     """Calibration (2,): scale error of the speeds [-], bias of the yaw rate [rad/s]."""
     online: RunResult | None
@@ -66,7 +66,6 @@ class BatchResult(BatchRun):
     system: BatchSystem
     """Problem that was solved, on curves with about one knot for each cone."""
     optimum: Evaluation
-    """Problem at the optimum."""
 
     @cached_property
     def pose_covariances(self) -> Array:
@@ -100,7 +99,7 @@ class BatchResult(BatchRun):
 
 @log_at_scale
 class BatchMapper:
-    """Maps a whole log at once."""
+    """Mapper of a whole log at once."""
 
     def __init__(
         self,

@@ -19,12 +19,11 @@ from .gauge import CurveGauge
 from .system import BatchSystem, Evaluation
 
 ROOM: Final = 4.0
-"""A factor searches its foot points this far (m along the curve) from where they are."""
+"""Distance from its foot points in which a factor searches them (m along the curve)."""
 HALVINGS: Final = 6
-"""Times that the room is halved at most while another foot point in it is nearer: where a bend turns about a
-detection."""
+"""Most halvings of the room while another foot point in it is nearer, as in a bend about a detection."""
 SAME: Final = 1e-3
-"""Two foot points closer than this (m along the curve) are the same."""
+"""Distance below which two foot points are the same (m along the curve)."""
 
 
 def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:

@@ -23,27 +23,26 @@ from .system import BatchSystem, Biweight, Evaluation, moved
 LOOSE_GATE: Final = 8.0
 """Gate of the first round (sigmas)."""
 GATE_FACTOR: Final = 0.7
-"""The gate is multiplied by this from each round to the next, down to `batch.gate`."""
+"""Factor of the gate from each round to the next, down to `batch.gate`."""
 SEARCH: Final = 20
-"""Associations are found anew in this number of rounds."""
+"""Rounds in which associations are found anew."""
 SETTLE: Final = 8
-"""Foot points are refined again at most this number of times before a step."""
+"""Most refinements of the foot points before a step."""
 POSE_STEPS: Final = 3
 """Gauss-Newton steps of the poses alone at first, while the map of the start is held."""
 ROUGH_TOLERANCE: Final = 8.0
-"""The tolerances are multiplied by this in the first optimization, on knots that follow the start."""
+"""Factor of the tolerances in the first optimization, on knots that follow the start."""
 TOLERANCE_COST: Final = 1e-5
-"""At convergence, |cost_before - cost_after| over a round is at most this share of the cost."""
+"""Largest |cost_before - cost_after| over a round at convergence, as a share of the cost."""
 TOLERANCE_CURVE: Final = 2e-3
-"""No point of a curve then moves farther than this across it in a round, as seen from its poses (m)."""
+"""Largest move of a point of a curve across it in a round then, as seen from its poses (m)."""
 TOLERANCE_DECREASE: Final = 5e-3
-"""An undamped step would then make the cost smaller by no more than this. A step of one sigma in any
-direction makes it smaller by 1/2, also where it swings a whole map by metres."""
+"""Largest decrease of the cost by an undamped step then. A step of one sigma in any direction makes it
+smaller by 1/2, also where it swings a whole map by metres."""
 CURVE_SAMPLES: Final = 2
 """Points in each knot interval at which the movement of a curve is measured."""
 SHARES: Final = (0.3, 0.97)
-"""Between these, the share that a step has of the one before lets it be extended to the sum of those that
-would follow it."""
+"""Shares of the step before between which a step is extended to the sum of those that would follow it."""
 
 
 REASONS: Final = {True: "nothing changes any more", False: "no round left"}
@@ -52,10 +51,10 @@ REASONS: Final = {True: "nothing changes any more", False: "no round left"}
 
 @dataclass(frozen=True, eq=False)
 class Convergence:
-    """How an optimization ended."""
+    """End of an optimization."""
 
     converged: bool
-    """True where nothing changed any more."""
+    """Whether nothing changed any more."""
     reason: str
     rounds: int
     """Times that foot points, gates and weights were refreshed."""
@@ -71,19 +70,17 @@ class Convergence:
 
 @dataclass(frozen=True)
 class Schedule:
-    """How an optimization goes on from round to round."""
+    """Gate, rounds and tolerances of an optimization."""
 
     gate: float
     """Gate of the first round (sigmas)."""
     rounds: int
-    """Most rounds."""
     tolerance: float = 1.0
-    """Factor of every tolerance."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How long the optimum of a log is searched for."""
+    """Length of the search for the optimum of a log."""
 
     rough_rounds: int = 24
     """Most rounds of the first optimization, on knots that follow the start."""
@@ -96,7 +93,7 @@ class Effort:
 
 
 class Optimizer:
-    """An optimizer takes a state to the minimum of the problem; it calls `on_round` after each round."""
+    """Levenberg-Marquardt from a state to the minimum; `on_round` is called after each round."""
 
     def __init__(
         self,
@@ -174,8 +171,7 @@ class Optimizer:
         return at, self._report(at, schedule.rounds, self.predicted_decrease(at), False)
 
     def _refreshed(self, state: State, gate: float, strict: bool, held: bool = False) -> Evaluation:
-        """Return the problem of a new round; associations and sigmas are those of the round before if
-        `held`."""
+        """Return the problem of a new round, with the associations and sigmas of the last one if `held`."""
         system = self.system
         if not strict:
             locate_poses(state, self.settings.association)

@@ -23,14 +23,14 @@ from pathspace_graph.spline.knots import chosen_breaks, fit_spline, refit
 from .association import MIN_CONES, associate, cones_of_curve, find_anywhere, first_parameter, locate_poses
 
 MIN_SIZE_SHARE: Final = 0.6
-"""The map's curves are tried with at least this share of the largest number of control points."""
+"""Least share of the largest number of control points that the map's curves are tried with."""
 ALIKE: Final = (3.0, 0.01)
 """Parameters of two curves through the same cones differ by less than `a + b L` (m), with L their length."""
 FOLDS: Final = 4
 """Groups of the cross-validation, which the cones are dealt to in turn. So the neighbours of a cone that is
 left out are always there."""
 FOOT_ROOM: Final = 1.5
-"""The foot point of a cone is searched this far (m along the curve) from its own place."""
+"""Distance from its own place in which the foot point of a cone is searched (m along the curve)."""
 
 
 # --- knots -----------------------------------------------------------------------------------------------
@@ -58,8 +58,7 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
 
 
 def size_share(cones: Mapping[int, int], batch: BatchSettings) -> float:
-    """Return the control points per cone: the settings' share, or their size over all cones of the
-    boundaries."""
+    """Return the control points per cone: the settings' share, or their size over all cones."""
     total = sum(cones.values())
     return batch.size_share if batch.size is None or total == 0 else batch.size / total
 
@@ -189,7 +188,7 @@ def map_block(state: State, label: int) -> slice:
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """How far cones lie from the simplified curves: a variance to be added to that of the curves.
+    """Distance of cones from the simplified curves: a variance to be added to that of the curves.
 
     `sigma^2(u) = seen^2 + (d / s)^2 (unseen^2 - seen^2)`, where d is the distance along the curve from u to
     the nearest detected cone, and s is the usual distance of two such cones. A cone that was never detected

@@ -36,34 +36,33 @@ from .simplification import boundary_of, exact_settings, fit_through
 ComplexArray = NDArray[np.complex128]
 
 PROFILE_STEP: Final = 0.5
-"""The path driven is sampled at this step (m)."""
+"""Step at which the path driven is sampled (m)."""
 SMOOTHING: Final = 3.0
-"""The curvature is averaged over this length (m)."""
+"""Length over which the curvature is averaged (m)."""
 CORRELATION_SHARE: Final = 0.8
-"""A lap is about the shortest lag whose correlation is at least this share of the largest one."""
+"""Least correlation of a lap's lag as a share of the largest one; a lap is about the shortest such lag."""
 RECURS: Final = 0.7
 """Least correlation of the curvature with itself a lap later. On a track of two loops of which one is wider,
 it is 0.56 at most after one of them."""
 MIN_OVERLAP: Final = 20.0
-"""The path must go on for this length (m) after a lap, or else the lap isn't found: over less, straights
-agree with straights."""
+"""Least length of the path after a lap (m): over less, straights agree with straights."""
 REFERENCE_STEP: Final = 8.0
 """Distance of the reference poses that every lap passes (m)."""
 LAP_SIGMAS: Final = np.array([1.5, 1.5, 0.15])
 """Standard deviations of a lap's pose about the reference pose that it passes (m, m, rad)."""
 ALIGN_STEPS: Final = 8
-"""Gauss-Newton steps at most that bring the laps together."""
+"""Most Gauss-Newton steps that bring the laps together."""
 ALIGN_TOLERANCE: Final = 1e-6
-"""They are brought together when a step moves nothing farther than this (m, rad)."""
+"""Largest move of a step at which they are together (m, rad)."""
 MAX_LATERAL: Final = 15.0
-"""A boundary has detections nearer to the driven path than this (m)."""
+"""Distance from the driven path within which a boundary has detections (m)."""
 
 
 # --- from an online run ----------------------------------------------------------------------------------
 
 
 class CurveMapper(OnlineEstimator, Protocol):
-    """An online estimator with curves, such as `FixedLagMapper`. The batch can begin with its map."""
+    """An online estimator with curves, such as `FixedLagMapper`, with whose map the batch can begin."""
 
     @property
     def boundaries(self) -> dict[int, Boundary]:
@@ -110,7 +109,7 @@ def unwrap(poses: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Recurrence:
-    """The length of the path driven, and after which length it recurs."""
+    """Length of the path driven, and after which length it recurs."""
 
     driven: Array
     """Path lengths (P,) from the first pose to each pose (m)."""

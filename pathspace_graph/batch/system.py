@@ -72,13 +72,12 @@ class Projected:
     """Rows (m,) of the detections in their table."""
     foot: FootPoints
     projection: ProjectionRows
-    """Residuals and derivatives."""
     sigma: Array
     """Standard deviations (m,) across the curve in m."""
     inside: BoolArray
-    """Set (m,) where the foot point was inside the curve when the round began."""
+    """Whether each foot point (m,) was inside the curve when the round began."""
     by: SensorRows
-    """How the residuals depend on the calibration of the sensor."""
+    """Derivatives of the residuals by the calibration of the sensor."""
 
     @property
     def whitened(self) -> Array:
@@ -88,7 +87,7 @@ class Projected:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The problem at one state."""
+    """Problem at one state."""
 
     state: State
     projected: dict[int, Projected]
@@ -100,7 +99,7 @@ class Evaluation:
 
 
 class BatchSystem:
-    """The problem is to minimize `sum rho(detections) + 1/2 |odometry, gauge, calibration, first pose|^2`."""
+    """Problem of minimizing `sum rho(detections) + 1/2 |odometry, gauge, calibration, first pose|^2`."""
 
     def __init__(
         self, detections: DetectionTable, chain: LogOdometry, settings: MapperSettings, kernel: Biweight
@@ -233,8 +232,7 @@ class BatchSystem:
 
 
 def seen_from(points: Array, poses: Array, points_after: Array, poses_after: Array) -> Array:
-    """Return points (m, 2) in the frames of poses (m, 3) after a step, to first order; all are in the map
-    frame."""
+    """Return points (m, 2), map frame, in the frames of poses (m, 3) after a step, to first order."""
     arm, change = points - poses[:, :2], points_after - points - poses_after[:, :2] + poses[:, :2]
     turn = (poses_after[:, 2] - poses[:, 2])[:, None]
     return turned(arm + change + turn * np.column_stack([arm[:, 1], -arm[:, 0]]), -poses[:, 2])

@@ -48,8 +48,7 @@ class Compare:
     reference: str | None = None
     """Estimator that the others are compared with: fixed-lag where it runs, otherwise the first."""
     jobs: int = 1
-    """Number of runs at a time, -1 for one on each core. The times of updates are comparable with 1 job
-    only."""
+    """Number of runs at a time, -1 for one on each core; times of updates are comparable with 1 only."""
     ghosts: GhostSettings = field(default_factory=GhostSettings)
     """Definition of a ghost."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)

@@ -46,8 +46,7 @@ class Export:
     speed: SpeedSettings = field(default_factory=SpeedSettings)
     """Vehicle of a `profile`."""
     start_speed: float | None = None
-    """Speed at which the `profile` of an open track begins (m/s), by default as fast as its curvature
-    allows."""
+    """Speed at which the `profile` of an open track begins (m/s), by default what its curvature allows."""
     stop: bool = False
     """End the `profile` of an open track at a standstill."""
 

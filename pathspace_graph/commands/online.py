@@ -60,8 +60,7 @@ class Online:
     save_view: Path | None = None
     """File (.rrd) for what the viewer shows; an earlier one is kept as a numbered backup."""
     animate: Path | None = None
-    """File for a film of the run (.gif, or .mp4 where ffmpeg is installed); an earlier one is kept as a
-    numbered backup."""
+    """File for a film (.gif, or .mp4 if ffmpeg is installed); an earlier one is kept as a numbered backup."""
     recording: RecordingSettings = field(default_factory=RecordingSettings)
     """What the viewer shows."""
     film: FilmSettings = field(default_factory=FilmSettings)
@@ -116,8 +115,7 @@ class Online:
 
 
 def tell(hints: Sequence[Hint], of: str = "") -> None:
-    """Print a line for each hint as an error, with the name of the log `of` which it is where there are
-    several."""
+    """Print a line for each hint as an error, with the name of the log `of` which it is, if given."""
     say = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
     for hint in hints:
         say.print(f"hint: {of}{'/' if of else ''}{hint.line}")
@@ -138,8 +136,7 @@ def map_online(
 
 
 def report(result: RunResult, log: Log) -> None:
-    """Print the run in a line, the paper's table where there is truth, and what was not mapped as an
-    error."""
+    """Print the run, the paper's table where there is truth, and as an error what was not mapped."""
     console = Console()
     laps = laps_of(result, log)
     if laps:

@@ -108,7 +108,7 @@ class Ablate(StudyCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class FaultSuite(StudyCommand):
-    """Run every fault of the suite, or what remains of it, and write a table and a figure of what it costs.
+    """Run the suite of faults, or what remains of it, and write a table and a figure of what each costs.
 
     The suite is the shipped study `faults`. Each run is compared with the clean run on the same track and
     with the same seed.

@@ -46,7 +46,7 @@ NEAREST: Final = 2
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """The readings of a cycle after they were judged."""
+    """Readings of a cycle after they were judged."""
 
     motion: MeasuredMotion
     """Motion that leads to the cycle."""
@@ -65,7 +65,7 @@ class Reading:
 
 
 class FrontEnd:
-    """Judges the readings of each cycle by those of the cycles before, without any map."""
+    """Judge of each cycle's readings by those of the cycles before, without any map."""
 
     def __init__(self, settings: MapperSettings, noise: KnownNoise) -> None:
         self.noise = NoiseLearner(noise, settings.noise)
@@ -145,18 +145,16 @@ class FrontEnd:
 
 @dataclass(frozen=True, eq=False)
 class JudgedLog:
-    """The readings of a whole log after they were judged cycle by cycle."""
+    """Readings of a whole log after they were judged cycle by cycle."""
 
     chain: LogOdometry
     """Motion from each cycle to the next."""
     cycles: Sequence[Detections]
-    """Detections of each cycle."""
     orange: Sequence[Detections]
     """Those of orange cones."""
     settings: MapperSettings
     """Settings, with wide priors of the sensor where the readings contradict them."""
     noise: RunNoise
-    """Noise that was used."""
 
 
 def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLog:
@@ -222,7 +220,6 @@ class LateDetections:
     detections: Detections
     """Detections in the vehicle frame of that pose."""
     cycle: int
-    """Perception cycle of the pose."""
     twist: Array
     """(3,) Mean twist of the vehicle then, m/s, m/s and rad/s."""
 

@@ -27,7 +27,6 @@ from pathspace_graph.settings.online import LimitSettings
 UNITS: Final = "stamps are in seconds"
 """Hint where a stamp looks like one in milliseconds or nanoseconds."""
 TWIST: Final = ("vx", "vy", "wz")
-"""Columns of a twist."""
 MAX_STAMP: Final = 1e11
 """Largest stamp, s: some three thousand years. Stamps in nanoseconds are larger."""
 MIN_INTERVAL: Final = 1e-3
@@ -42,7 +41,7 @@ MIN_SIGMA: Final = 1e-6
 MAX_SIGMA: Final = 100.0
 """Least and largest standard deviation of a detection in any direction, m."""
 MIN_DETERMINANT: Final = 1e-12
-"""A covariance with det <= this * xx * yy is singular to double precision, so not positive definite."""
+"""Least det of a covariance over xx * yy; below, it is singular to double precision."""
 MAX_ASYMMETRY: Final = 1e-6
 """Largest difference of the entries xy and yx of a covariance, by its larger eigenvalue."""
 
@@ -64,9 +63,7 @@ class Admitted:
     odometry: Odometry
     """Twists in force from the newest cycle in order to this one; a late cycle has none."""
     detections: Detections
-    """The possible detections."""
     dropped: int = 0
-    """Number of detections that were dropped."""
     late: bool = False
     """Whether the cycle is older than the newest one, and is used at its own time."""
     refused: int = 0
@@ -115,7 +112,7 @@ def admit(
 
 
 class Gate:
-    """Counts what was refused, and remembers which late cycles were used."""
+    """Counter of refused cycles, which remembers the late cycles that were used."""
 
     def __init__(self, limits: LimitSettings) -> None:
         self.limits = limits

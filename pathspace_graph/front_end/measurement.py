@@ -32,26 +32,26 @@ FIRST_ALONG: Final = (0.1, 0.04)
 FIRST_ACROSS: Final = (0.05, 0.016)
 """Noise that the iteration begins with: m and m/m, then m and rad."""
 PASSES: Final = 4
-"""Number of times that cones are followed."""
+"""Times that cones are followed."""
 FOLLOWED: Final = 40
-"""Number of cycles in which cones are followed in a step."""
+"""Cycles in which cones are followed in a step."""
 ROUNDS: Final = 5
-"""Number of times that errors, noise and weights are found in turn."""
+"""Times that errors, noise and weights are found in turn."""
 STRETCH: Final = 3.0
 """Time (s) over which errors of the odometry are alike."""
 COUNTED: Final = 0.8
-"""Cones beyond this share of `MAX_RANGE` hardly count: they are followed only where they seem nearer."""
+"""Share of `MAX_RANGE` beyond which cones hardly count: they are followed only where they seem nearer."""
 HARDLY: Final = 1e-6
 """Weight of their sightings. It is not zero, so that a cone seen only there still has a place."""
 HUBER: Final = 2.0
 MIN_COUNT: Final = 5
-"""A cone counts with this number of sightings."""
+"""Least number of sightings of a cone that counts."""
 MIN_ROWS: Final = 60
-"""Noise of detections is told from this number of sightings with a reference."""
+"""Least number of sightings with a reference that tell the noise of detections."""
 NEAR: Final = 0.6
-"""The reference of a sighting are those of the same cone from less than this share of its range."""
+"""Share of a sighting's range within which the same cone's sightings are its reference."""
 NEAR_TIME: Final = 6.0
-"""They are at most this time (s) away, for which odometry is trusted."""
+"""Greatest time to a reference (s), over which odometry is trusted."""
 BINS: Final = 8
 TIMES: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 """Correlation times that are tried (s)."""
@@ -62,7 +62,7 @@ MODEL_ERROR: Final = 0.05
 FIRST_SHARE: Final = 0.5
 """Share of a cone's error that stays with it, as long as hardly any cone says otherwise."""
 FIRST_CONES: Final = 8.0
-"""That counts as much as this number of cones."""
+"""Number of cones that `FIRST_SHARE` counts as much as."""
 LEAST: Final = (0.02, 0.002)
 """Least noise along the ray (m) and across it (rad): a cone is no point."""
 
@@ -283,7 +283,7 @@ def _staying(cones: _Cones, left: _Residuals, axis: int, noise: RayNoise) -> tup
 
 
 class _Rounds:
-    """Finds errors, noise and weights in turn."""
+    """Search for errors, noise and weights in turn."""
 
     def __init__(self, sightings: Sightings, cones: _Cones, found: MeasuredNoise) -> None:
         self._sightings, self._cones, self._found = sightings, cones, found
@@ -333,7 +333,7 @@ class _Rounds:
 
 
 class Measurement:
-    """Measures noise in steps short enough for a perception cycle.
+    """Measurement of noise in steps short enough for a perception cycle.
 
     Cones are followed again with the noise and the errors that were found, from those known already on.
     """

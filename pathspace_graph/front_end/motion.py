@@ -38,8 +38,7 @@ DOUBT_RATE: Final = 2.0
 MIN_DOUBTING: Final = 4
 """Least number of matched detections of a contradiction."""
 MISFIT: Final = 1.5
-"""Mean-square misfit beyond which detections are worse than they claim: their covariances are multiplied by
-its excess."""
+"""Mean-square misfit beyond which detections are worse than they claim: its excess scales covariances."""
 MISFIT_GAIN: Final = 0.02
 """Smoothing gain of the mean-square misfit."""
 MAX_MISFIT: Final = 3.0
@@ -76,7 +75,7 @@ SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)
 
 
 class MotionCheck:
-    """Integrates the odometry of each cycle, and checks it against the detections of the newest cycles.
+    """Odometry of each cycle, checked against the detections of the newest cycles.
 
     The frame of this check is that of the motion so far. It drifts, and only its newest part is used.
     """
@@ -144,7 +143,7 @@ class MotionCheck:
 
     @property
     def newest(self) -> Newest:
-        """What the readings of the next cycle go on from."""
+        """Stamp and twist of the last accepted cycle."""
         t, twist = self._reading
         return Newest(self._t, twist if t > -np.inf else None)
 
@@ -302,7 +301,7 @@ class MotionCheck:
 
 
 class Rest:
-    """Tells from the odometry whether the vehicle stands, and averages the yaw rate meanwhile."""
+    """Judge of whether the vehicle stands, by the odometry; it averages the yaw rate meanwhile."""
 
     def __init__(self, sigma: Array) -> None:
         """Keep the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""

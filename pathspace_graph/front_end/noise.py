@@ -21,18 +21,18 @@ from .sightings import SeenCycle, TwistRecord
 FIRST: Final = 8.0
 """Driving time (s) after which noise is measured first."""
 AGAIN: Final = 1.5
-"""It is measured again each time that the driving time has grown by this factor."""
+"""Growth of the driving time after which it is measured again."""
 MOST_CYCLES: Final = 300
-"""It is measured on this number of newest cycles, which bounds its time."""
+"""Newest cycles on which it is measured, which bounds its time."""
 MIN_SPEED: Final = 0.3
-"""Driving is faster than this (m/s)."""
+"""Speed from which on the vehicle drives (m/s)."""
 SCALE: Final = SENSOR.index("range_scale")
 REFERENCE_RANGE: Final = 10.0
-"""Ranges are compared with speeds by their noise at this range (m)."""
+"""Range at whose noise ranges are compared with speeds (m)."""
 
 
 class NoiseLearner:
-    """Measures the noise of a drive as it goes on, never reading ahead."""
+    """Measurement of the noise of a drive as it goes on, which never reads ahead."""
 
     def __init__(self, known: KnownNoise, use: str | None) -> None:
         """Keep what is known before the drive; `use` is `MapperSettings.noise`."""

@@ -65,7 +65,7 @@ def reaches(iterations: int = ITERATIONS) -> list[float]:
 
 
 class RecentDetections:
-    """The detections of the newest cycles in one frame.
+    """Detections of the newest cycles in one frame.
 
     They are corrected by what is known now of the errors of the sensor, so that a cone stays where it is when
     more is learned of them.
@@ -111,7 +111,7 @@ class RecentDetections:
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """The pose that lays detections on earlier ones."""
+    """Pose that lays detections on earlier ones."""
 
     pose: Array
     """(3,) In the frame of the earlier detections, m, m and rad."""
@@ -213,7 +213,7 @@ def by_errors(points_vehicle: Array, twist: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """How far a match of detections is off the odometry, in the vehicle frame."""
+    """Distance of a match of detections from the odometry, in the vehicle frame."""
 
     off: Array
     """(3,) m, m and rad."""

@@ -66,7 +66,7 @@ MIN_WIDTH: Final = 1.8
 
 
 class SideJudge:
-    """Gives the detections of each cycle the labels of their sides."""
+    """Judge of the side of each detection, which gives it the label."""
 
     def __init__(self, settings: SidesSettings) -> None:
         self.settings = settings
@@ -237,7 +237,7 @@ def _costs(
 
 
 class NearCones:
-    """The cones near the vehicle as means of their detections, with the colours in which they were seen."""
+    """Cones near the vehicle as means of their detections, with the colours in which they were seen."""
 
     def __init__(self) -> None:
         self.points: Array = np.zeros((0, 2))

@@ -18,15 +18,14 @@ from pathspace_graph.io.log import Detections, Odometry
 MAD: Final = 1.4826
 """Standard deviation of a Gaussian by its median absolute deviation."""
 MOST_TWISTS: Final = 4000
-"""Number of newest twists that are kept."""
 MIN_SPEED_SHARE: Final = 0.3
-"""A vehicle slower than this share of its median speed says little of noise in motion."""
+"""Share of its median speed below which a vehicle says little of noise in motion."""
 MIN_TWISTS: Final = 30
-"""White noise is told from this number of twists."""
+"""Least number of twists that tell white noise."""
 MAX_RANGE: Final = 30.0
-"""Sightings farther than this (m) are not followed: they are hardly ever seen near later."""
+"""Range beyond which sightings are not followed (m): they are hardly ever seen near later."""
 MAX_AGE: Final = 3.0
-"""A cone that was not seen for this time (s) is another one when it is seen again."""
+"""Time without a sighting after which a cone counts as another one (s)."""
 GATE: Final = (0.4, 0.06, 1.5)
 """Gate of the nearest cone while its noise is not known, `min(a + b r, c)`, m."""
 GATE_SIGMAS: Final = 3.5
@@ -54,7 +53,6 @@ class Sightings:
 
     @classmethod
     def none(cls) -> Sightings:
-        """Return a table without rows."""
         empty = np.zeros(0)
         return cls(
             empty.astype(np.intp), empty, empty.reshape(0, 2), *(empty.reshape(0, 3) for _ in range(3))
@@ -93,7 +91,7 @@ def follow(cycles: Iterable[SeenCycle], known: MeasuredNoise) -> Sightings:
 
 
 class Follower:
-    """Holds the cones that were seen in the last seconds, by dead reckoning."""
+    """Cones that were seen in the last seconds, by dead reckoning."""
 
     def __init__(self, known: MeasuredNoise) -> None:
         self._known = known
@@ -209,7 +207,7 @@ class Follower:
 
 
 class TwistRecord:
-    """Keeps the newest twists that were measured while the vehicle drove."""
+    """Newest twists that were measured while the vehicle drove."""
 
     def __init__(self) -> None:
         self._parts: deque[Odometry] = deque()

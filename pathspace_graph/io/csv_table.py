@@ -21,7 +21,6 @@ class Column(NamedTuple):
     """What the numbers of a column must be."""
 
     largest: float = MAX_COORDINATE
-    """Largest size of a number."""
     unit: str = ""
 
 

@@ -18,7 +18,6 @@ from .parsing import parse_toml, read_text
 
 FORMAT: Final = "pathspace-log/1"
 POSITIVE: Final = math.ulp(0.0)
-"""Smallest positive number."""
 STATED: Final = "stated"
 UNSTATED: Final = ("measured", "assumed")
 """Noise that nobody has stated was measured, or it is assumed where the drive shows too little."""

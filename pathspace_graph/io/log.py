@@ -62,8 +62,7 @@ _SENSOR_INFO: Final = ("range_max", "fov", "rate")
 MAX_HOLD: Final = 1.0
 """Longest time for which the last twist is held (s); a perception cycle later than that has no odometry."""
 MIN_RELATIVE_DETERMINANT: Final = 1e-12
-"""Least det of a covariance over xx * yy; a smaller one is singular to double precision, so not positive
-definite."""
+"""Least det of a covariance over xx * yy; below, it is singular to double precision."""
 
 
 @dataclass(frozen=True, eq=False)

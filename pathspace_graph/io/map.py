@@ -28,9 +28,9 @@ NO_COVARIANCE: Final[Array] = np.zeros((0, 0))
 """Covariance of a boundary for which none was asked; it can't be written."""
 
 _SYMMETRY_TOLERANCE = 1e-9
-"""A covariance is symmetric to rounding where |P - P^T| <= tolerance * max|P|."""
+"""Largest |P - P^T| over max|P| of a covariance that is symmetric to rounding."""
 _NEGATIVE_TOLERANCE = 1e-9
-"""A covariance is positive semidefinite to rounding where min eigenvalue >= -tolerance * max eigenvalue."""
+"""Most negative eigenvalue over the largest one of a covariance that is positive semidefinite to rounding."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,7 +74,6 @@ NoiseSource = Literal["stated", "measured", "assumed"]
 """Where noise comes from: the log's statement, the drive, or a default."""
 
 CYCLES_FILE: Final = "cycles.csv"
-"""File of the cycles in a result folder."""
 _CYCLE_COLUMNS: Final = (
     *("cycle", "t", "seconds", "size_left", "size_right", "readings", "lap"),
     *("offered", "health", "reason", "dropped"),
@@ -235,7 +234,7 @@ class RunResult:
     observing: float = 0.0
     """Wall time of the observers, s, which is no part of the estimator's."""
     batches: LapBatches | None = None
-    """When batches of the lap have ended, where the estimator has such."""
+    """Ends of the batches of the lap, where the estimator has such."""
     waited: float = 0.0
     """Wall time for which the run waited for batches between cycles, s."""
     noise: RunNoise | None = None

@@ -97,7 +97,7 @@ WORKER_IDLE: Final = 600
 LATE: Final = "the batch of the lap was late"
 """Why a batch was given up that the process has not solved in time."""
 SOLVED: Final = 3.0
-"""A batch counts as solved within this distance (joint sigmas) of its optimum: its marginal has the rest."""
+"""Distance from its optimum at which a batch counts as solved (joint sigmas): its marginal has the rest."""
 
 
 class DriveRecord:

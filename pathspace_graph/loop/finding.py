@@ -31,11 +31,11 @@ from pathspace_graph.spline.boundary import Boundary
 _POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])
 """Unit vectors that choose the position of a pose."""
 FOUND: Final = "the vehicle was lost, and is found again"
-"""Begin of the notice of a cycle in which the window starts anew at the place that was found."""
+"""Beginning of the notice of a cycle in which the window starts anew at the place that was found."""
 BESIDE: Final = 1.0
 """Distance from the closed curve of its colour within which an unused detection is explained (m)."""
 GAP: Final = 3.0
-"""Neighbouring cones farther apart than this number of times the median have a gap between them."""
+"""Least distance of neighbouring cones with a gap between them, over the median."""
 INTERVAL: Final = 0.5
 """Least time between two attempts (s)."""
 MEMORY: Final = 60.0
@@ -47,15 +47,15 @@ MIN_DETECTIONS: Final = 40
 STEP: Final = 2.0
 """Distance of the places along the loop (m)."""
 LEAD: Final = 4.0
-"""The vehicle heads for the middle of the track this far ahead (m)."""
+"""Distance ahead of the point on the middle of the track that the vehicle heads for (m)."""
 MISFIT: Final = 3.0
 """Rms distance of the path driven from the middle within which a place is compared (m)."""
 REACH: Final = 3.0
-"""A detection that is farther from its curve counts as if it were this far (m)."""
+"""Distance from its curve that any farther detection counts as (m)."""
 STARTS: Final = 12
 """Largest number of places that are refined."""
 APART: Final = 4.0
-"""Two places that are less than this apart are one (m)."""
+"""Distance below which two places are one (m)."""
 SIGMAS_PLACE: Final = (3.0, 3.0, 0.2)
 """Standard deviations of the pose about a place, before it is refined (m, m, rad)."""
 SIGMA_FIT: Final = 0.3
@@ -69,8 +69,7 @@ SIGMA_MAX: Final = 0.5
 CONFIRMATIONS: Final = 2
 """Attempts, one after the other, that must find the same place."""
 WIDENING: Final = 3.0
-"""Factor of the registration's standard deviations in the prior of the found pose: its detections are used
-again."""
+"""Factor of the registration's sigmas in the prior of the found pose: its detections are used again."""
 STEPS: Final = 2
 """Gauss-Newton steps at the place that was found."""
 
@@ -249,9 +248,9 @@ class Hypothesis:
     """A place where the vehicle may be."""
 
     found: RefinedMotion
-    """The motion moves the window onto the place."""
+    """Motion of the window onto the place."""
     score: float
-    """How well the detections lie on the map there, from 0 to 1."""
+    """Agreement of the detections with the map there, from 0 to 1."""
 
 
 class Search:

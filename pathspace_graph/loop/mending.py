@@ -30,7 +30,7 @@ from pathspace_graph.spline.bspline import BSpline, sampled
 from .finding import KnownLoop, Loop
 
 MENDED: Final = "the map was mended"
-"""Begin of the notice of a cycle in which mended curves take the place of the old ones."""
+"""Beginning of the notice of a cycle in which mended curves take the place of the old ones."""
 SIGHTINGS: Final = 6
 """Detections after which a cone contradicts the map: one that the vehicle passes is detected about twenty
 times, and a place in clutter hardly more than once."""
@@ -186,7 +186,7 @@ class Mending:
         return bool(self._stretches)
 
     def end(self, marginal: LapMarginal | str) -> str:
-        """End an attempt; returns the notice of a map that explains the contradictions, or an empty one."""
+        """End an attempt; return the notice of a map that explains the contradictions, or an empty one."""
         stretches, self._stretches = self._stretches, []
         if isinstance(marginal, str):
             return ""

@@ -40,12 +40,12 @@ STARTS: Final = 6
 
 @dataclass(frozen=True, eq=False)
 class RecognizedPlace:
-    """A place is where the newest stretch of the curves lies on an earlier stretch."""
+    """Place where the newest stretch of the curves lies on an earlier stretch."""
 
     motion: Motion
-    """The motion moves the newest stretch onto the earlier one."""
+    """Motion of the newest stretch onto the earlier one."""
     beside: dict[int, float]
-    """The newest pose was there beside each boundary at this parameter (m), a lap or more before."""
+    """Parameter of each boundary beside which the newest pose was there (m), a lap or more before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +148,7 @@ def _same(a: RecognizedPlace, b: RecognizedPlace, settings: ClosingSettings) -> 
 
 
 def _starts(state: State, prior: Array, settings: ClosingSettings) -> list[tuple[Array, float]]:
-    """Return motions (3,) onto earlier stretches that turn as the newest one does, the likest first.
+    """Return motions (3,) onto earlier stretches that turn as the newest one does, most similar first.
 
     Each goes with the parameter at which the earlier stretch of the first boundary begins. The headings along
     both stretches are compared, after a common turn.

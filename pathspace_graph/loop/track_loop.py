@@ -27,7 +27,7 @@ from .mending import Mending
 from .recognition import recognize
 
 OWN_PRIOR: Final = "the map goes on from the window's own prior"
-"""Begin of the notice of a cycle in which the batch of the lap does not replace the prior."""
+"""Beginning of the notice of a cycle in which the batch of the lap does not replace the prior."""
 LONGEST_WAIT: Final = 1.0
 """Longest time that a cycle waits for a batch (s), however long ago the cycle before it was."""
 REST: Final = 10.0
@@ -43,7 +43,7 @@ class LoopRefusedError(Exception):
 
 
 class TrackLoop:
-    """What is done about the loop: the batch of the open lap when it closes, and a vehicle that is lost."""
+    """The batch of the open lap when the loop closes, and the search for a vehicle that is lost."""
 
     def __init__(self, smoother: CurveSmoother, path: DrivenPath) -> None:
         self.settings = smoother.map.settings
@@ -352,7 +352,7 @@ class TrackLoop:
             self.record.give_up("the vehicle was lost")
 
     def find_back(self) -> tuple[Array | None, str]:
-        """Start the window anew where a lost vehicle is found; returns its jump (3,) and a notice."""
+        """Start the window anew where a lost vehicle is found; return its jump (3,) and a notice."""
         if self._search is None or self._rests:
             return None, ""
         found = self._search.find()

@@ -22,7 +22,7 @@ from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySe
 from .motion import MeasuredMotion
 
 _LEAST_VARIANCE: Final = 1e-12
-"""Eigenvalues are raised to this share of the largest one where a covariance has no Cholesky factor."""
+"""Share of the largest eigenvalue to which others are raised where a covariance has no Cholesky factor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,13 +74,13 @@ def transform(function: Callable[[Array], Array], mean: Array, covariance: Array
 
 _ODOMETRY: Final = slice(POSE, POSE + CALIBRATION_SIZE)
 HEAD: Final = POSE + CALIBRATION_SIZE + SENSOR_SIZE
-"""The state has this many entries before its points."""
+"""Number of entries of the state before its points."""
 SENSOR_COLUMNS: Final = np.arange(POSE + CALIBRATION_SIZE, HEAD)
 """Entries of the sensor's calibration in the state."""
 
 
 class Belief:
-    """A belief is a Gaussian over `x = [pose | calibration of odometry and sensor | points]`.
+    """Gaussian over `x = [pose | calibration of odometry and sensor | points]`.
 
     The pose (x, y, theta) and the points (x, y) are in the map frame, in m and rad. The calibration of the
     odometry is the scale error of the speeds and the bias of the yaw rate (rad/s), that of the sensor is
@@ -98,7 +98,7 @@ class Belief:
         self.covariance: Array = block_diag(covariance, np.diag(sigma**2))
         """(n, n) Covariance of x."""
         self.twist: Array = np.zeros(POSE)
-        """(3,) The vehicle moves with this twist, in m/s, m/s and rad/s."""
+        """(3,) Twist of the vehicle, in m/s, m/s and rad/s."""
 
     @classmethod
     def at_start(cls, settings: OdometrySettings, sensor: CalibrationSettings) -> Self:
@@ -144,7 +144,7 @@ class Belief:
         return VehicleState.split(self.pose, self.mean[POSE:HEAD], covariance)
 
     def follow(self, motion: MeasuredMotion) -> None:
-        """Predict the pose after a motion, and updates by a bias that was measured at rest."""
+        """Predict the pose after a motion, and update by a bias that was measured at rest."""
         self.predict(motion.odometry)
         if motion.bias is not None:
             measured, noise = np.array([motion.bias.value]), np.array([[motion.bias.sigma**2]])

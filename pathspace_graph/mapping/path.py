@@ -170,16 +170,16 @@ LATERAL_CHANGE: Final = 1.5
 LATERAL_RATE: Final = 0.2
 """Growth of `LATERAL_CHANGE` with the distance along the path (m/m)."""
 BESIDE: Final = 2.0
-"""Cones less than this apart along the path stand beside each other (m)."""
+"""Distance along the path below which cones stand beside each other (m)."""
 LATERAL_GAP: Final = 0.8
-"""A cone is behind the row if one beside it is nearer to the path by more than this (m)."""
+"""Distance beyond which a cone is behind the row if one beside it is nearer to the path by more (m)."""
 STATION_MARGIN: Final = 0.3
 """Least distance past the end of a curve of what extends it (m along the path)."""
 END_BEHIND: Final = 5.0
 """Farthest that the end of a curve is behind the vehicle (m along the path): a stranded end is carried on,
 and an older stretch of the path across the infield may be nearer to it, which means nothing."""
 STRANDED: Final = 2.0
-"""An end farther behind the vehicle than this, with nothing that extends it, is carried on (m)."""
+"""Distance behind the vehicle beyond which an end that nothing extends is carried on (m)."""
 CARRIED_TO: Final = 1.0
 """Distance behind the vehicle to which a stranded end is carried on (m)."""
 MIN_LATERAL: Final = 0.5

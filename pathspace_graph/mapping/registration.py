@@ -36,7 +36,6 @@ START_STEP: Final = 2.0
 START_CHI2: Final = 16.3
 """Their largest squared Mahalanobis distance under its uncertainty: 99.9 % of chi-square with 3 degrees."""
 MIN_DETECTIONS: Final = 25
-"""Least number of matched detections."""
 MIN_INLIERS: Final = 5
 """Least number of inliers on each boundary."""
 
@@ -108,12 +107,11 @@ class Matches:
 
 @dataclass(frozen=True, eq=False)
 class RefinedMotion:
-    """A motion that the registration has ended with."""
+    """Motion at the end of the registration."""
 
     motion: Motion
-    """The motion moves the detections onto their curves."""
+    """Motion of the detections onto their curves."""
     matches: Matches
-    """Detections at the last iteration."""
     covariance: Array
     """(3, 3) Covariance of the motion (m, m, rad)."""
 
@@ -236,7 +234,7 @@ def _match(
     stretches: Mapping[int, tuple[float, float]],
     reach: float,
 ) -> Matches:
-    """Match moved detections with a stretch of each curve, and linearizes those within `reach` (m)."""
+    """Match moved detections with a stretch of each curve, and linearize those within `reach` (m)."""
     moved = motion.apply(seen.points)
     hessian, negative_gradient = np.zeros((3, 3)), np.zeros(3)
     matched, u, inlier = [np.zeros(0, np.intp)], [np.zeros(0)], [np.zeros(0, bool)]

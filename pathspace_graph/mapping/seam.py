@@ -17,7 +17,7 @@ from .registration import BEGINNING
 EXTRAPOLATED: Final = 2
 """Knot intervals past the confirmed end whose parameters are mapped to the closed curve."""
 JOIN_MARGIN: Final = 10.0
-"""The seam lies within the last `BEGINNING` plus this length of a curve (m)."""
+"""Length before the end of a curve, beside `BEGINNING`, within which the seam lies (m)."""
 JOIN_SHARE: Final = 0.5
 """Share of a short curve past which the seam lies."""
 OVERLAP_STEP: Final = 1.0
@@ -25,7 +25,7 @@ OVERLAP_STEP: Final = 1.0
 OVERLAP_ROOM: Final = 4.0
 """Room about its expected place in which a point of the overlap is searched for (m along the curve)."""
 SEAM_MARGIN: Final = 0.5
-"""A cone nearer to the seam than this (m) was also detected at the beginning, and is not counted twice."""
+"""Distance from the seam below which a cone was also detected at the beginning, and counts once (m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class PeriodicCurve:
     points: Array
     """(m, 2) Control points in m, map frame."""
     old_from_new: Array
-    """(n, m) The matrix E changes the variables: `C_old = E C_new`."""
+    """(n, m) Matrix E of the change of variables: `C_old = E C_new`."""
 
 
 def make_periodic(

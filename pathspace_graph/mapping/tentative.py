@@ -163,7 +163,6 @@ class Sighting:
     """Orange cones as they were detected in one cycle."""
 
     cycle: int
-    """Number of the perception cycle."""
     pose: Array
     """(3,) Pose of the vehicle, map frame."""
     twist: Array

@@ -26,7 +26,7 @@ from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
 AROUND: Final = 2.0
-"""The path around a hairpin is at most this number of times as long as the curve inside."""
+"""Largest ratio of the path around a hairpin to the length of the curve inside."""
 NEWEST: Final = 3
 """Newest cones that, with the end of a curve, say how far it runs beside the path."""
 RECALL: Final = 25.0
@@ -261,7 +261,6 @@ class Growth:
         return True
 
     def _say_full(self, label: int) -> None:
-        """Note once that an open curve grows no further."""
         if label not in self._full:
             self._full.add(label)
             boundary = self._state.boundaries[label]

@@ -7,7 +7,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.settings.checked import Positive
 
 Knots = Literal["cones", "curvature"]
-"""The knots of a closed boundary follow its cones or its curvature."""
+"""What the knots of a closed boundary follow: its cones or its curvature."""
 
 
 @dataclass(frozen=True)
@@ -15,10 +15,9 @@ class BreakSettings:
     """How a curve's knots follow its curvature (paper: Simplification)."""
 
     baseline: float = 0.5
-    """This share in [0, 1] of the knots is spread evenly along the curve, so that straights keep their
-    minimum."""
+    """Share in [0, 1] of the knots that is spread evenly, so that straights keep their minimum."""
     curvature_max: float = 0.7
-    """Larger curvatures count as this one (1/m), that of the inside of a tight hairpin, so that a kink does
+    """Curvature that larger ones count as (1/m), that of the inside of a tight hairpin, so that a kink does
     not attract all knots."""
 
     def __post_init__(self) -> None:
@@ -51,15 +50,14 @@ Start = Literal["online", "odometry"]
 
 @dataclass(frozen=True)
 class AssociationSettings(Positive, group="batch.association"):
-    """How poses and detections are placed along the curves."""
+    """Places of poses and detections along the curves."""
 
     step: float = 1.0
     """Step at which nearest points of a curve are first searched for (m along the curve)."""
     direction_penalty: float = 100.0
-    """A stretch of curve that runs against a pose's heading counts as this much farther away (m)."""
+    """Distance added in quadrature to a stretch of curve that runs against a pose's heading (m)."""
     room: float = 2.0
-    """Along an open curve, the place of a pose is at most this farther from that of the pose before than was
-    driven between them (m)."""
+    """Most by which two poses may be farther apart along an open curve than was driven between them (m)."""
 
 
 @dataclass(frozen=True)
@@ -77,34 +75,30 @@ class ClosureSettings(Positive, group="batch.closure"):
 
 @dataclass(frozen=True)
 class OpenLapSettings(Positive, group="open_lap"):
-    """How the open lap is solved as a batch when the loop closes online."""
+    """Batch over the open lap when the loop closes online."""
 
     UNLIMITED = ("max_cycles", "max_cones")
 
     prior: Literal["batch", "window"] = "batch"
-    """After closing, the map goes on from a batch over the open lap, or with `window` from what the window
-    has marginalized."""
+    """Prior after closing: a batch over the open lap, or with `window` what the window has marginalized."""
     cycles: int = 20
-    """The batch replaces the prior this number of cycles after the loop has closed, or as many as the window
-    holds."""
+    """Cycles after closing at which the batch replaces the prior, or as many as the window holds."""
     cycles_share: float = 0.03
-    """A long lap gives its batch more time: this share of its cycles, if that is more than `cycles`. The
-    window holds more poses until then."""
+    """Share of a long lap's cycles that replaces `cycles` where it is more; the window grows until then."""
     late: int = 100
-    """A batch that is not solved by then replaces the prior once it is, and is given up where it is later
-    than this number of cycles, or where the window would hold more than `max_poses` poses."""
+    """Most cycles by which a batch may be late: it replaces the prior once it is solved, and is given up
+    after that, or where the window would hold more than `max_poses` poses."""
     ends: tuple[int, ...] = ()
-    """In a replay, the batches replace the prior in these cycles, one after the other: those that
+    """Cycles in which the batches replace the prior in a replay, one after the other: those that
     `summary.json` has as `batches.ends`. Later ones do so when they are due."""
     retry: float = 20.0
-    """A loop that no registration has closed is tried again after this length of path (m) where the
-    detections were against it."""
+    """Length of path to the next attempt at a loop that the detections were against (m)."""
     max_cycles: float = 6000.0
-    """Measurements of the open lap are kept up to this number of cycles. After a longer lap the map goes on
-    from what the window has marginalized."""
+    """Most cycles of the open lap whose measurements are kept. After a longer lap the map goes on from what
+    the window has marginalized."""
     max_cones: float = 1500.0
-    """A lap with more cones than this goes on from what the window has marginalized, since its batch would
-    not be in time."""
+    """Most cones of a lap that is solved as a batch. With more the map goes on from what the window has
+    marginalized, since the batch would not be in time."""
 
 
 @dataclass(frozen=True)
@@ -112,13 +106,11 @@ class BatchSettings(Positive):
     """The batch optimization over a whole log."""
 
     start: Start = "online"
-    """The optimization begins at the map of an online run over the log, or at odometry alone."""
+    """Start of the optimization: the map of an online run over the log, or odometry alone."""
     size: int | None = None
-    """Number of control points of both boundaries together; where it is not given, the number of cones
-    decides."""
+    """Number of control points of both boundaries together; by default the number of cones decides."""
     size_share: float = 0.43
-    """The number of control points is at most this share of the number of distinct cones that were detected
-    (the paper has 0.44)."""
+    """Most control points as a share of the distinct cones that were detected (the paper has 0.44)."""
     dense_share: float = 1.0
     """Control points for each cone of the curves that are solved for, so that they meet the cones. The map's
     own curves have fewer, and are fitted to them in the end."""
@@ -131,11 +123,9 @@ class BatchSettings(Positive):
     smaller than online, since a curve between cones that were never detected has many shapes that fit equally
     well, and each start would end in its own."""
     sigma_slide: float = 0.2
-    """Standard deviation (m) by which a control point slides along its curve from its place beside the pose
-    that it began beside."""
+    """Standard deviation of a control point's slide along its curve from beside its first pose (m)."""
     gate: float = 4.0
-    """Width of Tukey's loss: a detection farther from its curve than this number of standard deviations has
-    no weight."""
+    """Width of Tukey's loss: distance beyond which a detection has no weight, in standard deviations."""
     association: AssociationSettings = field(default_factory=AssociationSettings)
     """Places of poses and detections along the curves."""
     closure: ClosureSettings = field(default_factory=ClosureSettings)
@@ -150,8 +140,7 @@ class CkfSettings(Positive):
     """The paper's filters."""
 
     ridge: float = 0.05
-    """Lambda of the ridge regression: how strongly control points are held at their places (paper:
-    Update)."""
+    """Lambda of the ridge regression, which holds control points at their places (paper: Update)."""
     sigma_model: float = 0.25
     """Standard deviation (m) of a cone's distance from a smooth curve; its square is added to the covariance
     of each detection."""
@@ -159,8 +148,7 @@ class CkfSettings(Positive):
     """Standard deviation (m) of the distance along the curve between a cone and its foot point; its square is
     added to the covariance of each detection."""
     threshold: float = 4.0
-    """A detection nearer to the end than this growth threshold (m) updates the curve instead of extending
-    it."""
+    """Growth threshold (m): a detection nearer to the end updates the curve instead of extending it."""
     separation: float = 4.0
     """Least distance of an extension from the second-to-last control point (m)."""
     sigma_bend: float = 0.5
@@ -169,11 +157,9 @@ class CkfSettings(Positive):
     prior its uncertainty multiplies with each extension. A large value gives the filter as it is
     published."""
     knots: Knots = "curvature"
-    """The knots of a closed boundary follow its curvature as in the paper, or its cones as in the spline
-    graph."""
+    """What the knots of a closed boundary follow: curvature, as in the paper, or cones."""
     sightings: int = 3
-    """A landmark of the baseline filter is made by this number of detections; 1 takes every detection, as the
-    description of the baseline does."""
+    """Detections that make a landmark of the baseline filter; 1, as it is described, takes every one."""
 
 
 @dataclass(frozen=True)
@@ -183,8 +169,7 @@ class LandmarkSettings(Positive):
     match: float = 0.95
     """Probability of the gate inside which a detection may be of a landmark."""
     create: float = 0.99
-    """A detection may be of a new landmark if it lies outside the gate of this probability of every landmark
-    of its colour."""
+    """Probability of the gates of all landmarks of its colour outside of which a detection may be new."""
 
 
 @dataclass(frozen=True)

@@ -56,8 +56,7 @@ class SplineSettings(Positive):
     min_size: ClassVar[int] = 8
     """Least number of control points of a closed boundary."""
     sigma_simplify: ClassVar[float] = 0.1
-    """Standard deviation of what simplification may move a control point by, m; the prior is loosened by as
-    much."""
+    """Standard deviation of a control point's move by simplification, m; it loosens the prior."""
     confirmed_margin: ClassVar[float] = 0.5
     """Length past the last cone it was grown through up to which an open curve is believed, m."""
     search_step: ClassVar[float] = 1.0
@@ -93,8 +92,7 @@ class GateSettings(Positive):
     chi: float = 3.0
     """Gate of a detection's distance from a curve, in standard deviations of their joint uncertainty."""
     huber: float = 1.5
-    """Whitened residual beyond which the Huber loss reduces the weight of a detection; `inf` for plain least
-    squares."""
+    """Whitened residual beyond which the Huber loss reduces a weight; `inf` for plain least squares."""
     view_ahead: float = 25.0
     """Farthest place on a curve that a detection may belong to, m ahead of the vehicle along the curve."""
 

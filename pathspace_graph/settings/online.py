@@ -23,10 +23,9 @@ class GrowthSettings(Positive):
     forget_after: float = 6.0
     """Time without a detection after which a tentative track is dropped (s)."""
     threshold: float = 0.7
-    """A tentative track nearer to the end of the curve than this (m) does not extend it."""
+    """Distance from the end of the curve below which a tentative track does not extend it (m)."""
     max_lateral: float = 10.0
-    """A boundary begins with tentative tracks nearer to the driven path than this (m); circuits are up to 15
-    m wide."""
+    """Distance from the driven path at which tracks begin a boundary (m); circuits are up to 15 m wide."""
     max_size: float = 5000.0
     """Number of control points from which on an open curve grows no further."""
     max_unseen: float = 500.0
@@ -81,7 +80,7 @@ class ClosingSettings(Positive):
 
 @dataclass(frozen=True)
 class HealthSettings(Positive):
-    """When an estimate is good, degraded or lost.
+    """Limits of a good, a degraded and a lost estimate.
 
     The share of detections that the map explains is taken over the newest `window`. A coloured detection in
     the view of the curves is explained if it is in use, or if it lies on a closed curve of its colour farther
@@ -89,28 +88,26 @@ class HealthSettings(Positive):
     """
 
     window: float = 1.0
-    """Detections that are at most this old are judged together (s)."""
+    """Age up to which detections are judged together (s)."""
     min_offered: int = 12
-    """At least this number of detections is judged; where the window holds fewer, older ones count as
-    well."""
+    """Least number of detections that are judged; where the window holds fewer, older ones count as well."""
     blind: float = 2.0
-    """The estimate is degraded once no detection has come for this time (s)."""
+    """Time without detections from which on the estimate is degraded (s)."""
     share_degraded: float = 0.8
-    """On a closed map, the estimate is degraded where a smaller share of the detections is explained."""
+    """Share of explained detections on a closed map below which the estimate is degraded."""
     share_lost: float = 0.55
-    """On a closed map, the vehicle is lost where a smaller share of the detections is explained."""
+    """Share of explained detections on a closed map below which the vehicle is lost."""
     open_degraded: float = 0.35
-    """While the loop is open, the estimate is degraded below this share. It is low, since detections of
-    stretches that are not mapped yet lie beside the curves."""
+    """Share of explained detections below which the estimate is degraded while the loop is open. It is low,
+    since detections of stretches that are not mapped yet lie beside the curves."""
     innovation: float = 1.2
-    """The estimate is degraded where the mean squared distance of detections in use from their curve, before
-    the update and in units of its variance, is larger than this, and by one sigma of the mean over the cones
-    in view; it is about 1 if the model is right."""
+    """Largest mean squared distance of detections in use from their curve in a good estimate, before the
+    update and in units of its variance, to which one sigma of the mean over the cones in view is added; about
+    1 if the model is right."""
     sigma_degraded: float = 1.0
-    """The estimate is degraded where the standard deviation of the position on a closed map is larger than
-    this in its worst direction (m)."""
+    """Position's largest standard deviation on a closed map beyond which an estimate is degraded (m)."""
     sigma_lost: float = 5.0
-    """The vehicle is lost where that standard deviation is larger than this (m)."""
+    """The same standard deviation beyond which the vehicle is lost (m)."""
 
 
 # --- front end -----------------------------------------------------------------------------------------
@@ -146,8 +143,7 @@ class MotionSettings(Positive):
     UNLIMITED = ("doubt",)
 
     doubt: float = 5.0
-    """Contradiction from which the odometry is not believed, standard deviations; `inf` to believe it
-    always."""
+    """Contradiction from which the odometry is not believed, standard deviations; `inf` to believe it."""
     acceleration: float = 5.0
     """Growth of the speeds' uncertainty where a twist is held for longer than usual, m/s^2."""
     angular_acceleration: float = 1.5

@@ -57,101 +57,98 @@ class FilmSettings(Positive):
 
 @dataclass(frozen=True)
 class PlausibilitySettings(Positive):
-    """Describes how a log is judged before it is mapped."""
+    """Tests of a log before it is mapped."""
 
     least_twists: int = 20
-    """Nothing is said of a log with fewer twists than this."""
+    """Least number of twists of a log of which anything is said."""
     min_detections: int = 2
-    """Cycles with fewer detections than this are not compared."""
+    """Least number of detections of a cycle that is compared."""
     most_detections: int = 14
-    """At most this number of detections of a cycle is compared, the nearest ones."""
+    """Most detections of a cycle that are compared, the nearest ones."""
     cycles: int = 200
-    """The spacing of the cones is told from about this number of cycles."""
+    """Approximate number of cycles from which the spacing of the cones is told."""
     gaps: tuple[int, ...] = (1, 2, 4, 8)
-    """A cycle is compared with those that come this number of cycles later."""
+    """Numbers of cycles between the two that are compared."""
     pairs: int = 60
-    """About this number of pairs of cycles is compared for each of the gaps."""
+    """Approximate number of pairs of cycles that are compared for each of the gaps."""
     longest: float = 1.3
-    """The cycles of a pair are at most this far apart (s), if cycles do not come more rarely."""
+    """Longest time between the cycles of a pair (s), if cycles do not come more rarely."""
     reach: float = 0.2
-    """A detection at this share of the cones' spacing from another one counts as the same cone by
-    `exp(-1/2)`."""
+    """Distance from another detection, over the cones' spacing, that counts as the same by `exp(-1/2)`."""
     overlap: float = 0.5
-    """Two cycles are compared if by the odometry one could have seen this share of the other's detections."""
+    """Share of a cycle's detections that another could have seen, from which the two are compared."""
     turn: float = 15.0
-    """The frame of the detections is tried in steps of this angle (degrees)."""
+    """Step of the angles that the frame of the detections is tried at (degrees)."""
     equal: float = 0.02
-    """Hypotheses whose explained shares differ by less than this are equally good."""
+    """Difference of explained shares below which hypotheses are equally good."""
     sided: float = 0.2
-    """Of equally good hypotheses, one is better if this share more of the labels is on its side."""
+    """Further share of the labels on its side by which one of equally good hypotheses is better."""
     telling: float = 0.2
-    """A pair tells two hypotheses apart if their explained shares of it differ by more than this."""
+    """Difference of explained shares from which a pair tells two hypotheses apart."""
     chance: float = 1e-8
-    """A hypothesis is believed where it would win so many of the pairs with this probability by chance."""
+    """Probability of winning as many of the pairs by chance below which a hypothesis is believed."""
     far_better: float = 1.8
-    """A hypothesis that is believed explains this number of times as much as the log as it is written."""
+    """Least ratio of what a believed hypothesis explains to what the log as it is written does."""
     least_share: float = 0.3
-    """A hypothesis that is believed explains at least this share of the detections."""
+    """Least share of the detections that a believed hypothesis explains."""
     shortest_step: float = 2e-4
-    """Rows follow each other after this time at least, as a rule (s)."""
+    """Shortest usual time between rows (s)."""
     longest_step: float = 5.0
-    """Rows follow each other after this time at most, as a rule (s)."""
+    """Longest usual time between rows (s)."""
     farthest: float = 120.0
-    """No detector of cones sees them farther away than this, as a rule (m)."""
+    """Usual greatest range of a detector of cones (m)."""
     far: float = 20.0
-    """Of two units that both give possible positions, the one is told in which cones are nearer than this
-    (m)."""
+    """Range within which cones decide between two units that both give possible positions (m)."""
     nearest: float = 0.05
-    """No cones are nearer than this, as a rule (m)."""
+    """Usual least range of cones (m)."""
     fastest: float = 100.0
-    """No vehicle is faster than this in a tenth of its time (m/s)."""
+    """Speed that no vehicle exceeds in a tenth of its time (m/s)."""
     fastest_turn: float = 8.0
-    """No vehicle turns faster than this in a tenth of its time (rad/s)."""
+    """Yaw rate that no vehicle exceeds in a tenth of its time (rad/s)."""
     iterations: int = 5
-    """The mounting of the sensor is found in this number of Gauss-Newton steps."""
+    """Gauss-Newton steps that find the mounting of the sensor."""
     least_matches: int = 60
-    """The mounting is found from this number of matched detections at least."""
+    """Least number of matched detections from which the mounting is found."""
     worst_condition: float = 1e6
-    """The mounting is not found where the condition number of its normal equations is larger than this."""
+    """Largest condition number of the normal equations at which the mounting is found."""
     latest: float = 10.0
-    """Detections are tried up to this much too late or too early (s)."""
+    """Largest delay or lead of detections that is tried (s)."""
     late_step: float = 0.25
-    """They are tried in steps of this (s)."""
+    """Step of these (s)."""
     turned: float = 5.0
-    """A sensor that is turned by more than this is told (degrees)."""
+    """Turn of the sensor beyond which it is told (degrees)."""
     turned_sigma: float = 1.0
-    """The turn is told if its standard deviation is at most this (degrees)."""
+    """Largest standard deviation of the turn at which it is told (degrees)."""
     arm: float = 1.0
-    """A sensor that sits farther than this from the point that the odometry describes is told (m)."""
+    """Distance of the sensor from the point that the odometry describes beyond which it is told (m)."""
     arm_sigma: float = 0.2
-    """Its place is told if its standard deviation is at most this share of the distance."""
+    """Largest standard deviation of its place at which it is told, as a share of the distance."""
     claimed_less: float = 10.0
-    """Covariances are too small if detections of one cone are this number of times as far apart."""
+    """Ratio of one cone's scatter to the claimed one from which covariances are too small."""
     claimed_more: float = 30.0
-    """Covariances are too large if detections of one cone are this number of times nearer to each other."""
+    """Ratio of the claimed scatter to one cone's from which covariances are too large."""
     least_scatter: float = 0.02
-    """Detections that scatter less than this count as scattering by it (m)."""
+    """Scatter that detections which scatter less count as (m)."""
     noise_factor: float = 1.5
-    """Stated noise of the odometry is wrong if the measured one is larger or smaller by this factor."""
+    """Factor between measured and stated noise of the odometry from which the stated one is wrong."""
     noise_agreement: float = 1.2
-    """Odometry has white noise if its differences of different orders agree up to this factor."""
+    """Largest factor between the noise by differences of different orders where odometry has white noise."""
     scatter_factor: float = 2.0
-    """Covariances are wrong if detections scatter by this factor more or less. That is told less well, from
-    a few cones, and with the errors of odometry and stamps in it."""
+    """Factor between the scatter of detections and their covariances from which these are wrong. It is told
+    less well, from a few cones, and with the errors of odometry and stamps in it."""
     noise_share: float = 0.75
-    """Covariances are wrong if they are so in this share of the detections."""
+    """Share of the detections from which on wrong covariances are told."""
     noise_cycles: int = 300
-    """The noise of detections is measured on at most this number of cycles."""
+    """Most cycles on which the noise of detections is measured."""
     both_sides: float = 0.15
-    """Cones of one label are on both sides if their share on its own side is so near to a half."""
+    """Distance from a half of the share of a label's cones on its own side at which they are on both."""
     near: float = 0.25
-    """Two cycles see the same cones if the vehicle moved by less than this share of the usual range between
-    them, and turned by less than this (rad)."""
+    """Move by a share of the usual range, and turn (rad), below which two cycles see the same cones."""
     many: int = 6
-    """Such cycles have at least this number of detections together."""
+    """Least number of detections that such cycles have together."""
     least_near: int = 30
-    """Such pairs of cycles are counted from this number on."""
+    """Least number of such pairs of cycles that are counted."""
     unexplained: float = 0.15
-    """No motion explains the detections if the best one explains less than this share of them."""
+    """Share of the detections that the best motion must explain, or else none does."""
     line: float = 0.1
-    """Detections lie on a line if one coordinate varies by less than this share of the other."""
+    """Ratio of the variations of two coordinates below which detections lie on a line."""

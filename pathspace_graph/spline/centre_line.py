@@ -114,7 +114,7 @@ _FEWEST: Final = 4
 _STARTS: Final = 200
 """Number of samples of the left boundary among which the march begins."""
 _NEAR: Final = 12
-"""Segments up to this many samples away from a pair are tested for a crossing."""
+"""Distance in samples from a pair within which segments are tested for a crossing."""
 _ROUNDS: Final = 3
 """Number of times that the line is moved to the middle between the crossings of its normals."""
 _SMOOTHNESS: Final = 1e-3
@@ -122,11 +122,11 @@ _SMOOTHNESS: Final = 1e-3
 _CROSSING_STEPS: Final = 8
 """Number of Newton steps to the crossing of a normal and a boundary."""
 _CROSSED: Final = 1e-6
-"""A normal crosses a boundary where the point found is this close to it (m)."""
+"""Distance of the point found from a boundary below which a normal crosses it (m)."""
 _LEAST_COSINE: Final = 0.1
 """Least cosine of the angle between boundary and line at a crossing."""
 _FARTHEST: Final = 1.5
-"""A crossing farther away than this many times the paired sample belongs to another stretch."""
+"""Distance of a crossing, over that of the paired sample, beyond which it belongs to another stretch."""
 
 
 @dataclass(frozen=True, eq=False)

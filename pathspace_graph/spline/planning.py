@@ -41,8 +41,7 @@ class SpeedProfile:
     speed: Array
     """Speed (n,) in m/s."""
     acceleration: Array
-    """Acceleration along the line (n,) from each point to the next one, in m/s^2; 0 at the last point of an
-    open line."""
+    """Acceleration (n,) from each point to the next, in m/s^2; 0 at the last point of an open line."""
     time: Array
     """Time (n,) since the first point, in s."""
     duration: float
@@ -127,7 +126,7 @@ MOST_POINTS: Final = 200_000
 _FEWEST: Final = 4
 """Smallest number of points of a line."""
 _NEIGHBOURS: Final = 10
-"""Normals of points up to this number apart do not cross."""
+"""Number of points apart up to which normals must not cross."""
 _SHORT: Final = 0.95
 """Share of the way to where two normals would cross that is left to both widths."""
 
@@ -149,8 +148,7 @@ class CentreLine:
     arc_length: Array
     """Length (n,) of the line from its first point, in m."""
     width_left: Array
-    """Distance (n,) along the normal to the left boundary (m), or less where the normal would cross a
-    neighbour's."""
+    """Distance (n,) along the normal to the left boundary (m), or less to keep off a neighbour's."""
     width_right: Array
     """Distance (n,) along the normal to the right boundary (m), or less in the same way."""
     closed: bool
