@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pathspace_graph import ReadingError
 from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.factors.se2 import rotation
+from pathspace_graph.front_end import gate
 from pathspace_graph.front_end.gate import Admitted, Gate, Newest, admit, read_usable_log
 from pathspace_graph.io.log import Detections, Odometry, write_log
 from pathspace_graph.settings.online import LimitSettings
@@ -306,7 +307,7 @@ DROPPED = {
     "infinity": {"points_vehicle": with_entry(POINTS, (1, 1), -np.inf)},
     "beyond the sensor": {"points_vehicle": with_entry(POINTS, 1, turned(1.001 * LIMITS.range_max, 0.0))},
     "far beyond the sensor": {"points_vehicle": with_entry(POINTS, (1, 0), 1e200)},
-    "too near": {"points_vehicle": with_entry(POINTS, 1, turned(0.999 * LIMITS.range_min, 0.0))},
+    "too near": {"points_vehicle": with_entry(POINTS, 1, turned(0.999 * gate.MIN_RANGE, 0.0))},
     "at the vehicle": {"points_vehicle": with_entry(POINTS, 1, 0.0)},
     "NaN as a covariance": {"covariances": with_entry(COVARIANCES, (1, 0, 0), np.nan)},
     "infinite covariance": {"covariances": with_entry(COVARIANCES, 1, np.inf)},
@@ -314,8 +315,8 @@ DROPPED = {
     "negative covariance": {"covariances": with_entry(COVARIANCES, 1, -0.01)},
     "indefinite covariance": {"covariances": with_entry(COVARIANCES, (1, slice(None), slice(None)), 0.02)},
     "asymmetric covariance": {"covariances": with_entry(COVARIANCES, (1, 0, 1), 0.005)},
-    "long covariance": {"covariances": with_entry(COVARIANCES, 1, axes(1.001 * LIMITS.sigma_max, 1.0))},
-    "thin covariance": {"covariances": with_entry(COVARIANCES, 1, axes(1.0, 0.999 * LIMITS.sigma_min))},
+    "long covariance": {"covariances": with_entry(COVARIANCES, 1, axes(1.001 * gate.MAX_SIGMA, 1.0))},
+    "thin covariance": {"covariances": with_entry(COVARIANCES, 1, axes(1.0, 0.999 * gate.MIN_SIGMA))},
     "huge covariance": {"covariances": with_entry(COVARIANCES, (1, 0, 0), 1e308)},
     "tiny covariance": {"covariances": with_entry(COVARIANCES, (1, 0, 0), 1e-300)},
 }
@@ -335,10 +336,10 @@ def test_a_single_impossible_detection_is_dropped(name: str) -> None:
 @pytest.mark.parametrize(
     ("along", "across"),
     [
-        (0.999 * LIMITS.sigma_max, 0.5 * LIMITS.sigma_max),
-        (0.999 * LIMITS.sigma_max, 1e-3),
-        (1.001 * LIMITS.sigma_min, 1.001 * LIMITS.sigma_min),
-        (0.1, 1.001 * LIMITS.sigma_min),
+        (0.999 * gate.MAX_SIGMA, 0.5 * gate.MAX_SIGMA),
+        (0.999 * gate.MAX_SIGMA, 1e-3),
+        (1.001 * gate.MIN_SIGMA, 1.001 * gate.MIN_SIGMA),
+        (0.1, 1.001 * gate.MIN_SIGMA),
     ],
 )
 def test_long_and_thin_covariances_are_possible_up_to_the_limits(along: float, across: float) -> None:
@@ -346,7 +347,7 @@ def test_long_and_thin_covariances_are_possible_up_to_the_limits(along: float, a
     assert through(cycle=detections(covariances=covariances)).dropped == 0
 
 
-@pytest.mark.parametrize("distance", [1.001 * LIMITS.range_min, 0.999 * LIMITS.range_max])
+@pytest.mark.parametrize("distance", [1.001 * gate.MIN_RANGE, 0.999 * LIMITS.range_max])
 def test_detections_are_possible_up_to_the_limits_of_the_range(distance: float) -> None:
     points = with_entry(POINTS, 1, turned(distance, 0.0))
     assert through(cycle=detections(points_vehicle=points)).dropped == 0

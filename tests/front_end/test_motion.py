@@ -11,6 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import relative
+from pathspace_graph.front_end import motion as motion_module
+from pathspace_graph.front_end import scan_matching
 from pathspace_graph.front_end.motion import MotionCheck
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.mapping.motion import MeasuredMotion
@@ -77,14 +79,17 @@ def test_a_right_odometry_is_left_as_it_is(log: Log) -> None:
         np.testing.assert_array_equal(motion.odometry.covariance, own.odometry.covariance)
 
 
-def test_detections_that_are_worse_than_they_claim_do_not_deny_the_odometry(log: Log) -> None:
+def test_detections_that_are_worse_than_they_claim_do_not_deny_the_odometry(
+    log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """They have twice the standard deviation that they claim, and deny it unless their excess counts."""
     cycles = tuple(replace(c, covariances=c.covariances / 4.0) for c in log.cycles)
     overconfident = replace(log, cycles=cycles)
     motions = checked(overconfident)
     assert not any(motion.fault for motion in motions)
     assert np.abs(errors(log, motions).cumsum(axis=0)).max() < 0.2
-    assert any(motion.doubted for motion in checked(overconfident, MotionSettings(misfit=1e9)))
+    monkeypatch.setattr(motion_module, "MISFIT", 1e9)
+    assert any(motion.doubted for motion in checked(overconfident))
 
 
 @pytest.mark.parametrize(
@@ -124,8 +129,7 @@ def test_a_gap_is_filled_by_the_detections(log: Log) -> None:
 
 def test_a_gap_without_detections_is_as_uncertain_as_it_is_long() -> None:
     """A straight drive with odometry until 1 s and none afterwards: it is held, and its variance grows."""
-    settings = MotionSettings()
-    check = MotionCheck(np.array([0.1, 0.1, 0.01]), settings)
+    check = MotionCheck(np.array([0.1, 0.1, 0.01]), MotionSettings())
     nothing = np.zeros((0, 2))
     spreads, held = [], np.zeros(3)
     for k in range(20):
@@ -159,12 +163,12 @@ def test_readings_that_never_change_are_believed_if_the_detections_agree() -> No
         np.testing.assert_allclose(motion.odometry.delta, [0.5, 0.0, 0.0], atol=1e-12)
 
 
-def past_cones(settings: MotionSettings, variance: float) -> tuple[MotionCheck, list[MeasuredMotion]]:
+def past_cones(variance: float) -> tuple[MotionCheck, list[MeasuredMotion]]:
     """A drive with exact detections, of which a variance (m^2) is claimed, and half a second of slip."""
     rng, place, motions = np.random.default_rng(0), 0.0, []
     cones = np.array([[x, side] for x in np.arange(0.0, 40.0, 3.0) for side in (-2.0, 2.5)])
     cones += rng.uniform(-0.8, 0.8, cones.shape)
-    check = MotionCheck(np.array([0.1, 0.1, 0.01]), settings)
+    check = MotionCheck(np.array([0.1, 0.1, 0.01]), MotionSettings())
     for k in range(40):
         speed, slip = 5.0 + np.sin(0.5 * k), 2.5 if 20 <= k < 25 else 1.0
         place += 0.1 * speed
@@ -176,11 +180,20 @@ def past_cones(settings: MotionSettings, variance: float) -> tuple[MotionCheck, 
     return check, motions
 
 
-def test_an_excess_of_four_is_that_of_covariances_four_times_as_large() -> None:
+def test_an_excess_of_four_is_that_of_covariances_four_times_as_large(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """What is doubted, what takes its place, and what is learned of the sensor are the same."""
-    settings = MotionSettings(sigma_cone=1e-6, huber=np.inf, misfit_gain=1e-9)
-    check, motions = past_cones(replace(settings, misfit=0.25), 0.01)
-    other, wide = past_cones(replace(settings, misfit=1.5), 0.04)
+    for module, name, value in (
+        (scan_matching, "SIGMA_CONE", 1e-6),
+        (scan_matching, "HUBER", np.inf),
+        (motion_module, "MISFIT_GAIN", 1e-9),
+        (motion_module, "MISFIT", 0.25),
+    ):
+        monkeypatch.setattr(module, name, value)
+    check, motions = past_cones(0.01)
+    monkeypatch.setattr(motion_module, "MISFIT", 1.5)
+    other, wide = past_cones(0.04)
     assert [motion.fault for motion in motions] == [motion.fault for motion in wide]
     assert any(motion.doubted for motion in motions)
     for motion, same in zip(motions, wide, strict=True):

@@ -89,7 +89,7 @@ def test_matches_give_the_errors_with_the_claimed_covariance(
             noise = np.sqrt(np.diag(spread)) * rng.standard_normal(3)
             for _ in range(shared):
                 seen = shifts @ (truth - known.mean) + noise
-                known.update(Difference(seen, spread, shifts), SETTINGS.memory / shared)
+                known.update(Difference(seen, spread, shifts), scan_matching.MEMORY / shared)
         off.append(np.linalg.solve(np.linalg.cholesky(known.covariance), truth - known.mean))
     np.testing.assert_allclose(np.cov(np.array(off).T), np.eye(2), atol=0.25)
 
@@ -108,7 +108,7 @@ def test_an_old_latency_is_forgotten_so_that_a_new_one_is_learned() -> None:
     for cycle in range(9_000):
         truth = np.array([0.0, 0.0 if cycle < 7_500 else 0.03])
         shifts = known.shifts(np.array([1.0, 0.0]), np.array([*rng.normal(scale=0.5, size=2), 0.1]))
-        known.update(Difference(shifts @ (truth - known.mean), spread, shifts), SETTINGS.memory)
+        known.update(Difference(shifts @ (truth - known.mean), spread, shifts), scan_matching.MEMORY)
     assert known.mean[1] == pytest.approx(0.03, abs=0.003)
 
 
@@ -139,7 +139,7 @@ def test_a_drive_shows_the_errors_of_its_sensor(
     check = MotionCheck(log.odometry_sigma, SETTINGS)
     for odometry, cycle in split_odometry(log):
         check.update(odometry, cycle)
-    assert (np.sqrt(np.diag(check.errors.covariance)) < 0.2 * np.array(SETTINGS.sigmas_errors)).all()
+    assert (np.sqrt(np.diag(check.errors.covariance)) < 0.2 * np.array(SIGMAS_ERRORS)).all()
     assert (np.abs(check.errors.mean - expected) < (0.003, 0.006)).all()
     assert check.errors.contradict(CalibrationSettings()) == bool(faults)
 

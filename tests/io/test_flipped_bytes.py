@@ -85,7 +85,7 @@ def test_in_a_manifest(folder: str, read: Callable[[Path], object], written: Pat
 def test_in_a_cell_of_a_study(tmp_path: Path) -> None:
     """A damaged cell is run again."""
     track = NamedTrack("round", read_track(write_round_track(tmp_path)))
-    cell = Cell(Drive(track, 0, "nominal", SimulationSettings()), "fixed-lag", "default", MapperSettings())
+    cell = Cell(Drive(track, 0, "nominal", SimulationSettings()), "fixed-lag", MapperSettings(), "default")
     store = Store(tmp_path)
     record = record_of(cell, Outcome.failed(cell, ValueError("lost"))) | {
         "laps": [{"lap": 1, "rmse": 0.123456}]

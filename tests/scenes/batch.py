@@ -90,7 +90,7 @@ def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, A
     local = noise + driven.by_calibration @ calibration[:2]
     first = rng.multivariate_normal(chain.first, np.linalg.inv(chain.first_information))
     noisy = BatchSystem(
-        replace(detections, measured=points, point=points, u=detections.u.copy()),
+        replace(detections, measured=points, u=detections.u.copy()),
         _with_errors(replace(chain, first=first), local),
         system.settings,
         system.kernel,
