@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
+from pathspace_graph.batch.optimizer import Effort
 from pathspace_graph.cli import main
 from pathspace_graph.commands.batch import NOT_CONVERGED
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
@@ -156,11 +157,14 @@ def test_the_command_writes_its_result(tmp_path: Path) -> None:
     assert read_map(tmp_path / "map").closed
 
 
-def test_a_run_that_did_not_converge_is_written_and_reported(tmp_path: Path) -> None:
+def test_a_run_that_did_not_converge_is_written_and_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_log(bean(), tmp_path / "log")
     arguments = ["batch", str(tmp_path / "log"), "--out", str(tmp_path / "map"), "--start", "odometry"]
+    monkeypatch.setattr("pathspace_graph.batch.optimizer.Effort", lambda: Effort(rounds=1))
     with pytest.raises(SystemExit) as end:
-        main([*arguments, "--batch.max-rounds", "1"])
+        main(arguments)
     assert end.value.code == NOT_CONVERGED
     summary = json.loads((tmp_path / "map" / "summary.json").read_text())
     assert not summary["convergence"]["converged"]

@@ -162,6 +162,7 @@ def test_a_text_has_metres_of_the_scene() -> None:
     assert scaled(Health("lost", "the position is uncertain by 0.5 m"), 0.1).reason.endswith("by 0.05 m")
 
 
+@settings(deadline=None)
 @given(st.floats(0.01, 100.0))
 def test_there_and_back_is_the_same_log(factor: float) -> None:
     log = short_drive()

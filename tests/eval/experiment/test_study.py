@@ -210,10 +210,8 @@ def test_the_studies_listed_are_the_files_on_disk_and_are_shipped() -> None:
         "online",
         "open",
         "paper",
-        "places",
         "reach",
         "relinearize",
-        "residual",
         "robust",
     }
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
