@@ -130,7 +130,7 @@ def read(file: Path) -> tuple[Structure, Bytes]:
     return structure, numbers
 
 
-# --- the types ---------------------------------------------------------------------------------------------
+# --- the types -------------------------------------------------------------------------------------------
 
 
 def known_classes() -> dict[str, type]:
@@ -213,7 +213,7 @@ TYPES: Final[dict[type, tuple[Callable[[Any], Iterable[Any]], Callable[..., Any]
 _MAKERS: Final = {kind.__name__: make for kind, (_, make) in TYPES.items()}
 
 
-# --- from objects to a structure ---------------------------------------------------------------------------
+# --- from objects to a structure -------------------------------------------------------------------------
 
 
 class Encoder:
@@ -316,7 +316,7 @@ def _view(numbers: Bytes, node: list[Any]) -> NDArray[Any]:
     return np.empty(shape, dtype) if 0 in shape else np.ndarray(shape, dtype, numbers, offset, strides)
 
 
-# --- from a structure to objects ---------------------------------------------------------------------------
+# --- from a structure to objects -------------------------------------------------------------------------
 
 
 class Decoder:

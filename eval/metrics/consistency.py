@@ -25,7 +25,7 @@ LEVEL: Final = 0.95
 """Probability with which an honest map's NEES lies in the interval."""
 
 
-# --- squared errors ---------------------------------------------------------------------------------------
+# --- squared errors --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

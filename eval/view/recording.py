@@ -1,4 +1,4 @@
-"""Opens a recording of the live viewer rerun: as a file, in a window, or as both."""
+"""A recording for the live viewer rerun, as a file or in a window, and all that watches a run."""
 
 import os
 import socket
@@ -116,7 +116,7 @@ def _viewer() -> str | None:
     return str(viewer) if viewer.exists() else None
 
 
-# --- watch ---------------------------------------------------------------------------------------------
+# --- all that watches a run ------------------------------------------------------------------------------
 
 
 class Watched(Protocol):

@@ -285,11 +285,12 @@ def objection(found: Evidence, splines: Mapping[int, BSpline], poses: Array, set
     step, driven = SAMPLE, poses[:, :2]
     if boundaries_cross(splines, step):
         return "its boundaries cross"
+    by_drive = KDTree(driven)
     for curve in (sampled(spline, step) for spline in splines.values()):
         if polylines_cross(curve, driven):
             return "the vehicle would have crossed a boundary"
         aside = float(np.percentile(KDTree(curve).query(driven)[0], MOSTLY))
-        wider = float(np.max(KDTree(driven).query(curve)[0])) / aside
+        wider = float(np.max(by_drive.query(curve)[0])) / aside
         if wider > WIDER:
             return f"a boundary would be {wider:.1f} times as far from the drive as it is beside it"
     if found.used < settings.batch.closure.used:

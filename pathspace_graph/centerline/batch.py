@@ -1,4 +1,7 @@
-"""The batch of a centre line with a width: all poses and one ribbon, on GTSAM's own optimizer."""
+"""The batch of a centre line with a width: all poses and one ribbon, on GTSAM's own optimizer.
+
+Its factors are the detections of every cycle, and weak priors on what they leave free.
+"""
 
 from collections.abc import Callable, Iterator, MutableSequence
 from dataclasses import dataclass, replace
@@ -147,7 +150,7 @@ def ribbon_covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, r
     return np.asarray(np.linalg.inv(information), np.float64)
 
 
-# --- batch ---------------------------------------------------------------------------------------------
+# --- the optimization ------------------------------------------------------------------------------------
 
 
 NAME: Final = "centerline"

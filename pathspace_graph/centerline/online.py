@@ -1,4 +1,4 @@
-"""A centre line with a width, online: the ribbon that the fixed-lag posterior of the boundaries tells of."""
+"""A centre line with a width, online: the map of a ribbon, and the ribbon of a fixed-lag posterior."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -76,7 +76,7 @@ def ribbon_of(track: Map, settings: MapperSettings) -> FittedRibbon:
     return FittedRibbon(line.ribbon, covariance, until)
 
 
-# --- online --------------------------------------------------------------------------------------------
+# --- the mapper ------------------------------------------------------------------------------------------
 
 
 NAME: Final = "centerline-fixed-lag"

@@ -1,4 +1,4 @@
-"""`plot`: the picture of a map folder."""
+"""`plot`, `figures` and `verify`: pictures of a map, the paper's isolated tests, and a check of files."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,7 +57,7 @@ class Plot:
         save_plot(figure, self.out)
 
 
-# --- figures -------------------------------------------------------------------------------------------
+# --- the paper's isolated tests --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +75,7 @@ class Figures:
         Console().print(f"{names}: {self.out}", highlight=False, soft_wrap=True, markup=False)
 
 
-# --- verify --------------------------------------------------------------------------------------------
+# --- files as they were written --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)

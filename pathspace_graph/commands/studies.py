@@ -1,4 +1,4 @@
-"""What the commands that run a study share: their options, how a study is run, and what failed."""
+"""`ablate`, `faults` and `scale`: studies over many logs, in parallel and resumable."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -88,7 +88,7 @@ def report_failures(frame: pd.DataFrame, cells: int) -> None:
         raise SystemExit(CELLS_FAILED)
 
 
-# --- ablate --------------------------------------------------------------------------------------------
+# --- ablate ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +103,7 @@ class Ablate(StudyCommand):
         self.execute(read_study(find_study(self.study)), write_study)
 
 
-# --- faults --------------------------------------------------------------------------------------------
+# --- faults ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +127,7 @@ class FaultSuite(StudyCommand):
         self.execute(strongest(chosen) if self.quick else chosen, write_suite)
 
 
-# --- scale ---------------------------------------------------------------------------------------------
+# --- scale -----------------------------------------------------------------------------------------------
 
 
 FILE_WIDTH: Final = 160

@@ -1,4 +1,4 @@
-"""A map as GeoJSON (RFC 7946): its boundaries and its centre line, by longitude and latitude."""
+"""A map as GeoJSON (RFC 7946), by a plane that touches the ellipsoid WGS84 at the map's origin."""
 
 import json
 from dataclasses import dataclass
@@ -115,7 +115,7 @@ def _on_earth(geodetic: Array, height: Array) -> Array:
     return np.column_stack([x, y, (normal * (1.0 - _SQUARE) + height) * sine])
 
 
-# --- geojson -------------------------------------------------------------------------------------------
+# --- the file --------------------------------------------------------------------------------------------
 
 
 DECIMALS: Final = 10

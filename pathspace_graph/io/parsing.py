@@ -1,4 +1,8 @@
-"""Text files as plain data: TOML, JSON and YAML within the limits of what is read, and never as code."""
+"""TOML, JSON and YAML as plain data, never as code, within limits beyond which a file is refused.
+
+The limits are generous: they guard against damage and mistakes. What a certain vehicle can do is a setting of
+its estimator.
+"""
 
 import json
 import re
@@ -82,7 +86,7 @@ def _children(value: Any) -> Any:
     return value if isinstance(value, list) else (value,)
 
 
-# --- parsing -------------------------------------------------------------------------------------------
+# --- files and their formats -----------------------------------------------------------------------------
 
 
 _YAML_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

@@ -1,4 +1,7 @@
-"""The folder that a run leaves: its map, trajectory, cycles and summary (FORMATS)."""
+"""What a run leaves (FORMATS): its map, trajectory, cycles and summary in one folder.
+
+A trajectory is in the TUM format, a row `t tx ty tz qx qy qz qw` for each pose.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +70,7 @@ def _values(file: Path, line: str, number: int) -> list[float]:
     return values
 
 
-# --- results -------------------------------------------------------------------------------------------
+# --- cycles and the whole run ----------------------------------------------------------------------------
 
 
 NoiseSource = Literal["stated", "measured", "assumed"]

@@ -90,7 +90,7 @@ def _is_beside(place: Place, pose: Array, settings: MapperSettings) -> bool:
     return bool(distance < settings.growth.max_lateral and same_direction)
 
 
-# --- the record -----------------------------------------------------------------------------------------
+# --- the record ------------------------------------------------------------------------------------------
 
 WORKER_IDLE: Final = 600
 """Time with nothing to do after which the process that solves laps ends (s)."""

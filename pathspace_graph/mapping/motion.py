@@ -64,7 +64,7 @@ class MeasuredMotion:
         return "the detections contradict the odometry" if self.doubted else ""
 
 
-# --- prediction ---------------------------------------------------------------------------------------
+# --- prediction ------------------------------------------------------------------------------------------
 
 
 def known_noise(sigma: Array | KnownNoise | None) -> KnownNoise:

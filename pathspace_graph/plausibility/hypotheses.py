@@ -17,7 +17,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, UNKNOWN
-from pathspace_graph.settings.output import PlausibilitySettings
+from pathspace_graph.settings.plausibility import PlausibilitySettings
 
 from .pairs import DEGREE, Meaning, Pairs, motions
 

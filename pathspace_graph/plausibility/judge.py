@@ -10,7 +10,7 @@ from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.lengths import scaled
 from pathspace_graph.scale.scene import scale_of
-from pathspace_graph.settings.output import PlausibilitySettings
+from pathspace_graph.settings.plausibility import PlausibilitySettings
 
 from .hint import Hint, told
 from .hypotheses import Frame, Mounting, Trial, Trials, Verdict, best_lateness, mounting_of, verdict

@@ -11,7 +11,7 @@ from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.measurement import DRIFT, LEAST
 from pathspace_graph.front_end.sightings import GATE, MAX_RANGE, TwistRecord
 from pathspace_graph.io.log import Log
-from pathspace_graph.settings.output import PlausibilitySettings
+from pathspace_graph.settings.plausibility import PlausibilitySettings
 
 from .hint import Hint, told
 

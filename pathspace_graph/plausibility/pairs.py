@@ -11,7 +11,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import se2_exp, wrap_angle
 from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.settings.output import PlausibilitySettings
+from pathspace_graph.settings.plausibility import PlausibilitySettings
 
 SEEN: Final = 0.95
 """This share of the detections is nearer than the range, and between the bearings, that a cycle sees."""

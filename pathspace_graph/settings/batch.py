@@ -1,4 +1,4 @@
-"""Settings of the batch optimization over a whole log."""
+"""Settings of fits, of the batch over a whole log, and of the estimators to compare with."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -42,7 +42,7 @@ class FitSettings:
     breaks: BreakSettings = BreakSettings()
 
 
-# --- batch ---------------------------------------------------------------------------------------------
+# --- the batch over a log --------------------------------------------------------------------------------
 
 
 Start = Literal["online", "odometry"]
@@ -132,7 +132,7 @@ class BatchSettings(Positive):
     """Loops that no registration has closed."""
 
 
-# --- comparison ----------------------------------------------------------------------------------------
+# --- estimators to compare with --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

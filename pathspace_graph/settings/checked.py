@@ -1,4 +1,4 @@
-"""Settings whose numbers are checked where they are made."""
+"""Settings whose numbers are checked where they are made, and the settings that are gone."""
 
 from dataclasses import fields
 from math import inf, isfinite
@@ -40,7 +40,7 @@ class Positive:
                 raise SettingsError(f"{self.prefix}{entry.name}: expected a finite number, found {value}")
 
 
-# --- gone ----------------------------------------------------------------------------------------------
+# --- settings that are gone ------------------------------------------------------------------------------
 
 
 GONE: Final = """

@@ -1,4 +1,4 @@
-"""Settings of growth: how the open ends of the curves grow."""
+"""Settings of the online mapper, by subject: growth of open ends, closing, health, and the front end."""
 
 from dataclasses import dataclass
 
@@ -33,7 +33,7 @@ class GrowthSettings(Positive):
     vehicle, and not led on to a cone beyond that."""
 
 
-# --- closing -------------------------------------------------------------------------------------------
+# --- closing ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class ClosingSettings(Positive):
     of it than is known then. Infinite where they never are."""
 
 
-# --- health --------------------------------------------------------------------------------------------
+# --- health ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class HealthSettings(Positive):
     """The same standard deviation beyond which the vehicle is lost (m)."""
 
 
-# --- front end -----------------------------------------------------------------------------------------
+# --- front end -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

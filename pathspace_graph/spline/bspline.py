@@ -1,4 +1,4 @@
-"""Plane B-spline curves: evaluation, arc length, exact changes of the ends, and covariance."""
+"""Plane B-spline curves: evaluation, arc length, exact changes of the ends, covariance, and crossings."""
 
 from __future__ import annotations
 
@@ -356,7 +356,7 @@ def _blossom(knots: Array, degree: int, span: int, arguments: Array) -> Array:
     return np.asarray(weights[0])
 
 
-# --- crossing ------------------------------------------------------------------------------------------
+# --- whether boundaries cross ----------------------------------------------------------------------------
 
 
 def sampled(spline: BSpline, step: float) -> Array:

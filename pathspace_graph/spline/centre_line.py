@@ -1,4 +1,7 @@
-"""The centre line between two boundaries: the curve whose normals cross them equally far to both sides."""
+"""The centre line between two boundaries: the curve whose normals cross them equally far to both sides.
+
+It is kept as a ribbon, one B-spline of the centre line and half the width.
+"""
 
 from __future__ import annotations
 
@@ -97,7 +100,7 @@ class Ribbon(BSpline):
         return blank.with_points(fit @ points), by_ribbon
 
 
-# --- centre line ---------------------------------------------------------------------------------------
+# --- the line between two boundaries ---------------------------------------------------------------------
 
 
 Ints = IntArray

@@ -1,4 +1,4 @@
-"""Knots by curvature (paper: Simplification), refits onto other knots, and fits to ordered points."""
+"""Knots by curvature (paper: Simplification) or by the cones, and fits and refits on them."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -215,7 +215,7 @@ def energy_rows(spline: BSpline) -> Array:
     return np.asarray(spline.basis_matrix(u, min(2, spline.degree)) * root[:, None])
 
 
-# --- cone knots ----------------------------------------------------------------------------------------
+# --- knots where cones ask for them ----------------------------------------------------------------------
 
 
 EVEN: Final = 1e-9

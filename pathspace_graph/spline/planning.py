@@ -1,4 +1,4 @@
-"""What a planner is given of a track: a centre line with widths and curvature, each with its sigma."""
+"""What a planner takes of a track: a centre line with widths, curvature and sigmas, and a speed profile."""
 
 from dataclasses import dataclass
 from math import inf, sqrt
@@ -116,7 +116,7 @@ def _square(speed: float | None) -> float:
     return speed**2
 
 
-# --- planning ------------------------------------------------------------------------------------------
+# --- the sampled centre line -----------------------------------------------------------------------------
 
 
 LEAST_STEP: Final = 0.01

@@ -6,7 +6,7 @@ import numpy as np
 
 from pathspace_graph.plausibility.hypotheses import AS_WRITTEN, Trials, lever, mounting_of
 from pathspace_graph.plausibility.pairs import pairs_of
-from pathspace_graph.settings.output import PlausibilitySettings
+from pathspace_graph.settings.plausibility import PlausibilitySettings
 from pathspace_graph.sim.mistakes import in_frame
 
 from ..scenes.batch import course_log

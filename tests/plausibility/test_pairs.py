@@ -8,7 +8,7 @@ import pytest
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.io.log import Detections
 from pathspace_graph.plausibility.pairs import Pairs, pairs_of, spacing_of
-from pathspace_graph.settings.output import PlausibilitySettings
+from pathspace_graph.settings.plausibility import PlausibilitySettings
 
 SETTINGS = PlausibilitySettings()
 CONES = np.array([[2.0, 2.0], [6.0, 2.2], [10.0, 2.0], [2.5, -1.9], [7.0, -2.0], [11.0, -2.1]])
