@@ -43,9 +43,7 @@ def linear_graph(groups: Sequence[Rows], variables: Variables) -> gtsam.Gaussian
 
     The graph is for one linearization: unlike the window's factors, these are not kept.
     """
-    here = variables.copy()
-    here.reference = here.values
-    return graph_of(*(factor.linear for factor in jacobian_factors(groups, here).values()))
+    return graph_of(*jacobian_factors(groups, variables.layout).values())
 
 
 def fix_map(groups: Sequence[Rows]) -> list[Rows]:

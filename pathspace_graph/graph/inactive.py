@@ -51,7 +51,6 @@ class InactiveMap:
         """Conditionals, in the order of their deactivation."""
         self.keys: IntArray = _NO_KEYS
         """Keys (k,) of the inactive variables, ascending."""
-        self.members: frozenset[int] = frozenset()
         self.anchors: IntArray = _NO_KEYS
         """The last conditional depends on these poses (a,), which must stay active."""
         self._old_anchors: IntArray = _NO_KEYS  # they were eliminated with the next conditional
@@ -94,7 +93,6 @@ class InactiveMap:
         conditional, remaining = eliminate(graph, frontals)
         self.net.push_back(conditional)
         self.keys = np.union1d(self.keys, keys)
-        self.members = frozenset(self.keys.tolist())
         self._old_anchors = np.union1d(self._old_anchors, keyframes)
         separator = np.array(list(conditional.keys()), np.intp)[len(frontals) :]
         self.anchors = separator[are_poses(separator)]
@@ -226,7 +224,6 @@ class InactiveChain(InactiveMap):
         leaving = [link.leaving.keys for link in self.links]
         keys = np.concatenate([np.zeros(0, np.intp), *leaving])
         self.keys = np.sort(keys[~are_poses(keys)])
-        self.members = frozenset(self.keys.tolist())
         self.anchors = np.array([link.factor.frame for link in self.links[-1:]], np.intp)
         self._active = None
 

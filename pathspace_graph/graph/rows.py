@@ -1,26 +1,26 @@
 """Whitened linear rows on keys, the odometry's among them, and the GTSAM factors that are made of them.
 
-The residual functions give whitened rows of a whole window at once. The binding's constructors take at most
-three keys and one factor at a time. So the rows of all factors are written into one buffer, and each factor
-is made of a view of it by way of a Gaussian conditional, which is a Jacobian factor.
+The residual functions give whitened rows of a whole window at once. They are kept as rows, and summed into
+the Hessian of a step. A GTSAM factor is made of them where they are marginalized or a user asks. The
+binding's constructors take at most three keys, so it is made by way of a Gaussian conditional, which is one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from itertools import accumulate
 
 import gtsam
 import numpy as np
 
+from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, odometry_residuals
 from pathspace_graph.factors.se2 import compose, rotation
 
-from .gaussian import FactoredSystem, half_solve
+from .gaussian import FactoredSystem, half_solve, keys_of
 from .variables import (
     CALIBRATION_KEY,
     CALIBRATION_LETTER,
@@ -32,6 +32,7 @@ from .variables import (
     pose_key,
     pose_keys,
     sizes,
+    spread,
 )
 
 
@@ -55,13 +56,18 @@ class Rows:
     def __len__(self) -> int:
         return len(self.residual)
 
-    def where(self, chosen: BoolArray | IntArray) -> Rows:
+    def where(self, chosen: BoolArray | IntArray | slice) -> Rows:
         return Rows(self.keys[chosen], self.jacobian[chosen], self.residual[chosen], self.owner[chosen])
 
     @property
     def pattern(self) -> tuple[IntArray, IntArray]:
         """Return which of a row's keys each derivative (n,) is by, and which entry of its variable."""
-        return _pattern(tuple(sizes(self.keys[0]).tolist()))
+        return _pattern(self.widths)
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Return the widths (k,) of each row's variables."""
+        return tuple(sizes(self.keys[0]).tolist())
 
     def columns(self, layout: Layout) -> IntArray:
         """Return the column (m, n) of each derivative, which is UNKNOWN where a key is not in the layout."""
@@ -69,103 +75,156 @@ class Rows:
         starts = layout.columns(self.keys)[:, key]
         return np.where(starts == UNKNOWN, UNKNOWN, starts + entry)
 
+    def columns_in(self, layout: Layout) -> IntArray:
+        """Return the column (m, n) of each derivative; ValueError where the layout does not hold a key."""
+        key, entry = self.pattern
+        return np.asarray(layout.starts[layout.places(self.keys)][:, key] + entry)
+
 
 @cache
 def _pattern(widths: tuple[int, ...]) -> tuple[IntArray, IntArray]:
     return np.repeat(np.arange(len(widths)), widths), np.concatenate([np.arange(width) for width in widths])
 
 
-@dataclass(frozen=True, eq=False)
-class LinearFactor:
-    keys: frozenset[int]
-    linear: gtsam.GaussianConditional
+def at_reference(groups: Sequence[Rows], variables: Variables) -> list[Rows]:
+    """Return rows linearized at the variables' values as `J d + r` with d = value - reference."""
+    change = variables.values - variables.reference
+    moved = []
+    for rows in groups:
+        if len(rows):
+            by_change = rows.jacobian * change[rows.columns_in(variables.layout)]
+            moved.append(replace(rows, residual=rows.residual - by_change.sum(axis=1)))
+    return moved
 
 
-def jacobian_factors(groups: Sequence[Rows], variables: Variables) -> dict[int, LinearFactor]:
-    """Return a factor `1/2 |A d - b|^2` by owner, with d = value - reference, `A = J` and `b = J d_now - r`.
-
-    The rows must have been linearized at the variables' values, d_now from the reference.
-    """
-    groups = [rows for rows in groups if len(rows)]
-    if not groups:
-        return {}
-    blocks = _FactorBlocks(groups, variables.layout)
-    buffer = blocks.write(groups, variables)
-    return {owner: blocks.factor(f, buffer) for f, owner in enumerate(blocks.owners)}
+def jacobian_factors(groups: Sequence[Rows], layout: Layout) -> dict[int, gtsam.GaussianConditional]:
+    """Return a factor `1/2 |J d + r|^2` by owner, from rows whose unknowns are d, on the keys of its rows."""
+    parts: dict[int, list[tuple[Rows, IntArray]]] = {}
+    for unordered in groups:
+        rows = unordered.where(unordered.owner.argsort(kind="stable"))
+        places, (owners, first) = layout.places(rows.keys), np.unique(rows.owner, return_index=True)
+        for owner, begin, end in zip(owners.tolist(), first, np.append(first, len(rows))[1:], strict=True):
+            parts.setdefault(owner, []).append((rows.where(slice(begin, end)), places[begin:end]))
+    return {owner: _factor(parts[owner], layout) for owner in sorted(parts)}
 
 
-class _FactorBlocks:
-    """Where each derivative goes in the buffer of all factors, each of which is stored by columns."""
-
-    def __init__(self, groups: Sequence[Rows], layout: Layout) -> None:
-        owner = np.concatenate([rows.owner for rows in groups])
-        lowest = int(owner.min())
-        present = np.bincount(owner - lowest) > 0
-        owners = present.nonzero()[0]
-        self.owners: list[int] = (lowest + owners).tolist()
-        member = (present.cumsum() - 1)[owner - lowest]
-        ends = [*accumulate(len(rows) for rows in groups)]
-        self.slices = [slice(end - len(rows), end) for end, rows in zip(ends, groups, strict=True)]
-        places = [_places(rows.keys, layout) for rows in groups]
-        held = np.zeros(len(layout.keys), bool)
-        for place in places:
-            held[place] = True
-        number, self.held = held.cumsum() - 1, held.nonzero()[0]  # factors hold few keys of a large map
-        self.member, self.places = member, [number[place] for place in places]
-        touched = np.zeros((len(owners), len(self.held)), bool)
-        for place, own in zip(self.places, self.slices, strict=True):
-            touched[member[own, None], place] = True
-        widths = layout.widths[self.held]
-        ending = (touched * widths).cumsum(axis=1)
-        self.begin = ending - widths  # the column of each key in the factors that hold it
-        self.width, self.height = ending[:, -1] + 1, np.bincount(member)
-        self.size = self.height * self.width
-        self.offset = self.size.cumsum() - self.size
-        order = member.argsort(kind="stable")
-        first = self.height.cumsum() - self.height
-        self.row = np.empty(len(member), np.intp)
-        self.row[order] = np.arange(len(member)) - first[member[order]]
-        factor, key = touched.nonzero()
-        self._bounds = factor.searchsorted(np.arange(len(owners) + 1)).tolist()
-        self._keys, self._widths = layout.keys[self.held[key]].tolist(), widths[key].tolist()
-        ends = [*accumulate(self.size.tolist(), initial=0)]
-        self._blocks = list(zip(ends[:-1], ends[1:], self.height.tolist(), strict=True))
-
-    def write(self, groups: Sequence[Rows], variables: Variables) -> Array:
-        buffer = np.zeros(int(self.size.sum()))
-        change, starts = variables.values - variables.reference, variables.layout.starts[self.held]
-        for rows, place, own in zip(groups, self.places, self.slices, strict=True):
-            (key, entry), member = rows.pattern, self.member[own]
-            height, first = self.height[member], self.offset[member] + self.row[own]
-            columns = self.begin[member[:, None], place][:, key] + entry
-            columns *= height[:, None]
-            columns += first[:, None]
-            buffer[columns] = rows.jacobian
-            moved = change.take(starts.take(place)[:, key] + entry)
-            moved *= rows.jacobian
-            buffer[first + (self.width[member] - 1) * height] = moved.sum(axis=1) - rows.residual
-        return buffer
-
-    def factor(self, f: int, buffer: Array) -> LinearFactor:
-        own, (begin, end, height) = slice(self._bounds[f], self._bounds[f + 1]), self._blocks[f]
-        keys, block = self._keys[own], buffer[begin:end].reshape((height, -1), order="F")
-        matrix = gtsam.VerticalBlockMatrix([*self._widths[own], 1], block, False)
-        return LinearFactor(frozenset(keys), gtsam.GaussianConditional(keys, 1, matrix))
-
-
-def _places(keys: IntArray, layout: Layout) -> IntArray:
-    """Return the index of each key in a layout; ValueError where the layout does not hold it."""
-    places = layout.keys.searchsorted(keys)
-    known = layout.keys.take(places, mode="clip") == keys
-    if not known.all():
-        raise ValueError(f"expected rows on known variables, found {names(keys[~known])}")
-    return places
+def _factor(parts: Sequence[tuple[Rows, IntArray]], layout: Layout) -> gtsam.GaussianConditional:
+    """Return the factor of rows, each with the places (m, k) of its keys in a layout."""
+    held = np.unique(np.concatenate([places.ravel() for _, places in parts]))
+    ends = layout.widths[held].cumsum()
+    starts = ends - layout.widths[held]
+    height = sum(len(rows) for rows, _ in parts)
+    block, begin = np.zeros((height, int(ends[-1]) + 1), order="F"), 0
+    for rows, places in parts:
+        end, (key, entry) = begin + len(rows), rows.pattern
+        columns = starts[held.searchsorted(places)][:, key] + entry
+        block[np.arange(begin, end)[:, None], columns] = rows.jacobian
+        block[begin:end, -1] = -rows.residual
+        begin = end
+    matrix = gtsam.VerticalBlockMatrix([*layout.widths[held].tolist(), 1], block, False)
+    return gtsam.GaussianConditional(layout.keys[held].tolist(), 1, matrix)
 
 
 def stacked_factor(groups: Sequence[Rows], variables: Variables) -> list[gtsam.GaussianConditional]:
     """Return a list of one factor that holds all rows, or an empty list where there are no rows."""
-    stacked = [Rows(r.keys, r.jacobian, r.residual, np.zeros(len(r), np.intp)) for r in groups]
-    return [factor.linear for factor in jacobian_factors(stacked, variables).values()]
+    stacked = [replace(rows, owner=np.zeros(len(rows), np.intp)) for rows in groups]
+    return [*jacobian_factors(at_reference(stacked, variables), variables.layout).values()]
+
+
+class KeptRows:
+    """Rows `J d + r` with d = value - reference, which are kept until those of their owner are replaced."""
+
+    def __init__(self) -> None:
+        self.groups: list[Rows] = []
+        """Rows on variables of the same widths are one group."""
+
+    @property
+    def owners(self) -> IntArray:
+        """Return the owners of all rows, which may occur several times."""
+        return np.concatenate([np.zeros(0, np.intp), *(rows.owner for rows in self.groups)])
+
+    def holding(self, keys: IntArray) -> IntArray:
+        """Return the owners of rows that hold any of some ascending keys (k,)."""
+        of_groups = (rows.owner[among(rows.keys, keys).any(axis=1)] for rows in self.groups)
+        return np.concatenate([np.zeros(0, np.intp), *of_groups])
+
+    def replace(self, owners: IntArray, groups: Sequence[Rows], variables: Variables) -> None:
+        """Replace all rows of some owners by rows that are linearized at the variables' values."""
+        self.drop(owners)
+        for rows in at_reference(groups, variables):
+            widths = rows.widths
+            same = next((i for i, kept in enumerate(self.groups) if kept.widths == widths), None)
+            if same is None:
+                self.groups.append(rows)
+            else:
+                self.groups[same] = stacked_rows([self.groups[same], rows])
+
+    def drop(self, owners: IntArray) -> None:
+        """Drop the rows of some owners."""
+        if len(owners) == 0:
+            return
+        kept = [rows.where(~np.isin(rows.owner, owners)) for rows in self.groups]
+        self.groups = [rows for rows in kept if len(rows)]
+
+    def pop(self, owner: int, layout: Layout) -> gtsam.GaussianConditional:
+        """Remove the rows of an owner and return them as a factor."""
+        own = [rows.where(rows.owner == owner) for rows in self.groups]
+        self.drop(np.array([owner]))
+        return jacobian_factors([rows for rows in own if len(rows)], layout)[owner]
+
+
+def among(keys: IntArray, ascending: IntArray) -> BoolArray:
+    """Return which keys, in any shape, are among some ascending ones (k,)."""
+    if len(ascending) == 0:
+        return np.zeros(keys.shape, bool)
+    return np.asarray(ascending.take(ascending.searchsorted(keys), mode="clip") == keys)
+
+
+def stacked_rows(groups: Sequence[Rows]) -> Rows:
+    """Return the rows of groups on variables of the same widths as one group."""
+    return Rows(
+        keys=np.concatenate([rows.keys for rows in groups]),
+        jacobian=np.concatenate([rows.jacobian for rows in groups]),
+        residual=np.concatenate([rows.residual for rows in groups]),
+        owner=np.concatenate([rows.owner for rows in groups]),
+    )
+
+
+def newton_system(
+    graph: gtsam.GaussianFactorGraph, groups: Sequence[Rows], layout: Layout, change: Array
+) -> tuple[Array, Array]:
+    """Return the lower triangle of H (n, n), stored by columns, and the negative gradient (n,) at `change`.
+
+    H is the sum of the graph's and of `J'J` of rows `J d + r`, whose negative gradient is `-J'(J d + r)`.
+    Both are on the variables of a layout. SingularSystemError where nothing holds one of them, and ValueError
+    where something holds another one.
+    """
+    hessian, gradient = np.zeros((layout.size, layout.size), order="F"), np.zeros(layout.size)
+    if graph.size():
+        own = Layout(keys_of(graph))
+        entries = spread(layout.starts[layout.places(own.keys)], own.widths)
+        information, vector = graph.hessian(own.ordering)
+        hessian[np.ix_(entries, entries)] = information
+        gradient[entries] = vector - information @ change[entries]
+    for rows in groups:
+        add_rows(hessian, gradient, rows.columns_in(layout), rows.jacobian, rows.residual, change)
+    missing = layout.keys[hessian.diagonal()[layout.starts] == 0.0]
+    if len(missing):
+        raise SingularSystemError(f"expected a factor on every variable, found none on {names(missing)}")
+    return hessian, gradient
+
+
+def add_rows(
+    hessian: Array, gradient: Array, columns: IntArray, jacobian: Array, residual: Array, change: Array
+) -> None:
+    """Add `J'J` to the lower triangle of a Hessian (n, n), and `-J'(J d + r)` to a negative gradient (n,).
+
+    Derivatives J (m, k) are by the unknowns d of some columns (m, k), which are `change` (n,) now.
+    """
+    A = np.zeros((len(jacobian), len(gradient)))
+    A[np.arange(len(jacobian))[:, None], columns] = jacobian
+    hessian += A.T @ A
+    gradient -= (A @ change + residual) @ A
 
 
 class OdometryChain:

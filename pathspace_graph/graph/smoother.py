@@ -1,9 +1,9 @@
 """The fixed-lag smoother: a window of GTSAM factors on the map and the last few seconds of poses.
 
-In each cycle the stale factors of the window are linearized again. `graph.hessian(ordering)` and one dense
-Cholesky factor give the step and the joint covariance. Then the oldest pose is eliminated, and the graph that
-remains is the prior. GTSAM's own fixed-lag smoothers freeze the linearization point of every variable that a
-marginal touches, which here is the whole map.
+In each cycle the stale rows of the window are linearized again. They are added to the Hessian that GTSAM
+gives of the prior, and one dense Cholesky factor gives the step and the joint covariance. Then the oldest
+pose is eliminated, and the graph that remains is the prior. GTSAM's own fixed-lag smoothers freeze the
+linearization point of every variable that a marginal touches, which here is the whole map.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,6 @@ from .gaussian import (
     graph_of,
     marginalize,
     merge_variables,
-    normal_equations,
     remove_information,
     solve,
     sparse_marginal,
@@ -36,7 +35,7 @@ from .gaussian import (
 )
 from .inactive import Follower, InactiveChain, InactiveMap
 from .relative import Submaps
-from .rows import Rows, calibrated_delta, predicted_covariance
+from .rows import Rows, calibrated_delta, newton_system, predicted_covariance
 from .variables import CALIBRATION_KEY, POINT, POSE, POSE_LETTER, SENSOR_LETTER, Layout, pose_key, pose_keys
 from .window import M_co, SmootherSettings, UserFactors, WindowFactors, check_factors
 
@@ -129,7 +128,7 @@ class FixedLagSmoother(Generic[M_co]):
 
     def add_pose(self, t: float, pose: Array, odometry: IntegratedOdometry) -> None:
         """Add the next pose (3,) at t (s), and the odometry that leads to it."""
-        self.window.of_cycle.pop(self.next_cycle - 1, None)
+        self.window.measured.drop(np.array([self.next_cycle - 1]))
         self.variables.insert(pose_keys(np.array([self.next_cycle])), pose)
         self.times.append(t)
         self.window.odometry.append(odometry)
@@ -193,14 +192,13 @@ class FixedLagSmoother(Generic[M_co]):
 
         No variable moves. SingularSystemError where the system is not positive definite.
         """
-        while not self.window.relinearize(self._cycles, self.inactive.members) and len(self.inactive):
+        while not self.window.relinearize(self._cycles, self.inactive.keys) and len(self.inactive):
             self.activate(self.inactive.newest)  # rare: a detection has moved to where the map is inactive
         user, layout = self.user_factors.linearized(self.variables), self.layout
         held = self.chain.hold(self.variables) if self.chain is not None else []
-        graph = graph_of(self.prior, *self.window.linear, *user, *held)
-        hessian, vector = normal_equations(graph, layout)
-        now = self.variables.change(self.variables.layout.entries(layout.keys))
-        negative_gradient = vector - hessian @ now
+        graph = graph_of(self.prior, *user, *held) if user or held else self.prior
+        change = self.variables.change(self.variables.layout.entries(layout.keys))
+        hessian, negative_gradient = newton_system(graph, self.window.groups, layout, change)
         if sigma_step is not None:
             first, last = layout.block(SENSOR_LETTER).stop, layout.block(POSE_LETTER).start
             points = np.arange(first, last)
@@ -280,7 +278,7 @@ class FixedLagSmoother(Generic[M_co]):
         """
         cycle, key = self.first_cycle, pose_key(self.first_cycle)
         user = self.user_factors.remove(np.array([key]), self.variables)
-        factors = graph_of(self.window.of_cycle.pop(cycle).linear, *user)
+        factors = graph_of(self.window.measured.pop(cycle, self.variables.layout), *user)
         if self.submaps is not None:
             self.submaps.add_pose(key, factors, self.variables)
         self.prior = graph_of(self.prior, factors)
@@ -308,7 +306,7 @@ class FixedLagSmoother(Generic[M_co]):
         else:
             self.prior = self.inactive.push(graph_of(self.prior, *user), keys, keyframes, shared)
         self.variables.remove(keyframes)
-        self.window.drop(self.inactive.members)  # a factor linearized earlier may still hold one of them
+        self.window.drop(self.inactive.keys)  # a factor linearized earlier may still hold one of them
 
     def _finish_submap(self) -> None:
         """Finish the current submap, so that it stays small when other map points become active."""
@@ -324,7 +322,7 @@ class FixedLagSmoother(Generic[M_co]):
             return
         self._finish_submap()
         self.prior = self.chain.carry(self.prior, self.variables, self.followers)
-        self.window.relinearize(self._cycles, self.inactive.members)
+        self.window.relinearize(self._cycles, self.inactive.keys)
 
     def refresh(self) -> None:
         """Update the inactive variables."""

@@ -154,6 +154,14 @@ class Layout:
         places = np.minimum(self.keys.searchsorted(keys), len(self.keys) - 1)
         return np.where(self.keys[places] == keys, places, UNKNOWN)
 
+    def places(self, keys: IntArray) -> IntArray:
+        """Return the index of each key, in any shape; ValueError where the layout does not hold it."""
+        places = self.keys.searchsorted(keys)
+        known = self.keys.take(places, mode="clip") == keys
+        if not known.all():
+            raise ValueError(f"expected rows on known variables, found {names(keys[~known])}")
+        return np.asarray(places)
+
     def columns(self, keys: IntArray) -> IntArray:
         """Return the first column of each key, in any shape; UNKNOWN for a key that is not in the layout."""
         places = self.positions(keys)

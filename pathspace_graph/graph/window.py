@@ -4,9 +4,9 @@ This is the fluid relinearization of iSAM2 (Kaess et al. 2012). No linearization
 frozen.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Final, Generic, Protocol, TypeVar
 
 import gtsam
 import numpy as np
@@ -14,8 +14,8 @@ import numpy as np
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, IntArray
 
-from .gaussian import as_hessian_factor, graph_of, jacobian_factor, normal_equations, square_root_form
-from .rows import LinearFactor, OdometryChain, Rows, jacobian_factors, stacked_factor
+from .gaussian import graph_of, jacobian_factor, normal_equations, square_root_form
+from .rows import KeptRows, OdometryChain, Rows, among, at_reference, jacobian_factors, stacked_factor
 from .variables import (
     CALIBRATION_LETTER,
     POSE,
@@ -30,7 +30,8 @@ from .variables import (
     sizes,
 )
 
-SENSOR_LEVER = 10.0
+NO_OWNERS: Final = np.zeros(0, np.intp)
+SENSOR_LEVER: Final = 10.0
 """A change of the sensor's calibration moves detections by about this much (m by its unit): they are ten
 metres away, and the vehicle drives at ten metres a second."""
 
@@ -116,20 +117,19 @@ class WindowFactors(Generic[M_co]):
         """Odometry between each pose of the window and the next."""
         self.exact = False
         """If true, the tolerances are zero: factors of all variables that moved are linearized again."""
-        self.of_cycle: dict[int, LinearFactor] = {}
-        """Each perception cycle has a factor with its detections and the odometry to the next cycle."""
-        self.gauge: dict[int, LinearFactor] = {}
-        """Nonlinear weak priors by owner."""
+        self.measured = KeptRows()
+        """Rows of detections, and of the odometry to the next cycle, by perception cycle."""
+        self.gauge = KeptRows()
+        """Nonlinear weak priors."""
+        self.linear_gauge = KeptRows()
+        """Linear weak priors."""
         self._tolerances = tolerances
-        self._linear_gauge = gtsam.GaussianFactorGraph()
         self._structure: object = None
 
     @property
-    def linear(self) -> Iterator[gtsam.GaussianFactor | gtsam.GaussianFactorGraph]:
-        """Yield all factors as they were linearized last."""
-        yield self._linear_gauge
-        for factor in (*self.of_cycle.values(), *self.gauge.values()):
-            yield factor.linear
+    def groups(self) -> list[Rows]:
+        """Return all rows as they were linearized last, `J d + r` with d = value - reference."""
+        return [*self.measured.groups, *self.gauge.groups, *self.linear_gauge.groups]
 
     def fresh(self, cycles: IntArray, whole: bool) -> list[gtsam.GaussianFactor]:
         """Return factors of some cycles and weak priors, linearized at the variables' values.
@@ -138,8 +138,9 @@ class WindowFactors(Generic[M_co]):
         `whole`.
         """
         weak = [*self.map.gauge(whole), *self.map.linear_gauge(whole)]
-        own = jacobian_factors(self._rows(cycles), self.variables)
-        return [*(factor.linear for factor in own.values()), *stacked_factor(weak, self.variables)]
+        measured = at_reference(self._rows(cycles), self.variables)
+        factors = jacobian_factors(measured, self.variables.layout)
+        return [*factors.values(), *stacked_factor(weak, self.variables)]
 
     def weak_on(self, keys: IntArray) -> list[gtsam.GaussianFactor]:
         """Return the weak priors that hold any of some active map points (k,), as one factor."""
@@ -147,30 +148,30 @@ class WindowFactors(Generic[M_co]):
         touching = [rows.where(np.asarray(np.isin(rows.keys, keys).any(axis=1))) for rows in weak]
         return [*stacked_factor(touching, self.variables)]
 
-    def relinearize(self, cycles: IntArray, inactive: frozenset[int]) -> bool:
-        """Linearize stale factors again, and returns true.
+    def relinearize(self, cycles: IntArray, inactive: IntArray) -> bool:
+        """Linearize stale rows again, and return true.
 
-        Where one of them would hold an inactive variable, it changes nothing and returns false.
+        Where one of them would hold an inactive variable (k,), nothing changes and the result is false.
         """
         moved = self._moved()
         stale = self._stale(cycles, moved)
-        own = jacobian_factors(self._rows(stale), self.variables)
-        if self.map.reached_inactive or not all(inactive.isdisjoint(factor.keys) for factor in own.values()):
+        groups = self._rows(stale)
+        if self.map.reached_inactive or any(among(rows.keys, inactive).any() for rows in groups):
             return False
-        self.of_cycle |= own
+        self.measured.replace(stale, groups, self.variables)
         self.map.linearized(stale)
         self._relinearize_gauge(moved)
         entries = self.variables.layout.entries(moved)
         self.variables.linearized[entries] = self.variables.values[entries]
         return True
 
-    def drop(self, keys: frozenset[int]) -> None:
-        """Drop the factors of cycles that hold any of some keys, so that they are linearized again."""
-        self.of_cycle = {cycle: own for cycle, own in self.of_cycle.items() if keys.isdisjoint(own.keys)}
+    def drop(self, keys: IntArray) -> None:
+        """Drop the rows of cycles that hold any of some ascending keys, so that they are linearized again."""
+        self.measured.drop(self.measured.holding(keys))
 
     def clear(self) -> None:
-        """Drop every factor, since the map has other variables."""
-        self.of_cycle, self._structure = {}, None
+        """Drop every row, since the map has other variables."""
+        self.measured, self._structure = KeptRows(), None
 
     def _rows(self, cycles: IntArray) -> list[Rows]:
         return [*self.map.rows(cycles), *self.odometry.rows(self.variables, cycles)]
@@ -192,32 +193,21 @@ class WindowFactors(Generic[M_co]):
         return layout.keys[np.logical_or.reduceat(moved, layout.starts)]
 
     def _stale(self, cycles: IntArray, moved: IntArray) -> IntArray:
-        changed, moved_keys = set(self.map.changed().tolist()), frozenset(moved.tolist())
-        return np.array(
-            [
-                cycle
-                for cycle in cycles.tolist()
-                if cycle in changed
-                or cycle not in self.of_cycle
-                or not moved_keys.isdisjoint(self.of_cycle[cycle].keys)
-            ],
-            np.intp,
-        )
+        stale = ~np.isin(cycles, self.measured.owners)
+        stale |= np.isin(cycles, np.append(self.map.changed(), self.measured.holding(moved)))
+        return cycles[stale]
 
     def _relinearize_gauge(self, moved: IntArray) -> None:
-        structure, moved_keys = self.map.structure, frozenset(moved.tolist())
-        if structure is not self._structure:
-            self.gauge, self._structure = {}, structure
-            linear = jacobian_factors(self.map.linear_gauge(False), self.variables)
-            graph = graph_of(*(factor.linear for factor in linear.values()))
-            self._linear_gauge = graph_of(as_hessian_factor(graph)) if linear else graph
-        kept = [owner for owner, factor in self.gauge.items() if moved_keys.isdisjoint(factor.keys)]
-        if len(kept) == len(self.gauge) > 0:
+        if self.map.structure is not self._structure:
+            self.gauge, self.linear_gauge, self._structure = KeptRows(), KeptRows(), self.map.structure
+            self.linear_gauge.replace(NO_OWNERS, self.map.linear_gauge(False), self.variables)
+        stale = np.unique(self.gauge.holding(moved))
+        if self.gauge.groups and len(stale) == 0:
             return
-        stale = self.map.gauge(False)
-        if kept:
-            stale = [group.where(~np.isin(group.owner, kept)) for group in stale]
-        self.gauge |= jacobian_factors(stale, self.variables)
+        weak = self.map.gauge(False)
+        if self.gauge.groups:
+            weak = [rows.where(among(rows.owner, stale)) for rows in weak]
+        self.gauge.replace(stale, weak, self.variables)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -10,7 +10,7 @@ from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.residuals import ProjectionRows, pair_residuals, project
 from pathspace_graph.factors.sensor import SensorRows
-from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.rows import Rows, stacked_rows
 from pathspace_graph.graph.variables import CONTROL_LETTERS, SENSOR_KEY, control_keys, pose_keys
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Gauge
@@ -151,7 +151,7 @@ class CurveMap:
             off, direction = pair_residuals(first, second, gauge.nominal)
             jacobian = np.concatenate([-direction, direction], axis=1) / sigma[:, None]
             spacing.append(self._rows(label, gauge.pairs, jacobian, off / sigma))
-        return [_stacked(spacing)]
+        return [stacked_rows(spacing)]
 
     def linear_gauge(self, whole: bool) -> list[Rows]:
         """Return the linear priors: smoothness `D c / (sigma_smoothness spacing)`, and anchors.
@@ -168,7 +168,7 @@ class CurveMap:
             active = gauge.points[:, None]
             held = np.tile(held, (len(active), 1))
             anchors.append(self._rows(label, active, held, np.zeros(len(held))))
-        return [_stacked(groups) for groups in (smooth, anchors) if groups]
+        return [stacked_rows(groups) for groups in (smooth, anchors) if groups]
 
     def _gauges(self, whole: bool) -> Iterator[tuple[int, Gauge]]:
         for label, boundary in self.state.boundaries.items():
@@ -181,15 +181,6 @@ class CurveMap:
         return Rows(
             control_keys(label, self.state.boundaries[label].first + repeated), jacobian, residual, owner
         )
-
-
-def _stacked(groups: Sequence[Rows]) -> Rows:
-    return Rows(
-        keys=np.concatenate([rows.keys for rows in groups]),
-        jacobian=np.concatenate([rows.jacobian for rows in groups]),
-        residual=np.concatenate([rows.residual for rows in groups]),
-        owner=np.concatenate([rows.owner for rows in groups]),
-    )
 
 
 def _by_axis(coefficients: Array) -> Array:

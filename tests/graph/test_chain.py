@@ -14,7 +14,7 @@ from pathspace_graph.factors.se2 import compose, inverse, move_points, rotation
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, keys_of, marginalize, normal_equations
 from pathspace_graph.graph.inactive import InactiveChain, pose_and_reference
 from pathspace_graph.graph.relative import from_frame, relative_factor
-from pathspace_graph.graph.rows import Rows, jacobian_factors
+from pathspace_graph.graph.rows import Rows, at_reference, jacobian_factors
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
     ORIGIN_KEY,
@@ -86,7 +86,9 @@ class Drive:
 
     def _leave(self, k: int, rng: np.random.Generator) -> None:
         """Marginalizes pose k; from pose 4 on, a point is left behind at every second pose."""
-        factor = jacobian_factors(relative_rows(self.variables, k, rng), self.variables)[k].linear
+        factor = jacobian_factors(
+            at_reference(relative_rows(self.variables, k, rng), self.variables), self.variables.layout
+        )[k]
         self.prior, self.whole = graph_of(self.prior, factor), graph_of(self.whole, factor)
         self.variables.first_cycle = k + 1
         if pose_key(k) not in self.chain.anchors:

@@ -9,6 +9,7 @@ import pytest
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.graph.gaussian import graph_of, keys_of, normal_equations
 from pathspace_graph.graph.inactive import InactiveMap
+from pathspace_graph.graph.rows import jacobian_factors
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
     CONTROL_LETTERS,
@@ -200,7 +201,8 @@ class Checked(CurveSmoother):
         if len(self.inactive) == 0 or self.chain is not None:
             return
         assert sigma_step is not None
-        graph = graph_of(self.prior, self.inactive.net, *self.window.linear)
+        kept = jacobian_factors(self.window.groups, self.variables.layout)
+        graph = graph_of(self.prior, self.inactive.net, *kept.values())
         whole = Layout(keys_of(graph))
         hessian, vector = normal_equations(graph, whole)
         own = np.setdiff1d(self.layout.keys, self.inactive.keys)

@@ -14,7 +14,7 @@ from pathspace_graph.factors.odometry import odometry_residuals
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, keys_of, normal_equations
 from pathspace_graph.graph.relative import RelativeFactor, Submaps
-from pathspace_graph.graph.rows import Rows, jacobian_factors
+from pathspace_graph.graph.rows import Rows, at_reference, jacobian_factors
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
     POSE,
@@ -210,7 +210,7 @@ def drive_on(
     for k, own in enumerate(groups):
         if k == cut:
             submaps.remove_information(gone, variables)
-        graph = graph_of(jacobian_factors(own, variables)[k].linear)
+        graph = graph_of(jacobian_factors(at_reference(own, variables), variables.layout)[k])
         submaps.add_pose(int(drive.poses[k]), graph, variables)
         variables.remove(drive.poses[k : k + 1])
         variables.first_cycle = k + 1

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pathspace_graph.factors.arrays import IntArray
 from pathspace_graph.factors.odometry import integrate_twists
-from pathspace_graph.graph.gaussian import graph_of, keys_of, normal_equations
-from pathspace_graph.graph.rows import LinearFactor
+from pathspace_graph.graph.gaussian import graph_of, normal_equations
+from pathspace_graph.graph.rows import KeptRows, Rows, newton_system
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Layout, control_keys, pose_key, pose_keys
 from pathspace_graph.graph.window import WindowFactors
 
@@ -19,7 +20,7 @@ from ..scenes.linear_drive import LinearTrack
 
 CYCLES = np.arange(4)
 TOLERANCE_POINT, TOLERANCE_HEADING = 0.1, 0.01
-ACTIVE: frozenset[int] = frozenset()
+ACTIVE: IntArray = np.zeros(0, np.intp)
 """No variable is inactive."""
 
 
@@ -29,6 +30,18 @@ class Track(LinearTrack):
     def __init__(self, seed: int) -> None:
         super().__init__(seed)
         self.changed_cycles: list[int] = []
+        self.weight = 1.0
+        """Factor of the rows, by which those that are made later are told from those that were kept."""
+
+    def rows(self, cycles: IntArray) -> list[Rows]:
+        return self._weighed(super().rows(cycles))
+
+    def gauge(self, whole: bool) -> list[Rows]:
+        return self._weighed(super().gauge(whole))
+
+    def _weighed(self, groups: Sequence[Rows]) -> list[Rows]:
+        by = self.weight
+        return [replace(rows, jacobian=by * rows.jacobian, residual=by * rows.residual) for rows in groups]
 
     def changed(self) -> IntArray:
         return np.array(self.changed_cycles, np.intp)
@@ -52,9 +65,24 @@ def make_window(seed: int = 0) -> WindowFactors[Track]:
     return window
 
 
-def new_cycles(window: WindowFactors[Track], before: dict[int, LinearFactor]) -> list[int]:
-    """Returns the cycles whose factor is another object than before."""
-    return [cycle for cycle, factor in window.of_cycle.items() if before.get(cycle) is not factor]
+def new_owners(rows: KeptRows, before: dict[int, float]) -> list[int]:
+    """Returns the owners whose rows were made since."""
+    return [owner for owner, size in sizes_of(rows).items() if before.get(owner) != size]
+
+
+def sizes_of(kept: KeptRows) -> dict[int, float]:
+    """Returns the sum of the absolute derivatives of each owner's rows; then later rows weigh more."""
+    owners = np.unique(kept.owners).tolist()
+    return {
+        owner: sum(float(np.abs(rows.jacobian[rows.owner == owner]).sum()) for rows in kept.groups)
+        for owner in owners
+    }
+
+
+def mark(window: WindowFactors[Track]) -> dict[int, float]:
+    """Returns the rows of the cycles as they are; those that are made later weigh more."""
+    window.map.weight = 2.0
+    return sizes_of(window.measured)
 
 
 def move(window: WindowFactors[Track], key: int, entry: int, size: float) -> None:
@@ -62,8 +90,8 @@ def move(window: WindowFactors[Track], key: int, entry: int, size: float) -> Non
     variables.values[variables.layout.columns(np.array([key]))[0] + entry] += size
 
 
-def holding(factors: dict[int, LinearFactor], key: int) -> list[int]:
-    return [owner for owner, factor in factors.items() if key in factor.keys]
+def holding(kept: KeptRows, key: int) -> list[int]:
+    return np.unique(kept.holding(np.array([key]))).tolist()
 
 
 def assert_linearized_at_the_values(window: WindowFactors[Track]) -> None:
@@ -76,21 +104,21 @@ def assert_linearized_at_the_values(window: WindowFactors[Track]) -> None:
         *track.linear_gauge(False),
     ]
     J, r, _ = dense_rows(groups, variables.keys)
-    hessian, vector = normal_equations(graph_of(*window.linear), variables.layout)
-    np.testing.assert_allclose(hessian, J.T @ J, atol=1e-9 * np.abs(hessian).max())
     now = variables.values - variables.reference
-    np.testing.assert_allclose(vector - hessian @ now, -J.T @ r, atol=1e-8 * np.abs(vector).max())
+    hessian, gradient = newton_system(graph_of(), window.groups, variables.layout, now)
+    np.testing.assert_allclose(np.tril(hessian), np.tril(J.T @ J), atol=1e-9 * np.abs(hessian).max())
+    np.testing.assert_allclose(gradient, -J.T @ r, atol=1e-8 * np.abs(J.T @ J @ now).max())
 
 
 def test_the_first_linearization_makes_every_factor() -> None:
     window = make_window()
-    assert sorted(window.of_cycle) == CYCLES.tolist()
+    assert list(sizes_of(window.measured)) == CYCLES.tolist()
     assert_linearized_at_the_values(window)
 
 
 def test_a_factor_is_kept_while_nothing_moves_by_more_than_the_tolerance() -> None:
     window = make_window()
-    before, weak = dict(window.of_cycle), dict(window.gauge)
+    before, weak = mark(window), sizes_of(window.gauge)
     for key, entry, size in (
         (pose_key(1), 0, 0.9 * TOLERANCE_POINT),
         (pose_key(2), POSE - 1, -0.9 * TOLERANCE_HEADING),
@@ -98,8 +126,8 @@ def test_a_factor_is_kept_while_nothing_moves_by_more_than_the_tolerance() -> No
     ):
         move(window, key, entry, size)
     assert window.relinearize(CYCLES, ACTIVE)
-    assert new_cycles(window, before) == []
-    assert all(window.gauge[owner] is factor for owner, factor in weak.items())
+    assert new_owners(window.measured, before) == []
+    assert new_owners(window.gauge, weak) == []
 
 
 @pytest.mark.parametrize(
@@ -110,52 +138,53 @@ def test_a_moved_pose_makes_its_own_cycle_stale_and_the_one_whose_odometry_leads
     entry: int, size: float
 ) -> None:
     window = make_window()
-    before = dict(window.of_cycle)
+    before = mark(window)
     move(window, pose_key(2), entry, size)
     assert window.relinearize(CYCLES, ACTIVE)
-    assert new_cycles(window, before) == [1, 2]
+    assert new_owners(window.measured, before) == [1, 2]
 
 
 def test_a_moved_point_makes_the_cycles_and_the_weak_priors_stale_that_hold_it() -> None:
     window, key = make_window(), int(control_keys(0, np.array(2)))
-    before, weak = dict(window.of_cycle), dict(window.gauge)
+    before, weak = mark(window), sizes_of(window.gauge)
     move(window, key, 0, 1.1 * TOLERANCE_POINT)
     assert window.relinearize(CYCLES, ACTIVE)
-    assert 0 < len(new_cycles(window, before)) < len(CYCLES)
-    assert new_cycles(window, before) == holding(before, key)
-    replaced = [owner for owner, factor in weak.items() if window.gauge[owner] is not factor]
+    assert 0 < len(new_owners(window.measured, before)) < len(CYCLES)
+    assert new_owners(window.measured, before) == holding(window.measured, key)
+    replaced = new_owners(window.gauge, weak)
     assert 0 < len(replaced) < len(weak)
-    assert sorted(replaced) == sorted(holding(weak, key))
+    assert replaced == holding(window.gauge, key)
 
 
 def test_small_motions_add_up_until_the_tolerance_is_passed() -> None:
     """The distance counts from the last linearization, and not from the last call."""
     window = make_window()
-    before = dict(window.of_cycle)
+    before = mark(window)
     for expected in ([], [], [0]):
         move(window, pose_key(0), 0, 0.4 * TOLERANCE_POINT)
         assert window.relinearize(CYCLES, ACTIVE)
-        assert new_cycles(window, before) == expected
+        assert new_owners(window.measured, before) == expected
 
 
 def test_the_calibration_never_makes_a_factor_stale() -> None:
     """Every row is linear in it."""
     window = make_window()
-    before = dict(window.of_cycle)
+    before = mark(window)
     move(window, CALIBRATION_KEY, 0, 100.0)
     window.exact = True
     assert window.relinearize(CYCLES, ACTIVE)
-    assert new_cycles(window, before) == []
+    assert new_owners(window.measured, before) == []
+    window.map.weight = 1.0
     assert_linearized_at_the_values(window)
 
 
 def test_an_exact_window_relinearizes_after_any_motion() -> None:
     window = make_window()
-    before = dict(window.of_cycle)
+    before = mark(window)
     move(window, pose_key(3), 0, 1e-12)
     window.exact = True
     assert window.relinearize(CYCLES, ACTIVE)
-    assert new_cycles(window, before) == [2, 3]
+    assert new_owners(window.measured, before) == [2, 3]
     window.variables.values += 1.0
     assert window.relinearize(CYCLES, ACTIVE)
     assert_linearized_at_the_values(window)
@@ -163,10 +192,10 @@ def test_an_exact_window_relinearizes_after_any_motion() -> None:
 
 def test_other_detections_make_their_own_cycle_stale() -> None:
     window = make_window()
-    before = dict(window.of_cycle)
+    before = mark(window)
     window.map.changed_cycles = [1]
     assert window.relinearize(CYCLES, ACTIVE)
-    assert new_cycles(window, before) == [1]
+    assert new_owners(window.measured, before) == [1]
     assert window.map.changed_cycles == []
 
 
@@ -184,22 +213,22 @@ def test_only_moved_variables_get_another_linearization_point() -> None:
 
 def test_weak_priors_between_other_points_are_all_made_again() -> None:
     window = make_window()
-    before, weak = dict(window.of_cycle), dict(window.gauge)
+    before, weak = mark(window), sizes_of(window.gauge)
     window.map.inactive, window.map.structure = control_keys(0, np.array([0])), object()
     assert window.relinearize(CYCLES, ACTIVE)
-    assert new_cycles(window, before) == []
-    assert all(window.gauge[owner] is not factor for owner, factor in weak.items() if owner in window.gauge)
-    held = keys_of(graph_of(*(factor.linear for factor in window.gauge.values())))
+    assert new_owners(window.measured, before) == []
+    assert new_owners(window.gauge, weak) == list(sizes_of(window.gauge))
+    held = np.unique(np.concatenate([rows.keys for rows in window.gauge.groups]))
     np.testing.assert_array_equal(held, control_keys(0, np.arange(1, 6)))
 
 
-def on_an_inactive_point(window: WindowFactors[Track]) -> frozenset[int]:
+def on_an_inactive_point(window: WindowFactors[Track]) -> IntArray:
     """A stale cycle sees a point that is inactive."""
     move(window, pose_key(1), 0, 1.0)
-    return frozenset(control_keys(0, np.arange(6)).tolist())
+    return control_keys(0, np.arange(6))
 
 
-def beyond_the_active_map(window: WindowFactors[Track]) -> frozenset[int]:
+def beyond_the_active_map(window: WindowFactors[Track]) -> IntArray:
     """The map says that a row should be on a point that is inactive."""
     move(window, pose_key(1), 0, 1.0)
     window.map.reached_inactive = True
@@ -208,27 +237,30 @@ def beyond_the_active_map(window: WindowFactors[Track]) -> frozenset[int]:
 
 @pytest.mark.parametrize("reach", [on_an_inactive_point, beyond_the_active_map])
 def test_nothing_changes_where_a_row_needs_an_inactive_variable(
-    reach: Callable[[WindowFactors[Track]], frozenset[int]],
+    reach: Callable[[WindowFactors[Track]], IntArray],
 ) -> None:
     window = make_window()
-    before, point = dict(window.of_cycle), window.variables.linearized.copy()
+    before, point = mark(window), window.variables.linearized.copy()
     inactive = reach(window)
     assert not window.relinearize(CYCLES, inactive)
-    assert new_cycles(window, before) == []
+    assert new_owners(window.measured, before) == []
     np.testing.assert_array_equal(window.variables.linearized, point)
 
 
 def test_fresh_factors_are_at_the_values_and_leave_the_kept_ones_alone() -> None:
     window = make_window()
-    before = dict(window.of_cycle)
+    before = mark(window)
     window.variables.values += 0.5 * TOLERANCE_HEADING
     fresh = normal_equations(graph_of(*window.fresh(CYCLES, whole=False)), window.variables.layout)
-    assert new_cycles(window, before) == []
+    assert new_owners(window.measured, before) == []
     window.exact = True
     assert window.relinearize(CYCLES, ACTIVE)
-    kept = normal_equations(graph_of(*window.linear), window.variables.layout)
-    for found, expected in zip(fresh, kept, strict=True):
-        np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+    variables = window.variables
+    now = variables.values - variables.reference
+    hessian, gradient = newton_system(graph_of(), window.groups, variables.layout, now)
+    scale = np.abs(hessian).max()
+    np.testing.assert_allclose(np.tril(fresh[0]), np.tril(hessian), atol=1e-9 * scale)
+    np.testing.assert_allclose(fresh[1] - fresh[0] @ now, gradient, atol=1e-9 * scale)
 
 
 def test_weak_priors_on_some_points_are_the_rows_that_hold_one_of_them() -> None:
@@ -244,13 +276,14 @@ def test_weak_priors_on_some_points_are_the_rows_that_hold_one_of_them() -> None
 
 def test_dropped_factors_are_made_again() -> None:
     window = make_window()
-    before = dict(window.of_cycle)
-    window.drop(frozenset([pose_key(0)]))
-    assert sorted(window.of_cycle) == [1, 2, 3]
+    before = mark(window)
+    window.drop(np.array([pose_key(0)]))
+    assert list(sizes_of(window.measured)) == [1, 2, 3]
     assert window.relinearize(CYCLES, ACTIVE)
-    assert new_cycles(window, before) == [0]
+    assert new_owners(window.measured, before) == [0]
     window.clear()
-    assert window.of_cycle == {}
+    assert window.measured.groups == []
+    window.map.weight = 1.0
     assert window.relinearize(CYCLES, ACTIVE)
-    assert sorted(window.of_cycle) == CYCLES.tolist()
+    assert list(sizes_of(window.measured)) == CYCLES.tolist()
     assert_linearized_at_the_values(window)
