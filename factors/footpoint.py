@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from .arrays import Array, BoolArray, IntArray
 from .bspline import SpanPolynomials, Spans, horner
+from .kernels import compiled
 
 _STEP_TOLERANCE: Final = 1e-9
 """A row takes its last step where |step| <= tolerance * length of the domain; the error is its square."""
@@ -24,6 +25,8 @@ _SAFEGUARDED_STEPS: Final = 4
 """A Newton step that leads farther away is replaced by this number of bracketed steps."""
 _TINY: Final = 1e-300
 """Smallest divisor of a step; the numerator vanishes before it does."""
+_TOLERANCES: Final = (_STEP_TOLERANCE, _FLAT, _EQUAL_SQUARE, _END_TOLERANCE, _NO_TANGENT, _TINY)
+"""These, as they are handed to the compiled versions."""
 _CHUNK: Final = 1 << 20
 """At most this number of point-to-grid distances are held in memory at once."""
 SEARCH_ITERATIONS: Final = 50
@@ -202,12 +205,10 @@ def joint_foot_points(
     iterations: int = SEARCH_ITERATIONS,
 ) -> FootPoints:
     """Return `foot_points` on several curves; `curve` (m,) is the number of each row's own."""
-    curves = _Curves(spans, spans.curve_coefficients(control_points))
-    points_t = np.ascontiguousarray(points.T)
-    stretch = stretch_of(spans, curve, u_low, u_high)
-    start = _nearest_on_grid(curves, points, curve, stretch, coarse_step)
-    probe = _descend(curves, points_t, start, stretch, np.full(len(points), coarse_step), iterations)
-    return _finish(spans, control_points, points_t, curve, probe, stretch)
+    stretch = (curve, u_low, u_high)
+    return FootPoints(
+        *_searched(spans, control_points, points, *stretch, coarse_step, iterations, _TOLERANCES)
+    )
 
 
 def refine_foot_points(
@@ -241,6 +242,47 @@ def refine_joint_foot_points(
     iterations: int = REFINE_ITERATIONS,
 ) -> FootPoints:
     """Return `refine_foot_points` on several curves; `curve` (m,) is the number of each row's own."""
+    steps = (iterations, _SAFEGUARDED_STEPS)
+    return FootPoints(
+        *_refined(spans, control_points, points, curve, u_start, u_low, u_high, *steps, _TOLERANCES)
+    )
+
+
+@compiled
+def _searched(
+    spans: Spans,
+    control_points: Array,
+    points: Array,
+    curve: IntArray,
+    u_low: Array,
+    u_high: Array,
+    coarse_step: float,
+    iterations: int,
+    tolerances: tuple[float, ...],
+) -> tuple[Any, ...]:
+    """Return the fields of `joint_foot_points`; the tolerances are those of this module."""
+    curves = _Curves(spans, spans.curve_coefficients(control_points))
+    points_t = np.ascontiguousarray(points.T)
+    stretch = stretch_of(spans, curve, u_low, u_high)
+    start = _nearest_on_grid(curves, points, curve, stretch, coarse_step)
+    probe = _descend(curves, points_t, start, stretch, np.full(len(points), coarse_step), iterations)
+    return _finish(spans, control_points, points_t, curve, probe, stretch)
+
+
+@compiled
+def _refined(
+    spans: Spans,
+    control_points: Array,
+    points: Array,
+    curve: IntArray,
+    u_start: Array,
+    u_low: Array,
+    u_high: Array,
+    iterations: int,
+    safeguarded: int,
+    tolerances: tuple[float, ...],
+) -> tuple[Any, ...]:
+    """Return the fields of `refine_joint_foot_points`; the last two arguments are those of this module."""
     curves = _Curves(spans, spans.curve_coefficients(control_points))
     points_t = np.ascontiguousarray(points.T)
     stretch = stretch_of(spans, curve, u_low, u_high)
@@ -364,22 +406,22 @@ def _dot(a: Array, b: Array) -> Array:
 
 def _finish(
     spans: Spans, control_points: Array, points_t: Array, curve: IntArray, probe: _Probe, stretch: Stretch
-) -> FootPoints:
+) -> tuple[Any, ...]:
     columns = spans.columns.take(probe.number, axis=0)
     tangent = _unit_tangent(control_points, probe.first, columns, stretch.length)
     normal = np.empty_like(tangent)
     np.negative(tangent[1], out=normal[0])
     normal[1] = tangent[0]
-    return FootPoints(
-        u=stretch.in_domain(probe.v) - spans.shift.take(curve),
-        position=(points_t + probe.offset).T,
-        tangent_unit=tangent.T,
-        normal_unit=normal.T,
-        distance=-_dot(normal, probe.offset),
-        interior=_interior(probe, stretch),
-        basis=spans.basis(probe.number, probe.s),
-        span=probe.number + (spans.first + spans.degree),
-        columns=columns,
+    return (
+        stretch.in_domain(probe.v) - spans.shift.take(curve),
+        (points_t + probe.offset).T,
+        tangent.T,
+        normal.T,
+        -_dot(normal, probe.offset),
+        _interior(probe, stretch),
+        spans.basis(probe.number, probe.s),
+        probe.number + (spans.first + spans.degree),
+        columns,
     )
 
 

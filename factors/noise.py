@@ -7,7 +7,7 @@ import numpy as np
 
 from .arrays import Array
 from .se2 import left_of
-from .sensor import SENSOR_SIZE, by_sensor
+from .sensor import SENSOR_SIZE, shifted
 
 
 def whiteners(covariances: Array) -> Array:
@@ -173,7 +173,7 @@ class MeasuredNoise:
 
     def corrected(self, points: Array, twist: Array) -> Array:
         """Return detections at points (m, 2), vehicle frame, without the constant errors of the sensor."""
-        return np.asarray(points + by_sensor(points, np.tile(twist, (len(points), 1))) @ self.sensor)
+        return shifted(points, np.broadcast_to(twist, (len(points), 3)), self.sensor)
 
 
 def ray_sigmas(points: Array, covariances: Array) -> Array:

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from .arrays import Array
+from .kernels import compiled
 from .se2 import se2_exp, wrap_angle
 
 MIN_SIGMA = 1e-6
@@ -60,13 +61,20 @@ def integrate_twists(durations: Array, twists: Array, sigma: Array) -> Integrate
     """
     if len(durations) == 0:
         return integrated_odometry(np.zeros(3), np.zeros((3, 3)), np.zeros((3, CALIBRATION_SIZE)))
+    whole = integrated_odometry(*_integrated(durations, twists, np.broadcast_to(sigma, twists.shape)))
+    return replace(whole, twist=twists[-1])
+
+
+@compiled
+def _integrated(durations: Array, twists: Array, sigmas: Array) -> tuple[Array, Array, Array]:
+    """Return end pose (3,), covariance (3, 3) and calibration derivative (3, 2) of `integrate_twists`."""
     poses = integrate_poses(durations, twists)
     end = poses[-1]
     adjoints = _adjoints_to_end(_midpoints(poses, durations, twists), end)
-    scaled = (adjoints * (durations[:, None] * sigma)[:, None, :]).transpose(1, 0, 2).reshape(3, -1)
+    scaled = (adjoints * (durations[:, None] * sigmas)[:, None, :]).transpose(1, 0, 2).reshape(3, -1)
     by_speed, by_rate = adjoints[:, :, :2] @ twists[:, :2, None], adjoints[:, :, 2:]
     by_calibration = np.concatenate([by_speed, by_rate], axis=2).transpose(1, 2, 0) @ durations
-    return replace(integrated_odometry(end, scaled @ scaled.T, by_calibration), twist=twists[-1])
+    return end, scaled @ scaled.T, by_calibration
 
 
 def integrated_odometry(delta: Array, covariance: Array, calibration_jacobian: Array) -> IntegratedOdometry:
@@ -108,6 +116,14 @@ def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> t
     (m, 3) are in the map frame, deltas (m, 3) in the frame of the start. The Jacobians are by (x, y, theta)
     in the map frame.
     """
+    return _odometry_residuals(poses_start, poses_end, deltas, _SERIES_BELOW)
+
+
+@compiled
+def _odometry_residuals(
+    poses_start: Array, poses_end: Array, deltas: Array, series_below: float
+) -> tuple[Array, Array, Array]:
+    """Return `odometry_residuals`, with a series where |phi| is below a limit (rad)."""
     angle = poses_start[:, 2] + deltas[:, 2]
     c, s = np.cos(angle), np.sin(angle)
     offset = poses_end[:, :2] - poses_start[:, :2]
@@ -115,7 +131,7 @@ def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> t
     cd, sd = np.cos(deltas[:, 2]), np.sin(deltas[:, 2])
     dx, dy = along - (cd * deltas[:, 0] + sd * deltas[:, 1]), across - (cd * deltas[:, 1] - sd * deltas[:, 0])
     phi = wrap_angle(poses_end[:, 2] - angle)
-    a, slope = _inverse_left_terms(phi)
+    a, slope = _inverse_left_terms(phi, series_below)
     h = 0.5 * phi
     residuals = np.array([a * dx + h * dy, a * dy - h * dx, phi]).T
     by_phi_x, by_phi_y = slope * dx + 0.5 * dy, slope * dy - 0.5 * dx
@@ -129,9 +145,9 @@ def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> t
     return residuals, by_start, by_end
 
 
-def _inverse_left_terms(phi: Array) -> tuple[Array, Array]:
+def _inverse_left_terms(phi: Array, series_below: float) -> tuple[Array, Array]:
     """Return `a = (phi/2) cot(phi/2)` of SE(2)'s inverse left Jacobian, and da/dphi."""
-    small = np.abs(phi) < _SERIES_BELOW
+    small = np.abs(phi) < series_below
     half = np.where(small, 0.5, 0.5 * phi)
     cot = 1.0 / np.tan(half)
     a = np.where(small, 1.0 - phi**2 / 12.0, half * cot)

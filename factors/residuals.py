@@ -8,7 +8,9 @@ import numpy as np
 from .arrays import Array
 from .bspline import SpanPolynomials
 from .footpoint import FootPoints
+from .kernels import compiled
 from .se2 import to_vehicle
+from .sensor import sensor_rows
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,35 @@ def project(
         by_pose=np.concatenate([n, by_theta[:, None]], axis=1),
         by_control=-foot.basis[:, :, None] * n[:, None, :],
     )
+
+
+@compiled
+def detection_rows(
+    points_map: Array,
+    covariances: Array,
+    poses: Array,
+    normals: Array,
+    distances: Array,
+    basis: Array,
+    measured: Array,
+    twists: Array,
+    sensor: Array,
+    sigma_model: float,
+) -> tuple[Array, Array, Array]:
+    """Return residuals (m,) and sigmas (m,) of `project`, and derivatives by [pose | sensor | controls].
+
+    normals (m, 2), distances (m,) and basis (m, p + 1) are of the foot points. Residuals and derivatives
+    (m, 3 + 5 + 2 p + 2) are multiplied by the factor of `sensor:sensor_rows`, where the detections were
+    measured at (m, 2), vehicle frame, with twists (m, 3), and the sensor's calibration (5,) is not empty.
+    """
+    arm = points_map - poses[:, :2]
+    by_theta = normals[:, 1] * arm[:, 0] - normals[:, 0] * arm[:, 1]
+    by = sensor_rows(normals, distances, poses, measured, twists, sensor)
+    by_pose = np.concatenate([normals, by_theta[:, None]], axis=1)
+    by_control = (-basis[:, :, None] * normals[:, None, :]).reshape(len(basis), -1)
+    factor = by.factor[:, None]
+    jacobian = np.concatenate([factor * by_pose, by.by_sensor, factor * by_control], axis=1)
+    return by.factor * distances, sigma_across(normals, covariances, poses, sigma_model), jacobian
 
 
 # --- a ribbon: a centre line with a width ----------------------------------------------------------------

@@ -3,6 +3,7 @@
 import numpy as np
 
 from .arrays import Array
+from .kernels import compiled
 
 
 def wrap_angle(angle: Array) -> Array:
@@ -30,7 +31,9 @@ def rotated(covariances: Array, theta: Array) -> Array:
 
 def left_of(vectors: Array) -> Array:
     """Return vectors (n, 2) turned by a quarter to the left: (x, y) becomes (-y, x)."""
-    return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)
+    turned = np.empty_like(vectors)
+    turned[:, 0], turned[:, 1] = -vectors[:, 1], vectors[:, 0]
+    return turned
 
 
 def compose(pose: Array, delta: Array) -> Array:
@@ -41,7 +44,7 @@ def compose(pose: Array, delta: Array) -> Array:
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     dx, dy = delta[..., 0], delta[..., 1]
     moved = [pose[..., 0] + c * dx - s * dy, pose[..., 1] + s * dx + c * dy, pose[..., 2] + delta[..., 2]]
-    return np.stack(moved, axis=-1)
+    return np.array(moved).T
 
 
 def inverse(pose: Array) -> Array:
@@ -63,6 +66,7 @@ def move_points(motion: Array, points: Array) -> Array:
     return np.asarray(points @ rotation(motion[2]).T + motion[:2])
 
 
+@compiled
 def to_map(points_vehicle: Array, poses: Array) -> Array:
     """Return `p = R z + t` (m, 2) in the map frame.
 

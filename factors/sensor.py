@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .arrays import Array
+from .kernels import compiled
 from .se2 import left_of
 
 SENSOR = ("yaw", "lateral", "latency", "range_scale", "range_bias")
@@ -22,6 +23,7 @@ RANGE = slice(3, 5)
 """These of them are errors of the ranges."""
 
 
+@compiled
 def by_sensor(points_vehicle: Array, twists: Array) -> Array:
     """Return the derivatives C (m, 2, 5) of detections by the calibration b of the sensor, at b = 0.
 
@@ -51,6 +53,12 @@ def corrected(measured: Array, twists: Array, sensor: Array) -> Array:
     """
     if len(sensor) == 0:
         return measured
+    return shifted(measured, twists, sensor)
+
+
+@compiled
+def shifted(measured: Array, twists: Array, sensor: Array) -> Array:
+    """Return `z + C b` (m, 2) of detections z (m, 2), with C of `by_sensor` and a calibration b (5,)."""
     return np.asarray(measured + by_sensor(measured, twists) @ sensor)
 
 

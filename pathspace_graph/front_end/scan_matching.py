@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotation, to_map
 from pathspace_graph.factors.sensor import SENSOR
@@ -51,6 +52,7 @@ HUBER: Final = 2.5
 """Whitened distance beyond which the Huber loss reduces the weight of a matched detection."""
 SIGMA_CONE: Final = 0.05
 """Standard deviation added to that of a detection, m, since one side of a cone is seen."""
+LIMITS: Final = (FARTHEST, MIN_WEIGHT, HUBER, SIGMA_CONE)
 LEAST_SHARE: Final = 1e-6
 """Least determinant of a pose's information that holds it, by the product of the diagonal."""
 MOST_MISFIT: Final = 9.0
@@ -146,20 +148,40 @@ def match(
     """
     pose = start.copy()
     for reach in reaches:
-        points = to_map(points_vehicle, pose[None])
-        means, weights = _means(points, recent.points, reach)
-        matched = weights > MIN_WEIGHT
-        off, arm = (points - means)[matched], (points - pose[:2])[matched]
-        precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + SIGMA_CONE**2)
-        square = (off * off).sum(axis=1)
-        precision *= huber_weights(np.sqrt(square * precision), HUBER)
-        information, gradient = _normal_equations(off, arm, precision)
+        information, gradient, matched, cost = _matched(
+            recent.points, points_vehicle, variances, pose, reach, LIMITS
+        )
         if matched.sum() < MIN_MATCHED:
             break
         regular = information + np.diag(LEAST_SHARE * information.diagonal())
         pose = pose - np.linalg.solve(regular, gradient)
     count = int(matched.sum())
-    return Match(pose, information, matched, float(square @ precision) / max(count, 1))
+    return Match(pose, information, matched, cost / max(count, 1))
+
+
+@compiled
+def _matched(
+    recent: Array,
+    points_vehicle: Array,
+    variances: Array,
+    pose: Array,
+    reach: float,
+    limits: tuple[float, float, float, float],
+) -> tuple[Array, Array, BoolArray, float]:
+    """Return information (3, 3), gradient (3,), which detections (m,) are matched, and their weighted cost.
+
+    These are of a step of `match`, whose limits are FARTHEST, MIN_WEIGHT, HUBER and SIGMA_CONE.
+    """
+    farthest, min_weight, huber, sigma_cone = limits
+    points = to_map(points_vehicle, pose[None])
+    means, weights = _weighted_means(points, recent, reach, farthest)
+    matched = weights > min_weight
+    off, arm = (points - means)[matched], (points - pose[:2])[matched]
+    precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + sigma_cone**2)
+    square = (off * off).sum(axis=1)
+    precision *= huber_weights(np.sqrt(square * precision), huber)
+    information, gradient = _normal_equations(off, arm, precision)
+    return information, gradient, matched, float(square @ precision)
 
 
 def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array, pose: Array) -> float:
@@ -177,10 +199,16 @@ def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array,
 
 def _means(points: Array, recent: Array, reach: float) -> tuple[Array, Array]:
     """Return the weighted means (m, 2) of recent points (n, 2) beside points (m, 2), and sums of weights."""
+    return _weighted_means(points, recent, reach, FARTHEST)
+
+
+@compiled
+def _weighted_means(points: Array, recent: Array, reach: float, farthest: float) -> tuple[Array, Array]:
+    """Return `_means`, with weights `exp(-d^2 / 2 reach^2)` below a distance of `farthest` reaches."""
     dx = points[:, 0, None] - recent[:, 0]
     dy = points[:, 1, None] - recent[:, 1]
     square = (dx * dx + dy * dy) / reach**2
-    weights = np.where(square < FARTHEST**2, np.exp(-0.5 * square), 0.0)
+    weights = np.where(square < farthest**2, np.exp(-0.5 * square), 0.0)
     total = weights.sum(axis=1)
     return (weights @ recent) / np.maximum(total, _TINY)[:, None], total
 

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Odometry
@@ -162,13 +163,7 @@ class Follower:
 
     def _square(self, points: Array, others: Array, ranges: Array, pose: Array) -> Array:
         """Return the square (m, n) of the distances of points (m, 2) from others (n, 2) in their gates."""
-        ray = points - pose[:2]
-        ray = ray / np.maximum(np.hypot(*ray.T), np.finfo(float).tiny)[:, None]
-        off = others - points[:, None]
-        along = off[:, :, 0] * ray[:, :1] + off[:, :, 1] * ray[:, 1:]
-        across = off[:, :, 1] * ray[:, :1] - off[:, :, 0] * ray[:, 1:]
-        gate_along, gate_across = self._gates(ranges)
-        return np.asarray((along / gate_along[:, None]) ** 2 + (across / gate_across[:, None]) ** 2)
+        return _gated_squares(points, others, pose[:2], *self._gates(ranges))
 
     def _assign(
         self, points: Array, labels: IntArray, ranges: Array, pose: Array, t: float
@@ -204,6 +199,20 @@ class Follower:
         self._cones = np.concatenate([self._cones, cones[is_first]])
         self._count += int(is_first.sum())
         return np.concatenate([rows, new[own]]), found
+
+
+@compiled
+def _gated_squares(points: Array, others: Array, place: Array, along: Array, across: Array) -> Array:
+    """Return `(a_ij / along_i)^2 + (c_ij / across_i)^2` (m, n) of points (m, 2) and others (n, 2).
+
+    a and c are their differences along and across the rays from a place (2,) to the points.
+    """
+    ray = points - place
+    ray = ray / np.maximum(np.hypot(ray[:, 0], ray[:, 1]), np.finfo(float).tiny)[:, None]
+    off = others - points[:, None]
+    a = off[:, :, 0] * ray[:, :1] + off[:, :, 1] * ray[:, 1:]
+    c = off[:, :, 1] * ray[:, :1] - off[:, :, 0] * ray[:, 1:]
+    return np.asarray((a / along[:, None]) ** 2 + (c / across[:, None]) ** 2)
 
 
 class TwistRecord:

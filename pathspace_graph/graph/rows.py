@@ -17,6 +17,7 @@ import numpy as np
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
+from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, odometry_residuals
 from pathspace_graph.factors.se2 import compose, rotation
 
@@ -24,6 +25,7 @@ from .gaussian import FactoredSystem, half_solve, keys_of
 from .variables import (
     CALIBRATION_KEY,
     CALIBRATION_LETTER,
+    INDEX_BITS,
     POSE,
     UNKNOWN,
     Layout,
@@ -67,18 +69,34 @@ class Rows:
     @property
     def widths(self) -> tuple[int, ...]:
         """Return the widths (k,) of each row's variables."""
-        return tuple(sizes(self.keys[0]).tolist())
+        return tuple([_width(letter) for letter in (self.keys[0] >> INDEX_BITS).tolist()])
 
     def columns(self, layout: Layout) -> IntArray:
         """Return the column (m, n) of each derivative, which is UNKNOWN where a key is not in the layout."""
-        key, entry = self.pattern
-        starts = layout.columns(self.keys)[:, key]
-        return np.where(starts == UNKNOWN, UNKNOWN, starts + entry)
+        return _columns_of(layout.keys, layout.starts, self.keys, *self.pattern)
 
     def columns_in(self, layout: Layout) -> IntArray:
         """Return the column (m, n) of each derivative; ValueError where the layout does not hold a key."""
-        key, entry = self.pattern
-        return np.asarray(layout.starts[layout.places(self.keys)][:, key] + entry)
+        columns = self.columns(layout)
+        if (columns == UNKNOWN).any():
+            layout.places(self.keys)  # raises the error
+        return columns
+
+
+@cache
+def _width(letter: int) -> int:
+    """Return the width of the variables whose keys begin with a letter."""
+    return int(sizes(np.array([letter << INDEX_BITS]))[0])
+
+
+@compiled
+def _columns_of(
+    keys: IntArray, starts: IntArray, sought: IntArray, key: IntArray, entry: IntArray
+) -> IntArray:
+    """Return `starts[j] + entry` (m, n), j the place of `sought[:, key]` in ascending keys, or UNKNOWN."""
+    places = np.minimum(keys.searchsorted(sought), len(keys) - 1)
+    begin = np.where(keys[places] == sought, starts[places], UNKNOWN)[:, key]
+    return np.where(begin == UNKNOWN, UNKNOWN, begin + entry)
 
 
 @cache
@@ -93,7 +111,8 @@ def at_reference(groups: Sequence[Rows], variables: Variables) -> list[Rows]:
     for rows in groups:
         if len(rows):
             by_change = rows.jacobian * change[rows.columns_in(variables.layout)]
-            moved.append(replace(rows, residual=rows.residual - by_change.sum(axis=1)))
+            residual = rows.residual - by_change.sum(axis=1)
+            moved.append(Rows(rows.keys, rows.jacobian, residual, rows.owner))
     return moved
 
 
@@ -159,18 +178,20 @@ class KeptRows:
             else:
                 self.groups[same] = stacked_rows([self.groups[same], rows])
 
-    def drop(self, owners: IntArray) -> None:
-        """Drop the rows of some owners."""
-        if len(owners) == 0:
-            return
-        kept = [rows.where(~np.isin(rows.owner, owners)) for rows in self.groups]
+    def drop(self, owners: IntArray) -> list[Rows]:
+        """Drop the rows of some owners, and return them."""
+        ascending, dropped, kept = np.sort(owners), [], []
+        for rows in self.groups:
+            own = among(rows.owner, ascending)
+            kept.append(rows.where(~own) if own.any() else rows)
+            dropped.append(rows.where(own))
         self.groups = [rows for rows in kept if len(rows)]
+        return [rows for rows in dropped if len(rows)]
 
     def pop(self, owner: int, layout: Layout) -> gtsam.GaussianConditional:
         """Remove the rows of an owner and return them as a factor."""
-        own = [rows.where(rows.owner == owner) for rows in self.groups]
-        self.drop(np.array([owner]))
-        return jacobian_factors([rows for rows in own if len(rows)], layout)[owner]
+        own = self.drop(np.array([owner]))
+        return _factor([(rows, layout.places(rows.keys)) for rows in own], layout)
 
 
 def among(keys: IntArray, ascending: IntArray) -> BoolArray:
@@ -214,6 +235,7 @@ def newton_system(
     return hessian, gradient
 
 
+@compiled
 def add_rows(
     hessian: Array, gradient: Array, columns: IntArray, jacobian: Array, residual: Array, change: Array
 ) -> None:

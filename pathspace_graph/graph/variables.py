@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.sensor import SENSOR_SIZE
 
 CONTROL_LETTERS: Final = ("l", "r")
@@ -46,7 +47,7 @@ CALIBRATION_KEY: Final = int(gtsam.symbol(CALIBRATION_LETTER, 0))
 SENSOR_KEY: Final = int(gtsam.symbol(SENSOR_LETTER, 0))
 """Key of the sensor's calibration. The keys of all points and poses are greater."""
 
-_INDEX_BITS: Final = 56
+INDEX_BITS: Final = 56
 """GTSAM keeps the index of a symbol in this number of low bits, and its letter in the highest byte."""
 _NAMES_IN_MESSAGE: Final = 3
 """A message names at most this number of keys."""
@@ -56,7 +57,7 @@ _NAMES_IN_MESSAGE: Final = 3
 def letter_keys(letter: str) -> tuple[int, int]:
     """Return the first key of a letter, and the first key after its last one."""
     first = int(gtsam.symbol(letter, 0))
-    return first, first + (1 << _INDEX_BITS)
+    return first, first + (1 << INDEX_BITS)
 
 
 FIRST_POSE: Final = letter_keys(POSE_LETTER)[0]
@@ -89,7 +90,7 @@ def landmark_keys(numbers: IntArray) -> IntArray:
 
 def indices(keys: IntArray) -> IntArray:
     """Return the index of each key: the cycle of a pose, or the number of a point."""
-    return np.asarray(keys & ((1 << _INDEX_BITS) - 1))
+    return np.asarray(keys & ((1 << INDEX_BITS) - 1))
 
 
 def are_poses(keys: IntArray) -> BoolArray:
@@ -168,8 +169,12 @@ class Layout:
         return np.where(places >= 0, self.starts[places], UNKNOWN) if len(self.keys) else places
 
     def entries(self, keys: IntArray) -> IntArray:
-        """Return all columns (n,) of keys (k,), one key after the other; the layout must hold them."""
-        return spread(self.columns(keys), sizes(keys))
+        """Return all columns (n,) of keys (k,), one key after the other.
+
+        ValueError where the layout does not hold one of them.
+        """
+        places = self.places(keys)
+        return spread(self.starts[places], self.widths[places])
 
     def block(self, letter: str) -> slice:
         """Return the columns of all keys of a letter."""
@@ -183,6 +188,7 @@ class Layout:
         return int(self.starts[place]) if place < len(self.keys) else self.size
 
 
+@compiled
 def spread(starts: IntArray, widths: IntArray) -> IntArray:
     """Return the columns (n,) of blocks (k,) with these first columns and widths, one after the other."""
     ends = np.cumsum(widths)

@@ -193,8 +193,8 @@ class WindowFactors(Generic[M_co]):
         return layout.keys[np.logical_or.reduceat(moved, layout.starts)]
 
     def _stale(self, cycles: IntArray, moved: IntArray) -> IntArray:
-        stale = ~np.isin(cycles, self.measured.owners)
-        stale |= np.isin(cycles, np.append(self.map.changed(), self.measured.holding(moved)))
+        stale = ~among(cycles, np.sort(self.measured.owners))
+        stale |= among(cycles, np.sort(np.append(self.map.changed(), self.measured.holding(moved))))
         return cycles[stale]
 
     def _relinearize_gauge(self, moved: IntArray) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.residuals import ProjectionRows, pair_residuals, project
+from pathspace_graph.factors.residuals import ProjectionRows, detection_rows, pair_residuals, project
 from pathspace_graph.factors.sensor import SensorRows
 from pathspace_graph.graph.rows import Rows, stacked_rows
 from pathspace_graph.graph.variables import CONTROL_LETTERS, SENSOR_KEY, control_keys, pose_keys
@@ -63,12 +63,20 @@ class CurveMap:
         points = detections.points_map(rows, self.variables)
         foot = curves.refine(state.map_points, points, curve, detections.u[rows])
         self._refined, self.reached_inactive = (rows, foot.u), curves.reaches_inactive(curve, foot)
-        projected, by = self.project(rows, points, foot)
-        factor, residual = by.factor[:, None], by.factor * projected.residual
-        weight = np.sqrt(huber_weights(residual / projected.sigma, self.settings.gate.huber))
-        weight *= foot.interior / projected.sigma
-        by_control = factor * projected.by_control.reshape(len(rows), 2 * foot.basis.shape[1])
-        jacobian = np.concatenate([factor * projected.by_pose, by.by_sensor, by_control], axis=1)
+        residual, sigma, jacobian = detection_rows(
+            points,
+            detections.covariance[rows],
+            self.variables.poses_at(cycle),
+            foot.normal_unit,
+            foot.distance,
+            foot.basis,
+            detections.measured[rows],
+            detections.twist[rows],
+            self.variables.sensor,
+            self.settings.spline.sigma_model,
+        )
+        weight = np.sqrt(huber_weights(residual / sigma, self.settings.gate.huber))
+        weight *= foot.interior / sigma
         keys = np.concatenate([self.measuring_keys(cycle), curves.keys[foot.columns]], axis=1)
         return [Rows(keys, jacobian * weight[:, None], residual * weight, cycle)]
 

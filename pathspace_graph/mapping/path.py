@@ -6,6 +6,7 @@ from typing import Final, Self
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.labels import LEFT, RIGHT
 
@@ -130,6 +131,7 @@ class DrivenPath:
         return PathAhead(points, np.concatenate([self.stations[behind], self.length + s]), self.length)
 
 
+@compiled
 def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array, Array]:
     """Return the station (m,) and signed distance (m,), left positive, of points (m, 2) beside a polyline.
 

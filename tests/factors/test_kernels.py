@@ -1,0 +1,204 @@
+"""The compiled versions of functions of arrays against those in numpy."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pathspace_graph.factors.bspline import SpanPolynomials, lay_out
+from pathspace_graph.factors.footpoint import joint_foot_points, refine_joint_foot_points
+from pathspace_graph.factors.kernels import _KERNELS, COMPILED, IN_NUMPY, NUMPY_ONLY
+
+for _module in ("front_end.scan_matching", "front_end.sightings", "graph.rows", "mapping.path"):
+    import_module(f"pathspace_graph.{_module}")  # each registers its functions
+
+Arguments = Callable[[np.random.Generator], tuple[Any, ...]]
+COUNT = 17
+"""Rows of each argument."""
+
+needs_compiled = pytest.mark.skipif(not COMPILED, reason="the package was built without a compiler")
+
+
+def poses(rng: np.random.Generator, count: int = COUNT) -> np.ndarray:
+    return rng.normal(size=(count, 3)) * np.array([30.0, 30.0, 2.0])
+
+
+def covariances(rng: np.random.Generator) -> np.ndarray:
+    roots = rng.normal(size=(COUNT, 2, 2))
+    return roots @ roots.transpose(0, 2, 1)
+
+
+def rows_of_a_system(rng: np.random.Generator) -> tuple[Any, ...]:
+    columns = np.array([rng.choice(30, 6, replace=False) for _ in range(COUNT)])
+    hessian = np.asfortranarray(np.zeros((30, 30)))
+    jacobian, residual = rng.normal(size=(COUNT, 6)), rng.normal(size=COUNT)
+    return hessian, rng.normal(size=30), columns, jacobian, residual, rng.normal(size=30)
+
+
+def some_columns(rng: np.random.Generator) -> tuple[Any, ...]:
+    keys = np.sort(rng.choice(1000, 40, replace=False))
+    sought = rng.choice(np.append(keys, [-5, 1001]), (COUNT, 3))
+    return keys, np.arange(40) * 2, sought, np.array([0, 0, 1, 2, 2]), np.array([0, 1, 0, 0, 1])
+
+
+def detections(rng: np.random.Generator, sensor: int) -> tuple[Any, ...]:
+    points, measured, twists = rng.normal(size=(COUNT, 2)), rng.normal(size=(COUNT, 2)) * 9.0, poses(rng)
+    angle = rng.uniform(-3.0, 3.0, COUNT)
+    normals, basis = np.column_stack([np.cos(angle), np.sin(angle)]), rng.uniform(size=(COUNT, 4))
+    rest = (measured, twists, 0.1 * rng.normal(size=sensor), 0.07)
+    return points, covariances(rng), poses(rng), normals, rng.normal(size=COUNT), basis, *rest
+
+
+def scan(rng: np.random.Generator) -> tuple[Any, ...]:
+    recent = rng.uniform(-8.0, 8.0, (200, 2))
+    return recent, rng.uniform(-8.0, 8.0, (COUNT, 2)), rng.uniform(0.01, 0.1, COUNT), 0.1 * poses(rng, 1)[0]
+
+
+CASES: dict[str, Arguments] = {
+    "add_rows": rows_of_a_system,
+    "columns_of": some_columns,
+    "spread": lambda rng: (rng.integers(0, 99, COUNT), rng.integers(0, 4, COUNT)),
+    "by_sensor": lambda rng: (rng.normal(size=(COUNT, 2)) * 9.0, poses(rng)),
+    "shifted": lambda rng: (rng.normal(size=(COUNT, 2)) * 9.0, poses(rng), rng.normal(size=5)),
+    "to_map": lambda rng: (rng.normal(size=(COUNT, 2)), poses(rng)),
+    "detection_rows": lambda rng: detections(rng, 5),
+    "along_and_across": lambda rng: (poses(rng)[:, :2], poses(rng, 40)[:, :2], np.sort(rng.normal(size=40))),
+    "odometry_residuals": lambda rng: (poses(rng), poses(rng), poses(rng), 1e-3),
+    "integrated": lambda rng: (rng.uniform(0.0, 0.1, COUNT), poses(rng), rng.uniform(0.1, 0.2, (COUNT, 3))),
+    "weighted_means": lambda rng: (*rng.normal(size=(2, COUNT, 2)), 0.6, 3.0),
+    "matched": lambda rng: (*scan(rng), 1.0, (3.0, 0.7, 2.5, 0.05)),
+    "gated_squares": lambda rng: (
+        *rng.normal(size=(2, COUNT, 2)),
+        rng.normal(size=2),
+        *rng.uniform(1.0, 2.0, (2, COUNT)),
+    ),
+}
+SEARCHES = {"searched", "refined"}
+
+
+def results(function: Callable[..., Any], arguments: tuple[Any, ...]) -> list[Any]:
+    """What a function returns, or the arrays that it has changed."""
+    own = tuple(one.copy(order="K") if isinstance(one, np.ndarray) else one for one in arguments)
+    found = function(*own)
+    if found is None:
+        return [np.tril(own[0]), own[1]]
+    return list(found) if isinstance(found, tuple) else [found]
+
+
+def assert_equal(found: list[Any], expected: list[Any]) -> None:
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert np.shape(one) == np.shape(other)
+        assert np.asarray(one).dtype == np.asarray(other).dtype
+        scale = max(float(np.abs(np.asarray(other, float)).max(initial=0.0)), 1.0)
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12 * scale)
+
+
+@needs_compiled
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("name", CASES)
+def test_a_compiled_function_is_the_one_in_numpy(name: str, seed: int) -> None:
+    arguments = CASES[name](np.random.default_rng(seed))
+    assert_equal(results(getattr(_KERNELS, name), arguments), results(IN_NUMPY[name], arguments))
+
+
+@needs_compiled
+def test_every_compiled_function_is_tested() -> None:
+    assert set(IN_NUMPY) == set(CASES) | SEARCHES
+    assert set(IN_NUMPY) <= set(dir(_KERNELS))
+
+
+@needs_compiled
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("to_map", lambda rng: (rng.normal(size=(COUNT, 2)), poses(rng, 1))),
+        ("to_map", lambda rng: (rng.normal(size=(1, 2)), poses(rng))),
+        ("to_map", lambda rng: (np.zeros((0, 2)), poses(rng, 1))),
+        ("detection_rows", lambda rng: detections(rng, 0)),
+        ("odometry_residuals", lambda rng: (poses(rng), poses(rng), 1e-5 * poses(rng), 1e-3)),
+        ("matched", lambda rng: (np.zeros((0, 2)), *scan(rng)[1:], 1.0, (3.0, 0.7, 2.5, 0.05))),
+        ("integrated", lambda rng: (np.full(3, 0.1), np.zeros((3, 3)), np.full((3, 3), 0.1))),
+    ],
+)
+def test_cases_at_the_edge(name: str, arguments: Arguments) -> None:
+    """One pose for all points, no points, no calibration, small angles, nothing remembered, at rest."""
+    chosen = arguments(np.random.default_rng(3))
+    assert_equal(results(getattr(_KERNELS, name), chosen), results(IN_NUMPY[name], chosen))
+
+
+def curves(rng: np.random.Generator, periodic: bool, degree: int) -> tuple[Any, np.ndarray]:
+    """Two curves laid out together, and their control points."""
+    tables, points = [], []
+    for k in range(2):
+        count = 14 + 3 * k
+        if periodic:
+            breaks = np.cumsum(rng.uniform(1.0, 3.0, count + 1))
+            steps = np.diff(breaks)
+            before, after = (
+                breaks[0] - np.cumsum(steps[::-1][:degree])[::-1],
+                breaks[-1] + np.cumsum(steps[:degree]),
+            )
+            knots = np.concatenate([before, breaks, after])
+        else:
+            breaks = np.cumsum(rng.uniform(1.0, 3.0, count - degree + 1))
+            knots = np.concatenate([np.full(degree, breaks[0]), breaks, np.full(degree, breaks[-1])])
+        tables.append(SpanPolynomials(knots, degree, periodic))
+        angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+        ring = (8.0 + 3.0 * k) * np.column_stack([np.cos(angle), np.sin(angle)])
+        points.append(ring + rng.normal(size=ring.shape))
+    sizes = [len(own) for own in points]
+    return lay_out(tables, [0, sizes[0]], sizes if periodic else None), np.concatenate(points)
+
+
+@needs_compiled
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("periodic", [False, True])
+@pytest.mark.parametrize("seed", range(8))
+def test_foot_points(seed: int, periodic: bool, degree: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stretches across the seam, whole periods, reversed and empty ones; points far off and at a centre."""
+    rng = np.random.default_rng(seed)
+    spans, control_points = curves(rng, periodic, degree)
+    points, curve = rng.normal(size=(60, 2)) * 9.0, rng.integers(0, 2, 60)
+    points[0] = 0.0
+    low = rng.uniform(-10.0, 40.0, 60)
+    high = low + rng.choice([-1.0, 0.0, 5.0, 15.0, 200.0], 60)
+    start = rng.uniform(-10.0, 50.0, 60)
+    both = []
+    for versions in ({name: getattr(_KERNELS, name) for name in SEARCHES}, IN_NUMPY):
+        for name in SEARCHES:
+            monkeypatch.setattr(f"pathspace_graph.factors.footpoint._{name}", versions[name])
+        searched = joint_foot_points(spans, control_points, points, curve, low, high, 0.7)
+        refined = refine_joint_foot_points(spans, control_points, points, curve, start, low, high)
+        both.append([searched, refined])
+    for found, expected in zip(*both, strict=True):
+        for name in ("u", "position", "tangent_unit", "normal_unit", "distance", "basis"):
+            np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-9)
+        for name in ("interior", "span", "columns"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+@needs_compiled
+def test_shapes_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(ValueError, match="shapes that fit"):
+        _KERNELS.to_map(np.zeros((3, 2)), np.zeros((2, 3)))
+    with pytest.raises(TypeError):  # the Hessian is changed in place, so a copy of it would be lost
+        _KERNELS.add_rows(np.zeros((2, 3)), *[np.zeros(2)] * 5)
+
+
+def test_the_environment_keeps_the_compiled_versions_out() -> None:
+    code = "from pathspace_graph.factors import kernels, se2; print(kernels.COMPILED, se2.to_map.__module__)"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={NUMPY_ONLY: "1", "PATH": ""},
+    )
+    assert done.stdout.split() == ["False", "pathspace_graph.factors.se2"]
