@@ -25,6 +25,8 @@ def _built() -> Any:
 _KERNELS: Final = _built()
 COMPILED: Final = _KERNELS is not None
 """Whether the compiled versions run."""
+KERNELS: Final = "compiled" if COMPILED else "numpy"
+"""Word for it."""
 IN_NUMPY: Final[dict[str, Callable[..., Any]]] = {}
 """The versions in numpy by name."""
 

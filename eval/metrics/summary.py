@@ -10,6 +10,7 @@ import numpy as np
 
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.kernels import KERNELS
 from pathspace_graph.factors.noise import ray_sigmas
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import Health, Stretch, counts, stretches
@@ -40,6 +41,7 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         "settings": result.settings,
         "scale": result.scale,
         "versions": versions(),
+        "kernels": KERNELS,
         "lap_count": result.laps,
         "closed": result.map.closed,
         "size": result.map.size,

@@ -52,7 +52,6 @@ HUBER: Final = 2.5
 """Whitened distance beyond which the Huber loss reduces the weight of a matched detection."""
 SIGMA_CONE: Final = 0.05
 """Standard deviation added to that of a detection, m, since one side of a cone is seen."""
-LIMITS: Final = (FARTHEST, MIN_WEIGHT, HUBER, SIGMA_CONE)
 LEAST_SHARE: Final = 1e-6
 """Least determinant of a pose's information that holds it, by the product of the diagonal."""
 MOST_MISFIT: Final = 9.0
@@ -148,8 +147,9 @@ def match(
     """
     pose = start.copy()
     for reach in reaches:
+        limits = (FARTHEST, MIN_WEIGHT, HUBER, SIGMA_CONE)
         information, gradient, matched, cost = _matched(
-            recent.points, points_vehicle, variances, pose, reach, LIMITS
+            recent.points, points_vehicle, variances, pose, reach, limits
         )
         if matched.sum() < MIN_MATCHED:
             break
