@@ -89,7 +89,7 @@ def detection_rows(
     by_theta = normals[:, 1] * arm[:, 0] - normals[:, 0] * arm[:, 1]
     by = sensor_rows(normals, distances, poses, measured, twists, sensor)
     by_pose = np.concatenate([normals, by_theta[:, None]], axis=1)
-    by_control = (-basis[:, :, None] * normals[:, None, :]).reshape(len(basis), -1)
+    by_control = (-basis[:, :, None] * normals[:, None, :]).reshape(len(basis), 2 * basis.shape[1])
     factor = by.factor[:, None]
     jacobian = np.concatenate([factor * by_pose, by.by_sensor, factor * by_control], axis=1)
     return by.factor * distances, sigma_across(normals, covariances, poses, sigma_model), jacobian

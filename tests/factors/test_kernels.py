@@ -25,8 +25,8 @@ COUNT = 17
 needs_compiled = pytest.mark.skipif(not COMPILED, reason="the package was built without a compiler")
 
 
-def poses(rng: np.random.Generator, count: int = COUNT) -> np.ndarray:
-    return rng.normal(size=(count, 3)) * np.array([30.0, 30.0, 2.0])
+def poses(rng: np.random.Generator, count: int | None = None) -> np.ndarray:
+    return rng.normal(size=(COUNT if count is None else count, 3)) * np.array([30.0, 30.0, 2.0])
 
 
 def covariances(rng: np.random.Generator) -> np.ndarray:
@@ -35,7 +35,7 @@ def covariances(rng: np.random.Generator) -> np.ndarray:
 
 
 def rows_of_a_system(rng: np.random.Generator) -> tuple[Any, ...]:
-    columns = np.array([rng.choice(30, 6, replace=False) for _ in range(COUNT)])
+    columns = np.array([rng.permutation(30)[:6] for _ in range(COUNT)], np.intp).reshape(COUNT, 6)
     hessian = np.asfortranarray(np.zeros((30, 30)))
     jacobian, residual = rng.normal(size=(COUNT, 6)), rng.normal(size=COUNT)
     return hessian, rng.normal(size=30), columns, jacobian, residual, rng.normal(size=30)
@@ -105,6 +105,15 @@ def assert_equal(found: list[Any], expected: list[Any]) -> None:
 @pytest.mark.parametrize("name", CASES)
 def test_a_compiled_function_is_the_one_in_numpy(name: str, seed: int) -> None:
     arguments = CASES[name](np.random.default_rng(seed))
+    assert_equal(results(getattr(_KERNELS, name), arguments), results(IN_NUMPY[name], arguments))
+
+
+@needs_compiled
+@pytest.mark.parametrize("name", sorted(set(CASES) - {"integrated"}))
+def test_no_rows_are_no_rows(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nothing is seen; `integrate_twists` asks for no step without twists."""
+    monkeypatch.setitem(globals(), "COUNT", 0)
+    arguments = CASES[name](np.random.default_rng(0))
     assert_equal(results(getattr(_KERNELS, name), arguments), results(IN_NUMPY[name], arguments))
 
 
