@@ -35,13 +35,15 @@ FOLDERS = {package: folder_of(package) for package in PACKAGES}
 
 
 def python_folders() -> set[Path]:
-    """Every folder with Python code below the root, but for tests, examples and pages, and what is built."""
+    """Every folder with Python code, but for the root's setup.py, tests, examples, pages and what is built."""
     skipped = {"tests", "examples", "docs", "build", "dist"}
     files = (file.relative_to(ROOT) for file in ROOT.rglob("*.py"))
     return {
         file.parent
         for file in files
-        if file.parts[0] not in skipped and not any(part.startswith(".") for part in file.parts)
+        if file.parent != Path()
+        and file.parts[0] not in skipped
+        and not any(part.startswith(".") for part in file.parts)
     }
 
 
