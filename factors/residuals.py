@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from .arrays import Array
 from .bspline import SpanPolynomials
@@ -25,6 +26,11 @@ class ProjectionRows:
     """Derivatives (m, 3) by the pose (x, y, theta) in the map frame."""
     by_control: Array
     """Derivatives (m, degree + 1, 2) by the control points of the foot point's span."""
+
+
+def chi2_quantile(probability: float, degrees: int) -> float:
+    """Return the quantile of the chi-square distribution; `scipy.stats` would take a third of a start."""
+    return 2.0 * float(gammaincinv(0.5 * degrees, probability))
 
 
 def sigma_across(normals: Array, covariances: Array, poses: Array, sigma_model: float) -> Array:

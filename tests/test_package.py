@@ -35,7 +35,7 @@ FOLDERS = {package: folder_of(package) for package in PACKAGES}
 
 
 def python_folders() -> set[Path]:
-    """Every folder with Python code, but for the root's setup.py, tests, examples, pages and what is built."""
+    """Every folder with Python code, but for the root, tests, examples, pages and what is built."""
     skipped = {"tests", "examples", "docs", "build", "dist"}
     files = (file.relative_to(ROOT) for file in ROOT.rglob("*.py"))
     return {

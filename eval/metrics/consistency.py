@@ -9,11 +9,10 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
-from scipy.stats import chi2
 
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.residuals import greville
+from pathspace_graph.factors.residuals import chi2_quantile, greville
 from pathspace_graph.factors.se2 import left_of, rotation
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
@@ -51,8 +50,8 @@ class NormalizedError:
         """Return the two-sided 95 % interval of `ratio` for an honest covariance."""
         if not self.dof:
             return float("nan"), float("nan")
-        low, high = chi2.interval(LEVEL, self.dof)
-        return float(low) / self.dof, float(high) / self.dof
+        low, high = (chi2_quantile(0.5 * (1.0 + sign * LEVEL), self.dof) for sign in (-1.0, 1.0))
+        return low / self.dof, high / self.dof
 
     @property
     def honest(self) -> bool:

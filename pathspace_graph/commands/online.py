@@ -2,9 +2,11 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -22,7 +24,6 @@ from pathspace_graph.eval.metrics.summary import (
     summarize,
     vehicle_of,
 )
-from pathspace_graph.eval.view.recording import check_watchers, watchers
 from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import Log
@@ -74,11 +75,13 @@ class Online:
         name = for_map(self.estimator, self.map)
         check_target(self.out, MAP_FILE)
         self._check_snapshots(name)
-        check_watchers(self)
+        viewing = self._viewing()
+        if viewing is not None:
+            viewing.check_watchers(self)
         log, hints = read_plausible_log(self.log, self.settings.limits)
         tell(hints)
         log, estimator = self._begin(log, name)
-        with watchers(self, log) as observers:
+        with nullcontext([]) if viewing is None else viewing.watchers(self, log) as observers:
             result = map_online(log, estimator, name, observers)
             write_result(self.out, result, summarize(result, log, hints))
         if self.save is not None and isinstance(estimator, FixedLagMapper):
@@ -88,6 +91,11 @@ class Online:
             str(path) for path in (self.out, self.save_view, self.animate) if path is not None
         )
         Console().print(f"written to {written}", highlight=False, soft_wrap=True, markup=False)
+
+    def _viewing(self) -> Any:
+        """Return the module of viewers and films where one is asked for: drawing takes long to import."""
+        asked = self.view or self.save_view is not None or self.animate is not None
+        return import_module("pathspace_graph.eval.view.recording") if asked else None
 
     def _check_snapshots(self, estimator: str) -> None:
         """Raise a SettingsError where a snapshot is asked for that cannot be, before anything is mapped."""

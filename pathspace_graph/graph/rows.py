@@ -183,10 +183,15 @@ class KeptRows:
         ascending, dropped, kept = np.sort(owners), [], []
         for rows in self.groups:
             own = among(rows.owner, ascending)
-            kept.append(rows.where(~own) if own.any() else rows)
-            dropped.append(rows.where(own))
-        self.groups = [rows for rows in kept if len(rows)]
-        return [rows for rows in dropped if len(rows)]
+            if own.all():
+                dropped.append(rows)
+            elif own.any():
+                dropped.append(rows.where(own))
+                kept.append(rows.where(~own))
+            else:
+                kept.append(rows)
+        self.groups = kept
+        return dropped
 
     def pop(self, owner: int, layout: Layout) -> gtsam.GaussianConditional:
         """Remove the rows of an owner and return them as a factor."""

@@ -10,10 +10,9 @@ from typing import Final
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.residuals import landmark_residuals
+from pathspace_graph.factors.residuals import chi2_quantile, landmark_residuals
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.graph.variables import POINT
@@ -55,7 +54,7 @@ class Gates:
     @cache
     def of(settings: LandmarkSettings) -> "Gates":
         """Return the chi-square quantiles of the two probabilities in the settings."""
-        return Gates(float(chi2.ppf(settings.match, POINT)), float(chi2.ppf(settings.create, POINT)))
+        return Gates(chi2_quantile(settings.match, POINT), chi2_quantile(settings.create, POINT))
 
 
 # --- the assignment --------------------------------------------------------------------------------------

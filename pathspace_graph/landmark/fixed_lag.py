@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise
+from pathspace_graph.factors.residuals import chi2_quantile
 from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.front_end.front_end import FrontEnd, at_nearest_pose
 from pathspace_graph.graph.smoother import FixedLagSmoother
@@ -350,7 +350,7 @@ def _is_acceptable(smoother: LandmarkSmoother, pairs: LoopPairs) -> bool:
     """Return whether there are enough pairs of either label, which are compatible as a whole."""
     settings, labels = smoother.map.settings.landmark, smoother.map.state.labels[pairs.recent]
     enough = all((labels == label).sum() >= MIN_PAIRS // 3 for label in BOUNDARIES)
-    joint = chi2.ppf(settings.create, POINT * len(labels)) if len(labels) else 0.0
+    joint = chi2_quantile(settings.create, POINT * len(labels)) if len(labels) else 0.0
     return bool(enough and len(labels) >= MIN_PAIRS and pairs.distance < joint)
 
 

@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import rotation
@@ -110,7 +110,7 @@ class Verdict:
 
     def is_clear(self, settings: PlausibilitySettings) -> bool:
         """Returns whether the hypothesis is better beyond doubt."""
-        chance = float(binom.sf(self.better - 1, self.telling, 0.5))
+        chance = float(bdtrc(self.better - 1, self.telling, 0.5))
         far_better = self.share > settings.far_better * self.share_as_written
         return chance < settings.chance and far_better and self.share > settings.least_share
 
