@@ -1,8 +1,8 @@
 """One run of the mapper, timed beside GTSAM's elimination and the landmark graph, and the figures of it.
 
 GTSAM's figure is of the ordering that was fastest on average in the run. Ratios are of means over all cycles
-from the first sample on, the closing one included. The landmark graph gets every cycle right after the
-mapper. BLAS has one thread.
+from the first sample on, the closing one included. The landmark graph and GTSAM's ISAM2 get every cycle right
+after the mapper. BLAS has one thread.
 
 From closing until the map is replaced by one that was solved as a batch, the cycles come as they do in a car,
 since another process solves meanwhile.
@@ -27,6 +27,7 @@ from pathspace_graph.run import ObservedCycle, run_online, split_odometry, timed
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .gtsam_window import linear_window, time_gtsam
+from .isam2 import ToldLandmarks
 from .ratios import Metric
 
 AHEAD: Final = 20.0
@@ -53,7 +54,9 @@ BOUNDS: Final = {
 }
 """Worst value allowed of a figure, in its unit."""
 TOLERANCES: Final = {
-    **dict.fromkeys(("mean_by_gtsam", "mean_by_landmark"), 0.2),  # two means over the whole run
+    **dict.fromkeys(
+        ("mean_by_gtsam", "mean_by_landmark", "mean_by_isam2"), 0.2
+    ),  # two means over the whole run
     "last_lap_by_lap_2": 0.15,
     **dict.fromkeys(("meanwhile_by_before", "p99_by_mean", "closing_by_mean"), 0.5),  # tails, single cycles
 }
@@ -86,6 +89,8 @@ class Measurement:
     gtsam: Gtsam
     rival: tuple[float, ...]
     """Time of each update of the landmark graph (s)."""
+    isam2: tuple[float, ...]
+    """Time of each update of ISAM2 (s)."""
     swap: int | None = None
     """Cycle that replaced the map by one that was solved as a batch; None where none did."""
     solve: float = float("nan")
@@ -95,13 +100,15 @@ class Measurement:
 
 
 class _Sampler:
-    """Timer of GTSAM and the landmark graph between cycles, which notes the cycle that closes the loop."""
+    """Timer of GTSAM and the landmark graphs between cycles, which notes the cycle that closes the loop."""
 
     def __init__(self, mapper: FixedLagMapper, log: Log, every: int, advance: Callable[[], None]) -> None:
         self._mapper, self._every, self._advance = mapper, every, advance
         self._cycles, self._rival = split_odometry(log), make_online(RIVAL, mapper.settings, log)
         self._timings: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
+        self._told = ToldLandmarks(log)
         self.rival: list[float] = []
+        self.isam2: list[float] = []
         self.ahead: list[float] = []
         self.closing: ObservedCycle | None = None
         self.swap: ObservedCycle | None = None
@@ -123,6 +130,7 @@ class _Sampler:
         self.ahead.append(time.perf_counter() - begin)
         _, seconds = timed_update(self._rival, *next(self._cycles))
         self.rival.append(seconds)
+        self.isam2.append(self._told.advance())
         self._advance()
 
     def _solves(self, cycle: ObservedCycle) -> bool:
@@ -152,6 +160,7 @@ def measure(log: Log, settings: MapperSettings, every: int = SAMPLE_EVERY) -> Me
         closing,
         sampler.fastest(),
         tuple(sampler.rival),
+        tuple(sampler.isam2),
         swap,
         mapper.lap_seconds,
         tuple(sampler.ahead),
@@ -172,10 +181,13 @@ def _figures(measurement: Measurement) -> Iterator[tuple[str, float, str]]:
     times = np.array([record.seconds for record in cycles])
     mean, p99 = _mean(times[WARM_UP:]), float(np.quantile(times, 0.99))
     gtsam, rival = best.optimize + best.marginal, _mean(measurement.rival[WARM_UP:])
+    isam2, isam2_p99 = _mean(measurement.isam2[WARM_UP:]), float(np.quantile(measurement.isam2, 0.99))
     laps = _lap_means(cycles, measurement.laps)
     closing = float(times[measurement.closing]) if measurement.closing is not None else float("nan")
     yield "mean_by_gtsam", mean / gtsam, ""
     yield "mean_by_landmark", mean / rival, ""
+    yield "mean_by_isam2", mean / isam2, ""
+    yield "p99_by_isam2", p99 / isam2_p99, ""
     yield "p99", 1e3 * p99, "ms"
     yield "last_lap_by_lap_2", laps[-1] / laps[REFERENCE_LAP - 1] if len(laps) > REFERENCE_LAP else np.nan, ""
     yield "closing", 1e3 * closing, "ms"
@@ -188,6 +200,8 @@ def _figures(measurement: Measurement) -> Iterator[tuple[str, float, str]]:
         "median": float(np.median(times)),
         "slowest": float(times.max()),
         "landmark": rival,
+        "isam2": isam2,
+        "isam2_p99": isam2_p99,
         "gtsam": gtsam,
         "gtsam_optimize": best.optimize,
         "gtsam_marginal": best.marginal,

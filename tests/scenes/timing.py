@@ -27,4 +27,4 @@ def record(cycle: int, seconds: float, lap: int) -> CycleRecord:
 def steady_run(seconds: float = 0.002) -> Measurement:
     """Three laps of 100 cycles that take equally long; the last one of lap 1 closes the loop."""
     cycles = tuple(record(k, seconds, 1 + k // 100) for k in range(300))
-    return Measurement(cycles, 3, 99, Gtsam("any", 0.001, 0.001, 25), (0.01,) * 300)
+    return Measurement(cycles, 3, 99, Gtsam("any", 0.001, 0.001, 25), (0.01,) * 300, (0.002,) * 300)
