@@ -1,7 +1,7 @@
-"""Maps logs of a real car, and writes a table of what can be held against what.
+"""Map logs of a real car, and compare the maps, the last poses and the measured noise in tables.
 
 Each folder has odometry.csv (t, vx, vy, wz) and detections.csv (t, range, bearing, colour), y to the right.
-docs/real.md says where such recordings are, and what the table means.
+docs/real.md names the recordings and explains the tables.
 
     python examples/real_logs.py FOLDER [FOLDER ...] --out DIR [--page docs/real.md]
 """
@@ -38,6 +38,8 @@ Array = NDArray[np.float64]
 
 BEGIN, MARK = "<!-- real:begin -->", "<!-- real:end -->"
 """The tables of a page stand between these lines."""
+LANDMARKS = "landmark-fixed-lag"
+"""The graph of landmarks, whose run stands beside those of the curves."""
 FIRST, LAST = 25.0, 14.0
 """The last metres of a drive are registered on its first ones."""
 NEAR = 15.0
@@ -161,6 +163,7 @@ def drive(folder: Path, out: Path) -> Drive:
     runs: dict[str, RunResult] = {
         "online": run_online(log, make_online(DEFAULT, settings, log)),
         "batch": make_batch(DEFAULT_BATCH, settings, log).solve(log),
+        "landmarks": run_online(log, make_online(LANDMARKS, settings, log)),
     }
     for name, result in runs.items():
         write_result(out / name / folder.name, result, summarize(result, log))
@@ -204,9 +207,9 @@ def runs_table(drives: Sequence[Drive]) -> str:
                     "yes" if result.map.closed else "no",
                     off(result.trajectory[-1], one),
                     off(one.dead_reckoned, one) if name == "online" else "",
-                    "{}, {}".format(*crossings(result.map)),
+                    "{}, {}".format(*crossings(result.map)) if name != "landmarks" else "",
                     *(shares if any(health) else ("", "")),
-                    f"{ms:.1f}" if name == "online" else "",
+                    f"{ms:.1f}" if name != "batch" else "",
                 )
             )
     return table(header, rows)
