@@ -214,14 +214,14 @@ def log() -> Log:
     return replace(drive, cycles=cycles, odometry=drive.odometry.between(0.0, cycles[-1].t), truth=truth)
 
 
-def test_the_graph_is_asked_as_the_architecture_page_does(log: Log) -> None:
+def test_the_graph_is_asked_as_the_page_on_python_does(log: Log) -> None:
     mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
     for odometry, detections in split_odometry(log):
         mapper.update(odometry, detections)
-    (block,) = blocks(ROOT / "docs" / "architecture.md", "python")
+    _, block = blocks(ROOT / "docs" / "python.md", "python")
     make, show, *asks = ast.parse(block).body
     names: dict[str, Any] = {"mapper": mapper, "gtsam": gtsam}
-    exec(compile(ast.Module([make, show], []), "architecture.md", "exec"), names)
+    exec(compile(ast.Module([make, show], []), "python.md", "exec"), names)
     assert names["graph"].size() > 0 and set(names["graph"].keyVector()) == set(names["values"].keys())
     own, in_map = (eval(ast.unparse(ask), names) for ask in asks)
     turn = np.eye(3)

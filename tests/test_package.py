@@ -120,8 +120,8 @@ def test_the_factors_stand_on_their_own() -> None:
 # --- README ----------------------------------------------------------------------------------------------
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+def blocks(language: str, text: str = README) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
 
 
 def straight_log() -> Log:
@@ -140,14 +140,14 @@ def straight_log() -> Log:
     return Log(Odometry(t, twist), tuple(cycles), np.array([0.1, 0.1, 0.01]))
 
 
-def test_the_example_of_the_readme_runs(
+def test_the_example_of_the_page_on_python_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (example,) = blocks("python")
+    example, _ = blocks("python", (ROOT / "docs" / "python.md").read_text())
     assert len(example.strip().splitlines()) <= 12
     write_log(straight_log(), tmp_path / "log")
     monkeypatch.chdir(tmp_path)
-    exec(compile(example, "README.md", "exec"), {})
+    exec(compile(example, "python.md", "exec"), {})
     printed = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in printed] == [str(LEFT), str(RIGHT)]
 
