@@ -29,7 +29,7 @@ class ProjectionRows:
 
 
 def chi2_quantile(probability: float, degrees: int) -> float:
-    """Return the quantile of the chi-square distribution; `scipy.stats` would take a third of a start."""
+    """Return the chi-square quantile; importing `scipy.stats` for it would dominate the start-up time."""
     return 2.0 * float(gammaincinv(0.5 * degrees, probability))
 
 

@@ -95,6 +95,7 @@ def copied(value: Any, memo: Memo) -> Any:
 
 
 def is_shared(value: object) -> bool:
+    """Return whether a copy may hold the value itself, since nothing in it changes."""
     return all(map(is_shared, value)) if isinstance(value, tuple) else _copier_of(value) is None
 
 

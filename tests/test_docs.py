@@ -35,6 +35,7 @@ from pathspace_graph.sim import track_files
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
+from .scenes.drives import beginning
 from .scenes.jacobians import numeric_jacobian
 from .scenes.paths import ROOT, modules
 from .test_prose import texts
@@ -206,12 +207,8 @@ def test_python_blocks_compile(page: Path) -> None:
 def log() -> Log:
     """The first eight seconds of a drive on a generated track."""
     drive = simulate(generate_track(np.random.default_rng(0)), SimulationSettings(laps=1), seed=0)
-    assert drive.truth is not None
-    assert drive.truth.associations is not None
-    cycles = drive.cycles[:80]
-    detected = sum(len(cycle.labels) for cycle in cycles)
-    truth = replace(drive.truth, associations=drive.truth.associations[:detected])
-    return replace(drive, cycles=cycles, odometry=drive.odometry.between(0.0, cycles[-1].t), truth=truth)
+    first = beginning(drive, 80)
+    return replace(first, odometry=drive.odometry.between(0.0, first.cycles[-1].t))
 
 
 def test_the_graph_is_asked_as_the_page_on_python_does(log: Log) -> None:

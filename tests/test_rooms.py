@@ -15,6 +15,9 @@ MOST_FILES = 15
 EXTRAS = {"distributed", "rerun", "rosbags"}
 """Optional packages, which are imported only where they are needed."""
 
+LATE = {"commands.online": {"eval.view.recording"}, "factors.kernels": {"factors._kernels"}}
+"""Modules that are imported by name when needed: matplotlib is slow, and kernels may not be built."""
+
 LEAVES = {"errors", "labels", "progress", "lengths"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "ckf", "landmark", "centerline"}
@@ -113,6 +116,23 @@ def test_no_import_hides_inside_a_function() -> None:
             if isinstance(function, ast.FunctionDef):
                 hidden = {name for node in ast.walk(function) for name in imported_by(node)}
                 assert hidden <= EXTRAS, f"{module}: {function.name}"
+
+
+def test_imports_by_name_are_declared_and_follow_the_arrows() -> None:
+    found = {module: set(imports_by_name(file)) for module, file in modules().items()}
+    assert {module: names for module, names in found.items() if names} == LATE
+    for module, names in LATE.items():
+        rooms = {room_of(name) for name in names}
+        assert rooms <= ARROWS[room_of(module)] | {room_of(module)}, module
+
+
+def imports_by_name(file: Path) -> Iterator[str]:
+    """Modules of the package that `import_module` gets as a literal, without the package's own name."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            name = node.args[0].value if isinstance(node.args[0], ast.Constant) else ""
+            if str(name).startswith(f"{PACKAGE}."):
+                yield str(name).removeprefix(f"{PACKAGE}.")
 
 
 def imported_by(node: ast.AST) -> list[str]:

@@ -1,9 +1,8 @@
-"""GTSAM's ISAM2 on landmarks, told every association: what a user would take in place of the mapper.
+"""GTSAM's ISAM2 on landmarks, given every association: what a user would write instead of the mapper.
 
-Its graph has a pose for each cycle and a point for each cone, factors between poses by the odometry, and
-bearing and range of each detection, all of them GTSAM's own and so in C++. It is told by the truth which cone
-each detection is of, and has GTSAM's default parameters. The time is that of `update` and of the newest pose;
-the graph of a cycle is made before.
+The graph has a pose for each cycle, a point for each cone, odometry factors between poses, and a
+bearing-range factor for each detection. All factors are GTSAM's own, in C++; its parameters are the defaults.
+The truth gives the cone of each detection. `update` and the newest pose are timed; building the graph is not.
 """
 
 import time
@@ -13,6 +12,7 @@ import gtsam
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.noise import ray_sigmas
 from pathspace_graph.factors.se2 import compose, to_map
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.mapping.motion import integrate_odometry
@@ -39,7 +39,7 @@ class ToldLandmarks:
         self._seen: set[int] = set()
 
     def advance(self) -> float:
-        """Take the next cycle; return the time (s) of it."""
+        """Take the next cycle; return the wall time (s) of its update."""
         odometry, detections = next(self._cycles)
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         key = gtsam.symbol("x", self._count)
@@ -73,12 +73,11 @@ class ToldLandmarks:
     def _add_detections(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, detections: Detections, cones: IntArray
     ) -> None:
-        """Add bearing and range of the detections of cones; a false positive is of none, and left out."""
+        """Add bearing and range of each detection of a cone; false positives are left out."""
         points, key = detections.points_vehicle, gtsam.symbol("x", self._count)
         ranges = np.hypot(*points.T)
-        rays = points / ranges[:, None]
-        to_ray = np.stack([rays @ [[0.0, 1.0], [-1.0, 0.0]] / ranges[:, None], rays], axis=1)
-        sigmas = np.sqrt(np.einsum("nij,njk,nik->ni", to_ray, detections.covariances, to_ray))
+        along, across = ray_sigmas(points, detections.covariances).T
+        sigmas = np.stack([across / ranges, along], axis=1)
         points_map = to_map(points, self._pose[None])
         for i in np.flatnonzero(cones >= 0).tolist():
             cone = int(cones[i])
@@ -86,5 +85,6 @@ class ToldLandmarks:
             if cone not in self._seen:
                 self._seen.add(cone)
                 values.insert(landmark, points_map[i])
-            bearing, noise = gtsam.Rot2.fromCosSin(*rays[i]), gtsam.noiseModel.Diagonal.Sigmas(sigmas[i])
+            bearing = gtsam.Rot2.relativeBearing(points[i])
+            noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas[i])
             graph.add(gtsam.BearingRangeFactor2D(key, landmark, bearing, ranges[i], noise))

@@ -59,7 +59,7 @@ TOLERANCES: Final = {
     "last_lap_by_lap_2": 0.15,
     **dict.fromkeys(("p99_by_mean", "closing_by_mean"), 0.5),  # tails, single cycles
 }
-"""Share by which a ratio may be worse than its baseline; without those of the solver's delay."""
+"""Share by which a ratio may be worse than its baseline; those of the solver's delay have none."""
 
 
 @dataclass(frozen=True)

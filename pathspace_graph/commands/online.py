@@ -93,7 +93,7 @@ class Online:
         Console().print(f"written to {written}", highlight=False, soft_wrap=True, markup=False)
 
     def _viewing(self) -> Any:
-        """Return the module of viewers and films where one is asked for: drawing takes long to import."""
+        """Return the module of viewers and films if one is asked for; importing matplotlib is slow."""
         asked = self.view or self.save_view is not None or self.animate is not None
         return import_module("pathspace_graph.eval.view.recording") if asked else None
 

@@ -109,6 +109,7 @@ def name(key: int) -> str:
 
 
 def names(keys: IntArray) -> str:
+    """Return the first keys of an array as text for a message."""
     return ", ".join(name(key) for key in keys[:_NAMES_IN_MESSAGE].tolist())
 
 

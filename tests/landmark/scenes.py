@@ -19,7 +19,7 @@ from pathspace_graph.mapping.motion import smoother_settings
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 
-from ..scenes.drives import ODOMETRY_SIGMA, see
+from ..scenes.drives import ODOMETRY_SIGMA, beginning, see
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -78,10 +78,9 @@ def with_covariance(
 
 def beginning_of(log: Log, cycles: int) -> tuple[Log, NDArray[np.int_]]:
     """Returns the first cycles of a simulated log, and their true associations."""
-    assert log.truth is not None and log.truth.associations is not None
-    kept = log.cycles[:cycles]
-    detections = sum(len(cycle.labels) for cycle in kept)
-    return Log(log.odometry, kept, log.odometry_sigma), log.truth.associations[:detections]
+    first = beginning(log, cycles)
+    assert first.truth is not None and first.truth.associations is not None
+    return Log(log.odometry, first.cycles, log.odometry_sigma), first.truth.associations
 
 
 def oracle_system(log: Log, cycles: int) -> tuple[LandmarkSystem, LandmarkState]:

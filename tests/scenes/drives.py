@@ -95,6 +95,14 @@ def lap_log(track: Track, overrun: float = 10.0) -> Log:
     return exact_log(driven.twists, track.cones, track.cone_labels.astype(np.intp))
 
 
+def beginning(log: Log, cycles: int) -> Log:
+    """The first cycles of a simulated log, with their true associations."""
+    assert log.truth is not None and log.truth.associations is not None
+    kept = log.cycles[:cycles]
+    associations = log.truth.associations[: sum(len(cycle.labels) for cycle in kept)]
+    return replace(log, cycles=kept, truth=replace(log.truth, associations=associations))
+
+
 def noisy(log: Log, seed: int, sigma: float = 0.1) -> Log:
     """Returns the log with noise on its detections."""
     rng = np.random.default_rng(seed)

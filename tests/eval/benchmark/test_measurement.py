@@ -8,25 +8,16 @@ import numpy as np
 import pytest
 
 from pathspace_graph.eval.benchmark.measurement import Gtsam, Measurement, measure, metrics
-from pathspace_graph.io.log import Log
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
-from ...scenes.drives import bean_track
+from ...scenes.drives import bean_track, beginning
 from ...scenes.timing import record
 
 
-def beginning(cycles: int) -> Log:
-    """The first cycles of a simulated log."""
-    log = simulate(bean_track(), SimulationSettings(laps=1), 0)
-    assert log.truth is not None and log.truth.associations is not None
-    rows = sum(len(cycle.labels) for cycle in log.cycles[:cycles])
-    truth = replace(log.truth, associations=log.truth.associations[:rows])
-    return replace(log, cycles=log.cycles[:cycles], truth=truth)
-
-
 def test_a_short_run_gives_every_figure() -> None:
-    measurement = measure(beginning(70), MapperSettings(lag=1.0), every=10)
+    log = beginning(simulate(bean_track(), SimulationSettings(laps=1), 0), 70)
+    measurement = measure(log, MapperSettings(lag=1.0), every=10)
     assert len(measurement.cycles) == 70
     assert measurement.gtsam.samples == 2
     assert measurement.closing is None
