@@ -1,4 +1,4 @@
-"""The landmark factor: its Jacobians, and its residual against GTSAM's transform."""
+"""The landmark factor: its Jacobians, its residual against GTSAM's, and the quantile of its gate."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.residuals import landmark_residuals
+from pathspace_graph.factors.residuals import chi2_quantile, landmark_residuals
 
 from ..scenes.jacobians import assert_jacobians
 
@@ -37,3 +38,10 @@ def test_it_agrees_with_gtsam() -> None:
     rows = landmark_residuals(poses, landmarks, np.zeros((20, 2)))
     for pose, landmark, seen in zip(poses, landmarks, rows.residual, strict=True):
         np.testing.assert_allclose(gtsam.Pose2(*pose).transformTo(landmark), seen, atol=1e-12)
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 3, 160])
+@pytest.mark.parametrize("probability", [0.025, 0.5, 0.99, 1.0 - 1e-6])
+def test_a_quantile_of_chi_square_is_that_of_scipy(probability: float, degrees: int) -> None:
+    """It gates landmarks and gives the intervals of the NEES, so its tails count."""
+    assert chi2_quantile(probability, degrees) == pytest.approx(chi2.ppf(probability, degrees), rel=1e-10)
