@@ -46,6 +46,12 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
     """Yield all factors that hold no control point: odometry, first pose and the priors of calibrations."""
     for k, interval in enumerate(system.chain.odometry.intervals):
         yield odometry_factor(k, interval)
+    for one in system.revisits:
+        root = one.root.copy()  # GTSAM's tangents are in the frame of the later pose
+        root[:, :2] = root[:, :2] @ rotation(one.local[2])
+        noise = gtsam.noiseModel.Gaussian.Information(root.T @ root)
+        between = gtsam.Pose2(*one.local)
+        yield gtsam.BetweenFactorPose2(pose_key(one.earlier), pose_key(one.later), between, noise)
     yield from _priors(system.chain, at.state.poses[0, 2])
     sensor_key = at.state.variables.sensor_key
     if sensor_key is not None:

@@ -24,6 +24,7 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
 from pathspace_graph.mapping.registration import HEADING
+from pathspace_graph.mapping.revisit import Revisit
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
@@ -82,6 +83,10 @@ class CurveMapper(OnlineEstimator, Protocol):
     @property
     def corrected_poses(self) -> Array:
         """Return the poses (k, 3) of the first k cycles as the closing of the loop has corrected them."""
+
+    @property
+    def revisits(self) -> tuple[Revisit, ...]:
+        """Return the revisits of the drive, which an open map is optimized with."""
 
 
 def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:

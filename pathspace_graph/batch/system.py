@@ -16,6 +16,7 @@ from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import SENSOR_KEY, Layout, are_poses, pose_keys
 from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.revisit import Revisit
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -98,7 +99,7 @@ class Evaluation:
 
 
 class BatchSystem:
-    """Problem of minimizing `sum rho(detections) + 1/2 |odometry, gauge, calibration, first pose|^2`."""
+    """Problem of minimizing `sum rho(detections) + 1/2 |odometry, revisits, gauge, priors|^2`."""
 
     def __init__(
         self, detections: DetectionTable, chain: LogOdometry, settings: MapperSettings, kernel: Biweight
@@ -109,6 +110,8 @@ class BatchSystem:
         self.kernel = kernel
         self.gauges: dict[int, CurveGauge] = {}
         """Weak priors of each boundary."""
+        self.revisits: tuple[Revisit, ...] = ()
+        """Poses measured in the frame of earlier ones, where an open road was driven twice."""
         count = len(detections)
         self._sigma, self._inside, self._rates = np.ones(count), np.ones(count, bool), np.zeros((count, 2))
 
@@ -131,6 +134,7 @@ class BatchSystem:
         )
         cost += self.chain.prior_cost(state.poses[0], state.calibration)
         cost += sensor_prior_cost(state.variables, self.settings.calibration)
+        cost += sum(0.5 * float((one.residual(state.poses) ** 2).sum()) for one in self.revisits)
         return Evaluation(state, projected, odometry, cost)
 
     def _project(self, state: State, label: int, hold: bool) -> Projected:
@@ -162,6 +166,7 @@ class BatchSystem:
         state = at.state
         groups = self.chain.rows(at.odometry, state.poses[0], state.calibration)
         groups += sensor_prior(state.variables, self.settings.calibration)
+        groups += [one.rows(state.poses) for one in self.revisits]
         for label, gauge in (gauges or self.gauges).items():
             points = state.control_points(label)
             groups += [

@@ -28,7 +28,7 @@ from .gaussian import (
     remove_information,
     square_root_form,
 )
-from .variables import ORIGIN_KEY, POSE, Layout, Variables, rotation_blocks
+from .variables import ORIGIN_KEY, POSE, Layout, Variables, pose_key, rotation_blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +200,15 @@ class Submaps:
     def insert_keyframes(self, variables: Variables) -> None:
         for key, (pose, reference) in self.keyframes.items():
             variables.insert(np.array([key]), pose, reference)
+
+    def place(self, variables: Variables) -> dict[int, Array]:
+        """Keep the keyframes where they have been solved to be, and return their poses (3,) by cycle."""
+        keys = np.array([*self.keyframes])
+        poses = variables.of(keys).reshape(-1, POSE)
+        self.keyframes = {
+            key: (pose, self.keyframes[key][1]) for key, pose in zip(keys.tolist(), poses, strict=True)
+        }
+        return dict(zip((keys - pose_key(0)).tolist(), poses, strict=True))
 
     def _finished_submap(self, variables: Variables) -> RelativeFactor:
         """Return the marginal of the current submap, given that its keyframe is where it was."""

@@ -34,7 +34,7 @@ from .gaussian import (
     substitute_points,
 )
 from .inactive import Follower, InactiveChain, InactiveMap
-from .relative import Submaps
+from .relative import RelativeFactor, Submaps
 from .rows import Rows, calibrated_delta, newton_system, predicted_covariance
 from .variables import CALIBRATION_KEY, POINT, POSE, POSE_LETTER, SENSOR_LETTER, Layout, pose_key, pose_keys
 from .window import M_co, SmootherSettings, UserFactors, WindowFactors, check_factors
@@ -377,11 +377,28 @@ class FixedLagSmoother(Generic[M_co]):
 
     # --- what happens once: closing, other variables, another prior --------------------------------------
 
-    def solve_loop(self, iterations: int, sigma_step: float | None) -> None:
+    def revisit(
+        self, measured: RelativeFactor, iterations: int, sigma_step: float | None
+    ) -> dict[int, Array]:
+        """Optimize an open map with the window's oldest pose measured in the frame of a keyframe.
+
+        The measurement is one of the submaps from now on. Return the poses (3,) of the keyframes by cycle.
+        The map is in the map frame afterwards, as after closing.
+        """
+        assert self.submaps is not None
+        submaps = self.submaps
+        submaps.finish(self.variables)
+        submaps.finished.append(measured)
+        keyframes = self.solve_loop(iterations, sigma_step)
+        self.submaps = submaps
+        return keyframes
+
+    def solve_loop(self, iterations: int, sigma_step: float | None) -> dict[int, Array]:
         """Optimize the whole loop on the graph of its submaps, each relinearized in its own frame.
 
-        The keyframes are variables during the optimization, and are marginalized afterwards. Without submaps
-        (a user's factors are absolute) the prior keeps its linearization point.
+        The keyframes are variables during the optimization, and are marginalized afterwards; their poses (3,)
+        are returned by cycle. Without submaps (a user's factors are absolute) the prior keeps its
+        linearization point, and there are no keyframes.
         """
         self.reactivate(with_prior=self.submaps is None)
         submaps, self.submaps, self.epoch = self.submaps, None, self.epoch + 1
@@ -392,7 +409,9 @@ class FixedLagSmoother(Generic[M_co]):
             if submaps is not None:
                 self.prior = submaps.graph(self.variables)
             self.step(sigma_step)
+        keyframes = submaps.place(self.variables) if submaps is not None else {}
         self._marginalize_keyframes()
+        return keyframes
 
     def substitute(self, old: IntArray, new: IntArray, points: Array, change: Array, sigma: float) -> None:
         """Replace map points `old` (n,) by `new` (k,) at `points` (k, 2): `c_old = E c_new + N(0, sigma^2)`.

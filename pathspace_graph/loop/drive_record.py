@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Final, cast
 
@@ -15,7 +15,8 @@ from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, is_worth_
 from pathspace_graph.batch.start import Recurrence, find_recurrence, unwrap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import compose, to_map, wrap_angle
+from pathspace_graph.factors.se2 import compose, relative, to_map, wrap_angle
+from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.front_end.log_odometry import chained
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.detections import DetectionTable
@@ -112,6 +113,7 @@ class DriveRecord:
         self._stamps: list[float] = []
         self._motions: list[MeasuredMotion] = []
         self._detections: list[Detections] = []
+        self._orange: list[Detections] = []
         self._places: dict[int, list[Place]] = {}
         self._reckoned: list[Array] = []
         self._prepared = False
@@ -120,15 +122,16 @@ class DriveRecord:
         """Drop the measurements, since the lap cannot be solved for this reason."""
         if self.unsolvable is None:
             self.unsolvable = reason
-        self._stamps, self._motions, self._detections = [], [], []
+        self._stamps, self._motions, self._detections, self._orange = [], [], [], []
 
-    def measured(self, t: float, motion: MeasuredMotion, detections: Detections) -> None:
-        """Add the motion that leads to the pose at t (s), and the detections there."""
+    def measured(self, motion: MeasuredMotion, detections: Detections, orange: Detections) -> None:
+        """Add the motion that leads to a pose, and the detections there, those of orange cones apart."""
         if self.unsolvable is not None:
             return
-        self._stamps.append(t)
+        self._stamps.append(detections.t)
         self._motions.append(motion)
         self._detections.append(detections)
+        self._orange.append(orange)
         last = self._reckoned[-1] if self._reckoned else np.zeros(3)
         self._reckoned.append(_kept(compose(last, motion.odometry.delta)))
         if len(self._stamps) > self.settings.open_lap.max_cycles:
@@ -162,6 +165,32 @@ class DriveRecord:
     def replaced(self, earlier: Array, window: Array) -> None:
         """Replace all poses by those (k, 3) before the window and those (P, 3) in it, after a swap."""
         self.poses = [*_kept(unwrap(np.concatenate([earlier, window])))]
+
+    def bent(self, poses: Array, keyframes: Mapping[int, Array], window: Array) -> None:
+        """Replace all poses after a revisit: those of the window (P, 3), and earlier ones with keyframes.
+
+        The poses (n, 3) of all cycles before it move rigidly with the newest keyframe (3,) before them.
+        """
+        cycles, earlier = np.array(sorted(keyframes)), len(poses) - len(window)
+        frames = cycles[np.maximum(cycles.searchsorted(np.arange(earlier), side="right") - 1, 0)].tolist()
+        moved = [compose(keyframes[k], relative(poses[k], poses[c])) for c, k in enumerate(frames)]
+        bent = np.array([*moved, *window])
+        for places in self._places.values():
+            places[:] = [
+                replace(at, pose=compose(bent[at.cycle], relative(self.poses[at.cycle], at.pose)))
+                for at in places
+            ]
+        self.poses = [*_kept(unwrap(bent))]
+
+    def seen(self, cycle: int, sensor: Array) -> Detections:
+        """Return all detections of a cycle, corrected by the calibration (5,) of the sensor, or (0,)."""
+        both, twist = (self._detections[cycle], self._orange[cycle]), self._motions[cycle].odometry.twist
+        points, covariances, labels = (
+            np.concatenate([getattr(seen, name) for seen in both])
+            for name in ("points_vehicle", "covariances", "labels")
+        )
+        points = corrected(points, np.tile(twist, (len(points), 1)), sensor)
+        return Detections(both[0].t, points, covariances, labels)
 
     def recurrence(self) -> Recurrence | None:
         """Return the recurrence of the path driven, if odometry alone says that the lap is over."""

@@ -25,6 +25,7 @@ from .drive_record import LATE, DriveRecord, LapBatch
 from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
 from .mending import Mending
 from .recognition import recognize
+from .revisit import Revisits
 
 OWN_PRIOR: Final = "the map goes on from the window's own prior"
 """Beginning of the notice of a cycle in which the batch of the lap does not replace the prior."""
@@ -34,6 +35,8 @@ REST: Final = 10.0
 """Distance for which the loop is left as it is after a failure (m)."""
 RECOGNITION_INTERVAL: Final = 10.0
 """Least distance of two attempts to recognize the place (m along the path)."""
+REVISITED: Final = "the road was met again, and the open map is laid on its earlier pass"
+"""Notice of a cycle with a revisit."""
 LEARNED: Final = "the drive contradicts the calibration, which is learned"
 """Notice of the cycle in which the priors of the calibrations are first doubted."""
 
@@ -58,6 +61,7 @@ class TrackLoop:
         self.late_cycles = 0
         """Cycles by which the slowest batch is late in a vehicle, by its wall time."""
         self.record = DriveRecord(self.settings)
+        self.revisits = Revisits(smoother, path, self.record)
         self.mending = Mending(smoother)
         self._smoother = smoother
         self._path = path
@@ -175,6 +179,11 @@ class TrackLoop:
             self._record_open_lap()
         if self._rests:
             return None, ""
+        if not self.closed and self._lap_batch is None:
+            jump = self.revisits.use()
+            if jump is not None:
+                self.corrected_poses = np.array(self.record.poses)
+                return jump, REVISITED if len(self.revisits.found) == 1 else ""
         batch = self._lap_batch
         if batch is None:
             self._hold_gauge()

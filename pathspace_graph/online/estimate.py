@@ -25,6 +25,7 @@ from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.motion import vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
+from pathspace_graph.mapping.revisit import Revisit
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.tentative import OrangeCones
 from pathspace_graph.run import Readings
@@ -213,6 +214,11 @@ class MapperEstimate:
     def corrected_poses(self) -> Array:
         """Return the poses (k, 3) of the first k cycles as the closing of the loop has corrected them."""
         return self.loop.corrected_poses
+
+    @property
+    def revisits(self) -> tuple[Revisit, ...]:
+        """Return the poses measured in the frame of earlier ones, where an open road was driven twice."""
+        return tuple(self.loop.revisits.found)
 
     @property
     def lap_seconds(self) -> float:

@@ -247,7 +247,7 @@ class FixedLagMapper(MapperEstimate):
         predict(self.smoother, self.path, motion, t, self.settings)
         cycle, twist = self.smoother.next_cycle - 1, motion.odometry.twist
         self.orange.add(Sighting(cycle, self.poses[-1].copy(), twist, reading.orange), self._sensor)
-        self.loop.record.measured(t, motion, reading.detections)
+        self.loop.record.measured(motion, reading.detections, reading.orange)
         return reading
 
     @property

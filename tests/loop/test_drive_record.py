@@ -44,7 +44,8 @@ def driven(laps: float, drift: float) -> DriveRecord:
     for cycle in range(1, int(end * RADIUS / SPEED / CYCLE)):
         t, angle = CYCLE * cycle, SPEED * CYCLE * cycle / RADIUS
         step = integrate_odometry(Odometry(np.array([t - CYCLE]), twist), t, np.full(3, 0.01))
-        record.measured(t, MeasuredMotion(step, twist), Detections(t, *NOTHING))
+        nothing = Detections(t, *NOTHING)
+        record.measured(MeasuredMotion(step, twist), nothing, nothing)
         state.poses[-1] = np.append(on_circle(np.array([angle]))[0], angle)
         state.pose_u = {LEFT: np.array([angle * (RADIUS - 2.0)]), RIGHT: np.array([angle * (RADIUS + 2.0)])}
         record.estimated(state)

@@ -1,0 +1,55 @@
+"""A revisit: the pose of the vehicle as seen from an earlier one, by the cones that were seen from both.
+
+A drive may come back to a road without having driven a lap: the rounds of a skidpad, a lane that leads into a
+circuit. No loop closes there, and both boundaries are arcs along which a pose may slide. The cones themselves
+hold it in every direction.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import wrap_angle
+from pathspace_graph.graph.relative import RelativeFactor, by_frame_of, rotations, to_frame
+from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.variables import POSE, Layout, pose_keys
+
+HEADING_ENTRY: Final = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Revisit:
+    """The pose of one cycle in the frame of an earlier one's, as it was measured: `A (y(x) - y0)`."""
+
+    earlier: int
+    """Cycle in whose frame the pose is."""
+    later: int
+    local: Array
+    """(3,) The measured pose y0 (m, m, rad)."""
+    root: Array
+    """(3, 3) A, a square root of its information."""
+
+    def factor(self) -> RelativeFactor:
+        """Return the measurement as a factor of the engine."""
+        earlier, later = pose_keys(np.array([self.earlier, self.later]))
+        return RelativeFactor(int(earlier), Layout(np.array([later])), self.root, np.zeros(POSE), self.local)
+
+    def residual(self, poses: Array) -> Array:
+        """Return the whitened residual (3,) at the poses (P, 3) of all cycles."""
+        seen = to_frame(poses[self.later], poses[self.earlier], self._layout) - self.local
+        seen[HEADING_ENTRY] = wrap_angle(seen[HEADING_ENTRY])
+        return np.asarray(self.root @ seen)
+
+    def rows(self, poses: Array) -> Rows:
+        """Return the rows on [earlier pose | later pose], linearized at the poses (P, 3) of all cycles."""
+        frame, values, layout = poses[self.earlier], poses[self.later], self._layout
+        jacobian = [by_frame_of(values, frame, layout), rotations(layout, frame[HEADING_ENTRY]).T]
+        keys = np.tile(pose_keys(np.array([self.earlier, self.later])), (POSE, 1))
+        owner = np.full(POSE, -1 - self.later)  # a factor of its own, since its poses are far apart
+        return Rows(keys, self.root @ np.concatenate(jacobian, axis=1), self.residual(poses), owner)
+
+    @property
+    def _layout(self) -> Layout:
+        return Layout(pose_keys(np.array([self.later])))

@@ -1,0 +1,142 @@
+"""Revisits: which places are some, how certain they are, and what they make of the drive of a skidpad."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pathspace_graph import FixedLagMapper
+from pathspace_graph.batch.mapper import BatchMapper
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import compose, relative, rotation
+from pathspace_graph.io.log import Log
+from pathspace_graph.loop.revisit import Revisits, earlier_pass, measured_revisit
+from pathspace_graph.run import CycleResult
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track import skidpad
+
+from ..scenes.drives import bean_track, beginning, lap_log, map_log, true_poses
+
+STEP = 1.0
+SECONDS, PERIOD = 24.0, 0.1
+"""The drive of the skidpad ends in the second round."""
+
+
+def along(*pieces: tuple[float, float]) -> Array:
+    """Return poses (n, 3) a step apart on pieces of a path, each a length (m) and a curvature (1/m)."""
+    poses = [np.zeros(3)]
+    for length, curvature in pieces:
+        for _ in range(round(length / STEP)):
+            poses.append(compose(poses[-1], np.array([STEP, 0.0, STEP * curvature])))
+    return np.array(poses)
+
+
+ROUND = 2.0 * np.pi * 9.125
+
+
+def test_the_second_round_of_a_circle_that_was_entered_is_a_revisit() -> None:
+    entry, on_round = (15.0, 0.0), (ROUND, -1.0 / 9.125)
+    assert earlier_pass(along(entry, (0.8 * ROUND, -1.0 / 9.125))) is None
+    place = earlier_pass(along(entry, on_round, (20.0, -1.0 / 9.125)))
+    assert place is not None
+    assert place == pytest.approx(15 + 20, abs=2)
+    third = earlier_pass(along(entry, on_round, on_round, (20.0, -1.0 / 9.125)))
+    assert third == pytest.approx(15 + 20, abs=3)  # the first pass, not the second
+
+
+def test_a_lap_that_comes_by_way_of_its_start_is_none() -> None:
+    lap = along((200.0, 2.0 * np.pi / 200.0), (60.0, 2.0 * np.pi / 200.0))
+    assert earlier_pass(lap) is None
+
+
+@pytest.mark.parametrize("turn", [np.pi, 0.5 * np.pi])
+def test_a_road_that_is_crossed_or_driven_the_other_way_is_none(turn: float) -> None:
+    there = along((60.0, 0.0), (turn * 10.0, 0.1), (20.0, 0.0), ((2.0 * np.pi - turn) * 10.0, 0.1))
+    crossing = along((60.0, 0.0), (1.5 * np.pi * 10.0, 0.1), (30.0, 0.0))
+    assert earlier_pass(crossing) is None
+    back = there[::-1] + np.array([0.0, 0.0, np.pi])
+    assert earlier_pass(np.concatenate([there, back])) is None
+
+
+def test_the_information_moves_with_the_pose() -> None:
+    """The covariance in the frame of the earlier pose is that of samples, for an error of 1 cm and 1 mrad."""
+    rng = np.random.default_rng(0)
+    frame, centre = np.array([4.0, 1.0, 0.7]), np.array([7.0, -3.0, 2.1])
+    arm = np.array([-6.0, 2.0, -0.4])
+    spread = rng.normal(size=(3, 3)) * np.array([[1e-2], [1e-2], [1e-3]])
+    covariance = spread @ spread.T
+    later = compose(centre, relative(centre, centre + arm))
+    revisit = measured_revisit((3, frame), (9, later), centre, np.linalg.inv(covariance))
+    np.testing.assert_allclose(revisit.local, relative(frame, later))
+    samples = rng.multivariate_normal(np.zeros(3), covariance, 20_000)
+    moved = np.empty_like(samples)
+    for k, (x, y, turn) in enumerate(samples):
+        position = centre[:2] + (x, y) + rotation(turn) @ (later[:2] - centre[:2])
+        moved[k] = relative(frame, np.append(position, later[2] + turn))
+    found = np.linalg.inv(revisit.root.T @ revisit.root)
+    expected = np.cov(moved.T)
+    size = np.sqrt(np.diagonal(expected))
+    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=0.04)
+
+
+# --- the drive of a skidpad ------------------------------------------------------------------------------
+
+
+@cache
+def drive() -> Log:
+    log = simulate(skidpad(), SimulationSettings(), 2)
+    return beginning(log, int(SECONDS / PERIOD))
+
+
+@cache
+def mapped() -> tuple[FixedLagMapper, list[CycleResult]]:
+    return map_log(drive())
+
+
+def errors(poses: Array, truth: Array) -> Array:
+    """Return the distances (n,) of poses (n, 3) from the true ones (m)."""
+    return np.hypot(*(poses - truth[: len(poses)])[:, :2].T)
+
+
+def test_revisits_are_as_certain_as_they_say() -> None:
+    mapper, _ = mapped()
+    truth = true_poses(drive())
+    assert len(mapper.revisits) >= 3
+    for revisit in mapper.revisits:
+        assert np.abs(revisit.residual(truth)).max() < 4.0
+
+
+def test_the_map_is_better_for_them_and_nothing_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper, results = mapped()
+    truth = true_poses(drive())
+    notices = [result.notice for result in results if "met again" in result.notice]
+    assert len(notices) == 1 and not mapper.closed and mapper.recovery.failures == 0
+    jumps = [result.jump for result in results if result.jump is not None]
+    assert len(jumps) == len(mapper.revisits)
+    with_them = errors(np.array([result.pose for result in results]), truth)
+    smoothed = errors(mapper.corrected_poses, truth)
+    monkeypatch.setattr(Revisits, "use", lambda _: None)
+    _, without = map_log(drive())
+    alone = errors(np.array([result.pose for result in without]), truth)
+    assert with_them[-50:].mean() < 0.5 * alone[-50:].mean()
+    assert smoothed.mean() < 0.5 * alone.mean()
+
+
+def test_the_batch_takes_them_from_the_online_run() -> None:
+    log, truth = drive(), true_poses(drive())
+    result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log, "online")
+    assert len(result.system.revisits) == len(mapped()[0].revisits)
+    assert result.converged
+    assert errors(result.trajectory, truth).mean() < 0.2
+    ordering = result.optimum.state.variables.layout.ordering
+    theirs = result.graph().linearize(result.values()).hessian(ordering)[0]
+    ours = result.system.linear_graph(result.optimum).hessian(ordering)[0]
+    traces = [np.trace(matrix[-3:-1, -3:-1]) for matrix in (theirs, ours)]
+    assert traces[0] == pytest.approx(traces[1])
+
+
+def test_a_lap_that_closes_has_none() -> None:
+    mapper, _ = map_log(lap_log(bean_track(), 30.0))
+    assert mapper.closed and not mapper.revisits
