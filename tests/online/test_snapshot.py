@@ -24,9 +24,10 @@ from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track import skidpad
 
 from ..scenes.digest import digest
-from ..scenes.drives import ODOMETRY_SIGMA, ahead, bean_track, corridor, exact_log, map_log, replay
+from ..scenes.drives import ODOMETRY_SIGMA, ahead, bean_track, beginning, corridor, exact_log, map_log, replay
 from ..scenes.holes import unseen
 from ..scenes.kidnapped import laps_log, pear_track, put_down
 
@@ -108,6 +109,20 @@ def recurring() -> Drive:
     )
 
 
+def revisited() -> Drive:
+    """Both rounds to the right of a skidpad."""
+    return Drive(
+        beginning(simulate(skidpad(), SimulationSettings(), seed=2), 180),
+        {
+            "revisit": lambda mapper, result: result.jump is not None,
+            "afterwards": lambda mapper, _: (
+                len(mapper.revisits) == 1 and mapper.smoother.next_cycle % 10 == 0
+            ),
+            "second": lambda mapper, _: len(mapper.revisits) == 2,
+        },
+    )
+
+
 def standing() -> Drive:
     cones, labels = corridor(80.0)
     log = exact_log(np.concatenate([ahead(0.0, 3.0), ahead(8.0, 6.0)]), cones, labels)
@@ -179,7 +194,7 @@ def assert_same_map(track: Map, expected: Map) -> None:
         np.testing.assert_array_equal(boundary.covariance, known.covariance)
 
 
-@pytest.mark.parametrize("make", [laps, lost, mended, recurring, standing, colours, late])
+@pytest.mark.parametrize("make", [laps, lost, mended, recurring, revisited, standing, colours, late])
 def test_a_restored_mapper_goes_on_to_the_same_result(
     make: Callable[[], Drive], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
