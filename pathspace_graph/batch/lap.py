@@ -32,7 +32,7 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.registration import by_motion, sigma_of_information
 from pathspace_graph.mapping.state import SAMPLE, State
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.bspline import BSpline, boundaries_cross, polylines_cross, sampled
+from pathspace_graph.spline.bspline import BSpline, at_level_crossing, boundaries_cross, crossings, sampled
 
 from .association import add_drive
 from .gauge import curve_gauge
@@ -280,14 +280,14 @@ def objection(found: Evidence, splines: Mapping[int, BSpline], poses: Array, set
     """Return what speaks against a map of closed curves around the poses (P, 3) of a lap; empty for nothing.
 
     The boundaries of a road don't cross, the vehicle crosses neither and has driven beside all of both, and
-    the detections of the lap lie on them.
+    the detections of the lap lie on them. At a level crossing of the road with itself all of these cross.
     """
     step, driven = SAMPLE, poses[:, :2]
-    if boundaries_cross(splines, step):
+    if boundaries_cross(splines, step, driven):
         return "its boundaries cross"
     by_drive = KDTree(driven)
     for curve in (sampled(spline, step) for spline in splines.values()):
-        if polylines_cross(curve, driven):
+        if not at_level_crossing(crossings(curve, driven), driven).all():
             return "the vehicle would have crossed a boundary"
         aside = float(np.percentile(KDTree(curve).query(driven)[0], MOSTLY))
         wider = float(np.max(by_drive.query(curve)[0])) / aside

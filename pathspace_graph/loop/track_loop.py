@@ -256,7 +256,8 @@ class TrackLoop:
         if splines is None:
             self._smoother.refresh()
             splines = self._smoother.map.state.splines
-        return set(splines) == set(BOUNDARIES) and boundaries_cross(splines, SAMPLE)
+        driven = np.array(self.record.poses)[:, :2]
+        return set(splines) == set(BOUNDARIES) and boundaries_cross(splines, SAMPLE, driven)
 
     def _try_mending(self) -> None:
         record = self.record

@@ -12,7 +12,7 @@ from scipy.interpolate import BSpline as ScipyBSpline
 from scipy.spatial import KDTree
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import (
     SpanPolynomials,
     clamped_knots,
@@ -33,6 +33,13 @@ _ARC_NEWTON_STEPS: Final = 4
 """Newton steps that invert the arc length, from a table with the same grid."""
 _SHORTEST_EXTENSION: Final = 1e-3
 """Least knot interval of an extension over the mean one, even if the point is the old end."""
+NO_PATH: Final = np.zeros((0, 2))
+PATH_STEP: Final = 1.0
+"""Step at which a driven path is looked at for crossings with itself (m)."""
+LEVEL_SINE: Final = 0.7
+"""Least sine of the angle of a level crossing: laps over the same road meet at smaller ones."""
+LEVEL_CROSSING: Final = 8.0
+"""Largest distance of the crossing boundaries from where the driven path crosses itself there (m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,21 +372,43 @@ def sampled(spline: BSpline, step: float) -> Array:
     return spline.evaluate(np.linspace(low, high, max(int((high - low) / step), 1) + 1))
 
 
-def boundaries_cross(splines: Mapping[int, BSpline], step: float) -> bool:
-    """Return whether the left and the right boundary cross, sampled at this step (m)."""
-    return polylines_cross(sampled(splines[LEFT], step), sampled(splines[RIGHT], step))
+def boundaries_cross(splines: Mapping[int, BSpline], step: float, path: Array = NO_PATH) -> bool:
+    """Return whether the left and the right boundary cross, sampled at this step (m).
+
+    At a level crossing of the road with itself, where the driven path (n, 2) crosses itself, they do.
+    """
+    found = crossings(sampled(splines[LEFT], step), sampled(splines[RIGHT], step))
+    return not at_level_crossing(found, path).all()
 
 
-def polylines_cross(a: Array, b: Array) -> bool:
-    """Return whether a segment of the polyline a (n, 2) crosses one of the polyline b (m, 2)."""
+def at_level_crossing(points: Array, path: Array) -> BoolArray:
+    """Return whether each point (m, 2) is at a place where a driven path (n, 2) crosses itself."""
+    if len(points) == 0 or len(path) < 2:
+        return np.zeros(len(points), bool)
+    station = np.append(0.0, np.hypot(*np.diff(path, axis=0).T).cumsum())
+    _, kept = np.unique(station // PATH_STEP, return_index=True)
+    own = crossings(path[kept], path[kept], LEVEL_SINE)
+    if len(own) == 0:
+        return np.zeros(len(points), bool)
+    return np.asarray(KDTree(own).query(points)[0] < LEVEL_CROSSING)
+
+
+def crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
+    """Return the points (k, 2) where segments of the polyline a (n, 2) cross those of the polyline b (m, 2).
+
+    Only those count whose angle has at least this sine.
+    """
     middle_a, middle_b = 0.5 * (a[1:] + a[:-1]), 0.5 * (b[1:] + b[:-1])
     reach = 0.5 * (np.hypot(*np.diff(a, axis=0).T).max() + np.hypot(*np.diff(b, axis=0).T).max())
     near = KDTree(middle_a).query_ball_tree(KDTree(middle_b), reach)
     i = np.repeat(np.arange(len(near)), [len(own) for own in near])
     j = np.array([k for own in near for k in own], np.intp)
     (p, q), (r, s) = (a[i], a[i + 1]), (b[j], b[j + 1])
-    apart = _side(p, q, r) * _side(p, q, s) < 0.0
-    return bool((apart & (_side(r, s, p) * _side(r, s, q) < 0.0)).any())
+    crossed = (_side(p, q, r) * _side(p, q, s) < 0.0) & (_side(r, s, p) * _side(r, s, q) < 0.0)
+    p, q, r, s = (points[crossed] for points in (p, q, r, s))
+    turned = np.abs(_side(p, q, p + s - r)) > sine * np.hypot(*(q - p).T) * np.hypot(*(s - r).T)
+    share = _side(r, s, p) / (_side(r, s, p) - _side(r, s, q))
+    return np.asarray((p + share[:, None] * (q - p))[turned])
 
 
 def _side(p: Array, q: Array, point: Array) -> Array:
