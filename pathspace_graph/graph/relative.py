@@ -198,8 +198,10 @@ class Submaps:
         return graph_of(self.first, *(submap.factor(variables) for submap in self.finished))
 
     def insert_keyframes(self, variables: Variables) -> None:
-        for key, (pose, reference) in self.keyframes.items():
-            variables.insert(np.array([key]), pose, reference)
+        """Insert the keyframes as variables, as they were when they were marginalized or placed."""
+        keys = np.array(sorted(self.keyframes))
+        poses, references = np.array([self.keyframes[key] for key in keys.tolist()]).transpose(1, 0, 2)
+        variables.insert(keys, poses.ravel(), references.ravel())
 
     def place(self, variables: Variables) -> dict[int, Array]:
         """Keep the keyframes where they have been solved to be, and return their poses (3,) by cycle."""

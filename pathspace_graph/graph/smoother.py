@@ -346,7 +346,7 @@ class FixedLagSmoother(Generic[M_co]):
     def reactivate(self, with_prior: bool = True) -> None:
         """Make all variables active, and return the information about them to the prior.
 
-        Without `with_prior` the prior is left alone, because the submaps will replace it.
+        Without `with_prior` there is no prior afterwards, because the submaps or a marginal will replace it.
         """
         chain = self.chain
         if chain is None and len(self.inactive) == 0:
@@ -354,14 +354,19 @@ class FixedLagSmoother(Generic[M_co]):
         self.carry()
         self._finish_submap()
         self.refresh()
-        if chain is not None:  # its anchors become keyframes
+        if chain is not None:
             self._place_keyframes(chain)
+        if not with_prior:
+            self.prior = gtsam.GaussianFactorGraph()
+            self.variables.remove(self.variables.keyframes)
+        elif chain is not None:  # its anchors become keyframes
             self.prior = graph_of(self.prior, *(chain.detach(self.variables) for _ in range(len(chain))))
-        elif with_prior:
+        else:
             self.prior = self.inactive.joint_prior(self.prior)
         self.inactive = InactiveMap()
         self.user_factors.reactivate()
-        self._marginalize_keyframes()
+        if with_prior:
+            self._marginalize_keyframes()
         self.map.activate_all()
 
     def _place_keyframes(self, chain: InactiveChain) -> None:
