@@ -46,6 +46,7 @@ COMMANDS: Final = {
     "faults": Command(
         "studies", "FaultSuite", "measures what each fault of a car costs, and what is said of it"
     ),
+    "report": Command("studies", "Report", "measures the figures of the pages, and writes their tables"),
     "figures": Command("plot", "Figures", "draws the paper's isolated tests"),
     "scale": Command(
         "studies", "Scale", "measures the time of an update against map size, detections and laps"

@@ -56,10 +56,11 @@ ARROWS: dict[str, set[str]] = {
     "eval.figures": BELOW_EVAL | {"eval.metrics"},
     "eval.experiment": BELOW_EVAL | {"eval.metrics", "eval.figures"},
     "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.figures", "eval.experiment"},
-    "eval": BELOW_EVAL | {"eval.metrics", "eval.experiment"},
+    "eval": BELOW_EVAL | {"eval.metrics", "eval.experiment", "eval.benchmark"},
     "eval.view": BELOW_MAPPING | {"eval.metrics", "eval.figures"},
     "commands": BELOW_EVAL
     | {"export", "convert"}
+    | {"eval"}
     | {f"eval.{room}" for room in ("metrics", "figures", "experiment", "benchmark", "view")},
     "options": {"io", "settings"},
     "frames": {"io"},

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track import Track
+from pathspace_graph.sim.track import EVENTS, Track
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.track_generator import generate_track
 
@@ -97,7 +97,8 @@ def try_drive(drive: Drive) -> Log | Exception:
 def load_tracks(tracks: Iterable[Path | int]) -> list[NamedTrack]:
     """Read or generate tracks and name each of them; a folder stands for every track file in it.
 
-    A number is the seed of a generated track. InputError where a file is no track or a folder has none.
+    A number is the seed of a generated track, and the name of an event its track. InputError where a file is
+    no track or a folder has none.
     """
     every = [track for entry in tracks for track in _expanded(entry)]
     stems = [track.stem for track in every if isinstance(track, Path)]
@@ -115,9 +116,14 @@ def _expanded(entry: Path | int) -> list[Path | int]:
 
 
 def _load(track: Path | int, stems: list[str]) -> NamedTrack:
-    """Name a file by its stem, and by its folder too where several files have that stem."""
+    """Name a file by its stem, and by its folder too where several files have that stem.
+
+    A path that is no file but ends with the name of an event is that event's track.
+    """
     if isinstance(track, int):
         return NamedTrack(f"generated {track}", generate_track(np.random.default_rng(track)))
+    if track.name in EVENTS and not track.exists():
+        return NamedTrack(track.name, EVENTS[track.name]())
     _check_file(track)
     unique = stems.count(track.stem) == 1
     return NamedTrack(

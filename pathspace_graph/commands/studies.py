@@ -1,7 +1,10 @@
-"""`ablate`, `faults` and `scale`: studies over many logs, in parallel and resumable."""
+"""`ablate`, `faults`, `scale` and `report`: studies over many logs, in parallel and resumable."""
 
+import shutil
+import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -19,10 +22,13 @@ from pathspace_graph.eval.experiment.output import write_study, write_suite
 from pathspace_graph.eval.experiment.run import make_plan, run_plan
 from pathspace_graph.eval.experiment.study import Study, find_study, read_study
 from pathspace_graph.eval.experiment.workers import check_jobs
-from pathspace_graph.io.files import check_target, write_manifest
+from pathspace_graph.eval.report import FILE, Plan, measure_figures, read_figures, render_pages, to_json
+from pathspace_graph.io.files import check_target, write_json, write_manifest, write_text
 from pathspace_graph.progress import progress
 from pathspace_graph.settings.mapper import MapperSettings
 
+FIGURES: Final = Path("docs") / FILE
+"""File of the figures, from the root of the project."""
 CELLS_FAILED: Final = 3
 """Exit code of a study that is written, but some of whose cells failed."""
 LINES: Final = 20
@@ -175,3 +181,66 @@ class Scale:
         console.print(scaling_table(scaling).rich())
         for line in (*stops(scaling), f"written to {self.out}"):
             console.print(line, highlight=False, soft_wrap=True, markup=False)
+
+
+# --- report ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Measure the figures of the pages, or what remains of them, and write them and the pages' tables.
+
+    The experiments are `accuracy`, `skidpad` and `speed`. Each keeps its runs in a folder of its own, from
+    which a second call goes on.
+    """
+
+    out: Path
+    """Folder for the runs and for `figures.json`; a report that was begun there is continued."""
+    jobs: int = -1
+    """Number of processes at a time, -1 for one on each core."""
+    only: tuple[str, ...] = ()
+    """Names of the experiments to run; the other figures stay as they are."""
+    tracks: tuple[Path, ...] = ()
+    """Track files, or folders of them, that `accuracy` drives beside the generated tracks."""
+    pages: Path | None = None
+    """Root of the project whose `docs/figures.json` and pages are written."""
+    quick: bool = False
+    """Drive little, to see that everything works; it goes with no pages."""
+
+    def run(self) -> None:
+        """Check, measure, write and report."""
+        check_jobs(self.jobs)
+        if self.quick and self.pages is not None:
+            raise SettingsError("--pages: expected none with --quick, whose figures mean little")
+        known = read_figures(self.pages / FIGURES) if self.pages and (self.pages / FIGURES).exists() else {}
+        about = {
+            "command": "pathspace-graph report" + (" --tracks TRACKS" if self.tracks else ""),
+            "commit": commit_of(self.pages),
+            "date": date.today().isoformat(),
+        }
+        with progress("runs", lines=LINES) as advance:
+            plan = Plan(quick=self.quick, tracks=self.tracks, jobs=self.jobs, on_cell=advance)
+            tables = measure_figures(plan, self.out, self.only, about, known)
+        written = {self.out / FILE: to_json(tables)}
+        pages = render_pages(self.pages, tables) if self.pages is not None else {}
+        if self.pages is not None:
+            written[self.pages / FIGURES] = written[self.out / FILE]
+        for file, content in written.items():
+            write_json(file, content)
+        for page, text in pages.items():
+            write_text(page, text)
+        say = Console(soft_wrap=True, highlight=False, markup=False)
+        for name, table in tables.items():
+            say.print(f"{name}\n{table.markdown(table.sources)}".rstrip("\n"))
+        say.print(f"\nwritten to {', '.join(map(str, [*written, *pages]))}")
+
+
+def commit_of(root: Path | None) -> str:
+    """Return the short hash of the commit that is checked out at a root; empty where there is none."""
+    git = shutil.which("git")
+    if git is None or root is None:
+        return ""
+    found = subprocess.run(
+        [git, "-C", str(root), "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
+    )
+    return found.stdout.strip()

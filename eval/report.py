@@ -1,0 +1,291 @@
+"""The figures of the pages: measured in one run, kept as data, and shown as tables between markers.
+
+Each experiment is a study or a benchmark with a folder of its own, which is resumed where a run was stopped.
+Its tables are views of what it has measured. A page shows a table between `<!-- report: NAME -->` and
+`<!-- end report -->`. Where the sources of the estimators are no longer those that were measured, a line
+under the table says so.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from hashlib import sha256
+from importlib.util import find_spec
+from math import isfinite
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+import pandas as pd
+
+from pathspace_graph.errors import InputError, check_name
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.io.parsing import read_json, read_text
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
+
+from .benchmark.measurement import measure, metrics
+from .experiment.frame import COMBINATION, RUN, estimate, last_laps
+from .experiment.run import run_study
+from .experiment.study import Study
+from .experiment.tables import TextTable
+from .metrics.metric import METRICS
+
+FORMAT: Final = "pathspace-figures/1"
+FILE: Final = "figures.json"
+PAGES: Final = {
+    "readme-accuracy": "README.md",
+    "readme-compared": "README.md",
+    "readme-speed": "README.md",
+} | {"skidpad": "docs/closing.md"}
+"""Page of each table, from the root of the project."""
+ROOMS: Final = (
+    *("batch", "centerline", "ckf", "factors", "front_end", "graph", "landmark", "loop", "mapping", "online"),
+    *("scale", "settings", "sim", "spline"),
+)
+"""Rooms whose sources the figures depend on."""
+ESTIMATORS: Final = ("fixed-lag", "spline", "landmark-fixed-lag", "landmark-batch", "ckf", "landmark-ckf")
+ONLINE, BATCH = ESTIMATORS[:2]
+GENERATED: Final = (0, 1, 2)
+"""Seeds of the generated tracks."""
+SPEED: Final = {
+    "mean_by_isam2": "mean update by that of GTSAM's `ISAM2` on landmarks, given every association",
+    "p99_by_isam2": "99th percentile by that of `ISAM2`",
+    "mean_by_landmark": "mean update by that of `landmark-fixed-lag`",
+    "mean": "mean update [ms]",
+    "p99": "99th percentile of an update [ms]",
+    "closing": "the update that closes the loop [ms]",
+}
+"""Figures of the benchmark, each with its label."""
+BENCHMARK_SEEDS: Final = (0, 1, 2)
+RUN_OF: Final = (*RUN, *COMBINATION)
+"""Columns that name a run."""
+_MARKED: Final = re.compile(r"(<!-- report: ([\w-]+) -->\n)(.*?)(<!-- end report -->)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A measured value, with half the width of its 95 % interval over drives or runs."""
+
+    value: float | None
+    """Value in the table's unit; None where there is none."""
+    half: float | None = None
+    digits: int = 3
+
+    @classmethod
+    def of(cls, values: Array, digits: int = 3, factor: float = 1.0) -> Self:
+        """Return the mean of the known values (n,), times a factor."""
+        mean = estimate(factor * values[np.isfinite(values)])
+        value, half = (round(x, 6) if isfinite(x) else None for x in (mean.mean, mean.half))
+        return cls(value, half, digits)
+
+    @property
+    def text(self) -> str:
+        """Return the figure as a table shows it."""
+        if self.value is None:
+            return ""
+        half = "" if self.half is None else f" ± {self.half:.{self.digits}f}"
+        return f"{self.value:.{self.digits}f}{half}"
+
+
+@dataclass(frozen=True)
+class MeasuredTable:
+    """A table of figures, and how they were measured."""
+
+    command: str
+    """Command that measures them."""
+    commit: str
+    """Commit of the sources, where that was known."""
+    date: str
+    sources: str
+    """Digest of the sources of the estimators."""
+    header: tuple[str, ...]
+    """Headings of the labels and of each column."""
+    rows: tuple[tuple[str, tuple[Figure, ...]], ...]
+    """Label and figures of each row."""
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> Self:
+        """Return the table with the content of a file."""
+        rows = tuple(
+            (label, tuple(Figure(**figure) for figure in figures)) for label, figures in content["rows"]
+        )
+        return cls(**{**content, "header": tuple(content["header"]), "rows": rows})
+
+    def markdown(self, sources: str) -> str:
+        """Return the table in Markdown; `sources` is the digest of the present sources."""
+        rows = tuple((label, *(figure.text for figure in figures)) for label, figures in self.rows)
+        text = f"\n{TextTable('', self.header, rows).markdown()}\n"
+        if sources == self.sources:
+            return text
+        commit = f"commit {self.commit}, " if self.commit else ""
+        return f"{text}*Measured at {commit}{self.date}; the estimators have changed since.*\n\n"
+
+
+Tables = dict[str, MeasuredTable]
+Rows = dict[str, tuple[tuple[str, ...], tuple[tuple[str, tuple[Figure, ...]], ...]]]
+"""Header and rows of tables by name."""
+
+
+# --- experiments -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What is driven."""
+
+    quick: bool = False
+    """Drive little, to see that everything works."""
+    tracks: tuple[Path, ...] = ()
+    """Folders of track files that are driven beside the generated tracks."""
+    jobs: int = 1
+    on_cell: Callable[[int, int], None] | None = None
+    """Observer of the progress of a study."""
+
+    def accuracy(self, folder: Path) -> Rows:
+        """Return all estimators on all tracks."""
+        own = GENERATED[:1] if self.quick else (*GENERATED, *self.tracks)
+        estimators, seeds, laps = (ESTIMATORS[:3], (0, 1), 2) if self.quick else (ESTIMATORS, (0, 1, 2), 5)
+        frame = self._run("accuracy", folder, tracks=own, estimators=estimators, seeds=seeds, laps=laps)
+        return {"readme-accuracy": accuracy_table(frame, laps), "readme-compared": compared_table(frame)}
+
+    def skidpad(self, folder: Path) -> Rows:
+        """Return what becomes of a drive without a lap."""
+        seeds, estimators = tuple(range(2 if self.quick else 10)), ESTIMATORS[: 2 if self.quick else 4]
+        tracks = (Path("skidpad"),)
+        frame = self._run("skidpad", folder, tracks=tracks, estimators=estimators, seeds=seeds, laps=1)
+        return {"skidpad": skidpad_table(frame)}
+
+    def speed(self, _: Path) -> Rows:
+        """Return the times of the benchmark."""
+        seeds, laps = (BENCHMARK_SEEDS[:1], 1) if self.quick else (BENCHMARK_SEEDS, 5)
+        found: list[dict[str, float]] = []
+        for seed in seeds:
+            track = generate_track(np.random.default_rng(seed))
+            log = simulate(track, SimulationSettings(laps=laps), seed)
+            run = measure(log, MapperSettings())
+            found.append({figure.key: figure.value for figure in metrics(run)})
+        values = {key: np.array([figures.get(key, np.nan) for figures in found]) for key in SPEED}
+        rows = tuple(
+            (label, (Figure.of(values[key], 2 if key.endswith(("isam2", "landmark")) else 1),))
+            for key, label in SPEED.items()
+        )
+        return {"readme-speed": (("figure", "measured"), rows)}
+
+    def _run(self, name: str, folder: Path, **given: Any) -> pd.DataFrame:
+        return run_study(Study(name=name, **given), folder, jobs=self.jobs, on_cell=self.on_cell)
+
+
+EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Rows]]] = {
+    "accuracy": Plan.accuracy,
+    "skidpad": Plan.skidpad,
+    "speed": Plan.speed,
+}
+
+
+def accuracy_table(frame: pd.DataFrame, laps: int) -> tuple[tuple[str, ...], Any]:
+    """Return the online map after laps 1, 2 and the last, and the batch."""
+    shown = dict.fromkeys([1, 2, laps])
+    online, batch = (frame[frame["estimator"] == name] for name in (ONLINE, BATCH))
+    drives = len(online[online["lap"] == 1])
+    header = (f"mean over {drives} drives, at the end of", *(f"lap {lap}" for lap in shown), "batch")
+    parts = [*(online[online["lap"] == lap] for lap in shown), last_laps(batch)]
+    rows = tuple(
+        (METRICS[key].heading, tuple(_figure(key, part) for part in parts))
+        for key in ("rmse", "missed", "reach_median")
+    )
+    return header, rows
+
+
+def compared_table(frame: pd.DataFrame) -> tuple[tuple[str, ...], Any]:
+    """Return every estimator at the end of its last lap."""
+    keys = {"rmse": "rmse [m]", "missed": "missed [%]", "size": "size", "ate": "trajectory error [m]"}
+    return ("estimator, last lap", *keys.values()), _by_estimator(frame, tuple(keys))
+
+
+def skidpad_table(frame: pd.DataFrame) -> tuple[tuple[str, ...], Any]:
+    """Return every estimator: its trajectory error over the whole drive, and its map at the end."""
+    keys = {"ate": "trajectory error [m]", "rmse": "rmse [m]", "missed": "missed [%]"}
+    square = (frame["ate"] ** 2).groupby([frame[name] for name in RUN_OF]).transform("mean")
+    return ("estimator", *keys.values()), _by_estimator(frame.assign(ate=square**0.5), tuple(keys))
+
+
+def _by_estimator(frame: pd.DataFrame, keys: Sequence[str]) -> tuple[tuple[str, tuple[Figure, ...]], ...]:
+    last = last_laps(frame)
+    parts = {name: last[last["estimator"] == name] for name in ESTIMATORS}
+    return tuple(
+        (f"`{name}`", tuple(_figure(key, part) for key in keys)) for name, part in parts.items() if len(part)
+    )
+
+
+def _figure(key: str, part: pd.DataFrame) -> Figure:
+    metric, values = METRICS[key], part[key] if key in part else pd.Series(dtype=float)
+    return Figure.of(values.to_numpy(float), metric.digits, metric.factor)
+
+
+# --- files -----------------------------------------------------------------------------------------------
+
+
+def measure_figures(
+    plan: Plan, folder: Path, only: Sequence[str], about: Mapping[str, str], known: Tables
+) -> Tables:
+    """Run experiments, each in a folder of its own, and return the known tables with theirs in place.
+
+    `about` holds the command, the commit and the date of the run.
+    """
+    tables, sources = dict(known), sources_digest()
+    for name in only or EXPERIMENTS:
+        check_name(name, EXPERIMENTS, "--only: expected an experiment")
+        for table, (header, rows) in EXPERIMENTS[name](plan, folder / name).items():
+            tables[table] = MeasuredTable(**about, sources=sources, header=header, rows=rows)
+    return tables
+
+
+def to_json(tables: Tables) -> dict[str, Any]:
+    """Return the content of a file with the tables."""
+    return {"format": FORMAT, "tables": {name: asdict(table) for name, table in sorted(tables.items())}}
+
+
+def read_figures(file: Path) -> Tables:
+    """Return the tables of a file; InputError where it is none of `to_json`."""
+    content = read_json(file, "the figures of a report")
+    try:
+        if content["format"] != FORMAT:
+            raise ValueError(f"found {content['format']}")
+        return {name: MeasuredTable.from_json(table) for name, table in content["tables"].items()}
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(file, f"expected {FORMAT}: {error}") from error
+
+
+def sources_digest() -> str:
+    """Return the digest of the sources that the figures depend on."""
+    digest = sha256()
+    for room in ROOMS:
+        spec = find_spec(f"pathspace_graph.{room}")
+        root = Path(str(spec.origin if spec else None)).parent
+        for file in sorted([*root.glob("*.py"), *root.glob("*.cpp")]):
+            digest.update(f"{room}/{file.name}".encode() + file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def render_pages(root: Path, tables: Tables) -> dict[Path, str]:
+    """Return the text of each page below a root, with its tables; InputError where one is not known."""
+    sources = sources_digest()
+    return {
+        root / page: render(root / page, read_text(root / page, "a page"), tables, sources)
+        for page in dict.fromkeys(PAGES.values())
+    }
+
+
+def render(page: Path, text: str, tables: Tables, sources: str) -> str:
+    """Return the text of a page with each marked table made anew."""
+    return _MARKED.sub(partial(_rendered, page, tables, sources), text)
+
+
+def _rendered(page: Path, tables: Tables, sources: str, found: re.Match[str]) -> str:
+    begin, name, _, end = found.groups()
+    if name not in tables:
+        raise InputError(page, f"expected a table of the report, found {name}")
+    return f"{begin}{tables[name].markdown(sources)}{end}"
