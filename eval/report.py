@@ -34,6 +34,8 @@ from .experiment.tables import TextTable
 from .metrics.metric import METRICS
 
 FORMAT: Final = "pathspace-figures/1"
+NOTHING: Final = "pages"
+"""Name in place of the experiments where only the pages are written anew."""
 FILE: Final = "figures.json"
 PAGES: Final = {
     "readme-accuracy": "README.md",
@@ -236,8 +238,9 @@ def measure_figures(
     `about` holds the command, the commit and the date of the run.
     """
     tables, sources = dict(known), sources_digest()
-    for name in only or EXPERIMENTS:
-        check_name(name, EXPERIMENTS, "--only: expected an experiment")
+    for name in only:
+        check_name(name, (*EXPERIMENTS, NOTHING), "--only: expected an experiment")
+    for name in (name for name in only or EXPERIMENTS if name != NOTHING):
         for table, (header, rows) in EXPERIMENTS[name](plan, folder / name).items():
             tables[table] = MeasuredTable(**about, sources=sources, header=header, rows=rows)
     return tables

@@ -199,7 +199,7 @@ class Report:
     jobs: int = -1
     """Number of processes at a time, -1 for one on each core."""
     only: tuple[str, ...] = ()
-    """Names of the experiments to run; the other figures stay as they are."""
+    """Names of the experiments to run, or `pages` for none; the other figures stay as they are."""
     tracks: tuple[Path, ...] = ()
     """Track files, or folders of them, that `accuracy` drives beside the generated tracks."""
     pages: Path | None = None
@@ -225,6 +225,7 @@ class Report:
         pages = render_pages(self.pages, tables) if self.pages is not None else {}
         if self.pages is not None:
             written[self.pages / FIGURES] = written[self.out / FILE]
+        self.out.mkdir(parents=True, exist_ok=True)
         for file, content in written.items():
             write_json(file, content)
         for page, text in pages.items():

@@ -1,0 +1,128 @@
+"""The figures of the pages: as data, as tables, and as the pages show them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pathspace_graph.cli import main
+from pathspace_graph.errors import InputError
+from pathspace_graph.eval.report import (
+    PAGES,
+    Figure,
+    MeasuredTable,
+    accuracy_table,
+    read_figures,
+    render,
+    render_pages,
+    skidpad_table,
+    sources_digest,
+    to_json,
+)
+from pathspace_graph.io.files import write_json
+
+ROOT = Path(__file__).parents[2]
+FIGURES = ROOT / "docs" / "figures.json"
+TABLE = MeasuredTable(
+    command="pathspace-graph report",
+    commit="abc1234",
+    date="2026-11-24",
+    sources="old",
+    header=("mean", "lap 1"),
+    rows=(("rmse [m]", (Figure(0.5, 0.1),)), ("reach", (Figure(None),))),
+)
+
+
+def test_a_figure_is_a_mean_with_its_interval_of_the_known_values() -> None:
+    """Of 1, 2, 3 the sample's deviation is 1, and Student's t of 2 degrees is 4.303."""
+    figure = Figure.of(np.array([1.0, np.nan, 2.0, 3.0]), 1, 100.0)
+    assert figure.value == pytest.approx(200.0)
+    assert figure.half == pytest.approx(100.0 * 4.302653 / np.sqrt(3.0), rel=1e-6)
+    assert figure.text == "200.0 ± 248.4"
+    assert Figure.of(np.array([2.0])).text == "2.000"
+    assert Figure.of(np.array([np.nan])).text == ""
+
+
+def frame(estimator: str, laps: int, rmse: float) -> pd.DataFrame:
+    rows = [
+        {"track": "t", "seed": seed, "noise": "n", "estimator": estimator, "variant": "v", "failure": ""}
+        | {"lap": lap, "rmse": rmse / lap, "missed": 0.01, "reach_median": 10.0, "ate": float(lap)}
+        for seed in (0, 1)
+        for lap in range(1, laps + 1)
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_the_table_of_accuracy_has_the_laps_and_the_batch() -> None:
+    both = pd.concat([frame("fixed-lag", 3, 0.6), frame("spline", 3, 0.3)], ignore_index=True)
+    header, rows = accuracy_table(both, 3)
+    assert header == ("mean over 2 drives, at the end of", "lap 1", "lap 2", "lap 3", "batch")
+    label, figures = rows[0]
+    assert label == "rmse [m]"
+    assert [figure.value for figure in figures] == pytest.approx([0.6, 0.3, 0.2, 0.1])
+    assert rows[1][1][0].text.startswith("1.0")  # in percent
+
+
+def test_the_skidpad_s_trajectory_error_is_over_all_rounds() -> None:
+    _, rows = skidpad_table(frame("fixed-lag", 2, 0.6))
+    assert rows[0][1][0].value == pytest.approx(np.sqrt((1.0 + 4.0) / 2.0))
+
+
+def test_figures_come_back_from_their_file(tmp_path: Path) -> None:
+    write_json(tmp_path / "figures.json", to_json({"one": TABLE}))
+    assert read_figures(tmp_path / "figures.json") == {"one": TABLE}
+    write_json(tmp_path / "other.json", {"format": "pathspace-figures/0"})
+    with pytest.raises(InputError, match=r"other\.json: expected pathspace-figures/1"):
+        read_figures(tmp_path / "other.json")
+
+
+def test_a_page_has_its_tables_between_the_markers_and_says_how_old_they_are() -> None:
+    page = "before\n<!-- report: one -->\nanything\n<!-- end report -->\nafter\n"
+    now = render(Path("page.md"), page, {"one": TABLE}, "old")
+    assert now.startswith("before\n<!-- report: one -->\n\n| mean")
+    assert now.endswith("|\n\n<!-- end report -->\nafter\n") and "0.500 ± 0.100" in now
+    later = render(Path("page.md"), page, {"one": TABLE}, "new")
+    assert "*Measured at commit abc1234, 2026-11-24; the estimators have changed since.*" in later
+    assert render(Path("page.md"), later, {"one": TABLE}, "old") == now
+    with pytest.raises(InputError, match=r"page\.md: expected a table of the report, found one"):
+        render(Path("page.md"), page, {}, "old")
+
+
+def test_the_pages_show_the_committed_figures() -> None:
+    """`report --only pages --pages .` writes them anew after a change of the estimators."""
+    if not FIGURES.exists():
+        pytest.skip("there are no pages beside an installed package")
+    tables = read_figures(FIGURES)
+    for name, page in PAGES.items():
+        assert f"<!-- report: {name} -->" in (ROOT / page).read_text(), f"{page} has no table {name}"
+    for page, text in render_pages(ROOT, tables).items():
+        assert page.read_text() == text, f"{page} does not show the figures of {FIGURES.name}"
+
+
+def test_the_digest_is_that_of_the_sources() -> None:
+    assert len(sources_digest()) == 16
+    assert sources_digest() == sources_digest()
+
+
+def test_a_quick_report_goes_with_no_pages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", "--out", str(tmp_path / "r"), "--quick", "--pages", str(tmp_path)]) == 2
+    assert "--pages: expected none with --quick" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_report_writes_its_figures_and_the_pages_and_is_resumed(tmp_path: Path) -> None:
+    (tmp_path / "docs").mkdir()
+    for page in dict.fromkeys(PAGES.values()):
+        (tmp_path / page).write_text("<!-- report: skidpad -->\n<!-- end report -->\n")
+    run = ["report", "--out", str(tmp_path / "r"), "--only", "skidpad", "--jobs", "1", "--quick"]
+    assert main(run) == 0
+    found = read_figures(tmp_path / "r" / "figures.json")["skidpad"]
+    assert [label for label, _ in found.rows] == ["`fixed-lag`", "`spline`"]
+    assert found.sources == sources_digest()
+    assert all(figure.value is not None and figure.value < 1.0 for figure in found.rows[0][1])
+    cells = {file: file.stat().st_mtime_ns for file in (tmp_path / "r").rglob("cells/*")}
+    assert main(run) == 0
+    assert {file: file.stat().st_mtime_ns for file in (tmp_path / "r").rglob("cells/*")} == cells
