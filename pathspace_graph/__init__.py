@@ -6,9 +6,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pathspace_graph.batch.mapper import BatchMapper
+    from pathspace_graph.centerline.batch import CenterlineBatch
+    from pathspace_graph.centerline.online import CenterlineMapper
+    from pathspace_graph.ckf.mapper import CkfMapper
     from pathspace_graph.io.log import Detections, Log, Odometry, read_log, write_log
     from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, read_map
     from pathspace_graph.io.results import CycleRecord, RunResult, write_result
+    from pathspace_graph.landmark.batch import LandmarkBatch
+    from pathspace_graph.landmark.ckf import LandmarkCkf
+    from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
     from pathspace_graph.online.fixed_lag import FixedLagMapper
     from pathspace_graph.plausibility.hint import Hint
     from pathspace_graph.plausibility.judge import hints
@@ -16,16 +23,27 @@ if TYPE_CHECKING:
     from pathspace_graph.spline.bspline import BSpline
 
     from .errors import InputError, OutputError, PathspaceError, ReadingError, SettingsError, SolveError
+    from .estimators import make_batch, make_online
     from .frames import read_cycles, read_study
-    from .run import run_online
+    from .labels import LEFT, RIGHT
+    from .run import run_online, split_odometry
 
 __all__ = [
+    "LEFT",
+    "RIGHT",
     "BSpline",
+    "BatchMapper",
+    "CenterlineBatch",
+    "CenterlineMapper",
+    "CkfMapper",
     "CycleRecord",
     "Detections",
     "FixedLagMapper",
     "Hint",
     "InputError",
+    "LandmarkBatch",
+    "LandmarkCkf",
+    "LandmarkFixedLag",
     "Log",
     "Map",
     "MapperSettings",
@@ -39,26 +57,38 @@ __all__ = [
     "SolveError",
     "SplineBoundary",
     "hints",
+    "make_batch",
+    "make_online",
     "read_cycles",
     "read_log",
     "read_map",
     "read_study",
     "run_online",
+    "split_odometry",
     "write_log",
     "write_result",
 ]
 
 # imported when first asked for: the command line's help, and sim, need no estimator
 _HOMES = {
+    "batch.mapper": ("BatchMapper",),
+    "centerline.batch": ("CenterlineBatch",),
+    "centerline.online": ("CenterlineMapper",),
+    "ckf.mapper": ("CkfMapper",),
     "errors": ("InputError", "OutputError", "PathspaceError", "ReadingError", "SettingsError", "SolveError"),
+    "estimators": ("make_batch", "make_online"),
     "frames": ("read_cycles", "read_study"),
     "io.log": ("Detections", "Log", "Odometry", "read_log", "write_log"),
     "io.map": ("Map", "PointBoundary", "SplineBoundary", "read_map"),
     "io.results": ("CycleRecord", "RunResult", "write_result"),
+    "labels": ("LEFT", "RIGHT"),
+    "landmark.batch": ("LandmarkBatch",),
+    "landmark.ckf": ("LandmarkCkf",),
+    "landmark.fixed_lag": ("LandmarkFixedLag",),
     "online.fixed_lag": ("FixedLagMapper",),
     "plausibility.hint": ("Hint",),
     "plausibility.judge": ("hints",),
-    "run": ("run_online",),
+    "run": ("run_online", "split_odometry"),
     "settings.mapper": ("MapperSettings",),
     "spline.bspline": ("BSpline",),
 }

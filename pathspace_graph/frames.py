@@ -1,4 +1,4 @@
-"""Results as data frames: the cycles of a run and the runs of a study for pandas, and a study for xarray."""
+"""Data frames for pandas: a run, its cycles, and the runs of a study, which xarray has as well."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pandas as pd
 from pathspace_graph.io.csv_table import Table, read_table
 from pathspace_graph.io.manifest import verified
 from pathspace_graph.io.parsing import MAX_STAMP
-from pathspace_graph.io.results import CYCLES_FILE
+from pathspace_graph.io.results import CYCLE_COLUMNS, CYCLES_FILE, RunResult
 
 from .errors import InputError, SettingsError
 
@@ -66,6 +66,13 @@ def _column(table: Table, name: str, kind: str) -> pd.Series:
     if kind == "int64":
         table.require(values == values.round(), f"expected whole numbers in column '{name}'")
     return pd.Series(values).astype(kind)
+
+
+def run_frame(result: RunResult) -> pd.DataFrame:
+    """Return the cycles of a run as `read_cycles` does, each with its pose x, y (m) and theta (rad)."""
+    columns = {name: [getattr(record, name) for record in result.cycles] for name in CYCLE_COLUMNS}
+    frame = pd.DataFrame(columns).astype({name: CYCLE_TYPES[name] for name in columns}).set_index("cycle")
+    return frame.assign(**dict(zip(("x", "y", "theta"), result.trajectory.T, strict=True)))
 
 
 def read_study(folder: Path | str) -> pd.DataFrame:

@@ -81,7 +81,8 @@ def test_mypy_sees_every_folder() -> None:
 def test_every_public_name_is_found_where_it_is_said_to_be() -> None:
     assert sorted(pathspace_graph._HOME) == sorted(pathspace_graph.__all__)
     for name in pathspace_graph.__all__:
-        assert getattr(pathspace_graph, name).__name__ == name
+        home = import_module(f"pathspace_graph.{pathspace_graph._HOME[name]}")
+        assert getattr(pathspace_graph, name) is getattr(home, name)
     with pytest.raises(AttributeError):
         pathspace_graph.nothing  # noqa: B018 - the access is the test
 
@@ -96,6 +97,12 @@ def modules_after(code: str) -> set[str]:
 def test_the_command_line_starts_without_the_heavy_libraries() -> None:
     loaded = modules_after("from pathspace_graph.cli import main; main(['--help'])")
     assert not loaded & {"numpy", "scipy", "gtsam", "matplotlib", "tyro", "rich"}
+
+
+def test_the_package_itself_imports_nothing_but_the_standard_library() -> None:
+    loaded = modules_after("import pathspace_graph")
+    assert not loaded & {"numpy", "scipy", "gtsam", "matplotlib", "pandas"}
+    assert {name for name in loaded if name.startswith("pathspace_graph.")} == set()
 
 
 def test_the_simulator_knows_no_estimator() -> None:

@@ -26,6 +26,7 @@ from .style import (
     RED,
     SIGMAS,
     WIDTH,
+    Picture,
     draw_band,
     draw_control_points,
     draw_curve,
@@ -85,7 +86,7 @@ def plot_map(
     health: Sequence[str] = (),
     band_scale: float = 1.0,
     title: str | None = None,
-) -> Figure:
+) -> Picture:
     """Draw the map in metres, with equal scales and the band S(u) +- 2 band_scale sigma(u) n(u).
 
     `log` adds the true cones and the true path where it has truth; trajectory (n, 3) or (n, 2), map frame.
@@ -95,7 +96,7 @@ def plot_map(
     if not band_scale > 0.0:
         raise SettingsError(f"band_scale: expected a positive number, found {band_scale}")
     with figure_context():
-        figure = Figure(layout="constrained")
+        figure = Picture(layout="constrained")
         axes = figure.add_subplot()
         # the legend names what is drawn first before the rest; zorder decides what lies on top
         for label, boundary in sorted(track.boundaries.items()):
@@ -108,7 +109,7 @@ def plot_map(
             draw_trajectory(axes, np.asarray(trajectory), WHOLE_TRACK)
             draw_unhealthy(axes, np.asarray(trajectory), health, WHOLE_TRACK)
         draw_start(axes, WHOLE_TRACK)
-        _finish(figure, axes, title)
+        finish(figure, axes, title)
     return figure
 
 
@@ -127,7 +128,8 @@ def _draw_spline(
 ) -> None:
     color, name, spline = BOUNDARY_COLORS[label], NAMES[label], boundary.spline
     text = f"{name} {_band_name(band_scale)}"
-    draw_band(axes, boundary, color, text, band_scale, BAND_ALPHA, widest=style.widest_band)
+    if boundary.covariance.size:  # the outline of a map has none
+        draw_band(axes, boundary, color, text, band_scale, BAND_ALPHA, widest=style.widest_band)
     until = boundary.confirmed_until
     draw_curve(axes, spline, color, f"{name} boundary", style.curve_width, (-np.inf, until), zorder=4)
     if until < spline.domain[1]:
@@ -198,7 +200,7 @@ def draw_start(axes: Axes, style: MapStyle) -> None:
     draw_points(axes, np.zeros((1, 2)), ">", "black", "start", markersize=size, zorder=7)
 
 
-def _finish(figure: Figure, axes: Axes, title: str | None) -> None:
+def finish(figure: Figure, axes: Axes, title: str | None) -> None:
     """Add frame, axis titles and legend, and give the figure the map's shape."""
     axes.margins(0.0)
     axes.autoscale_view()

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
@@ -76,6 +77,15 @@ def figure_context() -> Iterator[None]:
     """Set the fonts and lines that all figures share."""
     with mpl.rc_context(_RC):
         yield
+
+
+class Picture(Figure):
+    """Figure that a notebook shows, whether or not it has a backend of matplotlib."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = BytesIO()
+        self.savefig(buffer, format="png", dpi=DPI)
+        return buffer.getvalue()
 
 
 def set_frame(axes: Axes, low: Array, high: Array) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.io import parsing as limits
+from pathspace_graph.io.brief import Brief, pictures
 from pathspace_graph.labels import NAMES, label_from_name
 from pathspace_graph.lengths import POSE
 
@@ -21,6 +22,9 @@ from .csv_table import Column, Table, read_table, write_table
 from .files import atomic_folder
 from .header import POSITIVE, Header, noise_sections, to_toml, toml_text
 from .manifest import verified
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LOG_FILE: Final = "log.toml"
 ODOMETRY_FILE: Final = "odometry.csv"
@@ -128,8 +132,8 @@ class SensorInfo:
     """Perception cycles per second, Hz."""
 
 
-@dataclass(frozen=True, eq=False)
-class Truth:
+@dataclass(frozen=True, eq=False, repr=False)
+class Truth(Brief):
     """What a simulator or a survey knows, for evaluation only; what is not known has no rows."""
 
     LENGTHS: ClassVar = {"poses": POSE, "cones": 1, "sensor": (0, 1, 0, 0, 1), "noise": (1, 1, 0, 0, 0, 0)}
@@ -155,7 +159,7 @@ class Truth:
     time of those (s)."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Log:
     """All that a vehicle recorded on one drive."""
 
@@ -183,6 +187,22 @@ class Log:
     measured: MeasuredNoise | None = None
     """Noise and constant errors of the sensor, as the readings themselves show them."""
     truth: Truth | None = None
+
+    def __repr__(self) -> str:
+        seconds, noise = self.odometry.t[-1] - self.odometry.t[0], ("measured", "stated")
+        detections = sum(len(cycle.labels) for cycle in self.cycles)
+        lines = (
+            f"Log({seconds:.1f} s: {len(self.odometry.t)} twists, their noise {noise[self.odometry_stated]};",
+            f"{len(self.cycles)} cycles with {detections} detections,"
+            f" their noise {noise[self.detections_stated]};",
+            f"{'no truth' if self.truth is None else 'with truth'})",
+        )
+        return "\n    ".join(lines)
+
+    def plot(self, **options: Any) -> Figure:
+        """Return a picture of the log; the options are those of `eval.figures.pictures.plot_log`."""
+        figure: Figure = pictures().plot_log(self, **options)
+        return figure
 
     @property
     def noise(self) -> KnownNoise:

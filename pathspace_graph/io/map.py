@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.io.brief import Brief, pictures
 from pathspace_graph.io.parsing import MAX_COORDINATE, MAX_DEGREE, MAX_INTEGER, shown
-from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, POINTS
+from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, POINTS, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
 from .manifest import verified
 from .parsing import read_json
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FORMAT = "pathspace-map/1"
 MAP_FILE = "map.json"
@@ -33,8 +37,8 @@ _NEGATIVE_TOLERANCE = 1e-9
 """Most negative eigenvalue over the largest one of a covariance that is positive semidefinite to rounding."""
 
 
-@dataclass(frozen=True, eq=False)
-class SplineBoundary:
+@dataclass(frozen=True, eq=False, repr=False)
+class SplineBoundary(Brief):
     """A boundary as a B-spline."""
 
     LENGTHS: ClassVar = {"spline": 0, "covariance": 2, "confirmed_until": 1}
@@ -54,8 +58,8 @@ class SplineBoundary:
         return self.spline.size
 
 
-@dataclass(frozen=True, eq=False)
-class PointBoundary:
+@dataclass(frozen=True, eq=False, repr=False)
+class PointBoundary(Brief):
     """A boundary as points: the landmarks of an estimator that does not know that they form a curve."""
 
     LENGTHS: ClassVar = {"points": 1, "covariance": 2}
@@ -75,7 +79,24 @@ class PointBoundary:
 MapBoundary = SplineBoundary | PointBoundary
 
 
-@dataclass(frozen=True, eq=False)
+class Boundaries(Mapping[Any, MapBoundary]):
+    """Boundaries by label or by its name: `boundaries[LEFT]` is `boundaries["left"]`."""
+
+    def __init__(self, boundaries: Mapping[Any, MapBoundary]) -> None:
+        self._by_label: dict[int, MapBoundary] = dict(boundaries)
+
+    def __getitem__(self, label: Any) -> MapBoundary:
+        by_name = {NAMES[known]: known for known in self._by_label}
+        return self._by_label[by_name.get(label, label)]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._by_label)
+
+    def __len__(self) -> int:
+        return len(self._by_label)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Map:
     """Map of a track."""
 
@@ -84,14 +105,43 @@ class Map:
     closed: bool
     """Whether the track was found to be a loop."""
 
-    boundaries: Mapping[int, MapBoundary]
-    """Boundaries by label, LEFT or RIGHT; one that could not be mapped is absent."""
+    boundaries: Mapping[Any, MapBoundary]
+    """Boundaries by label, LEFT or RIGHT, or by its name; one that could not be mapped is absent."""
 
     joint_covariance: Array | None = None
     """Joint covariance (2m, 2m) in m^2 of the points of all boundaries, in the order of their labels."""
 
     points: Mapping[int, PointBoundary] = field(default_factory=dict)
     """Cones of no boundary by their label, ORANGE or BIG_ORANGE, each label with one covariance."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "boundaries", Boundaries(self.boundaries))
+
+    def __repr__(self) -> str:
+        sides = [_outline(NAMES[label], own) for label, own in sorted(self.boundaries.items())]
+        cones = [f"{own.size} {NAMES[label].replace('_', ' ')} cones" for label, own in self.points.items()]
+        loop = "closed" if self.closed else "open"
+        return f"Map({', '.join([loop, *(sides or ['no boundary']), *cones])})"
+
+    @property
+    def left(self) -> MapBoundary:
+        """Return the left boundary; a SettingsError where it could not be mapped."""
+        return self._boundary(LEFT)
+
+    @property
+    def right(self) -> MapBoundary:
+        """Return the right boundary; a SettingsError where it could not be mapped."""
+        return self._boundary(RIGHT)
+
+    def _boundary(self, label: int) -> MapBoundary:
+        if label not in self.boundaries:
+            raise SettingsError(f"map.{NAMES[label]}: expected a mapped boundary, found none")
+        return self.boundaries[label]
+
+    def plot(self, **options: Any) -> Figure:
+        """Return a picture of the map; the options are those of `eval.figures.map_plot.plot_map`."""
+        figure: Figure = pictures().plot_map(self, **options)
+        return figure
 
     @property
     def size(self) -> int:
@@ -133,6 +183,12 @@ class Map:
                 "a centre line: expected both boundaries closed or both open, found one of each"
             )
         return left.spline.periodic
+
+
+def _outline(name: str, boundary: MapBoundary) -> str:
+    if isinstance(boundary, PointBoundary):
+        return f"{name}: {boundary.size} points"
+    return f"{name}: {boundary.size} control points on {boundary.spline.length():.0f} m"
 
 
 def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Array:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +19,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.io.brief import Brief, frames
 from pathspace_graph.io.csv_table import is_plain, read_table, write_table
 from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.log import CALIBRATION
@@ -26,6 +27,10 @@ from pathspace_graph.io.manifest import verified
 from pathspace_graph.io.map import MAP_FILE, Map, map_to_json
 from pathspace_graph.io.parsing import MAX_COORDINATE, MAX_STAMP, read_text, shown
 from pathspace_graph.lengths import POSE, scaled
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 TRAJECTORY_FILE: Final = "trajectory.tum"
 _COLUMNS: Final = 8
@@ -77,7 +82,7 @@ NoiseSource = Literal["stated", "measured", "assumed"]
 """Where noise comes from: the log's statement, the drive, or a default."""
 
 CYCLES_FILE: Final = "cycles.csv"
-_CYCLE_COLUMNS: Final = (
+CYCLE_COLUMNS: Final = (
     *("cycle", "t", "seconds", "size_left", "size_right", "readings", "lap"),
     *("offered", "health", "reason", "dropped"),
 )
@@ -124,8 +129,8 @@ class CycleRecord:
     """Number of cycles that were refused just before this one."""
 
 
-@dataclass(frozen=True, eq=False)
-class VehicleState:
+@dataclass(frozen=True, eq=False, repr=False)
+class VehicleState(Brief):
     """What an estimator believes of the vehicle: its pose, and the calibration of its odometry."""
 
     LENGTHS: ClassVar = {"pose": POSE, "sensor": (0, 1, 0, 0, 1)}
@@ -195,7 +200,7 @@ class RunNoise:
     """Ranges and speeds disagree, and the size of the map is that of these; None where they agree."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RunResult:
     """Result of an estimator's run over a log."""
 
@@ -245,12 +250,26 @@ class RunResult:
     scale: float = 1.0
     """Size of the scene by that of a Formula Student track."""
 
+    def __repr__(self) -> str:
+        name = f"{type(self).__name__}({self.estimator}: {len(self.cycles)} cycles, {self.laps} laps"
+        return f"{name},\n    {self.map})"
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return the run as a frame: a row for each cycle, as in `cycles.csv`, with its pose x, y, theta."""
+        frame: pd.DataFrame = frames().run_frame(self)
+        return frame
+
+    def plot(self, **options: Any) -> Figure:
+        """Return a picture of map and trajectory; the options are those of `Map.plot`."""
+        health = [record.health for record in self.cycles]
+        return self.map.plot(trajectory=self.trajectory, health=health, **options)
+
     def at_scale_one(self) -> Self:
         """Return the result of a scene that is as large as a Formula Student track."""
         return scaled(self, 1.0 / self.scale)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class BatchRun(RunResult):
     """Result of a batch estimator; its maps of the laps are all the one of the whole log."""
 
@@ -268,8 +287,8 @@ def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, An
     with atomic_folder(Path(folder), marker=MAP_FILE) as temporary:
         write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
         write_trajectory(temporary / TRAJECTORY_FILE, result.trajectory_t, result.trajectory)
-        columns = [[getattr(record, name) for record in result.cycles] for name in _CYCLE_COLUMNS]
-        write_table(temporary / CYCLES_FILE, _CYCLE_COLUMNS, *columns)
+        columns = [[getattr(record, name) for record in result.cycles] for name in CYCLE_COLUMNS]
+        write_table(temporary / CYCLES_FILE, CYCLE_COLUMNS, *columns)
         write_json(temporary / "summary.json", summary)
 
 

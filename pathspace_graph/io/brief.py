@@ -1,0 +1,43 @@
+"""What a notebook shows of records: short texts here, pictures and frames from the rooms that make them.
+
+Those rooms stand above the records and import matplotlib and pandas, so they are imported when asked for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass
+from importlib import import_module
+from typing import Any, Final
+
+LONGEST: Final = 3
+"""Most values of an array that its text lists."""
+
+
+def pictures() -> Any:
+    """Return the module of pictures of records."""
+    return import_module("pathspace_graph.eval.figures.pictures")
+
+
+def frames() -> Any:
+    """Return the module of frames of records."""
+    return import_module("pathspace_graph.frames")
+
+
+class Brief:
+    """A record whose text has the shapes of its arrays in place of their numbers."""
+
+    def __repr__(self) -> str:
+        return brief(self)
+
+
+def brief(value: Any) -> str:
+    """Return a text of a value on one line, with shapes and lengths in place of many numbers."""
+    shape = getattr(value, "shape", None)
+    if shape is not None and getattr(value, "size", 0) > LONGEST:
+        return f"array {shape}"
+    if isinstance(value, tuple | list) and len(value) > LONGEST:
+        return f"{type(value).__name__} of {len(value)} {type(value[0]).__name__}"
+    if is_dataclass(value) and not isinstance(value, type):
+        values = (f"{entry.name}={brief(getattr(value, entry.name))}" for entry in fields(value))
+        return f"{type(value).__name__}({', '.join(values)})"
+    return " ".join(repr(value).split())
