@@ -85,7 +85,8 @@ def _run(arguments: list[str]) -> int:
     if first in ("-h", "--help"):
         print(overview())
     elif first == "--version":
-        print(f"{PROGRAM} {version(PROGRAM)}")
+        kernels = import_module(".factors.kernels", __package__).KERNELS
+        print(f"{PROGRAM} {version(PROGRAM)} (GTSAM {version('gtsam')}, {kernels} kernels)")
     elif first in COMMANDS:
         command = parse_command(first, arguments[1:])
         if command is not None:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import pathspace_graph
+from pathspace_graph.cli import main
 from pathspace_graph.io.log import Detections, Log, Odometry, write_log
 from pathspace_graph.labels import LEFT, RIGHT
 
@@ -97,6 +98,13 @@ def modules_after(code: str) -> set[str]:
 def test_the_command_line_starts_without_the_heavy_libraries() -> None:
     loaded = modules_after("from pathspace_graph.cli import main; main(['--help'])")
     assert not loaded & {"numpy", "scipy", "gtsam", "matplotlib", "tyro", "rich"}
+
+
+def test_the_version_names_gtsam_and_the_kernels(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert re.fullmatch(
+        r"pathspace-graph \S+ \(GTSAM \S+, (compiled|numpy) kernels\)\n", capsys.readouterr().out
+    )
 
 
 def test_the_package_itself_imports_nothing_but_the_standard_library() -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
+from math import ceil
 from pathlib import Path
 from typing import Any, Final
 
@@ -69,6 +70,8 @@ _RC: Final = {
 }
 _LAYOUT_ROUNDS: Final = 2
 """Rounds in which the height is fitted, since the layout moves a little when it changes."""
+REST_COLUMNS: Final = 3
+"""Most columns of a legend beside those of the boundaries."""
 _SIDES: Final = tuple(NAMES[label] for label in BOUNDARIES)
 
 
@@ -113,7 +116,7 @@ def grouped_legend(figure: Figure) -> None:
     entries = _entries(figure.axes)
     sides = [[label for label in entries if label.startswith(side)] for side in _SIDES]
     rest = [label for label in entries if not label.startswith(_SIDES)]
-    rows = max(1, *(len(side) for side in sides))
+    rows = max(1, ceil(len(rest) / REST_COLUMNS), *(len(side) for side in sides))
     columns = [*(side for side in sides if side), *(rest[i : i + rows] for i in range(0, len(rest), rows))]
     padded = [label for column in columns for label in column + [""] * (rows - len(column))]
     blank = Line2D([], [], linestyle="none")
