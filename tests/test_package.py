@@ -132,6 +132,25 @@ def test_the_factors_stand_on_their_own() -> None:
                 assert {alias.name.split(".")[0] for alias in node.names} <= allowed | standard, file
 
 
+def test_reading_metrics_and_plots_need_nothing_of_linux() -> None:
+    """As on Windows: without `fcntl` and `resource`, and without the C library of the process."""
+    code = """
+import sys
+sys.modules["fcntl"] = sys.modules["resource"] = None
+import ctypes
+real = ctypes.CDLL
+def library(name, *rest, **named):
+    assert name is not None, "the library of the process"
+    return real(name, *rest, **named)
+ctypes.CDLL = library
+import pathspace_graph as package
+[getattr(package, name) for name in package.__all__]
+import pathspace_graph.eval.metrics.accuracy, pathspace_graph.eval.figures.pictures
+import pathspace_graph.eval.benchmark.scaling_output
+"""
+    assert "pathspace_graph.eval.figures.pictures" in modules_after(code)
+
+
 # --- README ----------------------------------------------------------------------------------------------
 
 

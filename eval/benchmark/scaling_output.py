@@ -2,11 +2,15 @@
 
 import math
 import platform
-import resource
 from dataclasses import asdict
 from itertools import cycle
 from pathlib import Path
 from typing import Any, Final
+
+try:
+    import resource
+except ImportError:  # Windows does not say how much memory was used at most
+    resource = None  # type: ignore[assignment]
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -129,8 +133,10 @@ def _content(scaling: Scaling) -> dict[str, Any]:
     }
 
 
-def _process_megabytes() -> float:
-    """Return the most memory (MB) that the process had, with all estimators loaded at once."""
+def _process_megabytes() -> float | None:
+    """Return the most memory (MB) that the process had, with all estimators loaded; None if unknown."""
+    if resource is None:
+        return None
     unit = 1e-6 if platform.system() == "Darwin" else 1.024e-3
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 

@@ -6,7 +6,6 @@ know announce themselves in the same way, so that a test can end the process bef
 
 import ctypes
 import errno
-import fcntl
 import os
 import re
 import secrets
@@ -14,15 +13,20 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks
+    fcntl = None  # type: ignore[assignment]
 
 SYNC: Final = "pathspace_graph.sync"
 """Audit event before a file or a folder is flushed to the disk, with its path."""
 RENAME: Final = "pathspace_graph.rename"
 """Audit event before a rename with flags, with both paths."""
 
-_RENAMEAT2: Final = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)  # of Linux only
 _AT_FDCWD: Final = -100  # a relative path is relative to the working folder
 _NOREPLACE: Final = 1
 _EXCHANGE: Final = 2
@@ -87,12 +91,19 @@ def exchange(first: Path, second: Path, spare: Path) -> None:
         raise
 
 
+@cache
+def _renameat2() -> Any:
+    """Return the rename with flags of Linux; None elsewhere."""
+    return getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if sys.platform == "linux" else None
+
+
 def _rename(source: Path, target: Path, flag: int) -> bool:
     """Rename with a flag; return False where the system or the file system does not know the flag."""
     sys.audit(RENAME, str(source), str(target))
-    if _RENAMEAT2 is None:
+    rename = _renameat2()
+    if rename is None:
         return False
-    if _RENAMEAT2(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), flag) == 0:
+    if rename(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), flag) == 0:
         return True
     code = ctypes.get_errno()
     if code in _UNSUPPORTED:
@@ -106,6 +117,8 @@ def lock(path: Path, *, wait: bool) -> int | None:
     None where the path is gone, where the file system has no locks, and, unless it is to `wait`, where
     another process holds the lock.
     """
+    if fcntl is None:
+        return None
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     except OSError:

@@ -75,7 +75,7 @@ def test_an_exchange_is_one_step_or_goes_by_way_of_a_spare_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_exchange: bool
 ) -> None:
     if not has_exchange:
-        monkeypatch.setattr(disk, "_RENAMEAT2", None)
+        monkeypatch.setattr(disk, "_renameat2", lambda: None)
     for name in "ab":
         (tmp_path / name).mkdir()
         (tmp_path / name / "file").write_text(name)
@@ -90,7 +90,7 @@ def test_an_exchange_is_one_step_or_goes_by_way_of_a_spare_path(
 def test_results_are_kept_where_the_system_can_not_exchange(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(disk, "_RENAMEAT2", None)
+    monkeypatch.setattr(disk, "_renameat2", lambda: None)
     for text in "123":
         with atomic_folder(tmp_path / "out", "marker") as folder:
             (folder / "marker").write_text(text)
