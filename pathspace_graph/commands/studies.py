@@ -221,19 +221,19 @@ class Report:
         with progress("runs", lines=LINES) as advance:
             plan = Plan(quick=self.quick, tracks=self.tracks, jobs=self.jobs, on_cell=advance)
             tables = measure_figures(plan, self.out, self.only, about, known)
-        written = {self.out / FILE: to_json(tables)}
-        pages = render_pages(self.pages, tables) if self.pages is not None else {}
-        if self.pages is not None:
-            written[self.pages / FIGURES] = written[self.out / FILE]
         self.out.mkdir(parents=True, exist_ok=True)
-        for file, content in written.items():
-            write_json(file, content)
-        for page, text in pages.items():
-            write_text(page, text)
+        written = [self.out / FILE]
+        write_json(written[0], to_json(tables))
+        if self.pages is not None:
+            pages = render_pages(self.pages, tables)
+            write_json(self.pages / FIGURES, to_json(tables))
+            for page, text in pages.items():
+                write_text(page, text)
+            written += [self.pages / FIGURES, *pages]
         say = Console(soft_wrap=True, highlight=False, markup=False)
         for name, table in tables.items():
             say.print(f"{name}\n{table.markdown(table.sources)}".rstrip("\n"))
-        say.print(f"\nwritten to {', '.join(map(str, [*written, *pages]))}")
+        say.print(f"\nwritten to {', '.join(map(str, written))}")
 
 
 def commit_of(root: Path | None) -> str:
