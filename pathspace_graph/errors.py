@@ -97,6 +97,13 @@ def check_name(name: Any, known: Iterable[str], expected: str) -> None:
     raise SettingsError(f"{expected}, found '{name}'{hint}")
 
 
+def check_type(name: str, value: object, kind: type[Any]) -> None:
+    """Raise a SettingsError that names an argument, unless its value is of the type."""
+    if not isinstance(value, kind):
+        found = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+        raise SettingsError(f"{name}: expected a {kind.__name__}, found {found}")
+
+
 NUMBERS: Final[dict[str, Callable[[Any], bool]]] = {
     "a positive number": lambda value: 0 < value < inf,
     "a number of at least 0": lambda value: 0 <= value < inf,

@@ -17,6 +17,7 @@ from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunNoise, RunResult, VehicleState
 from pathspace_graph.lengths import POSE, times
 
+from .errors import check_type
 from .health import Health
 from .labels import LEFT, RIGHT
 from .laps import LapCounter
@@ -58,6 +59,7 @@ class CycleResult:
     """Number of cycles that were refused since the last one that was used."""
 
 
+@runtime_checkable
 class OnlineEstimator(Protocol):
     """Interface of every online estimator."""
 
@@ -310,6 +312,8 @@ def run_online(
     result and the outline of the map. BLAS has one thread, since its threads stall small solves. Results of
     another process are waited for between cycles.
     """
+    check_type("log", log, Log)
+    check_type("estimator", estimator, OnlineEstimator)
     shown = [*observers]
     if on_cycle is not None:
         shown.append(lambda cycle: on_cycle(cycle.record))

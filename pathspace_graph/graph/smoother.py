@@ -88,6 +88,11 @@ class FixedLagSmoother(Generic[M_co]):
         return self.first_cycle + len(self.times)
 
     @property
+    def keyframes(self) -> list[int]:
+        """Return the cycles of the poses in whose frames the drive is kept until the loop closes."""
+        return [key - pose_key(0) for key in self.submaps.keyframes] if self.submaps is not None else []
+
+    @property
     def _cycles(self) -> IntArray:
         return np.arange(self.first_cycle, self.next_cycle)
 

@@ -16,7 +16,6 @@ from pathspace_graph.batch.start import unwrap
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import compose, inverse, relative, rotation, to_map, to_vehicle
 from pathspace_graph.front_end.scan_matching import ERRORS, Match, RecentDetections, match, reaches
-from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import HEADING
 from pathspace_graph.mapping.revisit import Revisit
@@ -61,7 +60,7 @@ class Revisits:
     def use(self) -> Array | None:
         """Look for a revisit, optimize the open map with it, and return the jump (3,) of the newest pose."""
         smoother, record, length = self._smoother, self._record, self._path.length
-        if length < self._next or smoother.submaps is None or record.unsolvable is not None:
+        if length < self._next or not smoother.keyframes or record.unsolvable is not None:
             return None
         self._next = length + ATTEMPTS
         poses = unwrap(np.array([*record.poses[: smoother.first_cycle], *smoother.variables.poses]))
@@ -84,14 +83,14 @@ class Revisits:
         smoother, stations, newest = self._smoother, path_lengths(poses), len(poses) - 1
         earlier, _ = self._scan(np.abs(stations - stations[place]) < ABOUT, poses)
         seen, variances = self._scan(stations > stations[-1] - NEWEST, poses)
-        if min(len(seen), len(earlier)) < MIN_DETECTIONS or smoother.submaps is None:
+        if min(len(seen), len(earlier)) < MIN_DETECTIONS:
             return None
         known = RecentDetections()
         known.add(0.0, earlier, np.zeros((len(earlier), 2, len(ERRORS))), np.zeros(3))
         found = match(known, to_vehicle(seen, poses[-1:]), variances, poses[-1], reaches())
         if not is_place(found, poses[-1]):
             return None
-        keyframes = np.array([*smoother.submaps.keyframes]) - pose_key(0)
+        keyframes = np.array(smoother.keyframes)
         first, later = int(keyframes[np.abs(keyframes - place).argmin()]), smoother.first_cycle
         cycles = int((stations > stations[-1] - NEWEST).sum())
         information = found.information / cycles  # the errors of a cone stay while it is passed

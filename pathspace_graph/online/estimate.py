@@ -47,6 +47,13 @@ class MapperEstimate:
     orange: OrangeCones
     loop: TrackLoop
 
+    def __repr__(self) -> str:
+        times, name = self.smoother.times, type(self).__name__
+        if not times:
+            return f"{name}(no cycle yet)"
+        poses = f"{self.smoother.next_cycle} cycles up to {times[-1]:.1f} s, {len(times)} poses in the window"
+        return f"{name}({poses},\n    {self.outline()})"
+
     # --- the map -----------------------------------------------------------------------------------------
 
     def map(self) -> Map:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Final, TypeVar
 
 import numpy as np
 
-from pathspace_graph.errors import ReadingError
+from pathspace_graph.errors import ReadingError, SettingsError, check_type
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
@@ -34,7 +34,8 @@ class FrontDoor:
         self, settings: MapperSettings | None = None, odometry_sigma: Any = None, *others: Any, **named: Any
     ) -> None:
         """Keep what an estimator is made from, whose settings may give the scale."""
-        settings = settings or MapperSettings()
+        settings = MapperSettings() if settings is None else settings
+        check_type("settings", settings, MapperSettings)
         self.scene = SceneScale(settings.scale)
         self.made_from = (settings, odometry_sigma, *deepcopy((others, named)))
         self.cycles: list[tuple[Odometry, Detections]] = []
@@ -67,7 +68,10 @@ def noise_at(noise: Array | KnownNoise | None, scale: float) -> Array | KnownNoi
     """Return the noise of an estimator's odometry as it is at scale 1."""
     if noise is None or isinstance(noise, KnownNoise):
         return scaled(noise, 1.0 / scale)
-    return np.asarray(times(np.asarray(noise, float), POSE, 1.0 / scale))
+    try:
+        return np.asarray(times(np.asarray(noise, float), POSE, 1.0 / scale))
+    except (TypeError, ValueError):
+        raise SettingsError(f"odometry_sigma: expected 3 positive numbers, found {noise!r:.80}") from None
 
 
 def in_scene(error: ReadingError, scale: float) -> ReadingError:
@@ -152,6 +156,7 @@ def log_at_scale(estimator: C) -> C:
 
     @wraps(solve)
     def solve_at_scale(self: Any, log: Log, *options: Any, **named: Any) -> Any:
+        check_type("log", log, Log)
         settings, noise, others, by_name = self._door.made_from
         scale = settings.scale or scale_of(log)
         inner = object.__new__(type(self))

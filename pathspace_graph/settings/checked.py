@@ -1,10 +1,18 @@
 """Settings whose numbers are checked where they are made, and the settings that are gone."""
 
 from dataclasses import fields
+from functools import cache
 from math import inf, isfinite
-from typing import ClassVar, Final
+from numbers import Integral, Real
+from types import NoneType, UnionType
+from typing import Any, ClassVar, Final, Literal, Union, get_args, get_origin, get_type_hints
 
 from pathspace_graph.errors import SettingsError
+
+_NUMBERS: Final[dict[Any, tuple[type[Any], str]]] = {
+    float: (Real, "a number"),
+    int: (Integral, "a whole number"),
+}
 
 
 class Positive:
@@ -26,8 +34,12 @@ class Positive:
 
     def __post_init__(self) -> None:
         """Raise a SettingsError that names the first wrong setting, as the command line knows it."""
+        types = _types(type(self))  # type: ignore[arg-type]  # a class has a hash, whatever its heirs'
         for entry in fields(self):  # type: ignore[arg-type]  # every heir is a dataclass
             value = getattr(self, entry.name)
+            if not _is_of(value, types[entry.name]):
+                expected = f"expected {_in_words(types[entry.name])}, found {value!r}"
+                raise SettingsError(f"{self.prefix}{entry.name}: {expected:.200}")
             if isinstance(value, bool) or not isinstance(value, int | float):
                 continue
             if entry.name in self.SIGNED:
@@ -38,6 +50,36 @@ class Positive:
                 raise SettingsError(f"{self.prefix}{entry.name}: expected a positive number, found {value}")
             if value == inf and entry.name not in self.UNLIMITED:
                 raise SettingsError(f"{self.prefix}{entry.name}: expected a finite number, found {value}")
+
+
+@cache
+def _types(settings: Any) -> dict[str, Any]:
+    return get_type_hints(settings)
+
+
+def _is_of(value: Any, kind: Any) -> bool:
+    """Return whether a value is of the type of a field; NumPy's numbers are numbers."""
+    options = get_args(kind)
+    if get_origin(kind) in (Union, UnionType):
+        return any(_is_of(value, option) for option in options)
+    if get_origin(kind) is Literal:
+        return value in options
+    if get_origin(kind) is tuple:
+        return isinstance(value, tuple) and all(_is_of(own, options[0]) for own in value)
+    if kind in _NUMBERS:
+        return isinstance(value, _NUMBERS[kind][0]) and not isinstance(value, bool)
+    return isinstance(value, kind)
+
+
+def _in_words(kind: Any) -> str:
+    options = get_args(kind)
+    if get_origin(kind) in (Union, UnionType):
+        return " or ".join(map(_in_words, options))
+    if get_origin(kind) is Literal:
+        return " or ".join(map(repr, options))
+    if kind in _NUMBERS:
+        return _NUMBERS[kind][1]
+    return {bool: "True or False", NoneType: "None"}.get(kind) or f"a {getattr(kind, '__name__', kind)}"
 
 
 # --- settings that are gone ------------------------------------------------------------------------------

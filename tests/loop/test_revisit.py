@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pathspace_graph import FixedLagMapper
+from pathspace_graph import FixedLagMapper, MapperSettings
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, relative, rotation
@@ -135,6 +135,13 @@ def test_the_batch_takes_them_from_the_online_run() -> None:
     ours = result.system.linear_graph(result.optimum).hessian(ordering)[0]
     traces = [np.trace(matrix[-3:-1, -3:-1]) for matrix in (theirs, ours)]
     assert traces[0] == pytest.approx(traces[1])
+
+
+def test_a_window_that_holds_the_whole_drive_has_none_and_fails_in_no_cycle() -> None:
+    settings = MapperSettings(lag=60.0, max_poses=1000)
+    log = beginning(drive(), 130)
+    mapper, _ = map_log(log, FixedLagMapper(settings, log.odometry_sigma))
+    assert mapper.recovery.failures == 0 and not mapper.revisits
 
 
 def test_a_lap_that_closes_has_none() -> None:

@@ -8,6 +8,7 @@ from dataclasses import fields, is_dataclass, replace
 from math import inf, nan
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pathspace_graph.errors import SettingsError
@@ -44,7 +45,7 @@ def numbers(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
         name, value = f"{prefix}{entry.name}", getattr(settings, entry.name)
         if is_dataclass(value):
             yield from numbers(value, f"{name}.")
-        elif isinstance(value, int | float):
+        elif isinstance(value, int | float) and not isinstance(value, bool):
             yield name, settings, entry.name
 
 
@@ -70,3 +71,22 @@ def test_infinity_means_no_limit_where_a_limit_is_set() -> None:
     settings = MapperSettings()
     assert replace(settings.gate, huber=inf).huber == inf
     assert replace(settings.growth, forget_after=inf).forget_after == inf
+
+
+@pytest.mark.parametrize(
+    ("wrong", "line"),
+    [
+        ({"lag": "3"}, "lag: expected a number, found '3'"),
+        ({"steps": 1.5}, "steps: expected a whole number, found 1.5"),
+        ({"steps": True}, "steps: expected a whole number, found True"),
+        ({"noise": "guessed"}, "noise: expected 'measured' or 'stated' or None, found 'guessed'"),
+        ({"spline": 3}, "spline: expected a SplineSettings, found 3"),
+    ],
+)
+def test_a_setting_of_a_wrong_type_is_named(wrong: dict[str, Any], line: str) -> None:
+    with pytest.raises(SettingsError, match=f"^{re.escape(line)}$"):
+        MapperSettings(**wrong)
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    assert MapperSettings(lag=np.float64(2.0), steps=np.int64(2)).lag == 2.0
