@@ -149,3 +149,68 @@ def imported_by(node: ast.AST) -> list[str]:
 def test_no_folder_is_crowded() -> None:
     for folder in {file.parent for file in (*modules().values(), *(ROOT / "tests").rglob("*.py"))}:
         assert len(list(folder.glob("*.py"))) <= MOST_FILES, folder
+
+
+# --- owners ----------------------------------------------------------------------------------------------
+
+VIEWS = {"values", "linearized", "poses", "calibrations", "mean"}
+"""Arrays of numbers that other rooms write through views (docs/architecture.md, "Owners")."""
+ASSIGNED = {
+    "batch.association": {"state.pose_u"},
+    "batch.mapper": {"system.settings", "system.chain"},
+    "batch.optimizer": {"system.kernel"},
+    "ckf.mapper": {"track.detections.used", "state.pose_u"},
+    "commands.online": {"column.justify"},  # of rich
+    "eval.view.film": {"self.writer.fig"},  # of matplotlib
+    "front_end.motion": {"self._rest.sigma"},
+    "front_end.sides": {"near.judged"},
+    "graph.smoother": {"self.variables.first_cycle", "self.submaps.first"},
+    "landmark.association": {"detections.landmark"},
+    "landmark.batch": {"state.votes", "detections.landmark"},
+    "landmark.fixed_lag": {"smoother.map.loop_pairs", "self.smoother.window.exact"},
+    "mapping.smoother": {"self.window.exact"},
+    "online.fixed_lag": {"self.recovery.failures"},
+    "online.outlook": {"row.ended"},
+    "options": {"entry.metadata"},  # of dataclasses
+    "scale.door": {"door.scene.is_final", "door.cycles"}
+    | {f"estimator.{name}" for name in ("__init__", "update", "solve", "ahead", "scale")},  # a decorator
+    "snapshot": {"array.flags.writeable", "zipped.comment"},  # of numpy and zipfile
+}
+"""Attributes that a module assigns to objects of others: no module may have another one."""
+
+
+def test_what_changes_is_changed_by_its_owner() -> None:
+    found: dict[str, set[str]] = {}
+    for module, file in modules().items():
+        for function in ast.walk(ast.parse(file.read_text())):
+            if isinstance(function, ast.FunctionDef):
+                found.setdefault(module, set()).update(assigned_to_others(function))
+    others = {
+        module: {name for name in names if not VIEWS & set(name.split("."))}
+        for module, names in found.items()
+    }
+    assert {module: names for module, names in others.items() if names} == ASSIGNED
+
+
+def assigned_to_others(function: ast.FunctionDef) -> Iterator[str]:
+    """Attributes, whole or in part, that a function assigns to objects that it has not made itself."""
+    made = {"self", "cls"}
+    for node in ast.walk(function):
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call):
+            made |= {
+                ast.unparse(part) for target in node.targets for part in getattr(target, "elts", [target])
+            }
+    for node in ast.walk(function):
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        if not isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign):
+            continue
+        for part in (part for whole in targets for part in getattr(whole, "elts", [whole])):
+            attribute = stripped(part)
+            own = isinstance(attribute, ast.Attribute) and ast.unparse(attribute.value) in made
+            if isinstance(attribute, ast.Attribute) and not own:
+                yield ast.unparse(attribute)
+
+
+def stripped(target: ast.expr) -> ast.expr:
+    """What is changed where a part of it is assigned: `a.b` of `a.b[i]`."""
+    return stripped(target.value) if isinstance(target, ast.Subscript) else target
