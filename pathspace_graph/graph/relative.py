@@ -199,13 +199,13 @@ class Submaps:
 
     def insert_keyframes(self, variables: Variables) -> None:
         """Insert the keyframes as variables, as they were when they were marginalized or placed."""
-        keys = np.array(sorted(self.keyframes))
-        poses, references = np.array([self.keyframes[key] for key in keys.tolist()]).transpose(1, 0, 2)
-        variables.insert(keys, poses.ravel(), references.ravel())
+        keys = np.array(sorted(self.keyframes), np.intp)
+        known = np.array([self.keyframes[key] for key in keys.tolist()]).reshape(-1, 2, POSE)
+        variables.insert(keys, known[:, 0].ravel(), known[:, 1].ravel())
 
     def place(self, variables: Variables) -> dict[int, Array]:
         """Keep the keyframes where they have been solved to be, and return their poses (3,) by cycle."""
-        keys = np.array([*self.keyframes])
+        keys = np.array([*self.keyframes], np.intp)
         poses = variables.of(keys).reshape(-1, POSE)
         self.keyframes = {
             key: (pose, self.keyframes[key][1]) for key, pose in zip(keys.tolist(), poses, strict=True)

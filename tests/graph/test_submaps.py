@@ -317,3 +317,24 @@ def test_a_drive_without_a_pose_has_no_submap() -> None:
     submaps.finish(variables)
     assert submaps.finished == [] and submaps.keyframes == {}
     assert keys_of(submaps.graph(variables)).tolist() == [CALIBRATION_KEY]
+
+
+def test_a_drive_without_keyframes_has_none_to_insert_or_to_place() -> None:
+    submaps, variables = Submaps(graph_of(), 10.0), Variables()
+    submaps.insert_keyframes(variables)
+    assert len(variables.keys) == 0
+    assert submaps.place(variables) == {}
+
+
+def test_keyframes_come_back_where_they_were_placed() -> None:
+    submaps, variables = Submaps(graph_of(), 10.0), Variables()
+    for key, at in ((KEYFRAME, 1.0), (END, 2.0)):
+        submaps.keyframes[key] = np.full(POSE, at), np.full(POSE, 0.1 * at)
+    submaps.insert_keyframes(variables)
+    np.testing.assert_array_equal(variables.of(np.array([END])), np.full(POSE, 2.0))
+    np.testing.assert_allclose(variables.reference, np.repeat([0.1, 0.2], POSE))
+    variables.values[:POSE] = 7.0
+    placed = submaps.place(variables)
+    np.testing.assert_array_equal(placed[KEYFRAME - pose_key(0)], np.full(POSE, 7.0))
+    np.testing.assert_array_equal(submaps.keyframes[KEYFRAME][0], np.full(POSE, 7.0))
+    np.testing.assert_allclose(submaps.keyframes[KEYFRAME][1], np.full(POSE, 0.1))
