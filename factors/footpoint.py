@@ -14,15 +14,13 @@ from .kernels import compiled
 _STEP_TOLERANCE: Final = 1e-9
 """A row takes its last step where |step| <= tolerance * length of the domain; the error is its square."""
 _FLAT: Final = 1e-12
-"""The derivative f' counts as positive where f' > tolerance * |S'|^2."""
+"""The derivative f' counts as zero where |f'| <= tolerance * |S'|^2."""
 _EQUAL_SQUARE: Final = 1e-12
 """Squared distances d, e (m^2) differ by more than round-off where e > d + tolerance * (1 + d)."""
 _END_TOLERANCE: Final = 1e-9
 """A foot point is at an end that is no farther away than tolerance * length of the domain."""
 _NO_TANGENT: Final = 1e-12
 """The tangent vanishes where |S'| <= tolerance * largest coordinate / length of the domain."""
-_SAFEGUARDED_STEPS: Final = 4
-"""A Newton step that leads farther away is replaced by this number of bracketed steps."""
 _TINY: Final = 1e-300
 """Smallest divisor of a step; the numerator vanishes before it does."""
 _TOLERANCES: Final = (_STEP_TOLERANCE, _FLAT, _EQUAL_SQUARE, _END_TOLERANCE, _NO_TANGENT, _TINY)
@@ -30,7 +28,7 @@ _TOLERANCES: Final = (_STEP_TOLERANCE, _FLAT, _EQUAL_SQUARE, _END_TOLERANCE, _NO
 _CHUNK: Final = 1 << 20
 """At most this number of point-to-grid distances are held in memory at once."""
 SEARCH_ITERATIONS: Final = 50
-"""A search takes at most this number of steps; it ends earlier once all rows have converged."""
+"""A search in a bracket takes at most this number of steps; it ends earlier once all rows have converged."""
 REFINE_ITERATIONS: Final = 2
 """A refinement from a known parameter takes this number of Newton steps."""
 
@@ -169,7 +167,7 @@ class _Probe:
     slope: Array
     """The slope f = (S - p) . S' (m,) is half the derivative of the squared distance."""
     step: Array
-    """The downhill step (m,) is Newton's -f / f', or Gauss-Newton's -f / |S'|^2 where f' is not positive."""
+    """The downhill step (m,) is Newton's -f / |f'|, or Gauss-Newton's -f / |S'|^2 where f' is zero."""
 
 
 def foot_points(
@@ -242,7 +240,7 @@ def refine_joint_foot_points(
     iterations: int = REFINE_ITERATIONS,
 ) -> FootPoints:
     """Return `refine_foot_points` on several curves; `curve` (m,) is the number of each row's own."""
-    steps = (iterations, _SAFEGUARDED_STEPS)
+    steps = (iterations, SEARCH_ITERATIONS)
     return FootPoints(
         *_refined(spans, control_points, points, curve, u_start, u_low, u_high, *steps, _TOLERANCES)
     )
@@ -287,7 +285,7 @@ def _refined(
     points_t = np.ascontiguousarray(points.T)
     stretch = stretch_of(spans, curve, u_low, u_high)
     start = stretch.moved_into(u_start + spans.shift.take(curve))
-    probe = _newton(curves, points_t, start, stretch, iterations)
+    probe = _newton(curves, points_t, start, stretch, iterations, safeguarded)
     return _finish(spans, control_points, points_t, curve, probe, stretch)
 
 
@@ -334,7 +332,10 @@ def _nearest_of(
     return index, least
 
 
-def _newton(curves: _Curves, points_t: Array, start: Array, stretch: Stretch, iterations: int) -> _Probe:
+def _newton(
+    curves: _Curves, points_t: Array, start: Array, stretch: Stretch, iterations: int, safeguarded: int
+) -> _Probe:
+    """Take Newton steps; a row that one leads farther away is searched for to the end of its bracket."""
     reach = stretch.interval
     last = _probe(curves, points_t, start)
     for _ in range(iterations):
@@ -344,9 +345,7 @@ def _newton(curves: _Curves, points_t: Array, start: Array, stretch: Stretch, it
         farther = ~_no_farther(probe.square, last.square)
         if farther.any():
             own, start = stretch.where(farther), last.v[farther]
-            v[farther] = _descend(
-                curves, points_t[:, farther], start, own, own.interval, _SAFEGUARDED_STEPS
-            ).v
+            v[farther] = _descend(curves, points_t[:, farther], start, own, own.interval, safeguarded).v
             probe = _probe(curves, points_t, v)
         last = probe
     return last
@@ -392,7 +391,7 @@ def _probe(curves: _Curves, points_t: Array, v: Array) -> _Probe:
     products = orders * offset
     square, slope, centripetal = products[:, 0] + products[:, 1]
     speed = _dot(first, first)
-    curvature = speed + centripetal
+    curvature = np.abs(speed + centripetal)
     divisor = np.where(curvature > _FLAT * speed, curvature, speed)
     step = -slope / np.maximum(divisor, _TINY)
     return _Probe(v, number, s, offset, first, square, slope, step)

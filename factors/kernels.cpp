@@ -170,7 +170,7 @@ class Search {
     at.square = at.offset[0] * at.offset[0] + at.offset[1] * at.offset[1];
     at.slope = at.first[0] * at.offset[0] + at.first[1] * at.offset[1];
     const double speed = at.first[0] * at.first[0] + at.first[1] * at.first[1];
-    const double curvature = speed + (second[0] * at.offset[0] + second[1] * at.offset[1]);
+    const double curvature = std::abs(speed + (second[0] * at.offset[0] + second[1] * at.offset[1]));
     const double divisor = curvature > eps_.flat * speed ? curvature : speed;
     at.step = -at.slope / std::max(divisor, eps_.tiny);
     return at;

@@ -85,7 +85,7 @@ def test_no_point_of_a_dense_grid_is_nearer(
     assert (found <= to_grid[:, ::10].min(axis=1) + 1e-6).all()
     longest_step = np.linalg.norm(np.diff(grid, axis=0), axis=1).max() * 10
     assert (found <= to_grid.min(axis=1) + longest_step).all()
-    assert (found <= to_grid.min(axis=1) + 1e-6).mean() > 0.75  # a kink may hold the search of a few
+    assert (found <= to_grid.min(axis=1) + 1e-6).mean() > 0.9
 
 
 @settings(max_examples=80, deadline=None)
@@ -229,9 +229,7 @@ def test_a_warm_start_never_ends_farther_away_and_converges(seed: int) -> None:
     assert (np.linalg.norm(points - feet.position, axis=1) <= before + 1e-6).all()
     done = refine_foot_points(tables, control_points, points, start, low, high, 60)
     along = np.abs(np.sum((points - done.position) * done.tangent_unit, axis=1))
-    converged = along[done.interior] < 1e-6
-    assert converged.mean() > 0.85  # near a centre of curvature Newton's method converges only linearly
-    assert (along[done.interior] < 0.1).all()
+    assert (along[done.interior] < 1e-6).all()
 
 
 def test_newton_is_exact_where_it_is_warm() -> None:
