@@ -22,12 +22,9 @@ import pandas as pd
 from pathspace_graph.errors import InputError, check_name
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.parsing import read_json, read_text
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track_generator import generate_track
 
-from .benchmark.measurement import measure, metrics
-from .experiment.frame import COMBINATION, RUN, estimate, last_laps
+from .benchmark.measurement import measure_drive, metrics
+from .experiment.frame import RUN_OF, estimate, last_laps
 from .experiment.run import run_study
 from .experiment.study import Study
 from .experiment.tables import TextTable
@@ -62,8 +59,6 @@ SPEED: Final = {
 }
 """Figures of the benchmark, each with its label."""
 BENCHMARK_SEEDS: Final = (0, 1, 2)
-RUN_OF: Final = (*RUN, *COMBINATION)
-"""Columns that name a run."""
 _MARKED: Final = re.compile(r"(<!-- report: ([\w-]+) -->\n)(.*?)(<!-- end report -->)", re.DOTALL)
 
 
@@ -165,10 +160,7 @@ class Plan:
         seeds, laps = (BENCHMARK_SEEDS[:1], 1) if self.quick else (BENCHMARK_SEEDS, 5)
         found: list[dict[str, float]] = []
         for seed in seeds:
-            track = generate_track(np.random.default_rng(seed))
-            log = simulate(track, SimulationSettings(laps=laps), seed)
-            run = measure(log, MapperSettings())
-            found.append({figure.key: figure.value for figure in metrics(run)})
+            found.append({figure.key: figure.value for figure in metrics(measure_drive(seed, laps))})
         values = {key: np.array([figures.get(key, np.nan) for figures in found]) for key in SPEED}
         rows = tuple(
             (label, (Figure.of(values[key], 2 if key.endswith(("isam2", "landmark")) else 1),))

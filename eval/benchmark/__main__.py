@@ -9,17 +9,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import tyro
 from rich.console import Console
 
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.io.files import atomic_file, check_file_target, write_json
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track_generator import generate_track
 
-from .measurement import Measurement, measure, metrics
+from .measurement import Measurement, measure_drive, metrics
 from .ratios import BASELINE, baseline_table, compare, metrics_table, read_baseline, write_baseline
 
 WORSE: Final = 1
@@ -55,9 +51,7 @@ class Benchmark:
 
     def measure(self) -> Measurement:
         """Simulate the drive and measure a run on it."""
-        track = generate_track(np.random.default_rng(self.seed))
-        log = simulate(track, SimulationSettings(laps=self.laps), self.seed)
-        return measure(log, MapperSettings())
+        return measure_drive(self.seed, self.laps)
 
 
 def main() -> None:

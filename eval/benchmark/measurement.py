@@ -25,6 +25,8 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.progress import progress
 from pathspace_graph.run import ObservedCycle, run_online, split_odometry, timed_update
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
 
 from .gtsam_window import linear_window, time_gtsam
 from .isam2 import ToldLandmarks
@@ -144,6 +146,12 @@ class _Sampler:
         best = min(self._timings, key=lambda name: float(np.mean(np.sum(self._timings[name], axis=1))))
         optimize, marginal = np.mean(self._timings[best], axis=0).tolist()
         return Gtsam(best, optimize, marginal, len(self._timings[best]))
+
+
+def measure_drive(seed: int, laps: int) -> Measurement:
+    """Map a simulated drive on a generated track; the seed is that of the track, the drive and its noise."""
+    track = generate_track(np.random.default_rng(seed))
+    return measure(simulate(track, SimulationSettings(laps=laps), seed), MapperSettings())
 
 
 def measure(log: Log, settings: MapperSettings, every: int = SAMPLE_EVERY) -> Measurement:

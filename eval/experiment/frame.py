@@ -24,6 +24,8 @@ COMBINATION: Final = ("noise", "estimator", "variant")
 """Columns that name a combination, which is compared with others."""
 RUN: Final = ("track", "seed")
 """Columns that name a drive; combinations are paired on the same drive and noise."""
+RUN_OF: Final = (*RUN, *COMBINATION)
+"""Columns that name a run."""
 SIMULATION: Final = "simulation."
 """Prefix of columns with settings of the simulation."""
 SETTING: Final = "settings."
@@ -52,7 +54,7 @@ def frame_of(study: Study, cells: Sequence[tuple[Cell[Drive], Record | None]]) -
         rows += [shared | lap | about for lap in record["laps"]] or [shared | {"lap": None} | about]
     add_batch(rows, (*RUN, "noise", "variant"))
     settings = _settings_row(study, cells[0][0])
-    order = ["study", *RUN, *COMBINATION, *settings, "lap", *METRICS, "failure", "said", *versions()]
+    order = ["study", *RUN_OF, *settings, "lap", *METRICS, "failure", "said", *versions()]
     known = dict.fromkeys([*order, *(name for row in rows for name in row)])
     frame = pd.DataFrame(rows, columns=[name for name in known if any(name in row for row in rows)])
     return frame.astype({"lap": "Int64"})
@@ -70,7 +72,7 @@ def add_batch(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
 def _settings_row(study: Study, cell: Cell[Drive]) -> dict[str, Any]:
     settings, simulation = leaves(cell.settings), leaves(cell.drive.simulation)
     row = {f"{SIMULATION}{name}": _cell(simulation[name]) for name in study.varied_noise}
-    own = {"study", *RUN, *COMBINATION}
+    own = {"study", *RUN_OF}
     return row | {f"{SETTING}{name}" if name in own else name: _cell(settings[name]) for name in study.varied}
 
 
@@ -85,13 +87,13 @@ def without_times(frame: pd.DataFrame) -> pd.DataFrame:
 
 def times_of(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the wall times, in the same rows."""
-    return frame[["study", *RUN, *COMBINATION, "lap", *(name for name in TIMES if name in frame)]]
+    return frame[["study", *RUN_OF, "lap", *(name for name in TIMES if name in frame)]]
 
 
 def last_laps(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the last row of each run that finished."""
     finished = frame[frame["failure"] == ""]
-    return finished.groupby([*RUN, *COMBINATION], sort=False).tail(1)
+    return finished.groupby(list(RUN_OF), sort=False).tail(1)
 
 
 # --- statistics ------------------------------------------------------------------------------------------

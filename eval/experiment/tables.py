@@ -14,7 +14,7 @@ from tabulate import LATEX_ESCAPE_RULES, SEPARATING_LINE, tabulate
 
 from pathspace_graph.eval.metrics.metric import LATER_LAPS, MEAN_DIGITS, METRICS, Column, column_of
 
-from .frame import COMBINATION, CORRECTION, LEVEL, RUN, Contrast, Estimate, contrasts, last_laps
+from .frame import COMBINATION, CORRECTION, LEVEL, RUN, RUN_OF, Contrast, Estimate, contrasts, last_laps
 from .study import Study
 
 _BORDER: Final = 3
@@ -115,7 +115,7 @@ def caption(study: Study, frame: pd.DataFrame) -> str:
     """Return what the tables show, and how it was tested."""
     base = study.baseline
     against = f"{base.estimator}: {study.baseline_variant}" if base.estimator else study.baseline_variant
-    runs = frame.groupby([*RUN, *COMBINATION], sort=False)["failure"].first()
+    runs = frame.groupby(list(RUN_OF), sort=False)["failure"].first()
     return (
         f"{study.name}: {study.question} "
         f"{len(runs)} runs ({int((runs != '').sum())} failed) of {study.laps} laps, at the end of the last. "

@@ -84,10 +84,10 @@ class Boundaries(Mapping[Any, MapBoundary]):
 
     def __init__(self, boundaries: Mapping[Any, MapBoundary]) -> None:
         self._by_label: dict[int, MapBoundary] = dict(boundaries)
+        self._by_name = {NAMES[label]: boundary for label, boundary in self._by_label.items()}
 
     def __getitem__(self, label: Any) -> MapBoundary:
-        by_name = {NAMES[known]: known for known in self._by_label}
-        return self._by_label[by_name.get(label, label)]
+        return self._by_name[label] if isinstance(label, str) else self._by_label[label]
 
     def __iter__(self) -> Iterator[int]:
         return iter(self._by_label)

@@ -6,17 +6,14 @@ hold it in every direction.
 """
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import wrap_angle
-from pathspace_graph.graph.relative import RelativeFactor, by_frame_of, rotations, to_frame
+from pathspace_graph.factors.se2 import relative, wrap_angle
+from pathspace_graph.graph.relative import RelativeFactor, by_frame_of, rotations
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import POSE, Layout, pose_keys
-
-HEADING_ENTRY: Final = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,18 +35,14 @@ class Revisit:
 
     def residual(self, poses: Array) -> Array:
         """Return the whitened residual (3,) at the poses (P, 3) of all cycles."""
-        seen = to_frame(poses[self.later], poses[self.earlier], self._layout) - self.local
-        seen[HEADING_ENTRY] = wrap_angle(seen[HEADING_ENTRY])
-        return np.asarray(self.root @ seen)
+        seen = relative(poses[self.earlier], poses[self.later]) - self.local
+        return np.asarray(self.root @ [*seen[:2], wrap_angle(seen[2])])
 
     def rows(self, poses: Array) -> Rows:
         """Return the rows on [earlier pose | later pose], linearized at the poses (P, 3) of all cycles."""
-        frame, values, layout = poses[self.earlier], poses[self.later], self._layout
-        jacobian = [by_frame_of(values, frame, layout), rotations(layout, frame[HEADING_ENTRY]).T]
+        frame, values = poses[self.earlier], poses[self.later]
+        layout = Layout(pose_keys(np.array([self.later])))
+        jacobian = [by_frame_of(values, frame, layout), rotations(layout, frame[2]).T]
         keys = np.tile(pose_keys(np.array([self.earlier, self.later])), (POSE, 1))
         owner = np.full(POSE, -1 - self.later)  # a factor of its own, since its poses are far apart
         return Rows(keys, self.root @ np.concatenate(jacobian, axis=1), self.residual(poses), owner)
-
-    @property
-    def _layout(self) -> Layout:
-        return Layout(pose_keys(np.array([self.later])))
