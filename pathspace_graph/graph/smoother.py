@@ -88,7 +88,7 @@ class FixedLagSmoother(Generic[M_co]):
         return self.first_cycle + len(self.times)
 
     @property
-    def keyframes(self) -> list[int]:
+    def keyframe_cycles(self) -> list[int]:
         """Return the cycles of the poses in whose frames the drive is kept until the loop closes."""
         return [key - pose_key(0) for key in self.submaps.keyframes] if self.submaps is not None else []
 

@@ -32,9 +32,9 @@ def apply_correspondences(smoother: CurveSmoother, registration: RefinedMotion) 
         smoother.map.detections.take(rows, label, u)
 
 
-def optimize_loop(smoother: CurveSmoother) -> None:
-    """Solve the whole loop; each submap is relinearized in its own frame."""
-    smoother.solve_loop(smoother.map.settings.closing.iterations, SIGMA_STEP)
+def optimize_loop(smoother: CurveSmoother) -> dict[int, Array]:
+    """Solve the whole loop, each submap relinearized in its own frame; return its keyframes (3,) by cycle."""
+    return smoother.solve_loop(smoother.map.settings.closing.iterations, SIGMA_STEP)
 
 
 def simplify(smoother: CurveSmoother) -> None:

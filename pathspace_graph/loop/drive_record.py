@@ -1,9 +1,8 @@
 """The drive as it was measured, its poses along the curves, and its batch when the loop closes."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Final, cast
 
@@ -15,7 +14,7 @@ from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, is_worth_
 from pathspace_graph.batch.start import Recurrence, find_recurrence, unwrap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import compose, relative, to_map, wrap_angle
+from pathspace_graph.factors.se2 import compose, to_map, to_vehicle, wrap_angle
 from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.front_end.log_odometry import chained
 from pathspace_graph.io.log import Detections
@@ -24,71 +23,32 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary
 
 from .recognition import RecognizedPlace
 
 
-@dataclass(frozen=True, eq=False)
-class Place:
-    """The point of a curve beside the vehicle, as the curve was in one cycle."""
+def bend(poses: Array, known: Mapping[int, Array]) -> Array:
+    """Return the poses (n, 3) of a path that is bent, so that some of them have known values (3,), by index.
 
-    cycle: int
-    u: float
-    """Parameter of the point, which goes on from lap to lap."""
-    pose: Array
-    """(3,) Position x, y (m) and direction theta of the curve there (rad)."""
-
-
-def curve_poses(boundary: Boundary, control_points: Array, u: Array) -> Array:
-    """Return the position of a curve at parameters u (m,) and its direction there, (m, 3): x, y, theta."""
-    values, span = boundary.tables.evaluate(u, 1)
-    position, tangent = np.einsum("omj,mjd->omd", values, control_points[boundary.columns(span)])
-    return np.column_stack([position, np.arctan2(tangent[:, 1], tangent[:, 0])])
-
-
-def in_final_map(
-    poses: Array,
-    closed_at: int,
-    places: Mapping[int, Sequence[Place]],
-    state: State,
-    settings: MapperSettings,
-) -> Array:
-    """Return the poses (P, 3), those before the loop closed moved with the curves beside them.
-
-    A loop closure bends the map, but an online estimator keeps its earlier poses as they were. Each of them
-    is put beside the final curves as it was beside the curves of its own cycle: the place on the curve is
-    moved rigidly to the same parameter of the final curve. The result is the mean over both boundaries. A
-    pose that was beside no curve is corrected as much as its neighbours are.
+    A pose between two of these is the mean of where it is as seen from each, weighed by how near they are
+    along the path. A pose after the last one moves with it.
     """
-    total, count = np.zeros_like(poses), np.zeros((len(poses), 1))
-    for label, boundary in state.boundaries.items():
-        beside = [place for place in places[label] if place.cycle < closed_at]
-        beside = [place for place in beside if _is_beside(place, poses[place.cycle], settings)]
-        if not beside:
-            continue
-        cycles = np.array([place.cycle for place in beside], np.intp)
-        before = np.array([place.pose for place in beside])
-        after = curve_poses(boundary, state.control_points(label), np.array([place.u for place in beside]))
-        after[:, 2] = wrap_angle(after[:, 2] - before[:, 2])
-        total[cycles, :2] += to_map(poses[cycles, :2] - before[:, :2], after)
-        total[cycles, 2] += poses[cycles, 2] + after[:, 2]
-        count[cycles] += 1
-    known = np.flatnonzero(count[:, 0])
-    if len(known) == 0:
-        return poses
-    correction = total[known] / count[known] - poses[known]
-    earlier, poses = np.arange(closed_at), poses.copy()
-    for k in range(poses.shape[1]):
-        poses[earlier, k] += np.interp(earlier, known, correction[:, k])
-    return poses
+    at, along = np.array(sorted(known)), path_lengths(poses)
+    before = at.searchsorted(np.arange(len(poses)), side="right") - 1
+    after = np.minimum(before + 1, len(at) - 1)
+    values = np.array([known[k] for k in at.tolist()])
+    first, second = (_moved(poses, poses[at[nearest]], values[nearest]) for nearest in (before, after))
+    driven, way = along - along[at[before]], along[at[after]] - along[at[before]]
+    weight = np.divide(driven, way, out=np.zeros_like(along), where=way > 0.0)[:, None]
+    change = second - first
+    change[:, 2] = wrap_angle(change[:, 2])
+    return np.asarray(first + weight * change)
 
 
-def _is_beside(place: Place, pose: Array, settings: MapperSettings) -> bool:
-    """Return whether the vehicle at a pose (3,) drove along the curve at a place."""
-    distance = float(np.hypot(*(pose[:2] - place.pose[:2])))
-    same_direction = np.cos(place.pose[2] - pose[2]) > SAME_DIRECTION
-    return bool(distance < settings.growth.max_lateral and same_direction)
+def _moved(poses: Array, frames: Array, to: Array) -> Array:
+    """Return poses (n, 3) moved rigidly as other poses (n, 3) have moved."""
+    points = to_map(to_vehicle(poses[:, :2], frames), to)
+    return np.column_stack([points, poses[:, 2] + to[:, 2] - frames[:, 2]])
 
 
 # --- the record ------------------------------------------------------------------------------------------
@@ -114,7 +74,7 @@ class DriveRecord:
         self._motions: list[MeasuredMotion] = []
         self._detections: list[Detections] = []
         self._orange: list[Detections] = []
-        self._places: dict[int, list[Place]] = {}
+        self._beside: dict[int, list[tuple[float, int]]] = {}  # parameter on each curve, and cycle
         self._reckoned: list[Array] = []
         self._prepared = False
 
@@ -149,13 +109,10 @@ class DriveRecord:
             )
 
     def estimated(self, state: State) -> None:
-        """Add the newest pose, and its place along each of the curves."""
-        cycle = len(self.poses)
+        """Add the newest pose, and its parameter on each of the curves."""
+        for label in state.boundaries:
+            self._beside.setdefault(label, []).append((float(state.pose_u[label][-1]), len(self.poses)))
         self.poses.append(_kept(state.poses[-1].copy()))
-        for label, boundary in state.boundaries.items():
-            u = state.pose_u[label][-1:]
-            (pose,) = curve_poses(boundary, state.control_points(label), u)
-            self._places.setdefault(label, []).append(Place(cycle, float(u[0]), pose))
 
     def followed(self, newest: Array) -> None:
         """Add the newest pose (3,) on a closed map."""
@@ -166,21 +123,12 @@ class DriveRecord:
         """Replace all poses by those (k, 3) before the window and those (P, 3) in it, after a swap."""
         self.poses = [*_kept(unwrap(np.concatenate([earlier, window])))]
 
-    def bent(self, poses: Array, keyframes: Mapping[int, Array], window: Array) -> None:
-        """Replace all poses after a revisit: those of the window (P, 3), and earlier ones with keyframes.
-
-        The poses (n, 3) of all cycles before it move rigidly with the newest keyframe (3,) before them.
-        """
-        cycles, earlier = np.array(sorted(keyframes)), len(poses) - len(window)
-        frames = cycles[np.maximum(cycles.searchsorted(np.arange(earlier), side="right") - 1, 0)].tolist()
-        moved = [compose(keyframes[k], relative(poses[k], poses[c])) for c, k in enumerate(frames)]
-        bent = np.array([*moved, *window])
-        for places in self._places.values():
-            places[:] = [
-                replace(at, pose=compose(bent[at.cycle], relative(self.poses[at.cycle], at.pose)))
-                for at in places
-            ]
-        self.poses = [*_kept(unwrap(bent))]
+    def bent(self, keyframes: Mapping[int, Array], smoother: CurveSmoother) -> None:
+        """Replace the poses: the window has its own, earlier ones move with the keyframes (3,), by cycle."""
+        first = smoother.first_cycle
+        earlier, window = unwrap(np.array(self.poses[: first + 1])), smoother.variables.poses
+        bent = bend(earlier, {0: earlier[0], **keyframes, first: window[0]})
+        self.replaced(bent[:first], window)
 
     def seen(self, cycle: int, sensor: Array) -> Detections:
         """Return all detections of a cycle, corrected by the calibration (5,) of the sensor, or (0,)."""
@@ -200,8 +148,7 @@ class DriveRecord:
     def recurrence_since(self, place: RecognizedPlace) -> Recurrence:
         """Return the recurrence of the path driven since the vehicle was at a place before."""
         poses, (label, u) = np.array(self._reckoned), next(iter(place.beside.items()))
-        places = self._places[label]
-        before = places[int(np.argmin([abs(at.u - u) for at in places]))].cycle
+        _, before = min(self._beside[label], key=lambda at: abs(at[0] - u))
         driven = path_lengths(poses)
         turn = float(poses[-1, 2] - poses[before, 2])
         return Recurrence(driven, float(driven[-1] - driven[before]), turn, 1.0)
@@ -220,16 +167,11 @@ class DriveRecord:
         if self._prepared and self.unsolvable is None:
             _submit(_nothing)
 
-    def corrected(self, smoother: CurveSmoother) -> Array:
-        """Return the poses (P, 3) of all cycles in the frame of the map that has just been closed."""
-        window = smoother.first_cycle
-        poses = unwrap(np.array([*self.poses[:window], *smoother.variables.poses]))
-        return in_final_map(poses, window, self._places, smoother.map.state, self.settings)
-
     def closed_map(self, smoother: CurveSmoother) -> ClosedMap:
-        """Return the map that has just been closed, with the poses of all cycles beside it."""
+        """Return the map that has just been closed, with the poses of all cycles in its frame."""
         state = smoother.map.state
-        return ClosedMap(state.splines, self.corrected(smoother), state.variables.calibrations.copy())
+        poses = unwrap(np.array([*self.poses[: smoother.first_cycle], *smoother.variables.poses]))
+        return ClosedMap(state.splines, poses, state.variables.calibrations.copy())
 
     def lap(self, first_kept: int, start: ClosedMap | Recurrence, settings: MapperSettings) -> OpenLap:
         """Return the lap, whose search begins at a map that has just been closed, or at odometry.

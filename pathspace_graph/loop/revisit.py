@@ -60,7 +60,7 @@ class Revisits:
     def use(self) -> Array | None:
         """Look for a revisit, optimize the open map with it, and return the jump (3,) of the newest pose."""
         smoother, record, length = self._smoother, self._record, self._path.length
-        if length < self._next or not smoother.keyframes or record.unsolvable is not None:
+        if length < self._next or not smoother.keyframe_cycles or record.unsolvable is not None:
             return None
         self._next = length + ATTEMPTS
         poses = unwrap(np.array([*record.poses[: smoother.first_cycle], *smoother.variables.poses]))
@@ -75,14 +75,15 @@ class Revisits:
         after = smoother.variables.poses[-1].copy()
         for follower in smoother.followers:
             follower.move(compose(after, inverse(before)))
-        record.bent(poses, keyframes, smoother.variables.poses)
+        record.bent(keyframes, smoother)
         return np.asarray(after - before)
 
     def _measured(self, poses: Array, place: int) -> Revisit | None:
         """Return the oldest pose of the window, as seen from the keyframe next to an earlier place."""
-        smoother, stations, newest = self._smoother, path_lengths(poses), len(poses) - 1
+        smoother, stations = self._smoother, path_lengths(poses)
+        newest = stations > stations[-1] - NEWEST
         earlier, _ = self._scan(np.abs(stations - stations[place]) < ABOUT, poses)
-        seen, variances = self._scan(stations > stations[-1] - NEWEST, poses)
+        seen, variances = self._scan(newest, poses)
         if min(len(seen), len(earlier)) < MIN_DETECTIONS:
             return None
         known = RecentDetections()
@@ -90,11 +91,10 @@ class Revisits:
         found = match(known, to_vehicle(seen, poses[-1:]), variances, poses[-1], reaches())
         if not is_place(found, poses[-1]):
             return None
-        keyframes = np.array(smoother.keyframes)
+        keyframes = np.array(smoother.keyframe_cycles)
         first, later = int(keyframes[np.abs(keyframes - place).argmin()]), smoother.first_cycle
-        cycles = int((stations > stations[-1] - NEWEST).sum())
-        information = found.information / cycles  # the errors of a cone stay while it is passed
-        moved = compose(found.pose, relative(poses[newest], poses[later]))
+        information = found.information / newest.sum()  # the errors of a cone stay while it is passed
+        moved = compose(found.pose, relative(poses[-1], poses[later]))
         return measured_revisit((first, poses[first]), (later, moved), found.pose, information)
 
     def _scan(self, of_cycles: BoolArray, poses: Array) -> tuple[Array, Array]:

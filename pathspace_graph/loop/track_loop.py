@@ -36,7 +36,7 @@ REST: Final = 10.0
 RECOGNITION_INTERVAL: Final = 10.0
 """Least distance of two attempts to recognize the place (m along the path)."""
 REVISITED: Final = "the road was met again, and the open map is laid on its earlier pass"
-"""Notice of a cycle with a revisit."""
+"""Notice of the first cycle with a revisit."""
 LEARNED: Final = "the drive contradicts the calibration, which is learned"
 """Notice of the cycle in which the priors of the calibrations are first doubted."""
 

@@ -293,7 +293,7 @@ class FixedLagMapper(MapperEstimate):
         if found is None or not passes_start(track.state, self.path, found.motion):
             return False
         apply_correspondences(self.smoother, found)
-        optimize_loop(self.smoother)
+        self.loop.record.bent(optimize_loop(self.smoother), self.smoother)
         return True
 
     def _simplify(self) -> None:

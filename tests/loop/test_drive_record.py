@@ -1,4 +1,4 @@
-"""The record of the open lap: after which path length the drive recurs, by its odometry or from a place."""
+"""The record of the open lap: its poses in the closed map, and after which path length the drive recurs."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.se2 import compose, wrap_angle
 from pathspace_graph.graph.variables import CALIBRATION_KEY, pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.drive_record import DriveRecord
+from pathspace_graph.loop.drive_record import DriveRecord, bend
 from pathspace_graph.loop.recognition import RecognizedPlace
 from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry
 from pathspace_graph.mapping.registration import Motion
@@ -90,3 +91,45 @@ def test_the_chain_of_the_lap_is_the_odometry_that_was_measured() -> None:
     angle = len(poses) * SPEED * CYCLE / RADIUS
     np.testing.assert_allclose(poses[-1, 2], angle)
     np.testing.assert_allclose(poses[-1, :2], on_circle(np.array([angle]))[0], atol=1e-6)
+
+
+# --- poses in the closed map -----------------------------------------------------------------------------
+
+
+def path() -> Array:
+    """Return poses (30, 3) of a path that turns at random; the vehicle stands still for some cycles."""
+    rng = np.random.default_rng(3)
+    poses = [np.zeros(3)]
+    for cycle in range(29):
+        driven = 0.0 if cycle in (7, 8, 9) else rng.uniform(0.5, 1.5)
+        poses.append(compose(poses[-1], np.array([driven, 0.0, rng.uniform(-0.2, 0.2)])))
+    return np.array(poses)
+
+
+def test_a_path_moves_rigidly_with_one_known_pose_or_several_of_one_motion() -> None:
+    poses, motion = path(), np.array([4.0, -7.0, 0.3])
+    moved = np.array([compose(motion, pose) for pose in poses])
+    for cycles in ([0], [0, 8], [0, 8, 9, 20], [0, 29]):
+        found = bend(poses, {cycle: moved[cycle] for cycle in cycles})
+        np.testing.assert_allclose(found, moved, atol=1e-12)
+
+
+def test_a_bent_path_goes_through_its_known_poses_and_between_them_is_a_mean() -> None:
+    straight = np.column_stack([np.arange(11.0), np.zeros((11, 2))])
+    known = {0: np.zeros(3), 10: np.array([10.0, 2.0, 0.0])}
+    np.testing.assert_allclose(bend(straight, known)[:, 1], 0.2 * np.arange(11), atol=1e-12)
+    poses = path()
+    noise = 0.3 * np.random.default_rng(4).normal(size=(30, 3))
+    known = {cycle: poses[cycle] + noise[cycle] for cycle in (0, 5, 8, 17)}
+    bent = bend(poses, known)
+    for cycle, pose in known.items():
+        np.testing.assert_allclose(bent[cycle], pose, atol=1e-12)
+    np.testing.assert_allclose(np.diff(bent[17:, 2]), np.diff(poses[17:, 2]), atol=1e-12)
+
+
+def test_a_known_heading_may_be_wrapped() -> None:
+    poses = path() + np.array([0.0, 0.0, np.pi])
+    known = {cycle: np.append(poses[cycle, :2], wrap_angle(poses[cycle, 2])) for cycle in (0, 10, 20)}
+    found = bend(poses, known)
+    np.testing.assert_allclose(found[:, :2], poses[:, :2], atol=1e-9)
+    np.testing.assert_allclose(wrap_angle(found[:, 2] - poses[:, 2]), 0.0, atol=1e-9)
