@@ -160,6 +160,14 @@ class BatchingEstimator(Protocol):
         """Return the cycles in which batches have ended."""
 
 
+@runtime_checkable
+class SmoothingEstimator(Protocol):
+    """An online estimator that corrects earlier poses when the loop closes."""
+
+    def smoothed(self, t: Array) -> Array:
+        """Return the corrected poses (n, 3) of the cycles at stamps (n,); NaN after the last of them."""
+
+
 def scale(estimator: OnlineEstimator) -> float:
     """Return the scale of the scene as an estimator knows it; 1 where it takes every scene as it is."""
     return float(getattr(estimator, "scale", 1.0))
@@ -366,12 +374,14 @@ class _Run:
         track = self._estimator.map()
         if self._laps.last_lap_is_complete:
             self._lap_maps.append((self._laps.lap, track))
+        t = np.array([record.t for record in self._records])
+        trajectory = np.array(self._poses).reshape(-1, 3)
         return RunResult(
             estimator=name,
             settings=settings_dict(self._estimator.settings),
             map=track,
-            trajectory_t=np.array([record.t for record in self._records]),
-            trajectory=np.array(self._poses).reshape(-1, 3),
+            trajectory_t=t,
+            trajectory=trajectory,
             cycles=tuple(self._records),
             laps=self._laps.completed,
             lap_maps=tuple(self._lap_maps),
@@ -382,7 +392,15 @@ class _Run:
             waited=self._waited,
             noise=self._estimator.noise_used() if isinstance(self._estimator, NoiseEstimator) else None,
             scale=scale(self._estimator),
+            smoothed=self._smoothed(t, trajectory),
         )
+
+    def _smoothed(self, t: Array, trajectory: Array) -> Array | None:
+        if not isinstance(self._estimator, SmoothingEstimator):
+            return None
+        smoothed = self._estimator.smoothed(t)
+        corrected = np.isfinite(smoothed)
+        return np.where(corrected, smoothed, trajectory) if corrected.any() else None
 
     def _take_snapshots(self, before: float) -> None:
         while len(self._snapshots) < len(self._snapshot_times):

@@ -76,6 +76,8 @@ class MapStyle:
 
 WHOLE_TRACK: Final = MapStyle()
 """Style of a panel that shows a whole track."""
+AT_ITS_TIME: Final = MapStyle(path_width=0.25)
+"""Style of the poses that were corrected afterwards."""
 
 
 def plot_map(
@@ -83,6 +85,7 @@ def plot_map(
     *,
     log: Log | None = None,
     trajectory: Array | None = None,
+    smoothed: Array | None = None,
     health: Sequence[str] = (),
     band_scale: float = 1.0,
     title: str | None = None,
@@ -90,7 +93,8 @@ def plot_map(
     """Draw the map in metres, with equal scales and the band S(u) +- 2 band_scale sigma(u) n(u).
 
     `log` adds the true cones and the true path where it has truth; trajectory (n, 3) or (n, 2), map frame.
-    It is drawn in another colour where the `health` of its n cycles is not good.
+    It is drawn in another colour where the `health` of its n cycles is not good. Beside a `smoothed` one
+    (n, 3) it is drawn thin, as the poses that were estimated at their time.
     The legend says so where a `band_scale` other than 1 draws the band wider than it is.
     """
     if not band_scale > 0.0:
@@ -105,6 +109,9 @@ def plot_map(
             draw_orange(axes, cones.points, label, WHOLE_TRACK)
         if log is not None and log.truth is not None:
             draw_truth(axes, log.truth, WHOLE_TRACK)
+        if smoothed is not None and trajectory is not None and len(smoothed):
+            draw_trajectory(axes, np.asarray(trajectory), AT_ITS_TIME, "poses as estimated at their time")
+            trajectory = smoothed
         if trajectory is not None and len(trajectory):
             draw_trajectory(axes, np.asarray(trajectory), WHOLE_TRACK)
             draw_unhealthy(axes, np.asarray(trajectory), health, WHOLE_TRACK)
@@ -167,10 +174,10 @@ def _band_name(scale: float, shape: str = "band") -> str:
     return f"{SIGMAS:g}σ {shape}{exaggerated}"
 
 
-def draw_trajectory(axes: Axes, trajectory: Array, style: MapStyle) -> None:
+def draw_trajectory(axes: Axes, trajectory: Array, style: MapStyle, label: str = "trajectory") -> None:
     """Draw poses (n, 3) or positions (n, 2) as a line, map frame (m)."""
     line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": style.path_width, "zorder": 3}
-    axes.plot(*trajectory[:, :2].T, label="trajectory", **line)
+    axes.plot(*trajectory[:, :2].T, label=label, **line)
 
 
 def draw_unhealthy(axes: Axes, trajectory: Array, health: Sequence[str], style: MapStyle) -> None:

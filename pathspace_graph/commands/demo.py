@@ -79,5 +79,5 @@ def write_demo(out: Path, log: Log, result: RunResult) -> None:
     with progress("writing"), atomic_folder(out, PICTURE) as folder:
         write_log(log, folder / "log")
         write_result(folder / "map", result, summarize(result, log))
-        picture = plot_map(result.map, log=log, trajectory=result.trajectory)
+        picture = plot_map(result.map, log=log, trajectory=result.trajectory, smoothed=result.smoothed)
         save_plot(picture, folder / PICTURE, PICTURE_DPI)

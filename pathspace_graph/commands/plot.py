@@ -16,7 +16,13 @@ from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import read_log
 from pathspace_graph.io.manifest import verify_all
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.results import CYCLES_FILE, TRAJECTORY_FILE, read_health, read_trajectory
+from pathspace_graph.io.results import (
+    CYCLES_FILE,
+    SMOOTHED_FILE,
+    TRAJECTORY_FILE,
+    read_health,
+    read_trajectory,
+)
 from pathspace_graph.progress import progress
 
 
@@ -42,14 +48,15 @@ class Plot:
             raise SettingsError(f"--band-scale: expected a positive number, found {self.band_scale}")
         track = read_map(self.map)
         log = None if self.log is None else read_log(self.log)
-        file = self.map / TRAJECTORY_FILE
-        trajectory = read_trajectory(file)[1] if file.exists() else None
+        files = (self.map / name for name in (TRAJECTORY_FILE, SMOOTHED_FILE))
+        trajectory, smoothed = (read_trajectory(file)[1] if file.exists() else None for file in files)
         cycles = self.map / CYCLES_FILE
         health = read_health(cycles) if cycles.exists() else []
         figure = plot_map(
             track,
             log=log,
             trajectory=trajectory,
+            smoothed=smoothed,
             health=health,
             band_scale=self.band_scale,
             title=self.title,

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TRAJECTORY_FILE: Final = "trajectory.tum"
+SMOOTHED_FILE: Final = "smoothed.tum"
 _COLUMNS: Final = 8
 
 
@@ -207,6 +208,7 @@ class RunResult:
     LENGTHS: ClassVar = {
         "map": 0,
         "trajectory": POSE,
+        "smoothed": POSE,
         "cycles": 0,
         "lap_maps": 0,
         "snapshots": 0,
@@ -249,6 +251,8 @@ class RunResult:
     """Noise that was used, where the estimator says it."""
     scale: float = 1.0
     """Size of the scene by that of a Formula Student track."""
+    smoothed: Array | None = None
+    """Poses (n, 3) of an online estimator whose earlier ones were corrected when the loop closed."""
 
     def __repr__(self) -> str:
         name = f"{type(self).__name__}({self.estimator}: {len(self.cycles)} cycles, {self.laps} laps"
@@ -262,7 +266,8 @@ class RunResult:
     def plot(self, **options: Any) -> Figure:
         """Return a picture of map and trajectory; the options are those of `Map.plot`."""
         health = [record.health for record in self.cycles]
-        return self.map.plot(trajectory=self.trajectory, health=health, **options)
+        paths = {"trajectory": self.trajectory, "smoothed": self.smoothed}
+        return self.map.plot(**paths, health=health, **options)
 
     def at_scale_one(self) -> Self:
         """Return the result of a scene that is as large as a Formula Student track."""
@@ -282,11 +287,14 @@ class BatchRun(RunResult):
 def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, Any]) -> None:
     """Write map.json, trajectory.tum, cycles.csv and summary.json: all of them, or on failure nothing.
 
+    A smoothed trajectory is in smoothed.tum.
     An earlier result in `folder` is kept as a numbered backup; anything else there is an OutputError.
     """
     with atomic_folder(Path(folder), marker=MAP_FILE) as temporary:
         write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
         write_trajectory(temporary / TRAJECTORY_FILE, result.trajectory_t, result.trajectory)
+        if result.smoothed is not None:
+            write_trajectory(temporary / SMOOTHED_FILE, result.trajectory_t, result.smoothed)
         columns = [[getattr(record, name) for record in result.cycles] for name in CYCLE_COLUMNS]
         write_table(temporary / CYCLES_FILE, CYCLE_COLUMNS, *columns)
         write_json(temporary / "summary.json", summary)

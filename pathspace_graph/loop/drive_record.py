@@ -70,7 +70,8 @@ class DriveRecord:
         """Why the drive cannot be solved as a batch; None if it can be."""
         self.poses: list[Array] = []
         """Pose (3,) of each cycle, map frame, as it was estimated then or by the newest batch."""
-        self._stamps: list[float] = []
+        self.stamps: list[float] = []
+        """Stamp of each cycle (s)."""
         self._motions: list[MeasuredMotion] = []
         self._detections: list[Detections] = []
         self._orange: list[Detections] = []
@@ -82,19 +83,19 @@ class DriveRecord:
         """Drop the measurements, since the lap cannot be solved for this reason."""
         if self.unsolvable is None:
             self.unsolvable = reason
-        self._stamps, self._motions, self._detections, self._orange = [], [], [], []
+        self._motions, self._detections, self._orange = [], [], []
 
     def measured(self, motion: MeasuredMotion, detections: Detections, orange: Detections) -> None:
         """Add the motion that leads to a pose, and the detections there, those of orange cones apart."""
+        self.stamps.append(detections.t)
         if self.unsolvable is not None:
             return
-        self._stamps.append(detections.t)
         self._motions.append(motion)
         self._detections.append(detections)
         self._orange.append(orange)
         last = self._reckoned[-1] if self._reckoned else np.zeros(3)
         self._reckoned.append(_kept(compose(last, motion.odometry.delta)))
-        if len(self._stamps) > self.settings.open_lap.max_cycles:
+        if len(self.stamps) > self.settings.open_lap.max_cycles:
             self.give_up("the lap is too long for a batch")
 
     def measured_late(self, cycle: int, detections: Detections) -> None:
@@ -178,7 +179,7 @@ class DriveRecord:
 
         The priors of the calibrations are those of the settings, which may have become wide.
         """
-        chain = chained(self._stamps, self._motions, settings.odometry)
+        chain = chained(self.stamps, self._motions, settings.odometry)
         return OpenLap(
             settings=settings,
             chain=chain,

@@ -222,6 +222,14 @@ class MapperEstimate:
         """Return the poses (k, 3) of the first k cycles as the closing of the loop has corrected them."""
         return self.loop.corrected_poses
 
+    def smoothed(self, t: Array) -> Array:
+        """Return the corrected poses (n, 3) of the cycles at stamps (n,); NaN after the last of them."""
+        poses = self.corrected_poses
+        stamps = np.array(self.loop.record.stamps[: len(poses)])
+        found, known = np.full((len(t), 3), np.nan), t <= stamps.max(initial=-np.inf)
+        found[known] = poses[np.maximum(stamps.searchsorted(t[known], side="right") - 1, 0)]
+        return found
+
     @property
     def revisits(self) -> tuple[Revisit, ...]:
         """Return the poses measured in the frame of earlier ones, where an open road was driven twice."""

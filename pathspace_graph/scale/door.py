@@ -20,7 +20,7 @@ from .scene import SceneScale, scale_of
 
 C = TypeVar("C", bound=type[Any])
 
-ANSWERS: Final = ("map", "outline", "readings", "vehicle_state", "noise_used", "window_poses")
+ANSWERS: Final = ("map", "outline", "readings", "vehicle_state", "noise_used", "window_poses", "smoothed")
 """What these methods of an online estimator return has its lengths multiplied by the scale."""
 
 

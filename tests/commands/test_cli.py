@@ -123,7 +123,7 @@ def test_a_track_file_wins_over_a_generated_one(tmp_path: Path) -> None:
 
 
 def test_a_map_keeps_the_formats_contract(log_folder: Path, map_folder: Path) -> None:
-    files = {"map.json", "trajectory.tum", "cycles.csv", "summary.json", "manifest.json"}
+    files = {"map.json", "trajectory.tum", "smoothed.tum", "cycles.csv", "summary.json", "manifest.json"}
     assert names(map_folder) == files
     content = json.loads((map_folder / "map.json").read_text())
     assert content["format"] == "pathspace-map/1"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,15 @@ import pytest
 
 from pathspace_graph.errors import OutputError
 from pathspace_graph.io.map import Map, PointBoundary
-from pathspace_graph.io.results import CYCLES_FILE, CycleRecord, RunResult, read_health, write_result
+from pathspace_graph.io.results import (
+    CYCLES_FILE,
+    SMOOTHED_FILE,
+    CycleRecord,
+    RunResult,
+    read_health,
+    read_trajectory,
+    write_result,
+)
 from pathspace_graph.labels import LEFT
 
 
@@ -51,6 +60,15 @@ def test_the_folder_holds_the_four_files_of_the_contract(tmp_path: Path) -> None
     assert read_health(tmp_path / "map" / CYCLES_FILE) == ["", "lost"]
     read = json.loads((tmp_path / "map" / "summary.json").read_text())
     assert read == {"estimator": "fixed-lag", "ate": None, "laps": [{"lap": 1, "rmse": 0.5}]}
+
+
+def test_a_smoothed_trajectory_has_a_file_of_its_own(tmp_path: Path) -> None:
+    smoothed = result().trajectory + np.array([1.0, -2.0, 0.1])
+    write_result(tmp_path / "map", replace(result(), smoothed=smoothed), {})
+    stamps, read = read_trajectory(tmp_path / "map" / SMOOTHED_FILE)
+    np.testing.assert_array_equal(stamps, result().trajectory_t)
+    np.testing.assert_allclose(read[:, :2], smoothed[:, :2], atol=1e-9)
+    np.testing.assert_allclose(np.cos(read[:, 2] - smoothed[:, 2]), 1.0)
 
 
 def test_a_second_result_keeps_the_first_and_a_foreign_folder_is_left_alone(tmp_path: Path) -> None:

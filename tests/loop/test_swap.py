@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
-from pathspace_graph.factors.se2 import relative
+from pathspace_graph.factors.se2 import relative, wrap_angle
 from pathspace_graph.graph.gaussian import normal_equations
 from pathspace_graph.graph.variables import Layout, Variables, pose_keys
 from pathspace_graph.io.log import Log
@@ -25,10 +25,10 @@ from pathspace_graph.loop.closing import _move_poses
 from pathspace_graph.loop.drive_record import DriveRecord
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.run import CycleResult, split_odometry
+from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.drives import bean_track, lap_log, map_log, noisy, replay
+from ..scenes.drives import bean_track, lap_log, map_log, noisy, replay, true_poses
 from ..scenes.graph import columns_of, dense_rows
 
 Array = NDArray[np.float64]
@@ -255,11 +255,37 @@ def test_a_users_factors_keep_the_prior_and_it_is_said() -> None:
     assert all(result.jump is None for result in results)
 
 
-def test_the_record_gives_the_poses_of_the_lap_in_the_closed_map() -> None:
+def test_the_poses_of_the_lap_are_corrected_as_soon_as_the_loop_closes() -> None:
+    """The odometry has turned the open map by then; the cycle's own pose was right only at its end."""
+    drive = lap_log(bean_track(), overrun=60.0)
+    drive = noisy(replace(drive, odometry_sigma=np.array([0.1, 0.1, 0.02])), seed=3)
+    mapper, results = FixedLagMapper(MapperSettings(), drive.odometry_sigma), []
+    for cycle in split_odometry(drive):
+        results.append(mapper.update(*cycle))
+        if mapper.closed:
+            break
+    assert len(mapper.corrected_poses) == len(results)
+    online, truth = np.array([result.pose for result in results]), true_poses(drive)[: len(results)]
+    before, after = (wrap_angle(poses[:, 2] - truth[:, 2]) for poses in (online, mapper.corrected_poses))
+    assert np.abs(after).max() < 0.02
+    assert np.square(after).mean() < np.square(before).mean()
+    before, after = (np.hypot(*(poses - truth)[:, :2].T) for poses in (online, mapper.corrected_poses))
+    assert np.square(after).mean() < 0.5 * np.square(before).mean()
+
+
+def test_the_smoothed_trajectory_is_the_corrected_poses_by_their_stamps() -> None:
     mapper, results = run()
-    closes = closing_cycle(results)
-    assert len(mapper.corrected_poses) == closes + 1
-    assert isinstance(mapper.loop.record, DriveRecord)
+    t, corrected = np.array([result.t for result in results]), mapper.corrected_poses
+    assert len(corrected) == closing_cycle(results) + 1
+    smoothed = mapper.smoothed(t)
+    np.testing.assert_array_equal(smoothed[: len(corrected)], corrected)
+    assert np.isnan(smoothed[len(corrected) :]).all()
+    np.testing.assert_array_equal(mapper.smoothed(t[3:5] + 1e-3), corrected[3:5])
+    assert np.isnan(FixedLagMapper().smoothed(t)).all()
+    whole = run_online(log(), FixedLagMapper(MapperSettings(), log().odometry_sigma))
+    assert whole.smoothed is not None
+    np.testing.assert_array_equal(whole.smoothed[: len(corrected)], corrected)
+    np.testing.assert_array_equal(whole.smoothed[len(corrected) :], whole.trajectory[len(corrected) :])
 
 
 def test_the_worker_solves_the_lap_as_this_process_does() -> None:

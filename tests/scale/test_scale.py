@@ -185,6 +185,9 @@ def assert_alike(found: RunResult, known: RunResult, scale: float) -> None:
     size = scale * np.ptp(known.trajectory[:, :2])
     weights = np.array([scale, scale, 1.0])
     np.testing.assert_allclose(found.trajectory, known.trajectory * weights, rtol=0.0, atol=CLOSE * size)
+    assert (found.smoothed is None) == (known.smoothed is None)
+    if known.smoothed is not None:
+        np.testing.assert_allclose(found.smoothed, known.smoothed * weights, rtol=0.0, atol=CLOSE * size)
     for label, boundary in known.map.boundaries.items():
         other = found.map.boundaries[label]
         assert isinstance(boundary, SplineBoundary)

@@ -51,6 +51,17 @@ def test_the_trajectory_has_other_colours_where_it_is_not_good() -> None:
     assert "lost" not in legend(plot_map(ring_map(), trajectory=trajectory, health=[]))
 
 
+def test_a_smoothed_trajectory_is_drawn_over_the_poses_of_their_time() -> None:
+    trajectory, smoothed = np.arange(12.0).reshape(4, 3), np.ones((4, 3))
+    figure = plot_map(ring_map(), trajectory=trajectory, smoothed=smoothed, health=["lost"] * 4)
+    lines = {line.get_label(): line for line in figure.axes[0].get_lines()}
+    thin, drawn = lines["poses as estimated at their time"], lines["trajectory"]
+    np.testing.assert_array_equal(thin.get_xydata(), trajectory[:, :2])
+    np.testing.assert_array_equal(drawn.get_xydata(), smoothed[:, :2])
+    np.testing.assert_array_equal(lines["lost"].get_xydata(), smoothed[:, :2])
+    assert thin.get_linewidth() < drawn.get_linewidth()
+
+
 def test_a_tentative_stretch_is_dashed() -> None:
     ring = shifted_ring(18.0)
     ring = replace(ring, confirmed_until=0.5 * sum(ring.spline.domain))
