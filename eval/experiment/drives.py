@@ -25,6 +25,8 @@ TRACK_SUFFIXES: Final = (".yaml", ".yml", ".csv")
 """Suffixes of track files."""
 _IDENTITY_DIGITS: Final = 20
 """Number of hexadecimal digits of an identity, which are 80 bits."""
+_SEED_DIGITS: Final = 8
+"""Number of hexadecimal digits of a seed."""
 _TRUTH: Final = {
     name: name for name in ("pose_t", "poses", "cones", "cone_labels", "associations", "calibration")
 } | {"sensor": "true_sensor", "noise": "true_noise"}
@@ -59,7 +61,7 @@ class Drive:
     track: NamedTrack
     """Track of the drive."""
     seed: int
-    """Seed of the drive and its noise."""
+    """Number of the drive on its track."""
     noise: str
     """Name of the noise."""
     simulation: SimulationSettings
@@ -71,13 +73,18 @@ class Drive:
         return {"track": self.track.name, "seed": self.seed, "noise": self.noise}
 
     @cached_property
+    def own_seed(self) -> int:
+        """Seed of the simulation: drives of one seed on several tracks are independent samples."""
+        return int(identity(track=self.track.digest, seed=self.seed)[:_SEED_DIGITS], 16)
+
+    @cached_property
     def id(self) -> str:
         """Identity of everything that the log depends on, except the code."""
-        return identity(track=self.track.digest, seed=self.seed, simulation=asdict(self.simulation))
+        return identity(track=self.track.digest, seed=self.own_seed, simulation=asdict(self.simulation))
 
     def simulate(self) -> Log:
         """Simulate the log."""
-        return simulate(self.track.track, self.simulation, self.seed)
+        return simulate(self.track.track, self.simulation, self.own_seed)
 
 
 def identity(**parts: Any) -> str:

@@ -1,9 +1,10 @@
 """The drive as it was measured, its poses along the curves, and its batch when the loop closes."""
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
+from multiprocessing import current_process
 from typing import Any, Final, cast
 
 import numpy as np
@@ -263,11 +264,15 @@ def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
 
 @cache
 def _worker() -> Any:
+    if current_process().daemon:  # it may have no children: a worker of Dask is one
+        return ThreadPoolExecutor(max_workers=1)
     return loky.ProcessPoolExecutor(max_workers=1, timeout=WORKER_IDLE)
 
 
 def _end_worker() -> None:
-    _worker().shutdown(wait=False, kill_workers=True)
+    worker = _worker()
+    options = {} if isinstance(worker, ThreadPoolExecutor) else {"kill_workers": True}
+    worker.shutdown(wait=False, **options)
     _worker.cache_clear()
 
 
