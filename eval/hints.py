@@ -13,11 +13,11 @@ from typing import Annotated, Any, Final
 import numpy as np
 import pandas as pd
 import tyro
-from rich.console import Console
 from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 from tyro.conf import arg
 
+from pathspace_graph.console import note, progress, say
 from pathspace_graph.errors import PathspaceError, check_name
 from pathspace_graph.estimators import DEFAULT, make_online
 from pathspace_graph.eval.experiment.drives import NamedTrack, load_tracks
@@ -28,7 +28,6 @@ from pathspace_graph.io.log import Detections, Log, Odometry, write_log
 from pathspace_graph.labels import LEFT
 from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.plausibility.reading import read_plausible_log
-from pathspace_graph.progress import progress
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
@@ -353,12 +352,9 @@ def main() -> None:
     try:
         table = study.run()
     except PathspaceError as error:
-        Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(f"hints: {error}")
+        note(f"hints: {error}")
         raise SystemExit(BAD_INPUT) from error
-    console = Console(highlight=False, soft_wrap=True, markup=False)
-    console.print(table.title)
-    console.print(table.text())
-    console.print(f"written to {study.out}")
+    say(table.title, table.text(), f"written to {study.out}")
 
 
 if __name__ == "__main__":

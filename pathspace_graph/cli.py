@@ -1,5 +1,6 @@
 """The command line: it finds the command, and turns errors into one line and an exit code."""
 
+import os
 import signal
 import sys
 import threading
@@ -7,8 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
+from traceback import print_exc
 from typing import Any, Final
 
+from .console import VERBOSITY, Verbosity
 from .errors import PathspaceError, SettingsError, SolveError
 
 PROGRAM: Final = "pathspace-graph"
@@ -16,7 +19,15 @@ DONE: Final = 0
 BAD_INPUT: Final = 2
 NOT_SOLVED: Final = 3
 INTERRUPTED: Final = 130
+BROKEN_PIPE: Final = 141
 TERMINATED: Final = 143
+LEVELS: Final = {
+    "-q": Verbosity.QUIET,
+    "--quiet": Verbosity.QUIET,
+    "-v": Verbosity.VERBOSE,
+    "--verbose": Verbosity.VERBOSE,
+}
+"""Options that every command takes."""
 
 
 @dataclass(frozen=True)
@@ -66,18 +77,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(
             signal.SIGTERM, lambda *_: sys.exit(TERMINATED)
         )  # temporary files are removed on the way
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    levels = [LEVELS[word] for word in given if word in LEVELS]
+    before = VERBOSITY.set(levels[-1] if levels else Verbosity.NORMAL)
     try:
-        return _run(list(sys.argv[1:] if arguments is None else arguments))
+        return _run([word for word in given if word not in LEVELS])
     except SolveError as error:
         _refuse(str(error))
         return NOT_SOLVED
     except PathspaceError as error:
         return _refuse(str(error))
+    except BrokenPipeError:  # `| head` has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE
     except OSError as error:
         return _refuse(f"{error.filename or 'output'}: {error.strerror or error}")
     except KeyboardInterrupt:
         print(f"{PROGRAM}: interrupted", file=sys.stderr)
         return INTERRUPTED
+    finally:
+        VERBOSITY.reset(before)
 
 
 def _run(arguments: list[str]) -> int:
@@ -87,6 +106,9 @@ def _run(arguments: list[str]) -> int:
     elif first == "--version":
         kernels = import_module(".factors.kernels", __package__).KERNELS
         print(f"{PROGRAM} {version(PROGRAM)} (GTSAM {version('gtsam')}, {kernels} kernels)")
+    elif first == "--completion":
+        options = import_module(".options", __package__)
+        print(options.completion(PROGRAM, {name: command_class(name) for name in COMMANDS}, LEVELS))
     elif first in COMMANDS:
         command = parse_command(first, arguments[1:])
         if command is not None:
@@ -102,16 +124,31 @@ def overview() -> str:
     width = max(map(len, COMMANDS)) + 2
     lines = [f"  {name:<{width}}{command.summary}" for name, command in COMMANDS.items()]
     usage = f"usage: {PROGRAM} COMMAND [OPTIONS]"
-    return "\n".join([usage, "", *lines, "", f"{PROGRAM} COMMAND --help explains each command."])
+    notes = [
+        f"{PROGRAM} COMMAND --help explains each command.",
+        "-q prints errors and hints only, -v progress in lines and where an error comes from.",
+        f'eval "$({PROGRAM} --completion)" completes commands and options in bash and zsh.',
+    ]
+    return "\n".join([usage, "", *lines, "", *notes])
 
 
 def parse_command(name: str, arguments: list[str]) -> Any:
     """Return the command with its options, or None where its help was asked for and printed."""
     options = import_module(".options", __package__)
-    command = import_module(f".commands.{COMMANDS[name].module}", __package__)
-    return options.parse(getattr(command, COMMANDS[name].name), f"{PROGRAM} {name}", arguments)
+    return options.parse(command_class(name), f"{PROGRAM} {name}", arguments)
+
+
+def command_class(name: str) -> type[Any]:
+    """Return the dataclass of a command."""
+    found: type[Any] = getattr(
+        import_module(f".commands.{COMMANDS[name].module}", __package__), COMMANDS[name].name
+    )
+    return found
 
 
 def _refuse(message: str) -> int:
+    """Print the traceback of an error if asked, and its one line; return the exit code."""
+    if VERBOSITY.get() == Verbosity.VERBOSE:
+        print_exc()
     print(f"{PROGRAM}: {' '.join(message.split())}", file=sys.stderr)
     return BAD_INPUT

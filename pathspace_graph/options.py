@@ -3,7 +3,7 @@
 import io
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import redirect_stderr
 from dataclasses import MISSING as NO_DEFAULT
 from dataclasses import Field, fields, is_dataclass
@@ -108,6 +108,45 @@ def _check_options(command: type[Any], arguments: list[str]) -> None:
         name = option.removeprefix("--").replace("-", "_")
         if option.startswith("--") and name not in known:
             check_gone(name, option)
+
+
+# --- completion ------------------------------------------------------------------------------------------
+
+_COMPLETION: Final = """\
+[ -n "$ZSH_VERSION" ] && autoload -U +X bashcompinit && bashcompinit
+_pathspace_graph() {{
+  local words
+  case "$COMP_CWORD:${{COMP_WORDS[1]}}" in
+    1:*) words="{commands}" ;;
+{cases}
+  esac
+  COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
+}}
+complete -o default -F _pathspace_graph {program}"""
+
+
+def completion(program: str, commands: Mapping[str, type[Any]], common: Iterable[str]) -> str:
+    """Return a script for bash and zsh that completes the commands, their options and names of files."""
+    shared = ("--help", HELP_ALL, *common)
+    cases = [
+        f'    *:{name}) words="{" ".join((*_names(command), *shared))}" ;;'
+        for name, command in commands.items()
+    ]
+    return _COMPLETION.format(commands=" ".join(commands), cases="\n".join(cases), program=program)
+
+
+def _names(command: type[Any]) -> Iterator[str]:
+    """Yield the names of all options of a command."""
+    hints = get_type_hints(command)
+    for entry in fields(command):
+        prefix = "" if entry.name == "settings" else f"{entry.name}."
+        if is_dataclass(hints[entry.name]):
+            names = [f"{prefix}{leaf}" for leaf in leaves(hints[entry.name]())]
+        else:
+            names = [] if "Positional" in str(entry.type) else [entry.name]
+        yield from (f"--{name.replace('_', '-')}" for name in names)
+    if _estimates(command):
+        yield SETTINGS
 
 
 # --- help ------------------------------------------------------------------------------------------------

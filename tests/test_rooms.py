@@ -21,7 +21,7 @@ LATE["io.brief"] = {"eval.figures.pictures", "frames"}
 ASKED = {"io.brief"}
 """Modules that import from above by name where a user asks a record for its picture or its frame."""
 
-LEAVES = {"errors", "labels", "progress", "lengths"}
+LEAVES = {"errors", "labels", "console", "lengths"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "ckf", "landmark", "centerline"}
 BELOW_MAPPING = {

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Final
 
 import tyro
-from rich.console import Console
 
+from pathspace_graph.console import note, output, say
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.io.files import atomic_file, check_file_target, write_json
 
@@ -60,7 +60,7 @@ def main() -> None:
     try:
         worse = _run(benchmark)
     except PathspaceError as error:
-        Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(f"benchmark: {error}")
+        note(f"benchmark: {error}")
         raise SystemExit(BAD_INPUT) from error
     if worse:
         raise SystemExit(WORSE)
@@ -74,16 +74,16 @@ def _run(benchmark: Benchmark) -> bool:
     if benchmark.json is not None:
         with atomic_file(benchmark.json) as temporary:
             write_json(temporary, [asdict(metric) for metric in figures])
-    console = Console(highlight=False)
+    console = output()
     console.print(metrics_table(figures))
     best = measurement.gtsam
-    console.print(f"GTSAM at its best over {best.samples} windows: {best.ordering}")
+    say(f"GTSAM at its best over {best.samples} windows: {best.ordering}")
     found = compare(figures, read_baseline(benchmark.baseline)) if benchmark.compare else []
     if benchmark.compare:
         console.print(baseline_table(found))
     if benchmark.write_baseline:
         write_baseline(benchmark.baseline, figures)
-        console.print(f"baseline written to {benchmark.baseline}", soft_wrap=True)
+        say(f"baseline written to {benchmark.baseline}")
     return any(compared.worse for compared in found)
 
 

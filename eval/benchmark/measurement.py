@@ -16,13 +16,13 @@ from typing import Final
 
 import numpy as np
 
+from pathspace_graph.console import progress
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.measures import stage_times
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.progress import progress
 from pathspace_graph.run import ObservedCycle, run_online, split_odometry, timed_update
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate

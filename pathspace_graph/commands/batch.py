@@ -5,10 +5,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from rich.console import Console
 from tyro.conf import Positional, arg
 
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
+from pathspace_graph.console import note, progress, say
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT_BATCH, MapKind, check_batch, for_map, make_batch
 from pathspace_graph.eval.metrics.reference import gap
@@ -19,7 +19,6 @@ from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.results import BatchRun, write_result
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.plausibility.reading import read_plausible_log
-from pathspace_graph.progress import progress
 from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -64,13 +63,12 @@ class Batch:
         start = self.start or self.settings.batch.start
         write_result(self.out, result, summarize_batch(result, log, start, hints))
         report(result, log)
-        Console().print(f"written to {self.out}", highlight=False, soft_wrap=True, markup=False)
+        say(f"written to {self.out}")
         if not result.converged:
             reason = (
                 result.convergence.reason if isinstance(result, BatchResult) else "associations still change"
             )
-            line = f"not converged: {reason}"
-            Console(stderr=True).print(line, highlight=False, soft_wrap=True, markup=False)
+            note(f"not converged: {reason}")
             raise SystemExit(NOT_CONVERGED)
 
 

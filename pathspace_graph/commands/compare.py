@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Final
 
-from rich.console import Console
 from tyro.conf import Positional, arg
 
+from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.eval.experiment.compare import (
     Comparison,
     choose,
@@ -19,15 +19,12 @@ from pathspace_graph.eval.experiment.output import MARKER, write_comparison
 from pathspace_graph.eval.experiment.workers import check_jobs
 from pathspace_graph.eval.metrics.accuracy import GhostSettings
 from pathspace_graph.io.files import check_target
-from pathspace_graph.progress import progress
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .online import tell
 
 FAILED: Final = 3
 """Exit code of a comparison that is written, but in which an estimator failed."""
-FILE_WIDTH: Final = 160
-"""Characters in a line of a table that is not printed on a terminal."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,18 +75,14 @@ class Compare:
         self._report(comparison)
 
     def _report(self, comparison: Comparison) -> None:
-        console = Console()
-        if not console.is_terminal:
-            console = Console(width=FILE_WIDTH)
+        console = output(wide=True)
         for table in tables(comparison).values():
             console.print(table.title, highlight=False, markup=False)
             for part in table.parts(console.width):
                 console.print(part.rich())
-        console.print(f"written to {self.out}", highlight=False, soft_wrap=True, markup=False)
-        say = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
+        say(f"written to {self.out}")
         told = [(outcome.names, "not converged") for outcome in comparison.unsettled]
         told += [(outcome.names, f"failed, {outcome.failure}") for outcome in comparison.failures]
-        for names, what in told:
-            say.print(f"{names['estimator']} on {names['log']}: {what}")
+        note(*(f"{names['estimator']} on {names['log']}: {what}" for names, what in told))
         if comparison.failures:
             raise SystemExit(FAILED)

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated, Final, Literal
 
 import numpy as np
-from rich.console import Console
 from tyro.conf import Positional, arg
 
+from pathspace_graph.console import note, progress, say
 from pathspace_graph.convert.bag import BagOptions, read_bag
 from pathspace_graph.convert.recording import Recording, to_log, windowed
 from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings, Side, Window
@@ -24,7 +24,6 @@ from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import measured_line
 from pathspace_graph.plausibility.hint import because
 from pathspace_graph.plausibility.judge import hints
-from pathspace_graph.progress import progress
 from pathspace_graph.scale.scene import scale_of
 
 from .online import tell
@@ -201,16 +200,12 @@ def write_checked(log: Log, out: Path, source: Path) -> None:
 
 def report(notes: Counter[str], rule: LabelRule, log: Log, out: Path) -> None:
     """Print what the labels were taken for, what was left out or assumed how often, and the log in short."""
-    console = Console()
-    for text, count in notes.items():
-        if count:
-            console.print(f"{count} {text}", highlight=False, soft_wrap=True, markup=False)
+    say(*(f"{count} {text}" for text, count in notes.items() if count))
     measured = [] if log.measured is None else [measured_line(log.measured)]
     labels = [rule.told()] if rule.met else []
     if hint := rule.hint():
-        Console(stderr=True).print(f"hint: {hint}", highlight=False, soft_wrap=True, markup=False)
-    for line in (*labels, outline(log), *measured, f"{out}: {describe(log)}"):
-        console.print(line, highlight=False, soft_wrap=True, markup=False)
+        note(f"hint: {hint}")
+    say(*labels, outline(log), *measured, f"{out}: {describe(log)}")
 
 
 def outline(log: Log) -> str:

@@ -1,14 +1,13 @@
 """`demo`: the main job with no argument, on a simulated Formula Student track."""
 
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
 from joblib import Parallel, delayed, parallel_config
-from rich.console import Console
 from tyro.conf import arg
 
+from pathspace_graph.console import output, progress, say
 from pathspace_graph.estimators import DEFAULT, make_online
 from pathspace_graph.eval.experiment.cells import run_estimator
 from pathspace_graph.eval.experiment.compare import side_by_side
@@ -18,7 +17,6 @@ from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.io.files import atomic_folder, check_target
 from pathspace_graph.io.log import Log, write_log
 from pathspace_graph.io.results import RunResult, write_result
-from pathspace_graph.progress import progress
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
@@ -50,17 +48,14 @@ class Demo:
         check_target(self.out, PICTURE)
         with progress("driving"):
             log = simulate(generated_track(self.seed), SimulationSettings(laps=self.laps), self.seed)
-        say = partial(Console().print, highlight=False, soft_wrap=True, markup=False)
         say(f"a generated track, {self.laps} times around: {describe(log)}")
         result, rival = map_with_both(log, self.settings)
         write_demo(self.out, log, result)
         table = side_by_side({run.estimator: laps_of(run, log) for run in (result, rival)})
         if table.rows:
-            Console().print(table.rich())
+            output().print(table.rich())
         say(outline(result))
-        for line in not_mapped(result.map, log):
-            say(line)
-        say(f"log, map and {PICTURE} are in {self.out}")
+        say(*not_mapped(result.map, log), f"log, map and {PICTURE} are in {self.out}")
 
 
 def map_with_both(log: Log, settings: MapperSettings) -> tuple[RunResult, RunResult]:

@@ -8,10 +8,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
-from rich.console import Console
 from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT, MapKind, check_online, for_map, make_online
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
@@ -34,7 +34,6 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.plausibility.diagnosis import diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.plausibility.reading import read_plausible_log
-from pathspace_graph.progress import progress
 from pathspace_graph.run import Observer, OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
@@ -90,7 +89,7 @@ class Online:
         written = ", ".join(
             str(path) for path in (self.out, self.save_view, self.animate) if path is not None
         )
-        Console().print(f"written to {written}", highlight=False, soft_wrap=True, markup=False)
+        say(f"written to {written}")
 
     def _viewing(self) -> Any:
         """Return the module of viewers and films if one is asked for; importing matplotlib is slow."""
@@ -124,9 +123,7 @@ class Online:
 
 def tell(hints: Sequence[Hint], of: str = "") -> None:
     """Print a line for each hint as an error, with the name of the log `of` which it is, if given."""
-    say = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
-    for hint in hints:
-        say.print(f"hint: {of}{'/' if of else ''}{hint.line}")
+    note(*(f"hint: {of}{'/' if of else ''}{hint.line}" for hint in hints))
 
 
 def map_online(
@@ -145,25 +142,19 @@ def map_online(
 
 def report(result: RunResult, log: Log) -> None:
     """Print the run, the paper's table where there is truth, and as an error what was not mapped."""
-    console = Console()
     laps = laps_of(result, log)
     if laps:
-        console.print(laps_table(laps))
-    console.print(outline(result), highlight=False)
-    for record in result.cycles:
-        if record.notice:
-            console.print(
-                f"at {record.t:.1f} s: {record.notice}", highlight=False, soft_wrap=True, markup=False
-            )
+        output().print(laps_table(laps))
+    say(outline(result))
+    say(*(f"at {record.t:.1f} s: {record.notice}" for record in result.cycles if record.notice))
     if result.batches is not None and result.batches.late:
         late = f"{result.batches.late} cycle{'' if result.batches.late == 1 else 's'}"
-        console.print(f"in a vehicle the batch of the lap would have been {late} late", highlight=False)
+        say(f"in a vehicle the batch of the lap would have been {late} late")
     state = vehicle_of(result)
-    for line in noise_lines(result.noise) + ([] if state is None else diagnose(state, result.settings)):
-        console.print(line, highlight=False, soft_wrap=True, markup=False)
+    say(*noise_lines(result.noise), *([] if state is None else diagnose(state, result.settings)))
     missing = not_mapped(result.map, log)
     if missing:
-        Console(stderr=True).print("; ".join(missing), highlight=False, soft_wrap=True, markup=False)
+        note("; ".join(missing))
 
 
 def outline(result: RunResult) -> str:

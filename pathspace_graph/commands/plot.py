@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from threadpoolctl import threadpool_limits
 from tyro.conf import Positional
 
+from pathspace_graph.console import progress, say
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.figures.isolated import FIGURES, MARKER, write_figures
 from pathspace_graph.eval.figures.map_plot import plot_map
@@ -23,7 +23,6 @@ from pathspace_graph.io.results import (
     read_health,
     read_trajectory,
 )
-from pathspace_graph.progress import progress
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +78,7 @@ class Figures:
         with progress("drawing", len(FIGURES)) as advance, threadpool_limits(limits=1):
             write_figures(self.out, advance)
         names = ", ".join(figure.name for figure in FIGURES)
-        Console().print(f"{names}: {self.out}", highlight=False, soft_wrap=True, markup=False)
+        say(f"{names}: {self.out}")
 
 
 # --- files as they were written --------------------------------------------------------------------------
@@ -96,4 +95,4 @@ class Verify:
         """Check and report; a file that is missing or has changed ends it."""
         count = verify_all(self.folder)
         line = f"{self.folder}: {count} files are as they were written"
-        Console().print(line, highlight=False, soft_wrap=True, markup=False)
+        say(line)

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from rich.console import Console
 from tyro import MISSING
 from tyro.conf import arg
 
+from pathspace_graph.console import progress, say
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import LOG_FILE, Log, write_log
-from pathspace_graph.progress import progress
 from pathspace_graph.sim.simulate import PRESETS, SimulationSettings, preset, simulate
 from pathspace_graph.sim.track import EVENTS, Track
 from pathspace_graph.sim.track_files import read_track
@@ -60,7 +59,7 @@ class Simulate:
         with progress("driving"):
             log = simulate(self._track(), self.settings, self.seed)
             write_log(log, self.out)
-        Console().print(f"{self.out}: {describe(log)}", highlight=False, soft_wrap=True, markup=False)
+        say(f"{self.out}: {describe(log)}")
 
     def _track(self) -> Track:
         if self.track is not None:

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import pandas as pd
-from rich.console import Console
 from tyro.conf import Positional, arg
 
+from pathspace_graph.console import LINES, note, output, progress, say
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT, ONLINE, check_online
 from pathspace_graph.eval.benchmark.roads import QUICK, ScalingSettings, make_drives
@@ -24,15 +24,12 @@ from pathspace_graph.eval.experiment.study import Study, find_study, read_study
 from pathspace_graph.eval.experiment.workers import check_jobs
 from pathspace_graph.eval.report import FILE, Plan, measure_figures, read_figures, render_pages, to_json
 from pathspace_graph.io.files import check_target, write_json, write_manifest, write_text
-from pathspace_graph.progress import progress
 from pathspace_graph.settings.mapper import MapperSettings
 
 FIGURES: Final = Path("docs") / FILE
 """File of the figures, from the root of the project."""
 CELLS_FAILED: Final = 3
 """Exit code of a study that is written, but some of whose cells failed."""
-LINES: Final = 20
-"""About the number of lines of progress of a whole study where there is no terminal."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,11 +61,9 @@ class StudyCommand:
         plan = make_plan(study)
         with progress("runs", lines=LINES) as advance:
             frame = run_plan(plan, self.out, self.jobs, self.cluster, self.retry_failed, advance)
-        say = Console(soft_wrap=True, highlight=False, markup=False)
         text = write(study, frame, self.out)
         write_manifest(self.out)
-        say.print(text.rstrip("\n"))
-        say.print(f"\nwritten to {self.out}")
+        say(text.rstrip("\n"), f"\nwritten to {self.out}")
         report_failures(frame, len(plan.cells))
 
 
@@ -89,8 +84,7 @@ def report_failures(frame: pd.DataFrame, cells: int) -> None:
     """Say on standard error how many cells failed, and exit with code 3 where any did."""
     failures = frame[frame["failure"] != ""]
     if len(failures):
-        line = f"{len(failures)} of {cells} cells failed, the first of {failures.iloc[0]['failure']}"
-        Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(line)
+        note(f"{len(failures)} of {cells} cells failed, the first of {failures.iloc[0]['failure']}")
         raise SystemExit(CELLS_FAILED)
 
 
@@ -136,10 +130,6 @@ class FaultSuite(StudyCommand):
 # --- scale -----------------------------------------------------------------------------------------------
 
 
-FILE_WIDTH: Final = 160
-"""Characters in a line of a table that is not printed on a terminal."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Scale:
     """Time every online estimator on ever larger maps and more and more detections, and draw the slopes.
@@ -175,12 +165,8 @@ class Scale:
         with progress("timing", drives.cycles) as advance:
             scaling = measure_scaling(names, drives, measured, self.settings, advance)
         write_scaling(self.out, scaling)
-        console = Console()
-        if not console.is_terminal:
-            console = Console(width=FILE_WIDTH)
-        console.print(scaling_table(scaling).rich())
-        for line in (*stops(scaling), f"written to {self.out}"):
-            console.print(line, highlight=False, soft_wrap=True, markup=False)
+        output(wide=True).print(scaling_table(scaling).rich())
+        say(*stops(scaling), f"written to {self.out}")
 
 
 # --- report ----------------------------------------------------------------------------------------------
@@ -230,10 +216,8 @@ class Report:
             for page, text in pages.items():
                 write_text(page, text)
             written += [self.pages / FIGURES, *pages]
-        say = Console(soft_wrap=True, highlight=False, markup=False)
-        for name, table in tables.items():
-            say.print(f"{name}\n{table.markdown(table.sources)}".rstrip("\n"))
-        say.print(f"\nwritten to {', '.join(map(str, written))}")
+        say(*(f"{name}\n{table.markdown(table.sources)}".rstrip("\n") for name, table in tables.items()))
+        say(f"\nwritten to {', '.join(map(str, written))}")
 
 
 def commit_of(root: Path | None) -> str:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
 from dataclasses import asdict, replace
 from math import inf
 from pathlib import Path
@@ -172,3 +175,50 @@ def test_what_is_gone_is_no_setting_and_its_new_name_is_one() -> None:
 def test_the_estimators_have_few_settings() -> None:
     """A number that neither a user nor a study changes is a constant."""
     assert len(leaves(MapperSettings())) <= MOST_SETTINGS
+
+
+# --- what every command takes ----------------------------------------------------------------------------
+
+
+def test_a_quiet_command_prints_no_result_and_a_verbose_one_says_where_an_error_comes_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", "--out", str(tmp_path / "loud"), "--event", "acceleration"]) == 0
+    assert str(tmp_path / "loud") in capsys.readouterr().out
+    assert main(["-q", "simulate", "--out", str(tmp_path / "log"), "--event", "acceleration"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert (tmp_path / "log" / "log.toml").exists()
+    for option in ("--quiet", "-v"):
+        assert main(["plot", option, str(tmp_path / "none"), "--out", str(tmp_path / "map.png")]) == 2
+        *before, last = capsys.readouterr().err.splitlines()
+        assert last.endswith("none/map.json: expected a map, found none")
+        assert (before[:1] == ["Traceback (most recent call last):"]) == (option == "-v")
+    assert main(["simulate", "--out", str(tmp_path / "again"), "--event", "acceleration"]) == 0
+    assert capsys.readouterr().out, "quiet holds for one call"
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash isn't installed")
+def test_the_shell_completes_commands_and_options(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--completion"]) == 0
+    script = capsys.readouterr().out
+
+    def completed(*words: str) -> list[str]:
+        line = " ".join(("pathspace-graph", *words))
+        asked = f'COMP_WORDS=({line}); COMP_CWORD={len(words)}; _pathspace_graph; echo "${{COMPREPLY[@]}}"'
+        done = subprocess.run(
+            ["bash", "-c", f"{script}\n{asked}"], capture_output=True, text=True, check=True
+        )
+        return done.stdout.split()
+
+    assert completed("on") == ["online"]
+    assert completed("online", "--spline.deg") == ["--spline.degree"]
+    assert completed("batch", "MAP", "--spline.deg") == ["--spline.degree"]
+    assert completed("simulate", "--ev") == ["--event"]
+    assert completed("plot", "MAP", "--band") == ["--band-scale"]
+    assert completed("verify", "--spline") == []
+
+
+def test_a_reader_that_has_seen_enough_is_no_error() -> None:
+    command = f"{sys.executable} -m pathspace_graph --completion | head -c 1"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("[", "")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pathspace_graph.progress import progress, time_remaining
+from pathspace_graph.console import progress, time_remaining
 
 
 def test_the_time_that_remains_is_that_of_the_mean_step() -> None:

@@ -1,14 +1,56 @@
-"""Progress of long work, on standard error."""
+"""What a command prints: results on standard output, hints and the progress of long work on the other."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from datetime import timedelta
+from enum import IntEnum
+from typing import Final
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
+
+
+class Verbosity(IntEnum):
+    """How much is printed; hints and errors always are."""
+
+    QUIET = -1
+    """No results and no progress."""
+    NORMAL = 0
+    VERBOSE = 1
+    """Progress in lines where there is no terminal, and the traceback of an error."""
+
+
+VERBOSITY: Final = ContextVar("verbosity", default=Verbosity.NORMAL)
+FILE_WIDTH: Final = 160
+"""Width of tables where the output is no terminal (characters)."""
+LINES: Final = 20
+"""About the number of lines of progress, where they are printed."""
+
+
+def output(wide: bool = False) -> Console:
+    """Return the console for results; tables are `FILE_WIDTH` wide in a file if `wide`."""
+    quiet = VERBOSITY.get() == Verbosity.QUIET
+    console = Console(quiet=quiet)
+    return Console(quiet=quiet, width=FILE_WIDTH) if wide and not console.is_terminal else console
+
+
+def say(*lines: str) -> None:
+    """Print lines of a result, as they are."""
+    _print(output(), lines)
+
+
+def note(*lines: str) -> None:
+    """Print lines on standard error, as they are."""
+    _print(Console(stderr=True), lines)
+
+
+def _print(console: Console, lines: tuple[str, ...]) -> None:
+    for line in lines:
+        console.print(line, highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
 @contextmanager
@@ -17,11 +59,13 @@ def progress(description: str, total: int | None = None, lines: int = 0) -> Iter
 
     Without a terminal nothing is shown, unless `lines` asks for about that many lines over the whole work.
     """
-    console = Console(stderr=True, highlight=False)
+    level, console = VERBOSITY.get(), Console(stderr=True, highlight=False)
+    lines = {Verbosity.QUIET: 0, Verbosity.VERBOSE: LINES}.get(level, lines)
     text, remaining = TextColumn("{task.description}"), TextColumn("{task.fields[remaining]}")
     columns = (SpinnerColumn(), text, BarColumn(), MofNCompleteColumn(), remaining)
     shown = columns if total is not None or lines else columns[:2]
-    with Progress(*shown, console=console, transient=True, disable=not console.is_terminal) as display:
+    hidden = level == Verbosity.QUIET or not console.is_terminal
+    with Progress(*shown, console=console, transient=True, disable=hidden) as display:
         yield Steps(display, description, total, lines)
 
 
