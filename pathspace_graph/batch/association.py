@@ -9,7 +9,7 @@ from scipy.ndimage import minimum_filter1d
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.residuals import project
-from pathspace_graph.factors.se2 import to_map, to_vehicle
+from pathspace_graph.factors.se2 import rotated, to_map, to_vehicle
 from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionTable
@@ -216,10 +216,10 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
         state, points[~used], detections.cycle[rows[~used]], label, settings
     )
     u = np.mod(u - begin, boundary.length) if boundary.periodic else u - begin
-    weight = certainty(detections, rows)
+    covariances = covariances_map(detections, rows, state.poses)
 
     def clustered(chosen: BoolArray) -> Cones:
-        along = points[chosen], u[chosen], weight[chosen]
+        along = points[chosen], u[chosen], covariances[chosen]
         return cluster(*along, boundary.length, boundary.periodic, settings)
 
     cones = clustered(on_curve)
@@ -238,9 +238,9 @@ def cone_counts(state: State, detections: DetectionTable, settings: MapperSettin
     return [len(cones_of_curve(state, detections, label, settings).u) for label in state.boundaries]
 
 
-def certainty(detections: DetectionTable, rows: IntArray) -> Array:
-    """Return the weights (m,) of detections, the inverse traces of their covariances (1/m^2)."""
-    return np.asarray(1.0 / np.trace(detections.covariance[rows], axis1=1, axis2=2))
+def covariances_map(detections: DetectionTable, rows: IntArray, poses: Array) -> Array:
+    """Return the covariances (m, 2, 2) of detections in the map frame (m^2), by the poses (P, 3)."""
+    return rotated(detections.covariance[rows], poses[detections.cycle[rows], 2])
 
 
 def sharp(rows: IntArray, detections: DetectionTable) -> IntArray:
@@ -316,14 +316,16 @@ def without_folds(cones: Cones, periodic: bool) -> Cones:
 
 
 def cluster(
-    points: Array, u: Array, weight: Array, length: float, periodic: bool, settings: MapperSettings
+    points: Array, u: Array, covariances: Array, length: float, periodic: bool, settings: MapperSettings
 ) -> Cones:
     """Return a cone at each peak of the density of detections (m, 2) along a curve or a path.
 
-    u (m,) in [0, length] are the parameters of the detections (m), and weight (m,) is their information
-    (1/m^2). A cone has at least `growth.sightings` detections, all within the merge radius of their peak.
+    u (m,) in [0, length] are the parameters of the detections (m), which are weighed by the inverse traces of
+    their covariances (m, 2, 2), map frame. A cone has at least `growth.sightings` detections, all within the
+    merge radius of their peak, and stands where these together say: what is smeared along one ray counts
+    across it.
     """
-    radius = settings.growth.merge_radius
+    radius, weight = settings.growth.merge_radius, 1.0 / np.trace(covariances, axis1=1, axis2=2)
     peaks = _peaks(u, weight, length, periodic, SEPARATION * radius)
     if len(peaks) == 0:
         return Cones(np.zeros((0, 2)), peaks, np.zeros(0, np.intp))
@@ -334,10 +336,13 @@ def cluster(
     inside = distance[np.arange(len(u)), nearest] < radius
     member = nearest[inside]
     count = np.bincount(member, minlength=len(peaks))
-    sums = [np.bincount(member, terms[inside], len(peaks)) for terms in (weight, *(weight * points.T))]
-    means = np.column_stack(sums[1:]) / np.maximum(sums[0], np.finfo(float).tiny)[:, None]
     enough = count >= max(settings.growth.sightings, MIN_SHARE * float(np.median(count)))
-    return without_folds(Cones(means, peaks, count).where(enough), periodic)
+    information, vector = np.zeros((len(peaks), 2, 2)), np.zeros((len(peaks), 2))
+    inverse = np.linalg.inv(covariances[inside])
+    np.add.at(information, member, inverse)
+    np.add.at(vector, member, np.einsum("mij,mj->mi", inverse, points[inside]))
+    means = np.asarray(np.linalg.solve(information[enough], vector[enough][:, :, None]), np.float64)[:, :, 0]
+    return without_folds(Cones(means, peaks[enough], count[enough]), periodic)
 
 
 def _peaks(u: Array, weight: Array, length: float, periodic: bool, apart: float) -> Array:

@@ -31,7 +31,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import Boundary
 
-from .association import MIN_CONES, add_drive, certainty, cluster, path_lengths
+from .association import MIN_CONES, add_drive, cluster, covariances_map, path_lengths
 from .simplification import boundary_of, exact_settings, fit_through
 
 ComplexArray = NDArray[np.complex128]
@@ -347,8 +347,8 @@ def _begin_boundary(
     side, ahead = SIDES[label] * lateral, station - recurrence.driven[cycles]
     kept = (side > MIN_LATERAL) & (side < MAX_LATERAL)
     kept &= (ahead > -gate.view_behind) & (ahead < gate.view_ahead) & (station >= 0.0) & (station < length)
-    weight = certainty(detections, rows[kept])
-    cones = cluster(points[kept], station[kept], weight, length, recurrence.recurs, settings)
+    covariances = covariances_map(detections, rows[kept], poses)
+    cones = cluster(points[kept], station[kept], covariances, length, recurrence.recurs, settings)
     if len(cones.u) >= MIN_CONES:
         spline = fit_through(cones.points, recurrence.recurs, settings, settings.batch.size_share)
         state.add_boundary(label, *boundary_of(spline, settings))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pathspace_graph.batch.association import (
     Cones,
@@ -29,10 +29,15 @@ def detected(u: Array, each: int, noise: float) -> tuple[Array, Array]:
     return np.column_stack([x, rng.normal(0.0, noise, len(x))]), x
 
 
+def round_covariances(information: ArrayLike) -> Array:
+    """Return covariances (m, 2, 2) that are the same in every direction, of an information (m,)."""
+    return np.eye(2) / np.asarray(information)[:, None, None]
+
+
 def test_every_cluster_is_a_cone() -> None:
     true = np.arange(2.0, 60.0, 4.0)
     points, u = detected(true, 30, 0.1)
-    cones = cluster(points, u, np.ones(len(u)), 62.0, False, SETTINGS)
+    cones = cluster(points, u, round_covariances(np.ones(len(u))), 62.0, False, SETTINGS)
     np.testing.assert_allclose(cones.points, np.column_stack([true, np.zeros(len(true))]), atol=0.1)
     np.testing.assert_array_equal(cones.count, np.full(len(true), 30))
 
@@ -40,18 +45,27 @@ def test_every_cluster_is_a_cone() -> None:
 def test_detections_on_both_sides_of_the_beginning_of_a_closed_curve_are_of_one_cone() -> None:
     u = np.array([0.2, 19.9, 19.9, 8.0, 8.4, 8.4])
     points = np.column_stack([np.mod(u + 10.0, 20.0), np.zeros(6)])
-    cones = cluster(points, u, np.array([2.0, 1.0, 1.0, 3.0, 0.5, 0.5]), 20.0, True, SETTINGS)
+    cones = cluster(points, u, round_covariances([2.0, 1.0, 1.0, 3.0, 0.5, 0.5]), 20.0, True, SETTINGS)
     np.testing.assert_array_equal(cones.count, [3, 3])
     np.testing.assert_allclose(np.sort(cones.points[:, 0]), [10.05, 18.1])
+
+
+def test_a_cone_stands_where_smeared_rays_meet() -> None:
+    """Far detections from one side lie along their ray; those along another ray say where on it."""
+    cone, along = np.array([10.0, 0.5]), np.array([[1.0, 0.0], [0.6, 0.8]])
+    off = np.array([-1.0, -0.6, 0.2, 0.9])
+    points = cone + np.concatenate([off[:, None] * ray for ray in along])
+    of_ray = [0.01 * np.eye(2) + 4.0 * np.outer(ray, ray) for ray in along]
+    cones = cluster(points, points[:, 0], np.repeat(of_ray, len(off), axis=0), 20.0, False, SETTINGS)
+    np.testing.assert_allclose(cones.points, [cone], atol=0.02)
 
 
 def test_a_cluster_of_few_detections_is_no_cone() -> None:
     true = np.arange(2.0, 60.0, 4.0)
     points, u = detected(true, 60, 0.1)
     others, others_u = detected(np.array([4.0, 24.0]), 4, 0.05)
-    cones = cluster(
-        np.concatenate([points, others]), np.append(u, others_u), np.ones(len(u) + 8), 62.0, False, SETTINGS
-    )
+    points, u = np.concatenate([points, others]), np.append(u, others_u)
+    cones = cluster(points, u, round_covariances(np.ones(len(u))), 62.0, False, SETTINGS)
     assert len(cones.u) == len(true)
 
 
