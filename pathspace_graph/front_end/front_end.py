@@ -56,6 +56,8 @@ class Reading:
     """(m,) Whether each of them lies where the cycles just before had one."""
     orange: Detections
     """Detections of orange cones, which bound no road."""
+    stated: Array
+    """(m, 2, 2) Covariances of the detections in m^2 as stated, before any noise was measured."""
     sensor_doubted: bool = False
     """Whether the readings so far contradict the prior of the sensor's yaw or latency."""
     measured: MapperSettings | None = None
@@ -114,6 +116,7 @@ class FrontEnd:
             judged,
             self._motion.seen_again,
             noise.for_map(orange),
+            detections.covariances,
             self._sensor_doubted,
             self._measured(odometry, replace(detections, labels=labels), motion),
             notice="; ".join(notices),

@@ -161,11 +161,18 @@ class MotionCheck:
         self._interval = min(self._interval, float(np.diff(measured).min(initial=np.inf)))
         ages = np.append(odometry.t[1:], t) - measured
         held = np.maximum(ages - max(HOLD, HOLD_INTERVALS * self._interval), 0.0)
-        sigma, missing = self.sigma, bool(held[-1] > 0.0)
+        excess, missing = np.zeros(3), bool(held[-1] > 0.0)
         if missing or held.any():
-            sigma = np.hypot(self.sigma, held[:, None] * np.array(self.settings.accelerations))
-        integrated = integrate_odometry(odometry, t, sigma)
-        return MeasuredMotion(integrated, odometry.twist, missing=missing, stuck=_is_stuck(odometry.twist))
+            excess = held[:, None] * np.array(self.settings.accelerations)
+        integrated = integrate_odometry(odometry, t, np.hypot(self.sigma, excess))
+        return MeasuredMotion(
+            integrated,
+            odometry.twist,
+            missing=missing,
+            stuck=_is_stuck(odometry.twist),
+            durations=np.diff(np.append(odometry.t, t)),
+            excess=excess,
+        )
 
     def _at_rest(self, motion: MeasuredMotion, detections: Detections, variances: Array) -> MeasuredMotion:
         """Return no motion at all, where the detections say so as well, or else the given one."""

@@ -1,6 +1,7 @@
 """Noise that is used in a drive: what the log states, or what the drive itself has shown so far."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
 from typing import Any, Final, Literal
@@ -111,6 +112,19 @@ class NoiseLearner:
         if covariances is None:
             covariances = measured.inflated(points, detections.covariances)
         return replace(detections, covariances=covariances)
+
+    def for_lap(
+        self, motions: Sequence[MeasuredMotion], detections: Sequence[Detections]
+    ) -> tuple[list[MeasuredMotion], list[Detections]]:
+        """Return the readings of a drive with the noise that is known now.
+
+        Its first seconds were driven before any was measured. They decide the heading of the map, so a lap
+        that is solved as a whole must not believe them more than the rest. The detections have their stated
+        covariances.
+        """
+        if self.of_odometry and self.measured is not None:
+            motions = [motion.with_sigma(self.twist_sigma) for motion in motions]
+        return list(motions), [self.for_map(cycle) for cycle in detections]
 
     def calibrated(self, settings: MapperSettings) -> MapperSettings:
         """Return settings with measured priors of the calibrations where one of the old ones is contradicted.

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from functools import cache
 from multiprocessing import current_process
 from typing import Any, Final, cast
@@ -17,7 +18,9 @@ from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, to_map, to_vehicle, wrap_angle
 from pathspace_graph.factors.sensor import corrected
+from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.log_odometry import chained
+from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import MeasuredMotion
@@ -65,8 +68,9 @@ SOLVED: Final = 3.0
 class DriveRecord:
     """The odometry, the detections and the poses of every cycle, kept as long as a batch can solve them."""
 
-    def __init__(self, settings: MapperSettings) -> None:
+    def __init__(self, settings: MapperSettings, noise: NoiseLearner) -> None:
         self.settings = settings
+        self._noise = noise
         self.unsolvable: str | None = None
         """Why the drive cannot be solved as a batch; None if it can be."""
         self.poses: list[Array] = []
@@ -86,14 +90,15 @@ class DriveRecord:
             self.unsolvable = reason
         self._motions, self._detections, self._orange = [], [], []
 
-    def measured(self, motion: MeasuredMotion, detections: Detections, orange: Detections) -> None:
-        """Add the motion that leads to a pose, and the detections there, those of orange cones apart."""
-        self.stamps.append(detections.t)
+    def measured(self, reading: Reading) -> None:
+        """Add the motion that leads to a pose, and the detections there with their stated covariances."""
+        motion = reading.motion
+        self.stamps.append(reading.detections.t)
         if self.unsolvable is not None:
             return
         self._motions.append(motion)
-        self._detections.append(detections)
-        self._orange.append(orange)
+        self._detections.append(replace(reading.detections, covariances=reading.stated))
+        self._orange.append(reading.orange)
         last = self._reckoned[-1] if self._reckoned else np.zeros(3)
         self._reckoned.append(_kept(compose(last, motion.odometry.delta)))
         if len(self.stamps) > self.settings.open_lap.max_cycles:
@@ -134,7 +139,8 @@ class DriveRecord:
 
     def seen(self, cycle: int, sensor: Array) -> Detections:
         """Return all detections of a cycle, corrected by the calibration (5,) of the sensor, or (0,)."""
-        both, twist = (self._detections[cycle], self._orange[cycle]), self._motions[cycle].odometry.twist
+        both = self._noise.for_map(self._detections[cycle]), self._orange[cycle]
+        twist = self._motions[cycle].odometry.twist
         points, covariances, labels = (
             np.concatenate([getattr(seen, name) for seen in both])
             for name in ("points_vehicle", "covariances", "labels")
@@ -180,11 +186,12 @@ class DriveRecord:
 
         The priors of the calibrations are those of the settings, which may have become wide.
         """
-        chain = chained(self.stamps, self._motions, settings.odometry)
+        motions, detections = self._noise.for_lap(self._motions, self._detections)
+        chain = chained(self.stamps, motions, settings.odometry)
         return OpenLap(
             settings=settings,
             chain=chain,
-            detections=DetectionTable.of(self._detections, twists=chain.twists),
+            detections=DetectionTable.of(detections, twists=chain.twists),
             first_kept=first_kept,
             start=start,
         )

@@ -11,6 +11,7 @@ from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.start import Recurrence
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Evidence, Health, HealthMonitor
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.motion import doubt_calibrations
@@ -48,7 +49,7 @@ class LoopRefusedError(Exception):
 class TrackLoop:
     """The batch of the open lap when the loop closes, and the search for a vehicle that is lost."""
 
-    def __init__(self, smoother: CurveSmoother, path: DrivenPath) -> None:
+    def __init__(self, smoother: CurveSmoother, path: DrivenPath, noise: NoiseLearner) -> None:
         self.settings = smoother.map.settings
         self.closed = False
         """Whether the loop has closed: the map has its final size."""
@@ -60,7 +61,7 @@ class TrackLoop:
         """Wall time (s) of the batch of the lap in its own process, once it has replaced the prior."""
         self.late_cycles = 0
         """Cycles by which the slowest batch is late in a vehicle, by its wall time."""
-        self.record = DriveRecord(self.settings)
+        self.record = DriveRecord(self.settings, noise)
         self.revisits = Revisits(smoother, path, self.record)
         self.mending = Mending(smoother)
         self._smoother = smoother

@@ -1,8 +1,8 @@
 """The motion between two perception cycles, the prediction by it (paper: Predict), and its calibration."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import inf
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
@@ -51,6 +51,17 @@ class MeasuredMotion:
     """Whether the twist stays the same to the last digit."""
     bias: BiasMeasurement | None = None
     """What the vehicle has measured at rest, where it has just done so."""
+    durations: Array | None = None
+    """(k,) Times for which the twists hold, s; None where the motion is not that of the odometry."""
+    excess: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) or (k, 3) Standard deviation of a twist that is held for long, beside that of its noise."""
+
+    def with_sigma(self, sigma: Array) -> Self:
+        """Return the motion by other standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
+        if self.durations is None:
+            return self
+        integrated = integrate_twists(self.durations, self.twists, np.hypot(sigma, self.excess))
+        return replace(self, odometry=integrated)
 
     @property
     def rests(self) -> bool:

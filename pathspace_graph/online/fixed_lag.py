@@ -65,7 +65,7 @@ class FixedLagMapper(MapperEstimate):
         self.orange = OrangeCones(self.settings.growth, self.settings.spline.sigma_shape)
         """Orange cones, which are points of the map."""
         self.smoother.add_followers(self.path, self.growth, self.orange)
-        self.loop = TrackLoop(self.smoother, self.path)
+        self.loop = TrackLoop(self.smoother, self.path, self.front_end.noise)
         if self.settings.open_lap.prior == "window":
             self.loop.record.give_up("no batch of the lap was asked for")
         self.recovery = Recovery()
@@ -247,7 +247,7 @@ class FixedLagMapper(MapperEstimate):
         predict(self.smoother, self.path, motion, t, self.settings)
         cycle, twist = self.smoother.next_cycle - 1, motion.odometry.twist
         self.orange.add(Sighting(cycle, self.poses[-1].copy(), twist, reading.orange), self._sensor)
-        self.loop.record.measured(motion, reading.detections, reading.orange)
+        self.loop.record.measured(reading)
         return reading
 
     @property

@@ -226,7 +226,7 @@ def test_steps_of_the_active_variables_are_steps_of_the_whole_system() -> None:
     mapper.smoother = smoother = Checked(EAGER)
     mapper.growth = Growth(smoother)
     smoother.add_followers(mapper.path, mapper.growth)
-    mapper.loop = TrackLoop(smoother, mapper.path)
+    mapper.loop = TrackLoop(smoother, mapper.path, mapper.front_end.noise)
     map_log(log, mapper)
     assert mapper.closed
     assert smoother.checked > 0.3 * len(log.cycles)

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.batch.start import Recurrence
+from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, RayNoise
+from pathspace_graph.factors.odometry import MIN_SIGMA, integrate_twists
 from pathspace_graph.factors.se2 import compose, wrap_angle
+from pathspace_graph.front_end.front_end import FrontEnd, Reading
+from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.variables import CALIBRATION_KEY, pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.drive_record import DriveRecord, bend
 from pathspace_graph.loop.recognition import RecognizedPlace
-from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry
+from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry, known_noise
 from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.calibration import OdometrySettings
@@ -35,7 +42,8 @@ def on_circle(angle: Array, side: float = 0.0) -> Array:
 
 def driven(laps: float, drift: float) -> DriveRecord:
     """Returns the record of a circle, driven for some laps; its odometry turns by `drift` rad/m too much."""
-    record, state, end = DriveRecord(MapperSettings()), State(), 2.0 * np.pi * laps
+    noise, end = NoiseLearner(known_noise(np.full(3, 0.01)), None), 2.0 * np.pi * laps
+    record, state = DriveRecord(MapperSettings(), noise), State()
     state.variables.insert(np.array([CALIBRATION_KEY]), np.zeros(2))
     state.variables.insert(pose_keys(np.arange(1)), np.zeros(3))
     angles = np.arange(0.0, end + 0.3, 3.0 / RADIUS)
@@ -46,7 +54,8 @@ def driven(laps: float, drift: float) -> DriveRecord:
         t, angle = CYCLE * cycle, SPEED * CYCLE * cycle / RADIUS
         step = integrate_odometry(Odometry(np.array([t - CYCLE]), twist), t, np.full(3, 0.01))
         nothing = Detections(t, *NOTHING)
-        record.measured(MeasuredMotion(step, twist), nothing, nothing)
+        motion, none = MeasuredMotion(step, twist), np.zeros(0, bool)
+        record.measured(Reading(motion, nothing, none, nothing, nothing.covariances))
         state.poses[-1] = np.append(on_circle(np.array([angle]))[0], angle)
         state.pose_u = {LEFT: np.array([angle * (RADIUS - 2.0)]), RIGHT: np.array([angle * (RADIUS + 2.0)])}
         record.estimated(state)
@@ -133,3 +142,27 @@ def test_a_known_heading_may_be_wrapped() -> None:
     found = bend(poses, known)
     np.testing.assert_allclose(found[:, :2], poses[:, :2], atol=1e-9)
     np.testing.assert_allclose(wrap_angle(found[:, 2] - poses[:, 2]), 0.0, atol=1e-9)
+
+
+# --- noise -----------------------------------------------------------------------------------------------
+
+
+def test_a_lap_is_solved_with_the_noise_that_is_known_when_it_closes() -> None:
+    """Cycle 0 was driven with the stated noise, before any was measured: it counts as the others do."""
+    stated, drift = np.array([0.01, 0.01, 0.002]), np.array([0.05, 0.05, 0.0017])
+    front_end = FrontEnd(MapperSettings(noise="measured"), KnownNoise(stated))
+    noise = front_end.noise
+    record = DriveRecord(MapperSettings(), noise)
+    cone = Detections(0.2, np.array([[6.0, 2.0]]), 1e-4 * np.eye(2)[None], np.array([LEFT]))
+    twist = np.array([[SPEED, 0.0, 0.3]] * 4)
+    for k in range(2):
+        odometry = Odometry(0.2 * k + np.array([0.0, 0.05, 0.1, 0.15]), twist)
+        record.measured(front_end.update(odometry, replace(cone, t=0.2 * (k + 1))))
+    along, across = RayNoise(np.array([0.1, 0.05])), RayNoise(np.array([0.0, 0.02]))
+    noise.measured = MeasuredNoise(stated, drift, 0.05, along, across)
+    lap = record.lap(0, Recurrence(np.zeros(2), 1.0, 0.0, 1.0), MapperSettings())
+    expected = integrate_twists(np.full(4, 0.05), twist, np.hypot(stated, drift / np.sqrt(0.05)))
+    found = lap.chain.odometry.intervals[0].covariance
+    np.testing.assert_allclose(found, expected.covariance, atol=2.0 * MIN_SIGMA**2)
+    np.testing.assert_array_equal(lap.detections.covariance, noise.for_map(cone).covariances[[0, 0]])
+    assert lap.detections.covariance[0, 0, 0] > 100.0 * cone.covariances[0, 0, 0]
