@@ -40,6 +40,9 @@ CONES: Final = 3
 """Least number of contradictions in a row that is mended."""
 BESIDE: Final = 0.5
 """Distance from a curve within which a cone does not contradict it (m)."""
+CERTAIN: Final = 1.0
+"""Standard deviation along its worst direction below which a detection may contradict the map (m): those of a
+far cone, smeared along their ray, are tracks beside a curve that the cone is on."""
 ROW: Final = 11.0
 """Largest distance of neighbours in a row (m): two regular gaps, since a cone may never be detected."""
 SETTLE: Final = 1.5
@@ -79,8 +82,10 @@ class Contradictions:
             unexplained[on - new.start] |= ~known.is_mapped(label, detections.u[on])
         rows = rows[unexplained]
         if len(rows):
-            points = detections.points_map(rows, track.variables)
             covariances = detections.covariances_map(rows, track.variables)
+            certain = np.linalg.eigvalsh(covariances)[:, -1] < CERTAIN**2
+            rows, covariances = rows[certain], covariances[certain]
+            points = detections.points_map(rows, track.variables)
             add_by_label(self._tracks, detections.label[rows], points, covariances, t)
 
     def clear(self) -> None:

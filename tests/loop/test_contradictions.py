@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.finding import KnownLoop, Loop, is_mapped
-from pathspace_graph.loop.mending import SETTLE, SIGHTINGS, Contradictions, in_rows
+from pathspace_graph.loop.mending import CERTAIN, SETTLE, SIGHTINGS, Contradictions, in_rows
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -47,6 +48,7 @@ def seen(
     label: int = LEFT,
     times: int = SIGHTINGS,
     found: Contradictions | None = None,
+    sigmas: tuple[float, float] = (0.1, 0.1),
 ) -> Contradictions:
     """Contradictions after cones were detected from a vehicle that stands at the origin; it has no map."""
     mapper = FixedLagMapper()
@@ -57,6 +59,7 @@ def seen(
     own = to_vehicle(points, np.zeros((len(points), 3)))
     for number in range(times):
         cycle = detections(0.1 * number, own, np.full(len(points), label))
+        cycle = replace(cycle, covariances=np.tile(np.diag(sigmas) ** 2, (len(points), 1, 1)))
         new = smoother.map.detections.append(cycle, 0)
         found.observe(smoother.map, WithoutGaps(smoother), new, cycle.t)
     return found
@@ -87,6 +90,11 @@ def test_other_cones_are_not(cones: list[list[float]], why: str) -> None:
 
 def test_a_cone_that_is_seen_less_often_does_not_count() -> None:
     assert seen(ROW, times=SIGHTINGS - 1).stretches(lane(), LATER) == []
+
+
+def test_detections_that_are_smeared_along_their_ray_do_not_count() -> None:
+    assert seen(ROW, sigmas=(1.01 * CERTAIN, 0.1)).stretches(lane(), LATER) == []
+    assert len(seen(ROW, sigmas=(0.99 * CERTAIN, 0.1)).stretches(lane(), LATER)) == 1
 
 
 def test_there_are_none_until_the_vehicle_has_passed_all_of_them() -> None:
