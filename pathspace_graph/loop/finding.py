@@ -267,7 +267,7 @@ class Search:
         self._seen: list[Detections] = []
         self._tried = smoother.times[-1]
         self._last: Motion | None = None
-        self._agreed = 0
+        self._agreed, self._missed = 0, 0  # attempts in a row
 
     def observe(self, pose: Array, detections: Detections) -> None:
         """Remember a cycle: its pose (3,) by odometry, and its detections."""
@@ -290,6 +290,11 @@ class Search:
         self._agreed = self._agreed + 1 if self._confirms(best.motion) else 1
         self._last = best.motion
         return best if self._agreed >= CONFIRMATIONS else None
+
+    @property
+    def is_off_map(self) -> bool:
+        """Return whether no place of the map agrees with what was seen, several times in a row."""
+        return self._missed >= CONFIRMATIONS
 
     def _confirms(self, motion: Motion) -> bool:
         newest = self._poses[-1][None, :2]
@@ -314,7 +319,9 @@ class Search:
         places = [self._refined(state, seen, Motion(centre, vector), i) for vector, i in self._starts(seen)]
         places = sorted(places, key=lambda place: -place.score)
         if not places or places[0].score < MIN_SCORE:
+            self._missed += 1
             return None
+        self._missed = 0
         best = places[0].found
         rivals = [place.score for place in places[1:] if not self._same(place.found, best)]
         if rivals and rivals[0] > places[0].score - MARGIN:

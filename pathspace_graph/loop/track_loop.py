@@ -37,6 +37,8 @@ RECOGNITION_INTERVAL: Final = 10.0
 """Least distance of two attempts to recognize the place (m along the path)."""
 REVISITED: Final = "the road was met again, and the open map is laid on its earlier pass"
 """Notice of the first cycle with a revisit."""
+NEW_ROAD: Final = "the vehicle has left the closed map, and is on new road"
+"""Reason of the health there, and notice of the first cycle."""
 LEARNED: Final = "the drive contradicts the calibration, which is learned"
 """Notice of the cycle in which the priors of the calibrations are first doubted."""
 
@@ -68,6 +70,7 @@ class TrackLoop:
         self._monitor = HealthMonitor(self.settings.health)
         self._known_loop = KnownLoop(smoother)
         self._search: Search | None = None
+        self._lost = Health()  # as it was when the search began
         self._lap_batch: LapBatch | None = None
         self._batch_ends: list[int] = []
         self._boundaries_cross = False
@@ -357,17 +360,22 @@ class TrackLoop:
         ready = self._known_loop.is_whole and self._lap_batch is None
         if self.health.condition == LOST and ready:
             self._smoother.map.detections.release_all()
-            self._search = Search(self._smoother)
+            self._search, self._lost = Search(self._smoother), self.health
             self.mending.contradictions.clear()
             self.record.give_up("the vehicle was lost")
 
-    def find_back(self) -> tuple[Array | None, str]:
-        """Start the window anew where a lost vehicle is found; return its jump (3,) and a notice."""
+    def find_back(self, *, sees_road: bool) -> tuple[Array | None, str]:
+        """Start the window anew where a lost vehicle is found; return its jump (3,) and a notice.
+
+        Where no place of the map agrees, but it `sees_road`, it has left the map, and is not lost.
+        """
         if self._search is None or self._rests:
             return None, ""
         found = self._search.find()
         if found is None:
-            return None, ""
+            before, is_new = self.health, self._search.is_off_map and sees_road
+            self.health = Health(DEGRADED, NEW_ROAD) if is_new else self._lost
+            return None, NEW_ROAD if is_new and before == self._lost else ""
         first_cycle = max(self._search.first_cycle, self._smoother.first_cycle)
         self._search, self.health = None, Health(DEGRADED, FOUND)
         self._monitor.restart()
