@@ -179,9 +179,13 @@ class TrackLoop:
         if self.closed:
             self.record.followed(self._smoother.variables.poses[-1])
         else:
-            self._record_open_lap()
+            self.record.estimated(self._smoother.map.state)
         if self._rests:
             return None, ""
+        if not self.closed and self._path.length > self.settings.closing.min_path:
+            self.record.prepare()
+            if self._lap_batch is None:
+                self._try_loop()
         if not self.closed and self._lap_batch is None:
             jump = self.revisits.use()
             if jump is not None:
@@ -190,7 +194,9 @@ class TrackLoop:
         batch = self._lap_batch
         if batch is None:
             self._hold_gauge()
-            self._try_mending()
+            may_mend = self._known_loop.is_whole and self._search is None and self.record.unsolvable is None
+            if may_mend and self.mending.is_due(self._known_loop, self._path.length):
+                self._begin_batch(self.mending.begin(np.array(self.record.poses)))
         elif self._smoother.next_cycle - 1 >= batch.due:
             return self._end(batch, spent)
         return None, ""
@@ -207,13 +213,6 @@ class TrackLoop:
             self._lap_batch.send()
         elif not self.closed:
             self.record.resume()
-
-    def _record_open_lap(self) -> None:
-        self.record.estimated(self._smoother.map.state)
-        if self._path.length > self.settings.closing.min_path and not self._rests:
-            self.record.prepare()
-            if self._lap_batch is None:
-                self._try_loop()
 
     def _end(self, batch: LapBatch, spent: float) -> tuple[Array | None, str]:
         """Take the result of a batch that is due, wait for the next cycle, or give the batch up.
@@ -262,13 +261,6 @@ class TrackLoop:
         driven = np.array(self.record.poses)[:, :2]
         return set(splines) == set(BOUNDARIES) and boundaries_cross(splines, SAMPLE, driven)
 
-    def _try_mending(self) -> None:
-        record = self.record
-        if not self._known_loop.is_whole or self._search is not None or record.unsolvable is not None:
-            return
-        if self.mending.is_due(self._known_loop, self._path.length):
-            self._begin_batch(self.mending.begin(np.array(record.poses)))
-
     def _hold_gauge(self) -> None:
         """Hold the position and heading of the closed map as a whole, once enough laps were driven on it.
 
@@ -312,18 +304,15 @@ class TrackLoop:
         """
         if self._lap_batch is not None:
             self._lap_batch.give_up()
-        open_lap, first, cycle = (
-            self.settings.open_lap,
-            self._smoother.first_cycle,
-            self._smoother.next_cycle - 1,
-        )
+        open_lap, smoother = self.settings.open_lap, self._smoother
+        first, cycle = smoother.first_cycle, smoother.next_cycle - 1
         wait = max(min(open_lap.cycles, cycle - first), int(open_lap.cycles_share * cycle))
         first_kept, due = min(first + wait, cycle), cycle + wait
         last = max(due, min(due + open_lap.late, first_kept + self.settings.max_poses - 1))
         recorded = open_lap.ends[len(self._batch_ends) :][:1]
         lap = self.record.lap(first_kept, start, self._believed)
         due = min(max([due, *recorded]), last + 1)
-        self._lap_batch = LapBatch(lap, self._smoother.times[-1], due, last)
+        self._lap_batch = LapBatch(lap, smoother.times[-1], due, last)
 
     def _try_loop(self) -> None:
         """Send the lap to a batch from odometry where the drive says that it is over.
@@ -334,21 +323,16 @@ class TrackLoop:
         if length < self._loop_tried or set(boundaries) != set(BOUNDARIES):
             return
         self._loop_tried = length + self.settings.closing.check_interval
-        recurrence = self._recurrence()
+        if self.record.unsolvable is not None:
+            return
+        recurrence = self.record.recurrence()
+        if recurrence is None and length >= self._recognition_tried + RECOGNITION_INTERVAL:
+            self._recognition_tried = length
+            place = recognize(self._smoother)
+            recurrence = None if place is None else self.record.recurrence_since(place)
         if recurrence is not None:
             self._loop_tried = length + self.settings.open_lap.retry
             self._begin_batch(recurrence)
-
-    def _recurrence(self) -> Recurrence | None:
-        record = self.record
-        if record.unsolvable is not None:
-            return None
-        found = record.recurrence()
-        if found is not None or self._path.length < self._recognition_tried + RECOGNITION_INTERVAL:
-            return found
-        self._recognition_tried = self._path.length
-        place = recognize(self._smoother)
-        return None if place is None else record.recurrence_since(place)
 
     # --- a vehicle that is lost --------------------------------------------------------------------------
 

@@ -80,9 +80,7 @@ class Row:
 
     @property
     def end(self) -> Array:
-        """Return the last point (2,) of the row."""
-        end: Array = self.line[-1]
-        return end
+        return np.asarray(self.line[-1])
 
     @property
     def tracks(self) -> Array:
@@ -269,9 +267,8 @@ def look_ahead(
         variances = tentative[label].variances(chosen) + SIGMA_CONE**2
         if label in state.boundaries:
             known, longer = state.control_points(label), copy(state.boundaries[label])
-            end, placement = longer.confirmed_end, None
-            if len(chosen):
-                placement = longer.extend(len(known), end + row.lengths)
+            end = longer.confirmed_end
+            placement = longer.extend(len(known), end + row.lengths) if len(chosen) else None
             outlooks[label] = Outlook(longer, known, end, row.tracks, variances, placement)
         elif len(chosen) >= MIN_TRACKS:
             outlooks[label] = _begun(track.settings, row, variances)
