@@ -243,16 +243,6 @@ def _sigma_of_position(smoother: CurveSmoother) -> float:
     return math.sqrt(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy))
 
 
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """A place where the vehicle may be."""
-
-    found: RefinedMotion
-    """Motion of the window onto the place."""
-    score: float
-    """Agreement of the detections with the map there, from 0 to 1."""
-
-
 class Search:
     """What a lost vehicle has seen, and the search for its place on a closed map."""
 
@@ -267,7 +257,7 @@ class Search:
         self._seen: list[Detections] = []
         self._tried = smoother.times[-1]
         self._last: Motion | None = None
-        self._agreed = 0
+        self._agreed, self._missed = 0, 0  # attempts in a row
 
     def observe(self, pose: Array, detections: Detections) -> None:
         """Remember a cycle: its pose (3,) by odometry, and its detections."""
@@ -287,16 +277,17 @@ class Search:
         if best is None:
             self._agreed, self._last = 0, None
             return None
-        self._agreed = self._agreed + 1 if self._confirms(best.motion) else 1
+        newest, agrees = self._poses[-1][None, :2], False
+        if self._last is not None:
+            agrees = _distance(best.motion.apply(newest)[0], self._last.apply(newest)[0]) < APART
+        self._agreed = self._agreed + 1 if agrees else 1
         self._last = best.motion
         return best if self._agreed >= CONFIRMATIONS else None
 
-    def _confirms(self, motion: Motion) -> bool:
-        newest = self._poses[-1][None, :2]
-        if self._last is None:
-            return False
-        apart = motion.apply(newest) - self._last.apply(newest)
-        return bool(np.hypot(*apart[0]) < APART)
+    @property
+    def is_off_map(self) -> bool:
+        """Return whether no place of the map agrees with what was seen, several times in a row."""
+        return self._missed >= CONFIRMATIONS
 
     def _best(self) -> RefinedMotion | None:
         """Return the motion onto the place that is clearly better than all others, if there is one.
@@ -312,18 +303,17 @@ class Search:
         self.loop = lay_out_loop(state)
         centre = self._poses[-1][:2]
         places = [self._refined(state, seen, Motion(centre, vector), i) for vector, i in self._starts(seen)]
-        places = sorted(places, key=lambda place: -place.score)
-        if not places or places[0].score < MIN_SCORE:
+        places = sorted(places, key=lambda place: -place[0])
+        if not places or places[0][0] < MIN_SCORE:
+            self._missed += 1
             return None
-        best = places[0].found
-        rivals = [place.score for place in places[1:] if not self._same(place.found, best)]
-        if rivals and rivals[0] > places[0].score - MARGIN:
+        self._missed = 0
+        most, best = places[0]
+        at = best.motion.vector[:2]
+        rivals = [score for score, found in places if _distance(found.motion.vector[:2], at) >= APART]
+        if rivals and rivals[0] > most - MARGIN:
             return None
         return best if worst_sigma(best.covariance) < SIGMA_MAX else None
-
-    def _same(self, a: RefinedMotion, b: RefinedMotion) -> bool:
-        apart = np.hypot(*(a.motion.vector - b.motion.vector)[:2])
-        return bool(apart < APART)
 
     def _sightings(self) -> Sightings:
         labels = np.concatenate([one.labels for one in self._seen])
@@ -381,23 +371,27 @@ class Search:
         shift = means - centre - turn * (mean - centre)
         return np.column_stack([shift.real, shift.imag, np.angle(turn)]), np.sqrt((misfit**2).mean(axis=1))
 
-    def _refined(self, state: State, seen: Sightings, start: Motion, i: int) -> Hypothesis:
-        """Return the hypothesis that registration makes of a motion onto point `i` of the middle."""
-        poses = np.array(self._poses)
+    def _refined(self, state: State, seen: Sightings, start: Motion, i: int) -> tuple[float, RefinedMotion]:
+        """Return what registration makes of a motion onto point `i` of the middle, after its score.
+
+        The score is the agreement of the detections with the map there, from 0 to 1.
+        """
+        poses, gate, stretches = np.array(self._poses), self.settings.gate, dict[int, tuple[float, float]]()
         driven = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
-        stretches = {
-            label: self._stretch(state, label, float(u[i]), driven) for label, u in self.loop.beside.items()
-        }
+        for label, u in self.loop.beside.items():  # what the vehicle has seen on a path that ends there
+            tables = state.boundaries[label].tables
+            low = float(u[i]) - driven - gate.station_room
+            high = float(u[i]) + gate.view_ahead + gate.station_room
+            whole = high - low >= tables.high - tables.low
+            stretches[label] = (tables.low, tables.high) if whole else (low, high)
         prior = start.vector, np.diag(np.array(SIGMAS_PLACE) ** -2)
         found = refine(state, seen, start, stretches, prior, self.settings.closing)
         distance = self.loop.distances(seen.labels, found.motion.apply(seen.points), REACH)
-        return Hypothesis(found, float(np.exp(-0.5 * (distance / SIGMA_FIT) ** 2).mean()))
+        return float(np.exp(-0.5 * (distance / SIGMA_FIT) ** 2).mean()), found
 
-    def _stretch(self, state: State, label: int, u: float, driven: float) -> tuple[float, float]:
-        """Return the stretch of a curve that the vehicle has seen on a path that ends beside u (m)."""
-        gate, tables = self.settings.gate, state.boundaries[label].tables
-        low, high = u - driven - gate.station_room, u + gate.view_ahead + gate.station_room
-        return (low, high) if high - low < tables.high - tables.low else (tables.low, tables.high)
+
+def _distance(a: Array, b: Array) -> float:
+    return float(np.hypot(*(a - b)))
 
 
 def start_anew(smoother: CurveSmoother, first_cycle: int, found: RefinedMotion) -> Array:

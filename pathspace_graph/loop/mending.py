@@ -195,7 +195,8 @@ class Mending:
         stretches, self._stretches = self._stretches, []
         if isinstance(marginal, str):
             return ""
-        label, cones = _cones(stretches)
+        label = np.repeat([one.label for one in stretches], [len(one.cones) for one in stretches])
+        cones = np.concatenate([one.cones for one in stretches])
         end = len(marginal.poses)
         cones = carried(cones, self._lap, marginal.poses[end - len(self._lap) :])
         distance = np.full(len(cones), np.inf)
@@ -209,12 +210,6 @@ class Mending:
         self.contradictions.clear()
         names = [name for number, name in enumerate(NAMES) if (label[explained] == number).any()]
         return f"{MENDED}: {int(explained.sum())} more cones on the {' and on the '.join(names)} lie on it"
-
-
-def _cones(stretches: list[Stretch]) -> tuple[IntArray, Array]:
-    """Return the label (k,) and the place (k, 2) of each cone of stretches."""
-    labels = np.repeat([one.label for one in stretches], [len(one.cones) for one in stretches])
-    return labels, np.concatenate([one.cones for one in stretches])
 
 
 def carried(points: Array, before: Array, after: Array) -> Array:

@@ -15,7 +15,7 @@ from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.batch.start import unwrap
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import compose, inverse, relative, rotation, to_map, to_vehicle
-from pathspace_graph.front_end.scan_matching import ERRORS, Match, RecentDetections, match, reaches
+from pathspace_graph.front_end.scan_matching import ERRORS, RecentDetections, match, reaches
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import HEADING
 from pathspace_graph.mapping.revisit import Revisit
@@ -89,7 +89,10 @@ class Revisits:
         known = RecentDetections()
         known.add(0.0, earlier, np.zeros((len(earlier), 2, len(ERRORS))), np.zeros(3))
         found = match(known, to_vehicle(seen, poses[-1:]), variances, poses[-1], reaches())
-        if not is_place(found, poses[-1]):
+        share = found.matched / len(found.is_matched)
+        drift = float(np.hypot(*(found.pose - poses[-1])[:2]))
+        agrees = found.is_certain and share > MIN_SHARE and found.misfit < MOST_MISFIT
+        if not agrees or drift >= MOST_DRIFT:
             return None
         keyframes = np.array(smoother.keyframe_cycles)
         first, later = int(keyframes[np.abs(keyframes - place).argmin()]), smoother.first_cycle
@@ -127,23 +130,12 @@ def earlier_pass(poses: Array) -> int | None:
 
 def have_parted(poses: Array, stations: Array, place: int) -> bool:
     """Return whether the ways to the newest of the poses (P, 3) and to an earlier place were apart."""
-    back = np.arange(0.0, min(float(stations[place]), WAY), WAY_STEP)
-    ways = [way_to(poses, stations, cycle, back) for cycle in (place, len(poses) - 1)]
+    back, ways = np.arange(0.0, min(float(stations[place]), WAY), WAY_STEP), []
+    for cycle in (place, len(poses) - 1):
+        at = stations[cycle] - back
+        points = np.column_stack([np.interp(at, stations, poses[:, k]) for k in range(2)])
+        ways.append(to_vehicle(points, poses[cycle][None]))
     return bool((np.hypot(*(ways[0] - ways[1]).T) > DIVERGED).any())
-
-
-def way_to(poses: Array, stations: Array, cycle: int, back: Array) -> Array:
-    """Return where the vehicle was at distances (n,) before a cycle along the path, (n, 2), as seen there."""
-    at = stations[cycle] - back
-    points = np.column_stack([np.interp(at, stations, poses[:, k]) for k in range(2)])
-    return to_vehicle(points, poses[cycle][None])
-
-
-def is_place(found: Match, believed: Array) -> bool:
-    """Return whether a match of detections is a place, near the pose (3,) that was believed."""
-    share = found.matched / len(found.is_matched)
-    near = float(np.hypot(*(found.pose - believed)[:2])) < MOST_DRIFT
-    return near and found.is_certain and share > MIN_SHARE and found.misfit < MOST_MISFIT
 
 
 def measured_revisit(

@@ -38,6 +38,8 @@ RECOGNITION_INTERVAL: Final = 10.0
 """Least distance of two attempts to recognize the place (m along the path)."""
 REVISITED: Final = "the road was met again, and the open map is laid on its earlier pass"
 """Notice of the first cycle with a revisit."""
+NEW_ROAD: Final = "the vehicle has left the closed map, and is on new road"
+"""Reason of the health there, and notice of the first cycle."""
 LEARNED: Final = "the drive contradicts the calibration, which is learned"
 """Notice of the cycle in which the priors of the calibrations are first doubted."""
 
@@ -69,6 +71,7 @@ class TrackLoop:
         self._monitor = HealthMonitor(self.settings.health)
         self._known_loop = KnownLoop(smoother)
         self._search: Search | None = None
+        self._lost = Health()  # as it was when the search began
         self._lap_batch: LapBatch | None = None
         self._batch_ends: list[int] = []
         self._boundaries_cross = False
@@ -177,9 +180,13 @@ class TrackLoop:
         if self.closed:
             self.record.followed(self._smoother.variables.poses[-1])
         else:
-            self._record_open_lap()
+            self.record.estimated(self._smoother.map.state)
         if self._rests:
             return None, ""
+        if not self.closed and self._path.length > self.settings.closing.min_path:
+            self.record.prepare()
+            if self._lap_batch is None:
+                self._try_loop()
         if not self.closed and self._lap_batch is None:
             jump = self.revisits.use()
             if jump is not None:
@@ -188,7 +195,9 @@ class TrackLoop:
         batch = self._lap_batch
         if batch is None:
             self._hold_gauge()
-            self._try_mending()
+            may_mend = self._known_loop.is_whole and self._search is None and self.record.unsolvable is None
+            if may_mend and self.mending.is_due(self._known_loop, self._path.length):
+                self._begin_batch(self.mending.begin(np.array(self.record.poses)))
         elif self._smoother.next_cycle - 1 >= batch.due:
             return self._end(batch, spent)
         return None, ""
@@ -205,13 +214,6 @@ class TrackLoop:
             self._lap_batch.send()
         elif not self.closed:
             self.record.resume()
-
-    def _record_open_lap(self) -> None:
-        self.record.estimated(self._smoother.map.state)
-        if self._path.length > self.settings.closing.min_path and not self._rests:
-            self.record.prepare()
-            if self._lap_batch is None:
-                self._try_loop()
 
     def _end(self, batch: LapBatch, spent: float) -> tuple[Array | None, str]:
         """Take the result of a batch that is due, wait for the next cycle, or give the batch up.
@@ -260,13 +262,6 @@ class TrackLoop:
         driven = np.array(self.record.poses)[:, :2]
         return set(splines) == set(BOUNDARIES) and boundaries_cross(splines, SAMPLE, driven)
 
-    def _try_mending(self) -> None:
-        record = self.record
-        if not self._known_loop.is_whole or self._search is not None or record.unsolvable is not None:
-            return
-        if self.mending.is_due(self._known_loop, self._path.length):
-            self._begin_batch(self.mending.begin(np.array(record.poses)))
-
     def _hold_gauge(self) -> None:
         """Hold the position and heading of the closed map as a whole, once enough laps were driven on it.
 
@@ -310,18 +305,15 @@ class TrackLoop:
         """
         if self._lap_batch is not None:
             self._lap_batch.give_up()
-        open_lap, first, cycle = (
-            self.settings.open_lap,
-            self._smoother.first_cycle,
-            self._smoother.next_cycle - 1,
-        )
+        open_lap, smoother = self.settings.open_lap, self._smoother
+        first, cycle = smoother.first_cycle, smoother.next_cycle - 1
         wait = max(min(open_lap.cycles, cycle - first), int(open_lap.cycles_share * cycle))
         first_kept, due = min(first + wait, cycle), cycle + wait
         last = max(due, min(due + open_lap.late, first_kept + self.settings.max_poses - 1))
         recorded = open_lap.ends[len(self._batch_ends) :][:1]
         lap = self.record.lap(first_kept, start, self._believed)
         due = min(max([due, *recorded]), last + 1)
-        self._lap_batch = LapBatch(lap, self._smoother.times[-1], due, last)
+        self._lap_batch = LapBatch(lap, smoother.times[-1], due, last)
 
     def _try_loop(self) -> None:
         """Send the lap to a batch from odometry where the drive says that it is over.
@@ -332,21 +324,16 @@ class TrackLoop:
         if length < self._loop_tried or set(boundaries) != set(BOUNDARIES):
             return
         self._loop_tried = length + self.settings.closing.check_interval
-        recurrence = self._recurrence()
+        if self.record.unsolvable is not None:
+            return
+        recurrence = self.record.recurrence()
+        if recurrence is None and length >= self._recognition_tried + RECOGNITION_INTERVAL:
+            self._recognition_tried = length
+            place = recognize(self._smoother)
+            recurrence = None if place is None else self.record.recurrence_since(place)
         if recurrence is not None:
             self._loop_tried = length + self.settings.open_lap.retry
             self._begin_batch(recurrence)
-
-    def _recurrence(self) -> Recurrence | None:
-        record = self.record
-        if record.unsolvable is not None:
-            return None
-        found = record.recurrence()
-        if found is not None or self._path.length < self._recognition_tried + RECOGNITION_INTERVAL:
-            return found
-        self._recognition_tried = self._path.length
-        place = recognize(self._smoother)
-        return None if place is None else record.recurrence_since(place)
 
     # --- a vehicle that is lost --------------------------------------------------------------------------
 
@@ -358,17 +345,22 @@ class TrackLoop:
         ready = self._known_loop.is_whole and self._lap_batch is None
         if self.health.condition == LOST and ready:
             self._smoother.map.detections.release_all()
-            self._search = Search(self._smoother)
+            self._search, self._lost = Search(self._smoother), self.health
             self.mending.contradictions.clear()
             self.record.give_up("the vehicle was lost")
 
-    def find_back(self) -> tuple[Array | None, str]:
-        """Start the window anew where a lost vehicle is found; return its jump (3,) and a notice."""
+    def find_back(self, *, sees_road: bool) -> tuple[Array | None, str]:
+        """Start the window anew where a lost vehicle is found; return its jump (3,) and a notice.
+
+        Where no place of the map agrees, but it `sees_road`, it has left the map, and is not lost.
+        """
         if self._search is None or self._rests:
             return None, ""
         found = self._search.find()
         if found is None:
-            return None, ""
+            before, is_new = self.health, self._search.is_off_map and sees_road
+            self.health = Health(DEGRADED, NEW_ROAD) if is_new else self._lost
+            return None, NEW_ROAD if is_new and before == self._lost else ""
         first_cycle = max(self._search.first_cycle, self._smoother.first_cycle)
         self._search, self.health = None, Health(DEGRADED, FOUND)
         self._monitor.restart()

@@ -46,6 +46,7 @@ class MapperEstimate:
     growth: Growth
     orange: OrangeCones
     loop: TrackLoop
+    new_road: "MapperEstimate | None"
 
     def __repr__(self) -> str:
         times, name = self.smoother.times, type(self).__name__
@@ -114,10 +115,13 @@ class MapperEstimate:
 
         This is what a controller asks for in each cycle, so it is fast, and nothing of the estimate changes.
         While the loop is open, it goes on beyond the confirmed ends through the cones of `outline`, and says
-        where. SettingsError is raised where a length is out of its range.
+        where. While the vehicle is lost on a closed map, it is the road as it has been mapped since then.
+        SettingsError is raised where a length is out of its range.
         """
         if not self.smoother.times:
             return track_ahead({}, np.zeros(POSE), distance, step)
+        if self.new_road is not None:
+            return self.new_road.ahead(distance, step)
         pose, state = self.poses[-1], self.smoother.map.state
         if not self.closed:
             t = self.smoother.times[-1]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Final, Self
 
 import gtsam
 import numpy as np
@@ -15,9 +15,10 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd, Reading, at_nearest_pose
 from pathspace_graph.front_end.gate import Admitted
+from pathspace_graph.health import GOOD
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import RunNoise
-from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.loop.closing import apply_correspondences, optimize_loop, simplify
 from pathspace_graph.loop.track_loop import LoopRefusedError, TrackLoop
 from pathspace_graph.mapping.motion import known_noise, predict
@@ -32,6 +33,9 @@ from pathspace_graph.snapshot import restore, save
 
 from .estimate import MapperEstimate
 from .growth import Growth
+
+ROAD: Final = 10.0
+"""Length of both boundaries beside a lost vehicle from which on they are a road (m)."""
 
 
 def careful(process: partial[CycleResult]) -> partial[CycleResult]:
@@ -69,6 +73,8 @@ class FixedLagMapper(MapperEstimate):
         if self.settings.open_lap.prior == "window":
             self.loop.record.give_up("no batch of the lap was asked for")
         self.recovery = Recovery()
+        self.new_road: FixedLagMapper | None = None
+        """The road beside a lost vehicle, mapped anew in the frame of the pose in which the search began."""
         self._unused: Odometry | None = None  # twists of a cycle that was left out
         self._grown: frozenset[int] = frozenset()
 
@@ -139,12 +145,13 @@ class FixedLagMapper(MapperEstimate):
             self.loop.record.give_up("the batch of the lap does not know the user's factors")
         if careful:
             self.loop.pause()
-        reading = self._predict(cycle.odometry, cycle.detections)
+            self.new_road = None
+        reading = self.front_end.update(cycle.odometry, cycle.detections)
+        self._predict(reading)
         watch.lap("predict")
         self._classify(reading)  # detections that no curve explains may expand one
         watch.lap("classify")
         self._expand()
-        self.smoother.deactivate_distant()
         watch.lap("expand")
         self._update()
         watch.lap("update")
@@ -159,7 +166,7 @@ class FixedLagMapper(MapperEstimate):
             self._place_orange_again()
         watch.lap("swap")
         if self.loop.is_searching:
-            jump, notice = self.loop.find_back()
+            jump, notice = self._find(reading)
         watch.lap("find")
         if self.closed:
             self.growth.clear()
@@ -237,18 +244,13 @@ class FixedLagMapper(MapperEstimate):
 
     # --- the steps of the paper --------------------------------------------------------------------------
 
-    def _predict(self, odometry: Odometry, detections: Detections) -> Reading:
-        """Add the pose of the cycle by the calibrated odometry, and extend the driven path.
-
-        Return the readings as the front end has judged them.
-        """
-        reading = self.front_end.update(odometry, detections)
-        motion, t = reading.motion, detections.t
+    def _predict(self, reading: Reading) -> None:
+        """Add the pose of the cycle by the calibrated odometry, and extend the driven path."""
+        motion, t = reading.motion, reading.detections.t
         predict(self.smoother, self.path, motion, t, self.settings)
         cycle, twist = self.smoother.next_cycle - 1, motion.odometry.twist
         self.orange.add(Sighting(cycle, self.poses[-1].copy(), twist, reading.orange), self._sensor)
         self.loop.record.measured(reading)
-        return reading
 
     @property
     def _sensor(self) -> Array:
@@ -273,6 +275,7 @@ class FixedLagMapper(MapperEstimate):
         if not self.closed:
             path_ahead = self.path.ahead(self.poses[-1], self.settings.growth.reach)
             self._grown = self.growth.expand(path_ahead)
+        self.smoother.deactivate_distant()
 
     def _update(self) -> None:
         """Take the Gauss-Newton steps of a cycle, each relinearized at the current estimate."""
@@ -298,6 +301,27 @@ class FixedLagMapper(MapperEstimate):
 
     def _simplify(self) -> None:
         simplify(self.smoother)
+
+    # --- off the closed map ------------------------------------------------------------------------------
+
+    def _find(self, reading: Reading) -> tuple[Array | None, str]:
+        """Map the road beside a lost vehicle anew, until its place on the closed map is found."""
+        if self.new_road is None:
+            open_lap = replace(self.settings.open_lap, prior="window")
+            settings = replace(self.settings, scale=1.0, open_lap=open_lap)
+            self.new_road = FixedLagMapper(settings, self.odometry_sigma)
+        road = self.new_road
+        road._predict(reading)
+        road._classify(reading)
+        road._expand()
+        road._update()
+        road.smoother.marginalize()
+        ends = [boundary.confirmed_end for boundary in road.boundaries.values()]
+        sees_road = len(ends) == len(BOUNDARIES) and min(ends) > ROAD and road.loop.health.condition == GOOD
+        jump, notice = self.loop.find_back(sees_road=sees_road)
+        if jump is not None:
+            self.new_road = None
+        return jump, notice
 
     def _result(self, t: float, stages: dict[str, float], jump: Array | None, notice: str) -> CycleResult:
         detections = self.smoother.map.detections

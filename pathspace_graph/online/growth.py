@@ -121,10 +121,7 @@ class Growth:
         return False
 
     def _follow_path(self, label: int, path_ahead: PathAhead, end: End, room: float) -> bool:
-        """Extrapolate an end that the vehicle has passed: the curve follows the path at the end's distance.
-
-        It does not where that is farther than `room` (m). Return whether the curve has grown.
-        """
+        """Extrapolate an end that was passed, at its distance from the path; True if the curve has grown."""
         side = max(end.side, MIN_LATERAL)
         point = path_ahead.beside(path_ahead.driven - CARRIED_TO, SIDES[label] * side)
         distance = float(np.hypot(*(point - end.position)))
@@ -136,10 +133,7 @@ class Growth:
         return True
 
     def _extend_through(self, label: int, end: Array, points: Array) -> Array:
-        """Extend a curve from its end (2,) through points (k, 2); return their parameters (k,).
-
-        The parameters increase by the distances between the points.
-        """
+        """Extend a curve from its end (2,) through points (k, 2); return their parameters (k,)."""
         boundary, known = self._state.boundaries[label], self._state.control_points(label)
         u = boundary.confirmed_end + np.cumsum(_distances(np.concatenate([end[None], points])))
         control_points = boundary.grow(known.copy(), u, points)
@@ -253,7 +247,6 @@ class Growth:
     # --- bounds ------------------------------------------------------------------------------------------
 
     def _is_full(self, label: int, path_ahead: PathAhead) -> bool:
-        """Return whether an open curve grows no further, since it is longer than it can be."""
         boundary, longest = self._state.boundaries[label], LENGTH_FREE + LENGTH_DRIVEN * path_ahead.driven
         if boundary.size < self.settings.max_size and boundary.confirmed_end < longest:
             return False

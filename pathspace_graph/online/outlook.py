@@ -80,9 +80,7 @@ class Row:
 
     @property
     def end(self) -> Array:
-        """Return the last point (2,) of the row."""
-        end: Array = self.line[-1]
-        return end
+        return np.asarray(self.line[-1])
 
     @property
     def tracks(self) -> Array:
@@ -183,45 +181,33 @@ class Outlook:
         """Return the curve."""
         return self.boundary.spline(self.control_points)
 
-    def linear(self, vehicle: Array) -> tuple[Array, Array]:
-        """Return A (2m, 2n + 3) and N (2m, 2m): the control points have the covariance `A Sigma A' + N`.
-
-        Sigma is the joint covariance of the known control points and of the newest pose `vehicle` (3,), from
-        which the tracks were seen. The placement is linear in both, in the tracks' own errors, and in the
-        second differences, which have the standard deviation `SIGMA_BEND`.
-        """
-        placement, eye, size = self.placement, np.eye(POINT), self.known.size
-        if placement is None:
-            return np.eye(size, size + POSE), np.zeros((size, size))
-        kept, by_track = POINT * placement.kept, np.kron(placement.by_target, eye)
-        A = np.zeros((kept + len(by_track), size + POSE))
-        A[:kept, :kept] = np.eye(kept)
-        A[kept:, POINT * placement.first : size] = np.kron(placement.by_known, eye)
-        A[kept:, size:] = by_track @ _by_pose(self.tracks, vehicle)
-        noise = (placement.by_target * self.variances) @ placement.by_target.T
-        noise += SIGMA_BEND**2 * placement.by_bend @ placement.by_bend.T
-        N = np.zeros((len(A), len(A)))
-        N[kept:, kept:] = np.kron(noise, eye)
-        return A, N
-
 
 def joint_covariance_of(
     outlooks: Sequence[Outlook], joint: Array, vehicle: Array
 ) -> tuple[Array, list[slice]]:
     """Return the joint covariance of the control points of all curves, and the block of each curve.
 
-    `joint` is the covariance of the known control points of all curves and, last, of the pose `vehicle` (3,).
+    `joint` is the covariance of the known control points of all curves and, last, of the pose `vehicle` (3,),
+    from which the tracks were seen. The placement is linear in both, in the tracks' own errors, and in the
+    second differences, which have the standard deviation `SIGMA_BEND`.
     """
-    changes, noises, blocks, begin, end = [], [], [], 0, 0
+    changes, noises, blocks, begin, end, eye = [], [], [], 0, 0, np.eye(POINT)
     for outlook in outlooks:
-        A, N = outlook.linear(vehicle)
-        size = outlook.known.size
-        change = np.zeros((len(A), len(joint)))
-        change[:, begin : begin + size], change[:, -POSE:] = A[:, :size], A[:, size:]
+        placement, known = outlook.placement, outlook.known.size
+        kept = known if placement is None else POINT * placement.kept
+        size = kept if placement is None else kept + POINT * len(placement.by_target)
+        change, noise = np.zeros((size, len(joint))), np.zeros((size, size))
+        change[:kept, begin : begin + kept] = np.eye(kept)
+        if placement is not None:
+            first = begin + POINT * placement.first
+            change[kept:, first : begin + known] = np.kron(placement.by_known, eye)
+            change[kept:, -POSE:] = np.kron(placement.by_target, eye) @ _by_pose(outlook.tracks, vehicle)
+            own = (placement.by_target * outlook.variances) @ placement.by_target.T
+            noise[kept:, kept:] = np.kron(own + SIGMA_BEND**2 * placement.by_bend @ placement.by_bend.T, eye)
         changes.append(change)
-        noises.append(N)
-        blocks.append(slice(end, end + len(A)))
-        begin, end = begin + size, end + len(A)
+        noises.append(noise)
+        blocks.append(slice(end, end + size))
+        begin, end = begin + known, end + size
     T = np.concatenate(changes)
     covariance = T @ joint @ T.T + block_diag(*noises)
     return np.asarray(0.5 * (covariance + covariance.T)), blocks
@@ -269,9 +255,8 @@ def look_ahead(
         variances = tentative[label].variances(chosen) + SIGMA_CONE**2
         if label in state.boundaries:
             known, longer = state.control_points(label), copy(state.boundaries[label])
-            end, placement = longer.confirmed_end, None
-            if len(chosen):
-                placement = longer.extend(len(known), end + row.lengths)
+            end = longer.confirmed_end
+            placement = longer.extend(len(known), end + row.lengths) if len(chosen) else None
             outlooks[label] = Outlook(longer, known, end, row.tracks, variances, placement)
         elif len(chosen) >= MIN_TRACKS:
             outlooks[label] = _begun(track.settings, row, variances)

@@ -413,7 +413,7 @@ def test_predicted_is_that_of_the_dense_joint_covariance_with_the_newest_pose(to
     """The newest pose was not in the step: its odometry predicts it and adds noise."""
     mapper = drive_bean(MapperSettings(), 59)
     smoother, odometry = mapper.smoother, list(split_odometry(lap_log(bean_track(), 0.0)))[59]
-    mapper._predict(*odometry)
+    mapper._predict(mapper.front_end.update(*odometry))
     step = smoother.last_step
     assert step is not None
     lower = np.tril(step.factor)

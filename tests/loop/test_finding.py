@@ -71,6 +71,7 @@ def test_a_vehicle_that_is_put_down_farther_on_is_lost_and_found(distance: float
     assert jump is not None and np.hypot(*jump[:2]) > 1.0
     assert conditions[found] == DEGRADED and set(conditions[found + 12 :]) == {GOOD}
     assert stamps[found] < lost + 6.0
+    assert set(conditions[conditions.index(LOST) : found]) == {LOST}  # and not on new road
     assert apart(log, results)[found:].max() < 1.0
     assert results[found].stages["find"] > 0.0
 

@@ -1,17 +1,22 @@
-"""Drives of several laps whose vehicle is put down elsewhere, which its odometry does not see."""
+"""Drives of several laps whose vehicle is put down elsewhere, or leaves the circuit by a lane of its own."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pathspace_graph.factors.se2 import left_of, to_map
 from pathspace_graph.io.log import Log, Odometry, Truth
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.sim.track import Track, to_map_frame
-from pathspace_graph.sim.vehicle import VehicleSettings, drive
+from pathspace_graph.sim.vehicle import VehicleSettings, drive, integrate
 
-from .drives import exact_log, noisy
+from .drives import DT, exact_log, noisy
+
+Array = NDArray[np.float64]
 
 
 def pear_track(skew: float = 0.15, half_width: float = 1.8, gap: float = 3.0) -> Track:
@@ -69,3 +74,45 @@ def put_down(log: Log, t: float, distance: float) -> Log:
 def _outside(t: np.ndarray, begin: float, end: float) -> np.ndarray:
     """Returns which stamps (n,) are before `begin`, or not before `end` (s)."""
     return (t < begin - 1e-9) | (t >= end - 1e-9)
+
+
+# --- a lane beside the circuit ---------------------------------------------------------------------------
+
+HALF_WIDTH, GAP, SPEED = 1.8, 3.0, 7.0
+"""Half the width of the lane, the distance of its cones (m), and the speed on it (m/s)."""
+
+
+@cache
+def circuit_with_lane(radius: float = 18.0, leaves: float = 25.0) -> tuple[Log, float, float]:
+    """Return the log of a lap and `leaves` metres, of a round on a lane to the right, and of the next lap.
+
+    The lane is a circle (radius in m) from and to the same place of the circuit. Return the stamps (s) at
+    which the vehicle leaves and is back, too.
+    """
+    track = to_map_frame(pear_track())
+    settings = VehicleSettings(speed_max=8.0, speed_start=6.0)
+    twists = drive(track, 3, settings, np.random.default_rng(0)).twists
+    road = integrate(twists[:-1], DT)
+    lap = np.mean([_stations(np.append(row, row[:1], axis=0))[-1] for row in (track.left, track.right)])
+    first = int(_stations(road[:, :2]).searchsorted(lap + leaves))
+    count = round(2.0 * np.pi * radius / SPEED / DT)
+    lane = np.tile([SPEED, 0.0, -2.0 * np.pi / (count * DT)], (count, 1))
+    on_lane = integrate(lane, DT)
+    at = on_lane[_stations(on_lane[:, :2]).searchsorted(np.arange(0.0, 2.0 * np.pi * radius - GAP / 2, GAP))]
+    across = HALF_WIDTH * left_of(np.column_stack([np.cos(at[:, 2]), np.sin(at[:, 2])]))
+    rows = [to_map(at[:, :2] + side * across, road[first, None]) for side in (1.0, -1.0)]
+    new, new_labels = np.concatenate(rows), np.repeat([LEFT, RIGHT], len(at))
+    free = _away(track.cones, to_map(on_lane[:, :2], road[first, None])) > 0.8 * HALF_WIDTH
+    new_free = (_away(new, road[:first, :2]) > 0.8 * HALF_WIDTH) & (_away(new, track.cones) > 1.0)
+    cones = np.concatenate([track.cones[free], new[new_free]])
+    labels = np.concatenate([track.cone_labels[free], new_labels[new_free]]).astype(np.intp)
+    log = exact_log(np.concatenate([twists[:first], lane, twists[first:]]), cones, labels)
+    return noisy(log, seed=5, sigma=0.05), first * DT, (first + count) * DT
+
+
+def _stations(points: Array) -> Array:
+    return np.append(0.0, np.hypot(*np.diff(points, axis=0).T).cumsum())
+
+
+def _away(points: Array, line: Array) -> Array:
+    return np.asarray(np.hypot(*(points[:, None] - line).transpose(2, 0, 1)).min(axis=1))
