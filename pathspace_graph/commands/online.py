@@ -61,9 +61,7 @@ class Online:
     animate: Path | None = None
     """File for a film (.gif, or .mp4 if ffmpeg is installed); an earlier one is kept as a numbered backup."""
     recording: RecordingSettings = field(default_factory=RecordingSettings)
-    """What the viewer shows."""
     film: FilmSettings = field(default_factory=FilmSettings)
-    """The film."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
     """Settings of the estimator."""
 
