@@ -3,6 +3,7 @@
     python examples/ros2_node.py --ros-args -r odometry:=/odom -r detections:=/cones -p markers:=false
 
 Detections are a PointCloud2 with labels, or with `markers:=true` a MarkerArray. Only `main` needs ROS.
+docs/ros2.md has the topics, frames and QoS.
 """
 
 from __future__ import annotations
@@ -15,27 +16,26 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph import FixedLagMapper, Map, SplineBoundary
+from pathspace_graph import LEFT, RIGHT, FixedLagMapper, Map, SplineBoundary
 from pathspace_graph.convert.settings import SIGMA_ODOMETRY, Frames
 from pathspace_graph.convert.stream import MessageStream
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.io.files import write_json
 from pathspace_graph.io.map import MAP_FILE, map_to_json
-from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.run import CycleResult
 
 Array = NDArray[np.float64]
 
 STEP = 1.0
-"""Points of a boundary are published at this distance (m)."""
+"""Distance of the published points of a boundary (m)."""
 AHEAD = 20.0
-"""Boundaries and centre line are published in the vehicle's frame up to this distance (m)."""
+"""Distance up to which boundaries and centre line are published in the vehicle's frame (m)."""
 CENTRE = 2
-"""The line with this number is the centre line."""
+"""Number of the centre line among the lines."""
 COLOURS = {LEFT: (0.0, 0.2, 1.0), RIGHT: (1.0, 0.9, 0.0), CENTRE: (1.0, 1.0, 1.0)}
-"""Each line has this red, green and blue."""
+"""Red, green and blue of each line."""
 LINE_STRIP = 4
-"""A `Marker` of this type is a line."""
+"""Type of a `Marker` that is a line."""
 
 
 class Bridge:
@@ -46,7 +46,7 @@ class Bridge:
         self.stream = MessageStream(Frames(mounting))
 
     def update(self, message: Any, received: float) -> CycleResult | None:
-        """Maps a message with detections, received at this time (s); None means that it could not be used."""
+        """Map a message with detections, received at this time (s); return None if it could not be used."""
         cycle = self.stream.take_detections(message, received)
         if cycle is None:
             return None
@@ -59,23 +59,23 @@ class Bridge:
         return result
 
     def save(self, folder: Path) -> None:
-        """Writes `map.json` to a folder, which `pathspace-graph plot` and `export` read."""
+        """Write `map.json` to a folder, which `pathspace-graph plot` and `export` read."""
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / MAP_FILE, map_to_json(self.mapper.map()))
 
 
 def boundary_points(track: Map) -> dict[int, Array]:
-    """Returns points (n, 2) along each boundary, in m, map frame."""
-    found = {}
+    """Return points (n, 2) along each boundary, in m, map frame."""
+    points = {}
     for label, boundary in track.boundaries.items():
         if isinstance(boundary, SplineBoundary):
             count = max(2, int(boundary.spline.length() / STEP) + 1)
-            found[label] = boundary.spline.evaluate(np.linspace(*boundary.spline.domain, count))
-    return found
+            points[label] = boundary.spline.evaluate(np.linspace(*boundary.spline.domain, count))
+    return points
 
 
 def fill_line(marker: Any, points: Array, label: int, make_point: Any) -> Any:
-    """Fills in a `Marker` as a line through points (n, 2)."""
+    """Fill in a `Marker` as a line through points (n, 2)."""
     marker.ns, marker.id, marker.type = "track", label, LINE_STRIP
     marker.scale.x, marker.pose.orientation.w = 0.1, 1.0
     colour = marker.color
@@ -85,23 +85,21 @@ def fill_line(marker: Any, points: Array, label: int, make_point: Any) -> Any:
 
 
 def fill_pose(stamped: Any, pose: Array) -> Any:
-    """Fills in a `PoseStamped` by a pose (3,), map frame."""
-    x, y, theta = pose.tolist()
-    stamped.pose.position.x, stamped.pose.position.y = x, y
-    stamped.pose.orientation.z, stamped.pose.orientation.w = (
-        float(np.sin(theta / 2)),
-        float(np.cos(theta / 2)),
-    )
+    """Fill in a `PoseStamped` by a pose (3,), map frame."""
+    at = stamped.pose
+    at.position.x, at.position.y = pose[:2].tolist()
+    at.orientation.z, at.orientation.w = float(np.sin(pose[2] / 2)), float(np.cos(pose[2] / 2))
     return stamped
 
 
 def main() -> None:
-    """Runs the node until it is stopped, and then writes the map to the folder `map`."""
+    """Run the node until it is stopped, and then write the map to the folder `map`."""
     import rclpy  # ROS is needed here only
     from geometry_msgs.msg import Point, PoseStamped
     from nav_msgs.msg import Odometry
     from nav_msgs.msg import Path as PathMessage
     from rclpy.executors import ExternalShutdownException
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
     from sensor_msgs.msg import PointCloud2
     from std_msgs.msg import Header
     from visualization_msgs.msg import Marker, MarkerArray
@@ -120,21 +118,24 @@ def main() -> None:
         markers = [fill_line(Marker(header=header), points[label], label, Point) for label in points]
         return MarkerArray(markers=markers)
 
+    def take_odometry(message: Any) -> None:
+        bridge.stream.take_odometry(message, now())
+
     def take_detections(message: Any) -> None:
         result = bridge.update(message, now())
         if result is None or result.late:
             return
-        stamp, points = node.get_clock().now().to_msg(), boundary_points(bridge.mapper.outline())
-        to_map.publish(lines(points, Header(frame_id="map", stamp=stamp)))
-        ahead = bridge.mapper.ahead(AHEAD)
+        stamp, ahead = node.get_clock().now().to_msg(), bridge.mapper.ahead(AHEAD)
+        path.header = Header(frame_id="map", stamp=stamp)
+        to_map.publish(lines(boundary_points(bridge.mapper.outline()), path.header))
         near = {LEFT: ahead.left, RIGHT: ahead.right, CENTRE: ahead.points}
         to_ahead.publish(lines(near, Header(frame_id="base_link", stamp=stamp)))
-        path.header = Header(frame_id="map", stamp=stamp)
         path.poses.append(fill_pose(PoseStamped(header=path.header), result.pose))
         to_path.publish(path)
 
-    node.create_subscription(Odometry, "odometry", lambda m: bridge.stream.take_odometry(m, now()), 100)
-    node.create_subscription(kind, "detections", take_detections, 10)
+    deep, short = (QoSProfile(depth=n, reliability=ReliabilityPolicy.BEST_EFFORT) for n in (100, 10))
+    node.create_subscription(Odometry, "odometry", take_odometry, deep)
+    node.create_subscription(kind, "detections", take_detections, short)
     try:
         with suppress(KeyboardInterrupt, ExternalShutdownException), threadpool_limits(limits=1):
             rclpy.spin(node)

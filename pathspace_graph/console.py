@@ -31,11 +31,17 @@ LINES: Final = 20
 """About the number of lines of progress, where they are printed."""
 
 
+class _Output(Console):
+    def on_broken_pipe(self) -> None:
+        """Leave a closed pipe to the command line; rich would exit with 1."""
+        raise  # noqa: PLE0704
+
+
 def output(wide: bool = False) -> Console:
     """Return the console for results; tables are `FILE_WIDTH` wide in a file if `wide`."""
     quiet = VERBOSITY.get() == Verbosity.QUIET
-    console = Console(quiet=quiet)
-    return Console(quiet=quiet, width=FILE_WIDTH) if wide and not console.is_terminal else console
+    console = _Output(quiet=quiet)
+    return _Output(quiet=quiet, width=FILE_WIDTH) if wide and not console.is_terminal else console
 
 
 def say(*lines: str) -> None:

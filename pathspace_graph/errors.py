@@ -108,6 +108,7 @@ NUMBERS: Final[dict[str, Callable[[Any], bool]]] = {
     "a positive number": lambda value: 0 < value < inf,
     "a number of at least 0": lambda value: 0 <= value < inf,
     "a number in [0, 1]": lambda value: 0 <= value <= 1,
+    "a number": lambda value: -inf < value < inf,
 }
 """Checks of numbers, by the words of the message."""
 

@@ -230,7 +230,11 @@ def _description(command: type[Any]) -> str:
 
 
 def _texts(settings: type[Any]) -> dict[str, str]:
-    return {
+    """Return the text of each field; a group of settings without one has that of its class."""
+    hints = get_type_hints(settings)
+    kinds = {name: kind for name, kind in hints.items() if isinstance(kind, type) and is_dataclass(kind)}
+    groups = {name: _description(kind) for name, kind in kinds.items()}
+    return groups | {
         text.arg_name: " ".join((text.description or "").split())
         for home in reversed(settings.__mro__)
         if is_dataclass(home)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.io.brief import Brief
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunNoise, RunResult, VehicleState
@@ -27,8 +28,8 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
-class CycleResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class CycleResult(Brief):
     """Result of an online estimator in one perception cycle."""
 
     LENGTHS: ClassVar = {"pose": POSE, "jump": POSE, "notice": 1, "health": 0}

@@ -1,7 +1,7 @@
 """Sampled curves in the plane, and the middle of a track: a smooth curve between two rows of cones."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,89 +14,85 @@ IntArray = NDArray[np.int_]
 
 
 def ring(points: FloatArray) -> FloatArray:
-    """Returns the points (n, 2) of a closed curve with the first one repeated at the end (n + 1, 2)."""
+    """Return the points (n, 2) of a closed curve with the first one repeated at the end (n + 1, 2)."""
     return np.vstack([points, points[:1]])
 
 
 def arc_lengths(points: FloatArray) -> FloatArray:
-    """Returns the path length (n,) in m along a polyline (n, 2) from its first point to each."""
+    """Return the path length (n,) in m along a polyline (n, 2) from its first point to each."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
 
 
 def along_polyline(at: FloatArray, s: FloatArray, points: FloatArray) -> FloatArray:
-    """Interpolates a polyline (n, 2) with increasing parameters `s` (n,) at the values `at` (k,): (k, 2)."""
+    """Interpolate a polyline (n, 2) with increasing parameters `s` (n,) at the values `at` (k,): (k, 2)."""
     return np.column_stack([np.interp(at, s, points[:, 0]), np.interp(at, s, points[:, 1])])
 
 
 def unit(vectors: FloatArray) -> FloatArray:
-    """Returns the vectors (n, 2) scaled to length 1."""
+    """Return the vectors (n, 2) scaled to length 1."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
 def left_normals(tangents: FloatArray) -> FloatArray:
-    """Returns the vectors (n, 2) turned a quarter to the left."""
+    """Return the vectors (n, 2) turned a quarter to the left."""
     return np.stack([-tangents[..., 1], tangents[..., 0]], axis=-1)
 
 
 def direction(theta: float) -> FloatArray:
-    """Returns the unit vector (2,) of a heading in rad."""
+    """Return the unit vector (2,) of a heading in rad."""
     return np.array([np.cos(theta), np.sin(theta)])
 
 
 def curvature(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Returns the signed curvature (n,) in 1/m, positive to the left, from both derivatives (n, 2)."""
+    """Return the signed curvature (n,) in 1/m, positive to the left, from both derivatives (n, 2)."""
     cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
     return np.asarray(cross / np.linalg.norm(first, axis=1) ** 3)
 
 
 STEP: Final = 0.25
-"""While the curve is fitted, its samples are this far apart (m)."""
+"""Distance of the samples of a curve that is fitted (m)."""
 KNOT_STEP: Final = 0.5
-"""The knots of the finished curve are this far apart (m)."""
+"""Distance of the knots of the finished curve (m)."""
 SMOOTHING: Final = 1.0
-"""The smoothing Gaussian has this standard deviation (m); it cuts a corner of radius R by its square / 2R."""
+"""Standard deviation of the smoothing Gaussian (m), which cuts a corner of radius R by its square / 2R."""
 CENTRINGS: Final = 4
-"""The curve is moved to equal distances from both rows and smoothed this number of times."""
+"""Times that the curve is moved to equal distances from both rows and smoothed."""
 NEIGHBOURS: Final = 3
-"""The distance of a sample to a row is measured to the segments within this number of cones from its own
-cone."""
+"""Cones to both sides of a sample's own one, up to which its distance to a row is measured."""
 START_CANDIDATES: Final = 4
-"""This number of cones of each row, those nearest to the start, are tried as the pair that the matching
-starts with."""
+"""Cones of each row nearest to the start that are tried as the first pair of the matching."""
 
 
 @dataclass(frozen=True, eq=False)
 class CentreLine:
-    """Holds a twice differentiable curve `c(s)` by arc length `s`, periodic where the track is closed."""
+    """A twice differentiable curve `c(s)` by arc length `s`, periodic where the track is closed."""
 
     spline: CubicSpline
-    """The curve maps s to points (2,) in m; its parameter is the arc length to about 0.1 %."""
+    """Points (2,) in m by s, which is the arc length to about 0.1 %."""
     length: float
-    """The curve, or one lap of it where it is closed, has this length (m)."""
+    """Length of the curve, or of one lap (m)."""
     closed: bool
-    """The end meets the beginning where this is true."""
     clearance: FloatArray
     """Distance to the nearer row of cones at the spline's knots (k,) in m."""
 
     def points(self, s: FloatArray) -> FloatArray:
-        """Returns the points (n, 2) of the curve at `s` (n,)."""
         return np.asarray(self.spline(s))
 
     def tangents(self, s: FloatArray) -> FloatArray:
-        """Returns the unit tangents (n, 2) in the direction of travel."""
+        """Return the unit tangents (n, 2) in the direction of travel."""
         return unit(np.asarray(self.spline(s, 1)))
 
     def curvatures(self, s: FloatArray) -> FloatArray:
-        """Returns the signed curvature (n,) in 1/m, positive to the left."""
+        """Return the signed curvature (n,) in 1/m, positive to the left."""
         return curvature(np.asarray(self.spline(s, 1)), np.asarray(self.spline(s, 2)))
 
     def clearances(self, s: FloatArray) -> FloatArray:
-        """Returns the distance to the nearer row of cones (n,) in m."""
+        """Return the distance to the nearer row of cones (n,) in m."""
         period = self.length if self.closed else None
         return np.interp(s, self.spline.x, self.clearance, period=period)
 
     def nearest(self, pose: FloatArray) -> float:
-        """Returns the arc length of the point nearest to a pose (3,) whose tangent leads forward."""
+        """Return the arc length of the point nearest to a pose (3,) whose tangent leads forward."""
         s = np.arange(0.0, self.length, STEP)
         distances = np.linalg.norm(self.points(s) - pose[:2], axis=1)
         ahead = self.tangents(s) @ direction(pose[2])
@@ -104,36 +100,34 @@ class CentreLine:
 
 
 def fit_centre_line(left: FloatArray, right: FloatArray, closed: bool, near: FloatArray) -> CentreLine:
-    """Returns the curve halfway between two rows of cones (n, 2) and (m, 2) in driving order.
+    """Return the curve halfway between two rows of cones (n, 2) and (m, 2) in driving order.
 
     The rows are matched from `near` on by the triangulation of least total squared width that runs along
-    both. So their counts and spacings may differ, and other parts of the track may be near. The midpoints are
-    then smoothed and moved to equal distances from both rows.
+    both. So their counts and spacings may differ, and other parts of the track may be near.
     """
     rungs = match_rows(left, right, closed, near)
     middles = (left[rungs[:, 0]] + right[rungs[:, 1]]) / 2
     curve, rung_of = _resample(middles, STEP, closed)
     curve = _smooth(curve, closed)
-    index = rungs[np.rint(rung_of).astype(int) % len(rungs)]
+    index = rungs[np.rint(rung_of).astype(int) % len(rungs)].T
+
+    def distances(curve: FloatArray) -> list[FloatArray]:
+        return [_row_distances(curve, row, k, closed) for row, k in zip((left, right), index, strict=True)]
+
     for _ in range(CENTRINGS):
-        offset = _row_distances(curve, left, index[:, 0], closed) - _row_distances(
-            curve, right, index[:, 1], closed
-        )
-        curve = _smooth(curve + _normals(curve, closed) * offset[:, None] / 2, closed)
-    clearance = np.minimum(
-        _row_distances(curve, left, index[:, 0], closed), _row_distances(curve, right, index[:, 1], closed)
-    )
-    return _as_spline(curve, clearance, closed)
+        to_left, to_right = distances(curve)
+        curve = _smooth(curve + _normals(curve, closed) * (to_left - to_right)[:, None] / 2, closed)
+    return _as_spline(curve, np.minimum(*distances(curve)), closed)
 
 
 def along_path(points: FloatArray, cones: FloatArray, closed: bool) -> CentreLine:
-    """Returns the smooth curve along points (k, 2), whose clearance is the distance to the nearest cone."""
+    """Return the smooth curve along points (k, 2), whose clearance is the distance to the nearest cone."""
     curve = _smooth(_resample(points, STEP, closed)[0], closed)
     return _as_spline(curve, np.asarray(KDTree(cones).query(curve)[0]), closed)
 
 
 def match_rows(left: FloatArray, right: FloatArray, closed: bool, near: FloatArray) -> IntArray:
-    """Returns index pairs (k, 2) into both rows, each step advancing one, of least total squared distance."""
+    """Return index pairs (k, 2) into both rows, each step advancing one, of least total squared distance."""
     if not closed:
         return _match(left, right)[1]
     best_cost, best = np.inf, np.zeros((0, 2), dtype=int)
@@ -148,7 +142,7 @@ def match_rows(left: FloatArray, right: FloatArray, closed: bool, near: FloatArr
 
 
 def _match(left: FloatArray, right: FloatArray) -> tuple[float, IntArray]:
-    """Returns the least total squared distance and its pairs, by dynamic programming along both rows."""
+    """Return the least total squared distance and its pairs, by dynamic programming."""
     width = np.sum((left[:, None] - right[None]) ** 2, axis=-1)
     total = np.empty_like(width)
     total[0] = np.cumsum(width[0])
@@ -167,7 +161,7 @@ def _match(left: FloatArray, right: FloatArray) -> tuple[float, IntArray]:
 
 
 def _resample(points: FloatArray, step: float, closed: bool) -> tuple[FloatArray, FloatArray]:
-    """Returns points (n, 2) about `step` apart along a polyline, and their fractional indices in it (n,)."""
+    """Return points (n, 2) about `step` apart along a polyline, and their fractional indices in it (n,)."""
     polyline = ring(points) if closed else points
     s = arc_lengths(polyline)
     count = max(int(np.ceil(s[-1] / step)), 2)
@@ -185,19 +179,16 @@ def _smooth(curve: FloatArray, closed: bool) -> FloatArray:
 
 
 def _normals(curve: FloatArray, closed: bool) -> FloatArray:
-    """Returns the unit normals (n, 2) to the left of a sampled curve."""
-    if not closed:
-        return left_normals(unit(np.gradient(curve, axis=0)))
-    return left_normals(unit(np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)))
+    """Return the unit normals (n, 2) to the left of a sampled curve."""
+    along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
+    return left_normals(unit(along if closed else np.gradient(curve, axis=0)))
 
 
 def _row_distances(curve: FloatArray, row: FloatArray, index: IntArray, closed: bool) -> FloatArray:
-    """Returns the distance of each sample to the row's segments near its matched cone `index` (n,)."""
+    """Return the distance of each sample to the row's segments near its matched cone `index` (n,)."""
     segments = index[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS)
-    if closed:
-        a, b = row[segments % len(row)], row[(segments + 1) % len(row)]
-    else:
-        a, b = row[segments.clip(0, len(row) - 1)], row[(segments + 1).clip(0, len(row) - 1)]
+    mode: Literal["wrap", "clip"] = "wrap" if closed else "clip"
+    a, b = (row.take(ends, axis=0, mode=mode) for ends in (segments, segments + 1))
     along = b - a
     length2 = np.maximum(np.sum(along**2, axis=-1), np.finfo(float).tiny)
     part = np.clip(np.sum((curve[:, None] - a) * along, axis=-1) / length2, 0.0, 1.0)

@@ -7,71 +7,73 @@ and leaves the truth as it is.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pathspace_graph.io.log import Log
+from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT
 
-FloatArray = NDArray[np.float64]
+from .curves import FloatArray
+
 Mistake = Callable[[Log], Log]
-"""It spoils a log."""
 
 DEGREE: Final = float(np.pi / 180.0)
 """A degree in radians."""
 
 
+def with_cycles(log: Log, change: Callable[[Detections], dict[str, Any]]) -> Log:
+    """Return the log with some fields of each cycle replaced."""
+    return replace(log, cycles=tuple(replace(cycle, **change(cycle)) for cycle in log.cycles))
+
+
 def with_points(log: Log, change: Callable[[FloatArray], FloatArray]) -> Log:
-    """Returns the log with other detections (m, 2), as they are in the vehicle frame."""
-    cycles = [replace(cycle, points_vehicle=change(cycle.points_vehicle)) for cycle in log.cycles]
-    return replace(log, cycles=tuple(cycles))
+    """Return the log with other detections (m, 2), as they are in the vehicle frame."""
+    return with_cycles(log, lambda cycle: {"points_vehicle": change(cycle.points_vehicle)})
 
 
 def with_covariances(log: Log, change: Callable[[FloatArray], FloatArray]) -> Log:
-    """Returns the log with other covariances (m, 2, 2)."""
-    cycles = [replace(cycle, covariances=change(cycle.covariances)) for cycle in log.cycles]
-    return replace(log, cycles=tuple(cycles))
+    """Return the log with other covariances (m, 2, 2)."""
+    return with_cycles(log, lambda cycle: {"covariances": change(cycle.covariances)})
 
 
-def with_twists(log: Log, factors: tuple[float, float, float]) -> Log:
-    """Returns the log with its twists times these factors."""
+def with_twists(log: Log, factors: FloatArray | tuple[float, float, float]) -> Log:
+    """Return the log with its twists times these factors."""
     return replace(log, odometry=replace(log.odometry, twist=log.odometry.twist * factors))
 
 
 def with_stamps(log: Log, odometry: float = 1.0, detections: float = 1.0) -> Log:
-    """Returns the log with its stamps times these factors."""
-    cycles = [replace(cycle, t=cycle.t * detections) for cycle in log.cycles]
-    return replace(log, odometry=replace(log.odometry, t=log.odometry.t * odometry), cycles=tuple(cycles))
+    """Return the log with its stamps times these factors."""
+    log = with_cycles(log, lambda cycle: {"t": cycle.t * detections})
+    return replace(log, odometry=replace(log.odometry, t=log.odometry.t * odometry))
 
 
 # --- frames ----------------------------------------------------------------------------------------------
 
 
+def turned(log: Log, to_vehicle: FloatArray) -> Log:
+    """Return the log with detections in a frame that a matrix (2, 2) takes to the vehicle's."""
+    log = with_covariances(log, lambda covariances: to_vehicle.T @ covariances @ to_vehicle)
+    return with_points(log, lambda points: points @ to_vehicle)
+
+
 def in_frame(log: Log, turn: float = 0.0, ahead: float = 0.0, left: float = 0.0) -> Log:
-    """Returns the log with detections in the frame of a sensor: turned to the left (rad), ahead and to the
-    left of the vehicle's origin (m)."""
+    """Return the log with detections in the frame of a sensor: turned to the left (rad), and placed (m)."""
     c, s = np.cos(turn), np.sin(turn)
-    to_vehicle = np.array([[c, -s], [s, c]])
-    turned = with_covariances(log, lambda covariances: to_vehicle.T @ covariances @ to_vehicle)
-    return with_points(turned, lambda points: (points - [ahead, left]) @ to_vehicle)
+    return turned(with_points(log, lambda points: points - [ahead, left]), np.array([[c, -s], [s, c]]))
 
 
 def y_to_the_right(log: Log) -> Log:
-    """Returns the log with detections whose y points to the right."""
-    flip = np.diag([1.0, -1.0])
-    turned = with_covariances(log, lambda covariances: flip @ covariances @ flip)
-    return with_points(turned, lambda points: points @ flip)
+    return turned(log, np.diag([1.0, -1.0]))
 
 
 def swapped(log: Log) -> Log:
-    """Returns the log with the columns x and y of the detections swapped."""
-    return with_points(with_covariances(log, lambda K: K[:, ::-1, ::-1]), lambda points: points[:, ::-1])
+    """Return the log with the columns x and y of the detections swapped."""
+    return turned(log, np.array([[0.0, 1.0], [1.0, 0.0]]))
 
 
 def camera(log: Log, height: float = 0.6, sigma: float = 0.02) -> Log:
-    """Returns the log with x to the right and y down of a camera at a height (m); z ahead is lost.
+    """Return the log with x to the right and y down of a camera at a height (m); z ahead is lost.
 
     The cones are not all equally low, by a standard deviation (m).
     """
@@ -82,13 +84,12 @@ def camera(log: Log, height: float = 0.6, sigma: float = 0.02) -> Log:
 
 
 def bearings_as_degrees(log: Log) -> Log:
-    """Returns the log with detections made of bearings in degrees that were taken for radians."""
+    """Return the log with detections made of bearings in degrees that were taken for radians."""
 
     def wrong(points: FloatArray) -> FloatArray:
         bearings = np.arctan2(points[:, 1], points[:, 0]) / DEGREE
-        return np.asarray(
-            np.hypot(*points.T)[:, None] * np.column_stack([np.cos(bearings), np.sin(bearings)])
-        )
+        rays = np.column_stack([np.cos(bearings), np.sin(bearings)])
+        return np.asarray(np.hypot(*points.T)[:, None] * rays)
 
     return with_points(log, wrong)
 
@@ -97,7 +98,7 @@ def bearings_as_degrees(log: Log) -> Log:
 
 
 def dead_reckoned(log: Log) -> FloatArray:
-    """Returns poses (N, 3) at the odometry's stamps, by the odometry alone."""
+    """Return poses (N, 3) at the odometry's stamps, by the odometry alone."""
     twist, dt = log.odometry.twist, np.diff(log.odometry.t)
     heading = np.append(0.0, np.cumsum(twist[:-1, 2] * dt))
     middle = heading[:-1] + 0.5 * twist[:-1, 2] * dt
@@ -107,64 +108,58 @@ def dead_reckoned(log: Log) -> FloatArray:
 
 
 def pose_as_twist(log: Log) -> Log:
-    """Returns the log with x, y and heading of the vehicle where vx, vy and wz should be."""
+    """Return the log with x, y and heading of the vehicle where vx, vy and wz should be."""
     return replace(log, odometry=replace(log.odometry, twist=dead_reckoned(log)))
 
 
 def speeds_in_the_map(log: Log) -> Log:
-    """Returns the log with speeds along the axes of the map."""
+    """Return the log with speeds along the axes of the map."""
     c, s = np.cos(dead_reckoned(log)[:, 2]), np.sin(dead_reckoned(log)[:, 2])
     vx, vy, wz = log.odometry.twist.T
-    return replace(
-        log, odometry=replace(log.odometry, twist=np.column_stack([c * vx - s * vy, s * vx + c * vy, wz]))
-    )
+    twist = np.column_stack([c * vx - s * vy, s * vx + c * vy, wz])
+    return replace(log, odometry=replace(log.odometry, twist=twist))
 
 
 def detections_in_the_map(log: Log) -> Log:
-    """Returns the log with detections in the map frame, by the odometry."""
+    """Return the log with detections in the map frame, by the odometry."""
     poses, t = dead_reckoned(log), log.odometry.t
-    cycles = []
-    for cycle in log.cycles:
+
+    def moved(cycle: Detections) -> dict[str, Any]:
         x, y, theta = (float(np.interp(cycle.t, t, column)) for column in poses.T)
         c, s = np.cos(theta), np.sin(theta)
-        points = cycle.points_vehicle @ np.array([[c, s], [-s, c]]) + [x, y]
-        cycles.append(replace(cycle, points_vehicle=points))
-    return replace(log, cycles=tuple(cycles))
+        return {"points_vehicle": cycle.points_vehicle @ np.array([[c, s], [-s, c]]) + [x, y]}
+
+    return with_cycles(log, moved)
 
 
 def late(log: Log, seconds: float) -> Log:
-    """Returns the log with detections that are stamped too late (s); those after its end are left out."""
+    """Return the log with detections that are stamped too late (s); those after its end are left out."""
     first, last = log.odometry.t[[0, -1]]
-    moved = (replace(cycle, t=cycle.t + seconds) for cycle in log.cycles)
-    kept = tuple(cycle for cycle in moved if first <= cycle.t <= last)
-    return replace(
-        log, cycles=kept, truth=None if log.truth is None else replace(log.truth, associations=None)
-    )
+    log = with_cycles(log, lambda cycle: {"t": cycle.t + seconds})
+    truth = None if log.truth is None else replace(log.truth, associations=None)
+    return replace(log, cycles=tuple(c for c in log.cycles if first <= c.t <= last), truth=truth)
 
 
 def all_left(log: Log) -> Log:
-    """Returns the log with the label `left` on each detection."""
-    cycles = [replace(cycle, labels=np.full(len(cycle.labels), LEFT)) for cycle in log.cycles]
-    return replace(log, cycles=tuple(cycles))
+    return with_cycles(log, lambda cycle: {"labels": np.full(len(cycle.labels), LEFT)})
 
 
 def in_millimetres(log: Log) -> Log:
-    """Returns the log with all lengths in mm: positions, covariances and speeds."""
-    return with_twists(
-        with_covariances(with_points(log, lambda p: 1e3 * p), lambda K: 1e6 * K), (1e3, 1e3, 1.0)
-    )
+    """Return the log with all lengths in mm: positions, covariances and speeds."""
+    log = with_covariances(with_points(log, lambda points: 1e3 * points), lambda K: 1e6 * K)
+    return with_twists(log, (1e3, 1e3, 1.0))
 
 
 MISTAKES: Final[dict[str, Mistake]] = {
-    "positions in millimetres": lambda log: with_points(log, lambda points: 1e3 * points),
-    "speeds in mm/s": lambda log: with_twists(log, (1e3, 1e3, 1.0)),
+    "positions in millimetres": partial(with_points, change=lambda points: 1e3 * points),
+    "speeds in mm/s": partial(with_twists, factors=(1e3, 1e3, 1.0)),
     "all lengths in millimetres": in_millimetres,
-    "yaw rate in degrees per second": lambda log: with_twists(log, (1.0, 1.0, 1.0 / DEGREE)),
+    "yaw rate in degrees per second": partial(with_twists, factors=(1.0, 1.0, 1.0 / DEGREE)),
     "bearings in degrees": bearings_as_degrees,
     "y to the right": y_to_the_right,
-    "stamps in nanoseconds": lambda log: with_stamps(log, 1e9, 1e9),
-    "stamps of the odometry in nanoseconds": lambda log: with_stamps(log, odometry=1e9),
-    "stamps of the detections in nanoseconds": lambda log: with_stamps(log, detections=1e9),
+    "stamps in nanoseconds": partial(with_stamps, odometry=1e9, detections=1e9),
+    "stamps of the odometry in nanoseconds": partial(with_stamps, odometry=1e9),
+    "stamps of the detections in nanoseconds": partial(with_stamps, detections=1e9),
     "sensor frame: x to the right, y ahead": partial(in_frame, turn=-0.5 * np.pi),
     "sensor frame: x to the left": partial(in_frame, turn=0.5 * np.pi),
     "sensor frame: x to the rear": partial(in_frame, turn=np.pi),
@@ -173,16 +168,16 @@ MISTAKES: Final[dict[str, Mistake]] = {
     "sensor frame: camera, z ahead": camera,
     "sensor frame: x and y swapped": swapped,
     "sensor frame: 2 m ahead": partial(in_frame, ahead=2.0),
-    "positions in centimetres": lambda log: with_points(log, lambda points: 1e2 * points),
-    "speeds in km/h": lambda log: with_twists(log, (3.6, 3.6, 1.0)),
-    "yaw rate to the right": lambda log: with_twists(log, (1.0, 1.0, -1.0)),
-    "stamps in milliseconds": lambda log: with_stamps(log, 1e3, 1e3),
+    "positions in centimetres": partial(with_points, change=lambda points: 1e2 * points),
+    "speeds in km/h": partial(with_twists, factors=(3.6, 3.6, 1.0)),
+    "yaw rate to the right": partial(with_twists, factors=(1.0, 1.0, -1.0)),
+    "stamps in milliseconds": partial(with_stamps, odometry=1e3, detections=1e3),
     "odometry is a pose": pose_as_twist,
     "speeds in the map frame": speeds_in_the_map,
     "detections in the map frame": detections_in_the_map,
     "detections 1 s late": partial(late, seconds=1.0),
-    "covariances in mm^2": lambda log: with_covariances(log, lambda K: 1e6 * K),
-    "covariances of zero": lambda log: with_covariances(log, lambda K: 0.0 * K),
+    "covariances in mm^2": partial(with_covariances, change=lambda K: 1e6 * K),
+    "covariances of zero": partial(with_covariances, change=lambda K: 0.0 * K),
     "all labels left": all_left,
     "y to the right, yaw rate in degrees": lambda log: with_twists(
         y_to_the_right(log), (1.0, 1.0, 1.0 / DEGREE)

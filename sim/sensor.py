@@ -5,36 +5,32 @@ from typing import Final
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from pathspace_graph.errors import SettingsError, check_numbers
 from pathspace_graph.io.log import Detections, covariances_of
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int_]
+from .curves import FloatArray, IntArray
 
 FALSE_POSITIVE: Final = -1
 """Association of a detection that is of no cone."""
 CAMERAS: Final = 2
-"""This number of cameras may see a cone at once."""
+"""Cameras that may see a cone at once."""
 
 
 @dataclass(frozen=True)
 class OdometryNoise:
-    """Describes the errors of the measured twist."""
+    """Errors of the measured twist."""
 
     white: tuple[float, float, float] = (0.25, 0.12, 0.035)
-    """Each measurement of [vx, vy, wz] has these standard deviations (m/s, m/s, rad/s), white from sample to
-    sample."""
+    """Standard deviations of [vx, vy, wz], white from sample to sample (m/s, m/s, rad/s)."""
     scale: float = 0.004
-    """Standard deviation of the relative scale error of vx and vy, which is drawn once for a log
-    (-)."""
+    """Standard deviation of the scale error of vx and vy, drawn once for a log (-)."""
     gyro_bias: float = 0.0015
-    """Standard deviation of the bias of wz, which is drawn once for a log (rad/s)."""
+    """Standard deviation of the bias of wz, drawn once for a log (rad/s)."""
     slow: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), repr=False)
-    """Standard deviations of the slow errors of [vx, vy, wz] (m/s, m/s, rad/s), beside the white noise."""
+    """Standard deviations of the slow errors of [vx, vy, wz] beside the white noise (m/s, m/s, rad/s)."""
     slow_time: float = field(default=5.0, repr=False)
     """Correlation time of the slow errors (s)."""
 
@@ -47,7 +43,7 @@ class OdometryNoise:
         check_numbers(self, "odometry", ("slow_time",), "a positive number")
 
     def drift_sigmas(self, dt: float) -> FloatArray:
-        """Returns the standard deviations (3,) of white noise that drifts as much, of readings `dt` s apart.
+        """Return the standard deviations (3,) of white noise that drifts as much, of readings `dt` s apart.
 
         It has the spectrum of the noise at frequency 0: `white^2 + slow^2 (1 + rho) / (1 - rho)`, where
         `rho = exp(-dt / slow_time)`.
@@ -58,10 +54,10 @@ class OdometryNoise:
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """Describes what the cone detector sees, and its errors."""
+    """What the cone detector sees, and its errors."""
 
     rate: float = 10.0
-    """The detector gives this number of perception cycles per second (Hz)."""
+    """Perception cycles per second (Hz)."""
     range_max: float = 15.0
     """Greatest true range of a detected cone (m)."""
     range_min: float = 0.5
@@ -71,36 +67,33 @@ class SensorSettings:
     range_sigma: float = 0.05
     """Standard deviation of the range at range 0 (m)."""
     range_sigma_growth: float = 0.012
-    """The standard deviation of the range grows by this with the range (m/m)."""
+    """Growth of that standard deviation with the range (m/m)."""
     bearing_sigma: float = float(np.deg2rad(0.9))
     """Standard deviation of the bearing (rad)."""
     detection_probability: float = 0.98
-    """A cone in the field of view is detected with this probability at range 0."""
+    """Probability that a cone in the field of view is detected at range 0."""
     detection_falloff: float = 0.01
-    """The probability of detection decreases by this with the range (1/m)."""
+    """Decrease of the probability of detection with the range (1/m)."""
     blind_fraction: float = 0.05
-    """This share of the cones is never detected; they are drawn once for a log."""
+    """Share of the cones that are never detected, drawn once for a log."""
     wrong_colour: float = 0.01
-    """A detected boundary cone has the other boundary's label with this probability."""
+    """Probability that a detected boundary cone has the other boundary's label."""
     false_positives: float = 0.03
-    """A cycle has this expected number of detections of nothing."""
+    """Expected number of detections of nothing in a cycle."""
     range_bias: bool = False
-    """Ranges have a systematic error, as those of cameras do, where this is true."""
+    """Whether ranges have a systematic error, as those of cameras do."""
     range_bias_at: tuple[float, ...] = (4.0, 9.0)
-    """The systematic error is given at these increasing ranges (m); it is linear between them and constant
-    outside."""
+    """Increasing ranges of the given systematic errors (m), which are linear between them."""
     range_bias_values: tuple[float, ...] = (0.02, 0.34)
-    """The systematic error has these values at those ranges (m). Cameras typically have 0.02 m below 4 m and
-    0.34 m beyond 8 m."""
+    """Systematic errors at those ranges (m), typical of cameras."""
     slow_range: float = field(default=0.0, repr=False)
-    """Share of a range's variance that is in the slow error of its cone (-)."""
+    """Share of a range's variance in the slow error of its cone (-)."""
     slow_bearing: float = field(default=0.0, repr=False)
-    """Share of a bearing's variance that is in the slow error of its cone (-)."""
+    """Share of a bearing's variance in the slow error of its cone (-)."""
     slow_time: float = field(default=5.0, repr=False)
     """Correlation time of the slow errors of a cone (s)."""
     duplicates: float = field(default=0.0, repr=False)
-    """Probability that a second camera detects a detected cone in the overlap of the fields in the same
-    cycle, with errors of its own (-)."""
+    """Probability that a second camera detects a detected cone of the overlap too, with its own errors."""
     overlap: tuple[float, float] = field(default=(0.0, float(np.pi)), repr=False)
     """Least and greatest bearing of the overlap, on both sides (rad)."""
     dropped_cycles: float = field(default=0.0, repr=False)
@@ -113,42 +106,34 @@ class SensorSettings:
         check_numbers(self, "sensor", at_least_0, "a number of at least 0")
         if self.fov > 2 * np.pi or self.range_min >= self.range_max:
             raise SettingsError("sensor: expected fov <= 2 pi rad and range_min < range_max")
-        shares = ("detection_probability", "blind_fraction", "wrong_colour")
-        check_numbers(self, "sensor", shares, "a number in [0, 1]")
-        shares_of_errors = ("slow_range", "slow_bearing", "duplicates", "dropped_cycles")
-        check_numbers(self, "sensor", shares_of_errors, "a number in [0, 1]")
+        shares = ("detection_probability", "blind_fraction", "wrong_colour", "duplicates", "dropped_cycles")
+        check_numbers(self, "sensor", (*shares, "slow_range", "slow_bearing"), "a number in [0, 1]")
         least, greatest = self.overlap
         if not 0.0 <= least < greatest:
             raise SettingsError(f"sensor.overlap: expected 0 <= least < greatest, found {self.overlap}")
-        if len(self.range_bias_at) != len(self.range_bias_values) or not np.all(
-            np.diff(self.range_bias_at) > 0
-        ):
-            raise SettingsError(
-                "sensor.range_bias_at: expected increasing ranges, one for each of range_bias_values"
-            )
+        at, values = self.range_bias_at, self.range_bias_values
+        if len(at) != len(values) or not np.all(np.diff(at) > 0):
+            expected = "expected increasing ranges, one for each of range_bias_values"
+            raise SettingsError(f"sensor.range_bias_at: {expected}")
 
     def range_sigmas(self, ranges: FloatArray) -> FloatArray:
-        """Returns the standard deviation of the range at each range (n,) in m."""
         return self.range_sigma + self.range_sigma_growth * ranges
 
     def range_biases(self, ranges: FloatArray) -> FloatArray:
-        """Returns the systematic error at each range (n,) in m."""
         if not self.range_bias or not self.range_bias_at:
             return np.zeros_like(ranges)
         return np.interp(ranges, self.range_bias_at, self.range_bias_values)
 
     def detection_probabilities(self, ranges: FloatArray) -> FloatArray:
-        """Returns the probability of detection at each range (n,)."""
         return np.clip(self.detection_probability - self.detection_falloff * ranges, 0.0, 1.0)
 
 
 def measure_twists(
     twists: FloatArray, dt: float, noise: OdometryNoise, rng: Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns measured twists (N, 3), and the scale error (-) and the bias (rad/s) that they have (2,).
+    """Return measured twists (N, 3), and the scale error (-) and the bias (rad/s) that they have (2,).
 
-    They are `(1 + scale) [vx, vy]` and `wz + bias`, each plus white noise and a slow error; they are `dt` s
-    apart.
+    They are `dt` s apart: `(1 + scale) [vx, vy]` and `wz + bias`, each plus white noise and a slow error.
     """
     scale = noise.scale * rng.standard_normal()
     bias = noise.gyro_bias * rng.standard_normal()
@@ -161,7 +146,7 @@ def measure_twists(
 
 
 def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> FloatArray:
-    """Returns stationary first-order Gauss-Markov processes of unit variance along the first axis.
+    """Return stationary first-order Gauss-Markov processes of unit variance along the first axis.
 
     `step` is that from sample to sample by the correlation time, so neighbours correlate by `exp(-step)`.
     """
@@ -172,7 +157,7 @@ def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> FloatAr
 
 
 class ConeSensor:
-    """Detects the cones of one log, some of which it never sees."""
+    """Detect the cones of one log, some of which it never sees."""
 
     def __init__(self, cones: FloatArray, labels: IntArray, settings: SensorSettings, rng: Generator) -> None:
         blind_rng, self._cone_rng, self._false_rng, self._slow_rng, self._second_rng, self._drop_rng = (
@@ -187,17 +172,13 @@ class ConeSensor:
     def detect(
         self, t: float, pose: FloatArray, scale: float = 0.0, bias: float = 0.0
     ) -> tuple[Detections, IntArray]:
-        """Returns a perception cycle from a pose [x, y, theta], and the true cone of each detection (m,).
+        """Return a perception cycle from a pose [x, y, theta], and the true cone of each detection (m,).
 
         A range r reads `(1 + scale) r + bias`, beside its systematic and its random error.
         """
-        ranges, bearings, labels, cones = self._detect_cones(pose, scale, bias)
-        false_ranges, false_bearings, false_labels = self._false_positives()
-        ranges = np.concatenate([ranges, false_ranges])
-        bearings = np.concatenate([bearings, false_bearings])
+        parts = zip(self._detect_cones(pose, scale, bias), self._false_positives(), strict=True)
+        ranges, bearings, labels, cones = (np.concatenate(part) for part in parts)
         points, covariances = _cartesian(ranges, bearings, self._settings)
-        labels = np.concatenate([labels, false_labels])
-        cones = np.concatenate([cones, np.full(len(false_ranges), FALSE_POSITIVE)])
         kept = slice(0 if self._drop_rng.random() < self._settings.dropped_cycles else None)
         return Detections(t, points[kept], covariances[kept], labels[kept]), cones[kept]
 
@@ -227,7 +208,7 @@ class ConeSensor:
         return ranges[rows], bearings[rows], labels[index], cones[index]
 
     def _errors(self, white: FloatArray, cones: IntArray) -> FloatArray:
-        """Returns errors (2, 2, m) of unit variance by camera, range or bearing, and cone, from white noise.
+        """Return errors (2, 2, m) of unit variance by camera, range or bearing, and cone, from white noise.
 
         Each cone's slow errors are Gauss-Markov processes that go on while it is not seen.
         """
@@ -239,17 +220,18 @@ class ConeSensor:
         self._slow = rho * self._slow + np.sqrt(1.0 - rho**2) * drawn
         return np.asarray(errors)
 
-    def _false_positives(self) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Draws detections of nothing, uniform over the area of the field, with either boundary's label."""
+    def _false_positives(self) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+        """Draw detections of nothing, uniform over the area of the field, with either boundary's label."""
         settings, rng = self._settings, self._false_rng
         count = int(rng.poisson(settings.false_positives))
         ranges = np.sqrt(rng.uniform(settings.range_min**2, settings.range_max**2, count))
         bearings = rng.uniform(-settings.fov / 2, settings.fov / 2, count)
-        return ranges, bearings, rng.integers(LEFT, RIGHT, count, endpoint=True)
+        labels = rng.integers(LEFT, RIGHT, count, endpoint=True)
+        return ranges, bearings, labels, np.full(count, FALSE_POSITIVE)
 
 
 def _polar(cones: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Returns range and bearing (n,) of points in the map frame, seen from a pose."""
+    """Return range and bearing (n,) of points in the map frame, seen from a pose."""
     step = cones - pose[:2]
     bearings = np.arctan2(step[:, 1], step[:, 0]) - pose[2]
     return np.hypot(step[:, 0], step[:, 1]), np.asarray((bearings + np.pi) % (2 * np.pi) - np.pi)
@@ -258,11 +240,10 @@ def _polar(cones: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArray]
 def _cartesian(
     ranges: FloatArray, bearings: FloatArray, settings: SensorSettings
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns points (m, 2) and covariances `R(b) diag(s_r^2, (r s_b)^2) R(b)^T`, vehicle frame."""
+    """Return points (m, 2) and covariances `R(b) diag(s_r^2, (r s_b)^2) R(b)^T`, vehicle frame."""
     cos, sin = np.cos(bearings), np.sin(bearings)
     along, across = settings.range_sigmas(ranges) ** 2, (ranges * settings.bearing_sigma) ** 2
     xx = cos**2 * along + sin**2 * across
     yy = sin**2 * along + cos**2 * across
     xy = cos * sin * (along - across)
-    covariances = covariances_of(xx, xy, yy)
-    return np.column_stack([ranges * cos, ranges * sin]), covariances
+    return np.column_stack([ranges * cos, ranges * sin]), covariances_of(xx, xy, yy)

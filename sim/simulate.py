@@ -6,37 +6,30 @@ from typing import Final
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.io.log import SENSOR, Detections, Log, SensorInfo, Truth
 from pathspace_graph.lengths import scaled
 
+from .curves import FloatArray, IntArray
 from .faults import Faults, FaultySensor, SensorFaults, colours, measure_odometry, put_down, turned_round
 from .sensor import ConeSensor, OdometryNoise, SensorSettings
 from .track import Track, to_map_frame
 from .vehicle import Drive, VehicleSettings, drive, integrate
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int_]
-
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """Describes a simulated drive."""
+    """A simulated drive."""
 
     laps: int = 5
-    """A closed track is driven for this number of laps, an open one once."""
+    """Laps on a closed track; an open one is driven once."""
     vehicle: VehicleSettings = field(default_factory=VehicleSettings)
-    """These settings describe how the vehicle drives."""
     odometry: OdometryNoise = field(default_factory=OdometryNoise)
-    """These settings describe the errors of the measured twist."""
     sensor: SensorSettings = field(default_factory=SensorSettings)
-    """These settings describe what the cone detector sees, and its errors."""
     faults: Faults = field(default_factory=Faults, repr=False)
-    """These settings describe what is wrong with the vehicle and its sensors."""
     scale: float = field(default=1.0, repr=False)
-    """All lengths and speeds are this many times as large: 0.1 for a model car of 1:10, 3 for a road."""
+    """Factor of all lengths and speeds: 0.1 for a model car of 1:10, 3 for a road."""
 
     def __post_init__(self) -> None:
         if self.laps < 1:
@@ -46,7 +39,7 @@ class SimulationSettings:
 
 
 def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
-    """Returns the log of a drive; a seed gives the same log to the byte.
+    """Return the log of a drive; a seed gives the same log to the byte.
 
     Wander, odometry, sensor and colours that are lost have random streams of their own, so that a setting of
     one does not shift the others. A cycle in which nothing is detected is not in the log, since the file
@@ -79,13 +72,13 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
 
 
 def _constant_errors(faults: SensorFaults) -> FloatArray | None:
-    """Returns the errors (5,) that stay, in the order of `io.log:SENSOR`, or None where there are none."""
+    """Return the constant errors (5,) in the order of `io.log:SENSOR`, or None where there are none."""
     errors = np.array([getattr(faults, name) for name in SENSOR])
     return errors if errors.any() else None
 
 
 def _noise(settings: SimulationSettings) -> FloatArray | None:
-    """Returns the noise (6,) in the order of `io.log:NOISE`, or None where all of it is white."""
+    """Return the noise (6,) in the order of `io.log:NOISE`, or None where all of it is white."""
     odometry, sensor = settings.odometry, settings.sensor
     if not (any(odometry.slow) or sensor.slow_range or sensor.slow_bearing):
         return None
@@ -94,7 +87,7 @@ def _noise(settings: SimulationSettings) -> FloatArray | None:
 
 
 def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, str]:
-    """Returns what the log says of its making, with its faults and slow errors where it has any."""
+    """Return what the log says of its making, with its faults and slow errors where it has any."""
     source = {"track": track.name, "seed": str(seed), "settings": repr(settings)}
     source |= {"scale": str(settings.scale)} if settings.scale != 1.0 else {}
     for group in ("odometry", "sensor"):
@@ -108,25 +101,21 @@ def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, 
 def _perceive(
     track: Track, driven: Drive, settings: SimulationSettings, sensor_rng: Generator, colour_rng: Generator
 ) -> tuple[list[Detections], IntArray]:
-    faults = settings.faults
+    """Return the perception cycles that are not empty, and the true cone of each detection."""
+    faults, rate, lap = settings.faults, settings.sensor.rate, track.centre_line.length
     cones = ConeSensor(track.cones, colours(track, faults.vehicle.wrong_way), settings.sensor, sensor_rng)
-    lap = track.centre_line.length
     sensor = FaultySensor(cones, track.cone_labels, driven, lap, faults.sensor, colour_rng)
-    stamps = np.arange(int(driven.t[-1] * settings.sensor.rate) + 1) / settings.sensor.rate
+    stamps = np.arange(int(driven.t[-1] * rate) + 1) / rate
     stamps = stamps[stamps - faults.sensor.latency <= driven.t[-1]]
     poses = _poses_at(driven, np.maximum(stamps - faults.sensor.latency, 0.0))
-    cycles: list[Detections] = []
-    associations: list[IntArray] = []
-    for t, pose in zip(stamps.tolist(), poses, strict=True):
-        detections, seen = sensor.detect(t, pose)
-        if len(seen):
-            cycles.append(detections)
-            associations.append(seen)
-    return cycles, np.concatenate([np.zeros(0, dtype=int), *associations])
+    seen = [sensor.detect(t, pose) for t, pose in zip(stamps.tolist(), poses, strict=True)]
+    seen = [cycle for cycle in seen if len(cycle[1])]
+    associations = np.concatenate([np.zeros(0, dtype=int), *(own for _, own in seen)])
+    return [detections for detections, _ in seen], associations
 
 
 def _poses_at(driven: Drive, stamps: FloatArray) -> FloatArray:
-    """Returns true poses (n, 3) at any stamps within the drive; the twist before each is held until then."""
+    """Return true poses (n, 3) at any stamps within the drive; the twist before each is held until then."""
     index = np.searchsorted(driven.t, stamps, side="right") - 1
     since = stamps - driven.t[index]
     poses = driven.poses[index].copy()
@@ -195,7 +184,7 @@ INS_RATE: Final = 40.0
 """Rate of the INS (Hz)."""
 
 PLAIN: Final = "plain"
-"""The preset of this name changes nothing."""
+"""Name of the preset that changes nothing."""
 
 
 def _camera(settings: SimulationSettings) -> SimulationSettings:
@@ -210,11 +199,11 @@ PRESETS: Final[dict[str, dict[str, Callable[[SimulationSettings], SimulationSett
     "sensor": {PLAIN: lambda settings: settings, "camera": _camera},
     "odometry": {PLAIN: lambda settings: settings, "ins": _ins},
 }
-"""Each group of settings has presets by name."""
+"""Presets by group of settings and name."""
 
 
 def preset(names: Mapping[str, str]) -> SimulationSettings:
-    """Returns the defaults of a simulation with a named preset for some groups of `PRESETS`."""
+    """Return the defaults of a simulation with named presets for some groups."""
     settings = SimulationSettings()
     for group, name in names.items():
         check_name(name, PRESETS[group], f"{group}: expected a known preset")

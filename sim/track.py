@@ -3,22 +3,27 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
-from .curves import STEP, CentreLine, along_path, direction, fit_centre_line, left_normals
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int_]
+from .curves import (
+    STEP,
+    CentreLine,
+    FloatArray,
+    IntArray,
+    along_path,
+    direction,
+    fit_centre_line,
+    left_normals,
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Holds the cones of a track, in a frame of its own."""
+    """Cones of a track, in a frame of its own."""
 
     left: FloatArray
     """Cones of the left boundary in driving order (n, 2) in m."""
@@ -27,51 +32,43 @@ class Track:
     other: FloatArray
     """Cones of no boundary, such as those of a gate (k, 2) in m."""
     closed: bool
-    """The last cones are followed by the first where this is true."""
+    """Whether the last cones are followed by the first."""
     start: FloatArray
-    """The vehicle starts from this pose [x, y, theta] (3,) in m, m, rad."""
+    """Pose [x, y, theta] (3,) from which the vehicle starts, in m, m, rad."""
     name: str
-    """The track is known by this name."""
     other_labels: IntArray | None = None
-    """(k,) Labels of the other cones; all are UNKNOWN where this is None."""
+    """Labels (k,) of the other cones, by default UNKNOWN."""
     path: FloatArray | None = None
-    """The road is driven along these points (k, 2) in m, where that is not once along its middle."""
+    """Points (k, 2) along which the road is driven, if not once along its middle (m)."""
 
     @cached_property
     def centre_line(self) -> CentreLine:
-        """Returns the smooth curve halfway between the boundaries, or along the path, track frame."""
+        """The smooth curve halfway between the boundaries, or along the path, track frame."""
         if self.path is not None:
             return along_path(self.path, np.vstack([self.left, self.right]), self.closed)
         return fit_centre_line(self.left, self.right, self.closed, self.start[:2])
 
     @property
     def cones(self) -> FloatArray:
-        """Returns all cones (M, 2) in m: left, right, other."""
+        """All cones (M, 2) in m: left, right, other."""
         return np.vstack([self.left, self.right, self.other])
 
     @property
     def cone_labels(self) -> IntArray:
-        """Returns the label of each of `cones` (M,)."""
+        """Labels (M,) of `cones`."""
         other = np.full(len(self.other), UNKNOWN) if self.other_labels is None else self.other_labels
         return np.concatenate([np.repeat([LEFT, RIGHT], [len(self.left), len(self.right)]), other])
 
 
 def to_map_frame(track: Track) -> Track:
-    """Moves the track so that its start pose is (0, 0, 0): the map frame of a log that starts there."""
+    """Move the track so that its start pose is (0, 0, 0): the map frame of a log that starts there."""
     ahead = direction(track.start[2])
     rotation = np.column_stack([ahead, left_normals(ahead)])
-
-    def move(points: FloatArray) -> FloatArray:
-        return np.asarray((points - track.start[:2]) @ rotation)
-
-    return replace(
-        track,
-        left=move(track.left),
-        right=move(track.right),
-        other=move(track.other),
-        start=np.zeros(3),
-        path=None if track.path is None else move(track.path),
-    )
+    points = {name: getattr(track, name) for name in ("left", "right", "other", "path")}
+    moved: dict[str, Any] = {
+        name: at if at is None else (at - track.start[:2]) @ rotation for name, at in points.items()
+    }
+    return replace(track, **moved, start=np.zeros(3))
 
 
 LANE: Final = 3.0
@@ -85,7 +82,7 @@ OUTER_CONES: Final = 13
 APPROACH: Final = 15.0
 """Length of the lanes into and out of the circles (m)."""
 ROUNDS: Final = 2
-"""Each circle is driven for this number of rounds: the right one first."""
+"""Rounds in each circle, the right one first."""
 
 STRETCH: Final = 75.0
 """Length of the acceleration event (m)."""
@@ -96,7 +93,7 @@ SPACING: Final = 5.0
 
 
 def skidpad() -> Track:
-    """Returns the two circles, entered and left along x between them: two rounds right, two rounds left.
+    """Return the two circles, entered and left along x between them: two rounds right, two rounds left.
 
     Inner and outer cones have the colour of their side as each circle is driven. The cones of the lanes into
     and out of the circles are orange.
@@ -130,18 +127,17 @@ def skidpad() -> Track:
 
 
 def _circle(radius: float, angles: FloatArray) -> FloatArray:
-    """Returns points (n, 2) of a circle about the origin, from its top on clockwise."""
+    """Return points (n, 2) of a circle about the origin, from its top on clockwise."""
     return radius * np.column_stack([np.sin(angles), np.cos(angles)])
 
 
 def _line(begin: float, end: float) -> FloatArray:
-    """Returns points (n, 2) along the x axis, the end left out."""
-    x = np.arange(begin, end, STEP)
-    return np.column_stack([x, np.zeros(len(x))])
+    """Return points (n, 2) along the x axis, the end left out."""
+    return np.arange(begin, end, STEP)[:, None] * [1.0, 0.0]
 
 
 def acceleration() -> Track:
-    """Returns the straight along x with its gates, and the road on which vehicles brake."""
+    """Return the straight along x with its gates, and the road on which vehicles brake."""
     x = np.arange(0.0, STRETCH + BRAKING + SPACING / 2, SPACING)
     left = np.column_stack([x, np.full(len(x), LANE / 2)])
     gates = [(at, y) for at in (0.3, STRETCH + 0.3) for y in (-LANE / 2 - 0.3, LANE / 2 + 0.3)]
@@ -151,4 +147,4 @@ def acceleration() -> Track:
 
 
 EVENTS: Final[dict[str, Callable[[], Track]]] = {"skidpad": skidpad, "acceleration": acceleration}
-"""Each event has its track."""
+"""Tracks of the events by name."""

@@ -25,37 +25,34 @@ from pathspace_graph.io.parsing import (
 from pathspace_graph.labels import BIG_ORANGE, POINTS, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
-from .curves import along_polyline, arc_lengths, direction, left_normals, ring, unit
+from .curves import FloatArray, along_polyline, arc_lengths, direction, left_normals, ring, unit
 from .driving_order import driving_order
 from .track import Track
 
-FloatArray = NDArray[np.float64]
-
 MIN_CONES: Final = 3
-"""A boundary has at least this number of cones."""
+"""Least number of cones of a boundary."""
 DUPLICATE_DISTANCE: Final = 0.3
-"""Two surveyed cones of one colour nearer to each other than this (m) are one."""
+"""Distance below which two surveyed cones of one colour are one (m)."""
 REPEAT_DISTANCE: Final = 0.01
-"""A cone of an ordered row nearer to the one before than this (m) is that cone again."""
+"""Distance below which a cone of an ordered row is the one before again (m)."""
 MAX_UNPLACED: Final = 0.2
-"""At most this share of the boundary cones may belong to no lane, as strays; more is not a track of one
-lane."""
+"""Largest share of stray cones, which belong to no lane."""
 MAX_START_DISTANCE: Final = 10.0
-"""The start is at most this far from the middle of the track (m)."""
+"""Largest distance of the start from the middle of the track (m)."""
 CONE_SPACING: Final = 5.0
-"""The cones along a circuit that is given by its widths are at most this far apart (m)."""
+"""Largest distance of cones along a circuit that is given by its widths (m)."""
 ORANGE: Final = "orange"
-"""PacSim's classes of cones of no boundary contain this."""
+"""Part of PacSim's classes of cones of no boundary."""
 INVISIBLE: Final = "invisible"
 """PacSim's class of cones that are not detected."""
 MIN_CLEARANCE: Final = 0.2
-"""The middle of a road is never nearer to a cone than this share of its usual distance."""
+"""Least distance of the middle of a road from a cone, as a share of the usual one."""
 WIDTH_STEP: Final = 0.5
-"""The samples of such a circuit's boundaries are this far apart (m)."""
+"""Distance of samples of a circuit (m)."""
 TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
-"""These columns hold the centre line and the distances of the boundaries from it."""
+"""Columns of the centre line and of the distances of the boundaries from it."""
 EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
-"""Cones with these EUFS tags belong to no boundary; further tags, such as midpoint, are no cones."""
+"""EUFS tags of cones of no boundary; further tags, such as midpoint, are no cones."""
 
 
 @dataclass(frozen=True)
@@ -63,28 +60,27 @@ class TrackFormat:
     """A kind of track file: how it is recognized, and what reads it."""
 
     description: str
-    """This names the format in messages."""
+    """Name of the format in messages."""
     suffixes: tuple[str, ...]
-    """File names of this format end in one of these (lower case, with the dot)."""
+    """Ends of file names (lower case, with the dot)."""
     parse: Callable[[Path], Any]
-    """This turns a file into the content that the next two take; it raises an InputError where it can't."""
+    """Parser of a file to the content that the next two take; it raises an InputError where it can't."""
     recognizes: Callable[[Any], bool]
-    """This tells whether the parsed content of a file is of this format."""
     read: Callable[[Path, Any], Track]
-    """This makes the track from the path, which its errors name, and from the parsed content."""
+    """Reader of the track from the path, which its errors name, and the content."""
 
 
 def read_track(path: Path | str) -> Track:
-    """Returns the track in a file of a known format: its cones in driving order, in the file's own frame.
+    """Return the track in a file of a known format: its cones in driving order, in the file's own frame.
 
     Raises an InputError that names the row or the key where the file is missing, of no known format or
     malformed.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    _check_exists(path)
+    if not path.is_file():
+        raise InputError(path, f"expected a track file, found {'a folder' if path.is_dir() else 'none'}")
     for known in FORMATS:
-        if suffix in known.suffixes and known.recognizes(content := known.parse(path)):
+        if path.suffix.lower() in known.suffixes and known.recognizes(content := known.parse(path)):
             track = known.read(path, content)
             _check(path, track)
             return track
@@ -92,47 +88,34 @@ def read_track(path: Path | str) -> Track:
     raise InputError(path, f"expected a track file of a known kind: {kinds}")
 
 
-def _check_exists(path: Path) -> None:
-    if not path.is_file():
-        raise InputError(path, "expected a track file, found " + ("a folder" if path.is_dir() else "none"))
-
-
 def _check(path: Path, track: Track) -> None:
     for name, row in (("left", track.left), ("right", track.right)):
         _check_size(path, row, f"the {name} boundary")
         if len(row) < MIN_CONES:
-            raise InputError(
-                path, f"expected at least {MIN_CONES} cones of the {name} boundary, found {len(row)}"
-            )
+            expected = f"expected at least {MIN_CONES} cones of the {name} boundary"
+            raise InputError(path, f"{expected}, found {len(row)}")
     line = track.centre_line
-    if line.clearance.min() < MIN_CLEARANCE * np.median(line.clearance):
-        raise InputError(
-            path,
-            f"expected two rows with a road between them, found their middle {line.clearance.min():.2f} m "
-            f"from a cone where the road is {2.0 * np.median(line.clearance):.1f} m wide",
-        )
+    least, usual = line.clearance.min(), np.median(line.clearance)
+    if least < MIN_CLEARANCE * usual:
+        found = f"found their middle {least:.2f} m from a cone where the road is {2.0 * usual:.1f} m wide"
+        raise InputError(path, f"expected two rows with a road between them, {found}")
     s = np.arange(0.0, line.length, WIDTH_STEP)
     distances = np.linalg.norm(line.points(s) - track.start[:2], axis=1)
     nearest = int(np.argmin(distances))
     if distances[nearest] > MAX_START_DISTANCE:
-        raise InputError(
-            path, f"expected the start on the track, found it {distances[nearest]:.1f} m from its middle"
-        )
+        found = f"found it {distances[nearest]:.1f} m from its middle"
+        raise InputError(path, f"expected the start on the track, {found}")
     if line.tangents(s[nearest : nearest + 1])[0] @ direction(track.start[2]) <= 0:
-        raise InputError(
-            path, "expected the boundaries in driving order, found them against the start's heading"
-        )
+        expected = "expected the boundaries in driving order"
+        raise InputError(path, f"{expected}, found them against the start's heading")
 
 
 def _check_size(path: Path, row: FloatArray, name: str) -> None:
-    """Raises an InputError where a row of points (n, 2) has too many or is too long."""
+    """Raise an InputError where a row of points (n, 2) has too many or is too long."""
     length = float(arc_lengths(row)[-1]) if len(row) else 0.0
     if len(row) > MAX_CONES or length > MAX_TRACK_LENGTH:
-        raise InputError(
-            path,
-            f"expected at most {MAX_CONES} cones over {MAX_TRACK_LENGTH:g} m as {name}, "
-            f"found {len(row)} over {length:g} m",
-        )
+        expected = f"expected at most {MAX_CONES} cones over {MAX_TRACK_LENGTH:g} m as {name}"
+        raise InputError(path, f"{expected}, found {len(row)} over {length:g} m")
 
 
 # YAML: PacSim and fssim
@@ -154,13 +137,12 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
     data = content["track"]
     closed = _get(path, data, "lanesFirstWithLastConnected", "track.")
     if not isinstance(closed, bool):
-        raise InputError(
-            path, f"expected true or false at track.lanesFirstWithLastConnected, found {shown(closed)}"
-        )
+        expected = "expected true or false at track.lanesFirstWithLastConnected"
+        raise InputError(path, f"{expected}, found {shown(closed)}")
     start = _get(path, data, "start", "track.")
-    position = _vector(path, _get(path, start, "position", "track.start."), 2, "track.start.position")
-    orientation = _vector(
-        path, _get(path, start, "orientation", "track.start."), 3, "track.start.orientation"
+    position, orientation = (
+        _vector(path, _get(path, start, name, "track.start."), size, f"track.start.{name}")
+        for name, size in (("position", 2), ("orientation", 3))
     )
     rows = [
         _pacsim_cones(path, _get(path, data, name, "track."), f"track.{name}") for name in ("left", "right")
@@ -174,14 +156,13 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
         for points, kinds in rows
     )
     start = np.append(position, orientation[2])
-    other, labels = other[no_boundary], labels[no_boundary]
-    track = Track(left, right, other, closed, start, path.stem, labels)
+    track = Track(left, right, other[no_boundary], closed, start, path.stem, labels[no_boundary])
     hidden = np.vstack([points[kinds == INVISIBLE] for points, kinds in rows])
     return _with_hidden(track, hidden) if len(hidden) else track
 
 
 def _with_hidden(track: Track, hidden: FloatArray) -> Track:
-    """Returns the track without the cones (k, 2) that nobody sees; they still say where its middle is."""
+    """Return the track without the cones (k, 2) that nobody sees; they still say where its middle is."""
     line = track.centre_line
     left, right = (
         row[~(row[:, None] == hidden).all(axis=2).any(axis=1)] for row in (track.left, track.right)
@@ -191,7 +172,7 @@ def _with_hidden(track: Track, hidden: FloatArray) -> Track:
 
 
 def _pacsim_cones(path: Path, cones: object, key: str) -> tuple[FloatArray, NDArray[np.str_]]:
-    """Returns the points (n, 2) and the classes (n,) of a list of cones."""
+    """Return the points (n, 2) and the classes (n,) of a list of cones."""
     points, kinds = [], []
     for k, cone in enumerate(_list(path, cones, key)):
         points.append(_vector(path, _get(path, cone, "position", f"{key}[{k}]."), 2, f"{key}[{k}].position"))
@@ -200,10 +181,8 @@ def _pacsim_cones(path: Path, cones: object, key: str) -> tuple[FloatArray, NDAr
 
 
 def _pacsim_label(kind: str) -> int:
-    """Returns the label of a class of cones of no boundary."""
-    if ORANGE not in kind:
-        return UNKNOWN
-    return BIG_ORANGE if "big" in kind else SMALL_ORANGE
+    orange = BIG_ORANGE if "big" in kind else SMALL_ORANGE
+    return orange if ORANGE in kind else UNKNOWN
 
 
 def _fssim(path: Path, data: Mapping[str, Any]) -> Track:
@@ -239,7 +218,7 @@ def _list(path: Path, value: object, key: str) -> list[Any]:
 
 
 def _vector(path: Path, value: object, size: int, key: str) -> FloatArray:
-    """Returns the first `size` numbers of a list, all within the limit of coordinates."""
+    """Return the first `size` numbers of a list, all within the limit of coordinates."""
     try:
         if not isinstance(value, list) or len(value) < size:
             raise ValueError
@@ -256,11 +235,10 @@ def _vector(path: Path, value: object, size: int, key: str) -> FloatArray:
 
 
 def _without_repeats(row: FloatArray, closed: bool) -> FloatArray:
-    """Removes cones that repeat the one before, and on a closed row a last one that repeats the first."""
+    """Remove cones that repeat the one before, and on a closed row a last one that repeats the first."""
     if not len(row):
         return row
-    keep = np.append(True, np.linalg.norm(np.diff(row, axis=0), axis=1) > REPEAT_DISTANCE)
-    row = row[keep]
+    row = row[np.append(True, np.linalg.norm(np.diff(row, axis=0), axis=1) > REPEAT_DISTANCE)]
     if closed and len(row) > 1 and np.linalg.norm(row[-1] - row[0]) <= REPEAT_DISTANCE:
         row = row[:-1]
     return row
@@ -295,29 +273,21 @@ def _eufs(path: Path, _: Table) -> Track:
             raise InputError(path, f"expected at least {MIN_CONES} {tag} cones, found {len(cones)}")
     start = _eufs_start(table, tags, points, left, right)
     order = driving_order(left, right, gate, start)
-    placed = 0 if order is None else len(order.left) + len(order.right)
-    if order is None or placed < (1 - MAX_UNPLACED) * (len(left) + len(right)):
-        count = len(left) + len(right)
-        raise InputError(
-            path, f"expected one lane from the start on, found {count - placed} of {count} cones off it"
-        )
+    count, placed = len(left) + len(right), 0 if order is None else len(order.left) + len(order.right)
+    if order is None or placed < (1 - MAX_UNPLACED) * count:
+        found = f"found {count - placed} of {count} cones off it"
+        raise InputError(path, f"expected one lane from the start on, {found}")
     others += [np.delete(left, order.left, axis=0), np.delete(right, order.right, axis=0)]
     kinds = [*map(label_from_name, EUFS_OTHER), UNKNOWN, UNKNOWN]
-    return Track(
-        left[order.left],
-        right[order.right],
-        np.concatenate(others),
-        order.closed,
-        start,
-        path.stem,
-        np.repeat(kinds, [len(cones) for cones in others]),
-    )
+    labels = np.repeat(kinds, [len(cones) for cones in others])
+    left, right = left[order.left], right[order.right]
+    return Track(left, right, np.concatenate(others), order.closed, start, path.stem, labels)
 
 
 def _eufs_start(
     table: Table, tags: NDArray[np.str_], points: FloatArray, left: FloatArray, right: FloatArray
 ) -> FloatArray:
-    """Returns the pose of the first `car_start`, or one between the first blue cone and its opposite."""
+    """Return the pose of the first `car_start`, or one between the first blue cone and its opposite."""
     rows = np.flatnonzero(tags == "car_start")
     if len(rows):
         text = table.columns.get("direction", [""] * len(table))[rows[0]].strip()
@@ -326,9 +296,8 @@ def _eufs_start(
         except ValueError:
             theta = math.nan
         if not math.isfinite(theta):
-            table.fail(
-                int(rows[0]), f"expected the heading of car_start in column 'direction', found '{text}'"
-            )
+            expected = "expected the heading of car_start in column 'direction'"
+            table.fail(int(rows[0]), f"{expected}, found '{text}'")
         return np.append(points[rows[0]], theta)
     opposite = right[np.argmin(np.linalg.norm(right - left[0], axis=1))]
     across = left[0] - opposite
@@ -336,7 +305,7 @@ def _eufs_start(
 
 
 def _without_duplicates(cones: FloatArray) -> FloatArray:
-    """Returns the cones (n, 2) that are not within the duplicate distance of one kept before."""
+    """Return the cones (n, 2) that are not within the duplicate distance of one kept before."""
     kept, count = np.empty_like(cones), 0
     for cone in cones:
         if (np.linalg.norm(kept[:count] - cone, axis=1) >= DUPLICATE_DISTANCE).all():
@@ -350,21 +319,23 @@ def _tum(path: Path, _: Table) -> Track:
     knots = arc_lengths(circuit[:, :2])
     spline = CubicSpline(knots, circuit[:, :2], bc_type="periodic")
     s = np.linspace(0.0, knots[-1], math.ceil(knots[-1] / WIDTH_STEP), endpoint=False)
-    tangents = unit(np.asarray(spline(s, 1)))
-    right_width, left_width = (np.interp(s, knots, circuit[:, k])[:, None] for k in (2, 3))
-    left = np.asarray(spline(s)) + left_normals(tangents) * left_width
-    right = np.asarray(spline(s)) - left_normals(tangents) * right_width
+    points, tangents = np.asarray(spline(s)), unit(np.asarray(spline(s, 1)))
+    right, left = (
+        _spaced(points + side * left_normals(tangents) * np.interp(s, knots, circuit[:, k])[:, None])
+        for side, k in ((-1.0, 2), (1.0, 3))
+    )
     start = np.append(circuit[0, :2], math.atan2(tangents[0, 1], tangents[0, 0]))
-    return Track(_spaced(left), _spaced(right), np.zeros((0, 2)), True, start, path.stem)
+    return Track(left, right, np.zeros((0, 2)), True, start, path.stem)
 
 
 def _tum_circuit(path: Path) -> FloatArray:
-    """Returns checked rows [x, y, right width, left width], with the first repeated at the end (n + 1, 4)."""
+    """Return checked rows [x, y, right width, left width], with the first repeated at the end (n + 1, 4)."""
     table = read_table(path, TUM_COLUMNS, comment="#")
     circuit = table.stack(TUM_COLUMNS)
-    table.require(np.asarray(circuit[:, 2:].min(axis=1) > 0), "expected widths above 0")
-    widths = f"expected widths of at most {MAX_TRACK_WIDTH:g} m"
-    table.require(np.asarray(circuit[:, 2:].max(axis=1) <= MAX_TRACK_WIDTH), widths)
+    widths = circuit[:, 2:]
+    table.require(np.asarray(widths.min(axis=1) > 0), "expected widths above 0")
+    widest = f"expected widths of at most {MAX_TRACK_WIDTH:g} m"
+    table.require(np.asarray(widths.max(axis=1) <= MAX_TRACK_WIDTH), widest)
     _check_size(path, circuit[:, :2], "the middle of the track")
     moved = np.asarray(np.diff(arc_lengths(circuit[:, :2])) > REPEAT_DISTANCE)
     table.require(np.append(True, moved)[: len(circuit)], "expected a point other than the one before")
@@ -376,7 +347,7 @@ def _tum_circuit(path: Path) -> FloatArray:
 
 
 def _spaced(boundary: FloatArray) -> FloatArray:
-    """Returns cones at equal gaps along a closed polyline (n, 2)."""
+    """Return cones at equal gaps along a closed polyline (n, 2)."""
     polyline = ring(boundary)
     s = arc_lengths(polyline)
     at = np.linspace(0.0, s[-1], math.ceil(s[-1] / CONE_SPACING), endpoint=False)

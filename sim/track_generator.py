@@ -1,8 +1,7 @@
 """Random tracks by the rules of Formula Student: straights, hairpins, slaloms, chicanes, no crossing."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -13,58 +12,59 @@ from scipy.spatial import cKDTree
 
 from pathspace_graph.errors import SettingsError, check_numbers
 
-from .curves import along_polyline, arc_lengths, curvature, left_normals, ring, unit
+from .curves import (
+    SMOOTHING,
+    STEP,
+    FloatArray,
+    along_polyline,
+    arc_lengths,
+    curvature,
+    left_normals,
+    ring,
+    unit,
+)
 from .track import Track
 
-FloatArray = NDArray[np.float64]
-
-STEP: Final = 0.25
-"""The samples of the centre line are this far apart (m)."""
-SMOOTHING: Final = 1.0
-"""The Gaussian that eases corners in and out has this standard deviation (m)."""
 MAX_ATTEMPTS: Final = 500
-"""This number of attempts may fail. Two in three keep the default rules, so this many mean that the settings
-contradict each other."""
+"""Attempts that may fail; two in three keep the default rules, and contradicting settings fail them all."""
 STRAIGHT_RADIUS: Final = 150.0
-"""A stretch with a larger radius than this (m) is straight."""
+"""Radius above which a stretch is straight (m)."""
 CORNER_RADIUS: Final = 8.0
-"""At this radius (m), cones stand twice as close as on straights."""
+"""Radius at which cones stand twice as close as on straights (m)."""
 CORNER_BLUR: Final = 2.0
-"""Corners draw cones closer before and after them, by a Gaussian with this standard deviation (m)."""
+"""Standard deviation of the Gaussian by which corners draw cones closer before and after them (m)."""
 MIN_CONE_GAP: Final = 1.0
-"""Cones are never closer than this along a row (m)."""
+"""Least distance of cones along a row (m)."""
 
 
 @dataclass(frozen=True)
 class TrackGeneratorSettings:
-    """Holds the rules that a generated track keeps."""
+    """Rules that a generated track keeps."""
 
     lap_length: tuple[float, float] = (220.0, 400.0)
-    """The centre line has at least and at most this length (m); the rules allow 200 to 500."""
+    """Least and greatest length of the centre line (m); the rules allow 200 to 500."""
     width: tuple[float, float] = (3.2, 4.2)
-    """The boundaries are at least and at most this far apart (m), constant along one track; the rules ask for
-    3."""
+    """Least and greatest distance of the boundaries, constant along a track (m); the rules ask for 3."""
     hairpin_diameter: float = 9.0
-    """The outside diameter of any corner is at least this (m)."""
+    """Least outside diameter of a corner (m)."""
     straight_max: float = 80.0
-    """A straight is at most this long (m)."""
+    """Greatest length of a straight (m)."""
     cones: int = 200
-    """Both boundaries together have this number of cones, as nearly as the gaps allow."""
+    """Cones of both boundaries together, as nearly as the gaps allow."""
     cone_gap_max: float = 5.0
-    """The gap between cones of a row is at most this (m); they stand closer in corners."""
+    """Greatest gap between cones of a row (m); they stand closer in corners."""
     separation: float = 1.5
-    """Boundaries of different stretches are at least this far apart (m)."""
+    """Least distance of boundaries of different stretches (m)."""
     corners: tuple[int, int] = (5, 9)
-    """The layout that the elements are put into has at least and at most this number of corners."""
+    """Least and greatest number of corners of the layout that the elements are put into."""
     hairpins: tuple[int, int] = (0, 3)
-    """At least and at most this number of hairpins is put into the layout, whose corners may be hairpins as
-    well."""
+    """Least and greatest number of hairpins put into the layout, whose corners may be hairpins as well."""
     hairpin_inward: float = 0.3
-    """A hairpin that is put in points to the inside of the layout with this probability."""
+    """Probability that such a hairpin points to the inside of the layout."""
     slalom_probability: float = 0.35
-    """A straight that is long enough becomes a slalom with this probability."""
+    """Probability that a straight that is long enough becomes a slalom."""
     chicane_probability: float = 0.3
-    """A straight that is long enough becomes a chicane with this probability."""
+    """Probability that a straight that is long enough becomes a chicane."""
 
     def __post_init__(self) -> None:
         for name in ("lap_length", "width", "corners", "hairpins"):
@@ -82,8 +82,7 @@ class TrackGeneratorSettings:
 
 
 def generate_track(rng: Generator, settings: TrackGeneratorSettings | None = None) -> Track:
-    """Returns a random closed track that keeps the rules and starts on its longest straight, in a frame of
-    its own.
+    """Return a random closed track that keeps the rules and starts on its longest straight.
 
     Layouts are drawn until one keeps every rule; a SettingsError is raised where none does.
     """
@@ -91,29 +90,26 @@ def generate_track(rng: Generator, settings: TrackGeneratorSettings | None = Non
     for _ in range(MAX_ATTEMPTS):
         width = rng.uniform(*settings.width)
         layout = _layout(width, settings, rng)
-        curve = None if layout is None else _curve(layout, width, settings, rng)
+        curve = None if layout is None else _curve(layout, settings, rng)
         if curve is not None and _keeps_rules(curve, width, settings):
             return _with_cones(curve, width, settings, rng)
     raise SettingsError(f"generator: no track kept the rules in {MAX_ATTEMPTS} attempts: {settings}")
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Holds a polygon whose corners are to be rounded."""
+class _Layout(NamedTuple):
+    """A polygon whose corners (n, 2) are to be rounded by arcs of radii (n,), in m."""
 
     corners: FloatArray
-    """Each row is a corner (n, 2) in m."""
     radii: FloatArray
-    """Radius of the arc at each corner (n,) in m."""
 
 
 def _least_radius(width: float, settings: TrackGeneratorSettings) -> float:
-    """Returns the least radius of the centre line in m."""
+    """Return the least radius of the centre line in m."""
     return (settings.hairpin_diameter - width) / 2
 
 
 def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _Layout | None:
-    """Returns a star-shaped polygon with hairpins on some sides, or None where a corner cannot be rounded."""
+    """Return a star-shaped polygon with hairpins on some sides, or None where a corner cannot be rounded."""
     count = int(rng.integers(*settings.corners, endpoint=True))
     angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
     distances = rng.uniform(0.35, 1.0, count)
@@ -129,9 +125,8 @@ def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _
     layout: _Layout | None = _Layout(corners, radii)
     for leg in legs:
         inward = rng.random() < settings.hairpin_inward
-        layout = (
-            None if layout is None else _with_hairpin(layout, float(leg) * (-1 if inward else 1), least, rng)
-        )
+        if layout is not None:
+            layout = _with_hairpin(layout, float(-leg if inward else leg), least, rng)
     if layout is None:
         return None
     if rng.random() < 0.5:
@@ -140,7 +135,7 @@ def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _
 
 
 def _with_hairpin(layout: _Layout, leg: float, least: float, rng: Generator) -> _Layout | None:
-    """Adds a finger to a random side long enough for it: out (inward for a negative leg), round and back."""
+    """Add a finger to a random side long enough for it: out (inward for a negative leg), round and back."""
     radius, bend = least + rng.uniform(0.3, 1.5), least + rng.uniform(0.5, 3.0)
     sides = np.roll(layout.corners, -1, axis=0) - layout.corners
     lengths = np.linalg.norm(sides, axis=1)
@@ -160,7 +155,7 @@ def _with_hairpin(layout: _Layout, leg: float, least: float, rng: Generator) -> 
 
 
 def _rounded(layout: _Layout, least: float) -> _Layout | None:
-    """Cuts the radii to what the sides have room for; returns None where one is less than the least."""
+    """Cut the radii to what the sides have room for; return None where one is less than the least."""
     half_turn = np.abs(_turns(layout.corners)) / 2
     before = np.linalg.norm(layout.corners - np.roll(layout.corners, 1, axis=0), axis=1)
     # both corners of a side may take half of it
@@ -170,34 +165,31 @@ def _rounded(layout: _Layout, least: float) -> _Layout | None:
 
 
 def _turns(corners: FloatArray) -> FloatArray:
-    """Returns the signed change of direction at each corner (n,) in rad."""
+    """Return the signed change of direction at each corner (n,) in rad."""
     before = corners - np.roll(corners, 1, axis=0)
     after = np.roll(before, -1, axis=0)
     cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
     return np.asarray(np.arctan2(cross, np.sum(before * after, axis=1)))
 
 
-def _curve(layout: _Layout, width: float, settings: TrackGeneratorSettings, rng: Generator) -> FloatArray:
-    """Returns samples (n, 2) of the centre line: straights and their elements, joined by eased arcs."""
-    turns = _turns(layout.corners)
-    tangent = layout.radii * np.tan(np.abs(turns) / 2)
+def _curve(layout: _Layout, settings: TrackGeneratorSettings, rng: Generator) -> FloatArray:
+    """Return samples (n, 2) of the centre line: straights and their elements, joined by eased arcs."""
+    (corners, radii), turns = layout, _turns(layout.corners)
+    tangent = radii * np.tan(np.abs(turns) / 2)
     pieces: list[FloatArray] = []
     for k in range(len(turns)):
         following = (k + 1) % len(turns)
-        side = layout.corners[following] - layout.corners[k]
+        side = corners[following] - corners[k]
         direction = side / np.linalg.norm(side)
-        begin = layout.corners[k] + direction * tangent[k]
-        end = layout.corners[following] - direction * tangent[following]
-        pieces += [
-            _straight(begin, end, settings, rng),
-            _arc(end, direction, layout.radii[following], turns[following]),
-        ]
+        end = corners[following] - direction * tangent[following]
+        pieces.append(_straight(corners[k] + direction * tangent[k], end, settings, rng))
+        pieces.append(_arc(end, direction, radii[following], turns[following]))
     curve = _evenly(np.vstack(pieces))
     return np.asarray(gaussian_filter1d(curve, SMOOTHING / STEP, axis=0, mode="wrap"))
 
 
 def _arc(begin: FloatArray, direction: FloatArray, radius: float, turn: float) -> FloatArray:
-    """Returns samples of an arc from `begin` on, first along `direction`."""
+    """Return samples of an arc from `begin` on, first along `direction`."""
     angles = turn * np.linspace(0.0, 1.0, max(int(radius * abs(turn) / STEP), 1), endpoint=False)
     normal = left_normals(direction) * np.sign(turn)
     forward, sideways = np.sin(np.abs(angles))[:, None], 1 - np.cos(angles)[:, None]
@@ -207,7 +199,7 @@ def _arc(begin: FloatArray, direction: FloatArray, radius: float, turn: float) -
 def _straight(
     begin: FloatArray, end: FloatArray, settings: TrackGeneratorSettings, rng: Generator
 ) -> FloatArray:
-    """Returns samples from `begin` to `end`, by chance with a slalom or a chicane where there is room."""
+    """Return samples from `begin` to `end`, by chance with a slalom or a chicane where there is room."""
     length = float(np.linalg.norm(end - begin))
     if length < STEP:
         return begin[None]
@@ -220,21 +212,17 @@ def _straight(
 def _element(
     along: FloatArray, length: float, settings: TrackGeneratorSettings, rng: Generator
 ) -> FloatArray:
-    """Returns the lateral offset (n,) of a slalom, a chicane or nothing, on a straight of this length."""
+    """Return the lateral offset (n,) of a slalom, a chicane or nothing, on a straight of this length."""
     dice = rng.random()
-    elements: tuple[tuple[float, Callable[[FloatArray, float, Generator], FloatArray]], ...] = (
-        (settings.slalom_probability, _slalom),
-        (settings.chicane_probability, _chicane),
-    )
-    for probability, element in elements:
-        if dice < probability:
-            return element(along, length, rng)
-        dice -= probability
+    if dice < settings.slalom_probability:
+        return _slalom(along, length, rng)
+    if dice - settings.slalom_probability < settings.chicane_probability:
+        return _chicane(along, length, rng)
     return np.zeros_like(along)
 
 
 def _slalom(along: FloatArray, length: float, rng: Generator) -> FloatArray:
-    """Returns two or three eased waves `A sin(2 pi s / wavelength)`, or zeros where there is no room."""
+    """Return two or three eased waves `A sin(2 pi s / wavelength)`, or zeros where there is no room."""
     wavelength = rng.uniform(14.0, 22.0)
     waves = min(int(length / wavelength), 3)
     if waves < 2:
@@ -244,13 +232,12 @@ def _slalom(along: FloatArray, length: float, rng: Generator) -> FloatArray:
     # the tightest bend of a sine has the radius (wavelength / 2 pi)^2 / A
     amplitude = (wavelength / (2 * np.pi)) ** 2 / rng.uniform(5.0, 9.0)
     ease = np.clip(np.minimum(s, total - s) / (wavelength / 4), 0.0, 1.0)
-    return np.asarray(
-        rng.choice([-1.0, 1.0]) * amplitude * np.sin(2 * np.pi * s / wavelength) * ease**2 * (3 - 2 * ease)
-    )
+    wave = rng.choice([-1.0, 1.0]) * amplitude * np.sin(2 * np.pi * s / wavelength)
+    return np.asarray(wave * ease**2 * (3 - 2 * ease))
 
 
 def _chicane(along: FloatArray, length: float, rng: Generator) -> FloatArray:
-    """Returns a shift to one side and back by half cosine waves, or zeros where there is no room."""
+    """Return a shift to one side and back by half cosine waves, or zeros where there is no room."""
     shift, hold = rng.uniform(8.0, 13.0), rng.uniform(0.0, 5.0)
     total = 2 * shift + hold
     if length < total:
@@ -263,35 +250,30 @@ def _chicane(along: FloatArray, length: float, rng: Generator) -> FloatArray:
 
 
 def _evenly(points: FloatArray) -> FloatArray:
-    """Returns samples (n, 2) of a closed polyline at equal distances of about STEP."""
+    """Return samples (n, 2) of a closed polyline at equal distances of about STEP."""
     polyline = ring(points)
     s = arc_lengths(polyline)
     return along_polyline(np.linspace(0.0, s[-1], int(s[-1] / STEP), endpoint=False), s, polyline)
 
 
 def _keeps_rules(curve: FloatArray, width: float, settings: TrackGeneratorSettings) -> bool:
-    length = _length(curve)
     bend = np.abs(_curvature(curve))
     return bool(
-        settings.lap_length[0] <= length <= settings.lap_length[1]
+        settings.lap_length[0] <= arc_lengths(ring(curve))[-1] <= settings.lap_length[1]
         and bend.max() * _least_radius(width, settings) <= 1
         and _longest_run(bend < 1 / STRAIGHT_RADIUS)[1] * STEP <= settings.straight_max
         and _is_separate(curve, width + settings.separation)
     )
 
 
-def _length(curve: FloatArray) -> float:
-    return float(arc_lengths(ring(curve))[-1])
-
-
 def _curvature(curve: FloatArray) -> FloatArray:
-    """Returns the signed curvature (n,) in 1/m of an evenly sampled closed curve."""
+    """Return the signed curvature (n,) in 1/m of an evenly sampled closed curve."""
     after, before = np.roll(curve, -1, axis=0), np.roll(curve, 1, axis=0)
     return curvature((after - before) / 2, after - 2 * curve + before)
 
 
 def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
-    """Returns start and length of the longest run of good samples on a ring."""
+    """Return start and length of the longest run of good samples on a ring."""
     bad = np.flatnonzero(~good)
     if not len(bad):
         return 0, len(good)
@@ -301,7 +283,7 @@ def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def _is_separate(curve: FloatArray, distance: float) -> bool:
-    """Says whether samples nearer than `distance` are of one stretch: less apart than half such a circle."""
+    """Return whether samples nearer than `distance` are of one stretch, apart by less than half a circle."""
     pairs = cKDTree(curve).query_pairs(distance, output_type="ndarray")
     apart = np.abs(pairs[:, 0] - pairs[:, 1])
     apart = np.minimum(apart, len(curve) - apart) * STEP
@@ -309,7 +291,7 @@ def _is_separate(curve: FloatArray, distance: float) -> bool:
 
 
 def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSettings, rng: Generator) -> Track:
-    """Returns the track that starts early on the longest straight, with cones along both boundaries."""
+    """Return the track that starts early on the longest straight, with cones along both boundaries."""
     first, run = _longest_run(np.abs(_curvature(curve)) < 1 / STRAIGHT_RADIUS)
     curve = np.roll(curve, -(first + run // 3), axis=0)
     along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
@@ -325,12 +307,12 @@ def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSetting
 
 
 def _density(gap: float, crowding: FloatArray, settings: TrackGeneratorSettings) -> FloatArray:
-    """Returns the number of cones per metre (n,) along a row for this gap on straights."""
+    """Return the number of cones per metre (n,) along a row for this gap on straights."""
     return 1.0 / np.clip(gap / crowding, MIN_CONE_GAP, settings.cone_gap_max)
 
 
 def _straight_gap(rows: list[FloatArray], crowding: FloatArray, settings: TrackGeneratorSettings) -> float:
-    """Returns the gap on straights, before it is limited, that gives the wanted number of cones."""
+    """Return the gap on straights, before it is limited, that gives the wanted number of cones."""
 
     def excess(gap: float) -> float:
         density = _density(gap, crowding, settings)
@@ -345,13 +327,13 @@ def _straight_gap(rows: list[FloatArray], crowding: FloatArray, settings: TrackG
 
 
 def _cumulative(row: FloatArray, density: FloatArray) -> FloatArray:
-    """Returns the number of cones from the first sample to each, and round to the first again (n + 1,)."""
+    """Return the number of cones from the first sample to each, and round to the first again (n + 1,)."""
     steps = np.diff(arc_lengths(ring(row)))
     return np.concatenate([[0.0], np.cumsum(steps * density)])
 
 
 def _place_cones(row: FloatArray, density: FloatArray, rng: Generator) -> FloatArray:
-    """Places cones (k, 2) along a closed row at this density, with a random offset."""
+    """Place cones (k, 2) along a closed row at this density, with a random offset."""
     total = _cumulative(row, density)
     count = int(np.ceil(total[-1]))
     at = (np.arange(count) + rng.random()) * total[-1] / count

@@ -5,27 +5,24 @@ from typing import Final
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from pathspace_graph.errors import SettingsError, check_numbers
 
-from .curves import CentreLine, arc_lengths, curvature, direction, left_normals
+from .curves import CentreLine, FloatArray, arc_lengths, curvature, direction, left_normals
 from .track import Track
 
-FloatArray = NDArray[np.float64]
-
 PATH_STEP: Final = 0.25
-"""The samples of the driven path are this far apart (m)."""
+"""Distance of the samples of the driven path (m)."""
 WAVES: Final = 8
-"""The wander is a sum of this number of sines."""
+"""Number of sines whose sum is the wander."""
 MIN_PATH: Final = 10
-"""A path has at least this number of samples."""
+"""Least number of samples of a path."""
 
 
 @dataclass(frozen=True)
 class VehicleSettings:
-    """Describes how the vehicle drives."""
+    """How the vehicle drives."""
 
     speed_max: float = 12.0
     """Greatest speed (m/s)."""
@@ -38,38 +35,28 @@ class VehicleSettings:
     deceleration: float = 4.0
     """Greatest longitudinal deceleration (m/s^2)."""
     wander: float = 0.3
-    """The smooth lateral wander leads at most this far from the middle (m)."""
+    """Largest distance of the smooth lateral wander from the middle (m)."""
     wander_wavelengths: tuple[float, float] = (15.0, 60.0)
-    """Shortest and the longest wavelength of the wander (m)."""
+    """Shortest and longest wavelength of the wander (m)."""
     half_width: float = 0.75
-    """Half the vehicle's width (m); the wander never brings its side nearer to the cones than
-    `margin`."""
+    """Half the vehicle's width (m), which the wander keeps `margin` away from the cones."""
     margin: float = 0.25
-    """The vehicle's side keeps this distance from the cones (m) where the track is wide enough."""
+    """Distance of the vehicle's side from the cones where the track is wide enough (m)."""
     settle_distance: float = 5.0
-    """The vehicle moves from its start pose to the middle over this distance (m)."""
+    """Distance over which the vehicle moves from its start pose to the middle (m)."""
     overrun: float = 10.0
-    """The vehicle drives this far beyond the last lap's end (m), so that the lap is complete; where it is
-    negative, the drive ends before the line, and the road stays open."""
+    """Distance driven beyond the last lap's end (m); where it is negative, the road stays open."""
     rest: float = 0.0
-    """The vehicle stands at the start pose for this time (s) before it drives."""
+    """Time at the start pose before the vehicle drives (s)."""
     rate: float = 50.0
-    """There are this many true poses per second (Hz), at the odometry's rate."""
+    """Rate of the odometry and of the true poses (Hz)."""
 
     def __post_init__(self) -> None:
-        positive = (
-            "speed_max",
-            "acceleration_lateral",
-            "acceleration",
-            "deceleration",
-            "settle_distance",
-            "rate",
-        )
-        check_numbers(self, "vehicle", positive, "a positive number")
+        positive = ("speed_max", "acceleration_lateral", "acceleration", "deceleration")
+        check_numbers(self, "vehicle", (*positive, "settle_distance", "rate"), "a positive number")
         at_least_0 = ("speed_start", "rest", "wander", "half_width", "margin")
         check_numbers(self, "vehicle", at_least_0, "a number of at least 0")
-        if not np.isfinite(self.overrun):
-            raise SettingsError(f"vehicle.overrun: expected a number, found {self.overrun}")
+        check_numbers(self, "vehicle", ("overrun",), "a number")
         shortest, longest = self.wander_wavelengths
         if not 0 < shortest <= longest < np.inf:
             raise SettingsError(f"vehicle.wander_wavelengths: expected 0 < a <= b, found {shortest, longest}")
@@ -77,35 +64,30 @@ class VehicleSettings:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """Holds what the vehicle truly did."""
+    """What the vehicle truly did."""
 
     t: FloatArray
     """Stamps (N,) in s, from 0."""
     poses: FloatArray
-    """Each row is a true pose [x, y, theta] (N, 3), map frame; the first is (0, 0, 0), and theta is not
-    wrapped."""
+    """True poses [x, y, theta] (N, 3), map frame, from (0, 0, 0); theta is not wrapped."""
     twists: FloatArray
-    """Each row is a true body twist [vx, vy, wz] (N, 3), constant until the next stamp; the last is held."""
+    """True body twists [vx, vy, wz] (N, 3), each held until the next stamp."""
 
 
 def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) -> Drive:
-    """Drives `laps` laps of a track in the map frame and a little more, or once along an open one."""
+    """Drive `laps` laps of a track in the map frame and a little more, or once along an open one."""
     path = _driven_path(track, laps, settings, rng)
-    speeds = _speed_profile(path, settings)
-    t, s = _sample_times(path, speeds, settings.rate)
+    s = _stations(path, _speed_profile(path, settings), settings.rate)
     derivative = path(s, 1)
     headings = np.unwrap(np.arctan2(derivative[:, 1], derivative[:, 0]))
-    sampled = np.column_stack([path(s), headings])
-    twists = _twists(sampled, 1.0 / settings.rate)
-    still = round(settings.rest * settings.rate)
-    twists = np.concatenate([np.zeros((still, 3)), twists])
+    twists = _twists(np.column_stack([path(s), headings]), 1.0 / settings.rate)
+    twists = np.concatenate([np.zeros((round(settings.rest * settings.rate), 3)), twists])
     t = np.arange(len(twists)) / settings.rate
     return Drive(t, integrate(twists[:-1], 1.0 / settings.rate), twists)
 
 
 def integrate(twists: FloatArray, dt: float) -> FloatArray:
-    """Integrates body twists (N, 3), each constant for `dt`, to poses (N + 1, 3) from (0, 0, 0); theta is not
-    wrapped.
+    """Integrate body twists (N, 3), each constant for `dt`, to poses (N + 1, 3) from (0, 0, 0), not wrapped.
 
     Over one step the vehicle moves by `V(wz dt) [vx, vy] dt` in its own frame, the exponential map of SE(2).
     """
@@ -119,8 +101,7 @@ def integrate(twists: FloatArray, dt: float) -> FloatArray:
 
 
 def _twists(poses: FloatArray, dt: float) -> FloatArray:
-    """Returns body twists (N, 3) that carry each pose to the next in `dt` (SE(2) logarithm); the last
-    repeats."""
+    """Return body twists (N, 3), each of which leads to the next pose in `dt` (SE(2) logarithm)."""
     step = np.diff(poses, axis=0)
     cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     dx, dy = cos * step[:, 0] + sin * step[:, 1], -sin * step[:, 0] + cos * step[:, 1]
@@ -131,13 +112,13 @@ def _twists(poses: FloatArray, dt: float) -> FloatArray:
 
 
 def _exponential(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Returns `sin(angle) / angle` and `(1 - cos(angle)) / angle`, also at 0."""
+    """Return `sin(angle) / angle` and `(1 - cos(angle)) / angle`, also at 0."""
     half = np.sinc(angle / (2 * np.pi))
     return np.sinc(angle / np.pi), np.sin(angle / 2) * half
 
 
 def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Generator) -> CubicSpline:
-    """Returns the path from the start pose on, nearly by arc length: the centre line with an offset."""
+    """Return the path from the start pose on, nearly by arc length: the centre line with an offset."""
     line = track.centre_line
     start = line.nearest(track.start)
     total = laps * line.length + settings.overrun if line.closed else line.length - start
@@ -155,7 +136,7 @@ def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Genera
 def _settling(
     line: CentreLine, start: float, pose: FloatArray, s: FloatArray, settings: VehicleSettings
 ) -> FloatArray:
-    """Returns a lateral offset (n,) that begins with the start pose's offset and slope and dies away."""
+    """Return a lateral offset (n,) that begins with the start pose's offset and slope and dies away."""
     point, tangent = line.points(np.array([start]))[0], line.tangents(np.array([start]))[0]
     normal = left_normals(tangent)
     offset = float(normal @ (pose[:2] - point))
@@ -167,7 +148,7 @@ def _settling(
 
 
 def _wander(s: FloatArray, clearance: FloatArray, settings: VehicleSettings, rng: Generator) -> FloatArray:
-    """Returns the lateral wander (n,) in m: a sum of sines with random phases that begins at 0."""
+    """Return the lateral wander (n,) in m: a sum of sines of random phases, from 0 on."""
     shortest, longest = settings.wander_wavelengths
     wavenumbers = 2 * np.pi * rng.uniform(1 / longest, 1 / shortest, WAVES)
     phases = rng.uniform(0.0, 2 * np.pi, WAVES)
@@ -178,24 +159,22 @@ def _wander(s: FloatArray, clearance: FloatArray, settings: VehicleSettings, rng
 
 
 def _speed_profile(path: CubicSpline, settings: VehicleSettings) -> FloatArray:
-    """Returns speeds (n,) at the path's knots that keep the acceleration limits, by two passes."""
+    """Return speeds (n,) at the path's knots that keep the acceleration limits, by two passes."""
     s = path.x
     bend = np.abs(curvature(np.asarray(path(s, 1)), np.asarray(path(s, 2))))
     cornering2 = settings.acceleration_lateral / np.maximum(bend, np.finfo(float).tiny)
     speed2 = np.minimum(cornering2, settings.speed_max**2)
     speed2[0] = min(speed2[0], settings.speed_start**2)
-    gain = (2 * settings.acceleration * np.diff(s)).tolist()
-    loss = (2 * settings.deceleration * np.diff(s)).tolist()
-    limits = speed2.tolist()
+    gain, loss = 2 * settings.acceleration * np.diff(s), 2 * settings.deceleration * np.diff(s)
     for i in range(len(gain)):
-        limits[i + 1] = min(limits[i + 1], limits[i] + gain[i])
-    for i in range(len(loss) - 1, -1, -1):
-        limits[i] = min(limits[i], limits[i + 1] + loss[i])
-    return np.asarray(np.sqrt(np.array(limits)))
+        speed2[i + 1] = min(speed2[i + 1], speed2[i] + gain[i])
+    for i in range(len(loss))[::-1]:
+        speed2[i] = min(speed2[i], speed2[i + 1] + loss[i])
+    return np.sqrt(speed2)
 
 
-def _sample_times(path: CubicSpline, speeds: FloatArray, rate: float) -> tuple[FloatArray, FloatArray]:
-    """Returns stamps k / rate and their arc lengths, with constant acceleration between knots."""
+def _stations(path: CubicSpline, speeds: FloatArray, rate: float) -> FloatArray:
+    """Return the arc lengths at the stamps k / rate, with constant acceleration between knots."""
     s = path.x
     durations = 2 * np.diff(s) / (speeds[1:] + speeds[:-1])
     knots_t = np.concatenate([[0.0], np.cumsum(durations)])
@@ -203,4 +182,4 @@ def _sample_times(path: CubicSpline, speeds: FloatArray, rate: float) -> tuple[F
     index = np.clip(np.searchsorted(knots_t, t, side="right") - 1, 0, len(durations) - 1)
     since = t - knots_t[index]
     acceleration = (speeds[index + 1] - speeds[index]) / durations[index]
-    return t, s[index] + speeds[index] * since + acceleration * since**2 / 2
+    return np.asarray(s[index] + speeds[index] * since + acceleration * since**2 / 2)

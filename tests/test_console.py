@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
-from pathspace_graph.console import progress, time_remaining
+from pathspace_graph.console import progress, say, time_remaining
 
 
 def test_the_time_that_remains_is_that_of_the_mean_step() -> None:
@@ -26,3 +28,11 @@ def test_without_a_terminal_only_the_lines_that_were_asked_for_are_written(
         "cells: 3 of 5",
         "cells: 5 of 5",
     ]
+
+
+def test_a_closed_pipe_is_left_to_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with pytest.raises(BrokenPipeError), os.fdopen(write, "w", buffering=1) as pipe:
+        monkeypatch.setattr("sys.stdout", pipe)
+        say("nobody reads this")

@@ -29,6 +29,7 @@ from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import write_log
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.results import write_result
+from pathspace_graph.labels import NAMES
 from pathspace_graph.run import run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim import track_files
@@ -224,6 +225,24 @@ def test_the_graph_is_asked_as_the_page_on_python_does(log: Log) -> None:
     turn = np.eye(3)
     turn[:2, :2] = rotation(mapper.poses[-1, 2])
     np.testing.assert_allclose(turn @ own @ turn.T, in_map, rtol=0.02, atol=1e-3 * np.abs(in_map).max())
+
+
+def test_the_bridge_of_the_page_on_ros_maps_json_lines(log: Log) -> None:
+    files = file_blocks(ROOT / "docs" / "ros2.md")
+    lines = [
+        (float(t), "twist", twist.tolist()) for t, twist in zip(*vars(log.odometry).values(), strict=True)
+    ]
+    for cycle in log.cycles[:30]:
+        rows = zip(*cycle.points_vehicle.T.tolist(), (NAMES[label] for label in cycle.labels), strict=True)
+        lines.append((cycle.t, "detections", [{"x": x, "y": y, "label": label} for x, y, label in rows]))
+    lines.sort(key=lambda line: line[0])
+    text = "".join(json.dumps({"t": t, kind: content}) + "\n" for t, kind, content in lines)
+    command = [sys.executable, "-c", files["mapper.py"]]
+    run = subprocess.run(command, input=text, capture_output=True, text=True, check=True)
+    assert run.stderr == ""
+    answers = [json.loads(line) for line in run.stdout.splitlines()]
+    assert [answer["t"] for answer in answers] == [cycle.t for cycle in log.cycles[:30]]
+    assert answers[-1]["pose"][0] > 1.0
 
 
 def test_each_step_of_the_paper_is_two_calls_from_the_update() -> None:

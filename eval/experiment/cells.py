@@ -17,7 +17,7 @@ from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError
 from pathspace_graph.eval.metrics.measures import Row, StageTime, measure, online_cycles, stage_times
 from pathspace_graph.eval.metrics.metric import METRICS
-from pathspace_graph.eval.metrics.summary import has_cones, lap_times, vehicle_of, versions
+from pathspace_graph.eval.metrics.summary import has_cones, lap_times, versions
 from pathspace_graph.eval.metrics.trajectory import ReachObserver
 from pathspace_graph.io.files import replacing, to_plain, write_json
 from pathspace_graph.io.log import Log
@@ -181,7 +181,7 @@ def said(run: RunResult | None) -> str:
     """Return the notices of a run's cycles and its diagnosis, each once, or an empty text."""
     if run is None:
         return ""
-    state = vehicle_of(run)
+    state = run.vehicle
     lines = [record.notice for record in run.cycles if record.notice]
     lines += [] if state is None else diagnose(state, run.settings)
     return "; ".join(dict.fromkeys(lines))

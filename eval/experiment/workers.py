@@ -1,25 +1,21 @@
 """Work is spread over processes or a cluster, and goes on when a worker dies."""
 
 import os
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from threading import Thread
 from typing import Any, Final, TypeVar
 
 from joblib import Parallel, delayed, parallel_config
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.loop.drive_record import end_with
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 CONNECT_SECONDS: Final = 20.0
 """Time (s) within which a cluster has to answer."""
-
-WATCH_SECONDS: Final = 1.0
-"""Interval (s) at which a worker checks whether the process that started it is still there."""
 
 
 class WorkerDiedError(RuntimeError):
@@ -30,7 +26,7 @@ class WorkerDiedError(RuntimeError):
 def workers(jobs: int, cluster: str | None) -> Iterator[None]:
     """Start processes on this machine with one BLAS thread each, or connect to a Dask cluster's workers."""
     if cluster is None:
-        leave = {"initializer": _end_with, "initargs": (os.getpid(),)}
+        leave = {"initializer": end_with, "initargs": (os.getpid(),)}
         with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1, **leave):
             yield
         return
@@ -44,18 +40,6 @@ def workers(jobs: int, cluster: str | None) -> Iterator[None]:
         raise SettingsError(f"--cluster: expected a Dask scheduler, found none at {cluster}") from error
     with client, parallel_config(backend="dask", wait_for_workers_timeout=CONNECT_SECONDS):
         yield
-
-
-def _end_with(parent: int) -> None:
-    """End this process soon after its parent, since a parent that is killed can't end its workers."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(WATCH_SECONDS)
-        os._exit(1)
-
-    if os.getpid() != parent:
-        Thread(target=watch, daemon=True).start()
 
 
 def check_jobs(jobs: int) -> None:

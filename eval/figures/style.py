@@ -19,7 +19,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.io.files import atomic_file, replacing
+from pathspace_graph.io.files import atomic_file, is_stream, replacing
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.sim.curves import left_normals
@@ -278,17 +278,21 @@ _FILE_RC: Final = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "
 """Settings by which text stays text in vector formats, and identifiers don't change from run to run."""
 
 
-def check_plot_file(file: Path | str) -> None:
-    """Raise SettingsError where a figure can't be saved under the suffix of `file`."""
-    if Path(file).suffix.lower() not in FORMATS:
+def check_plot_file(file: Path | str) -> str:
+    """Return the suffix of `file`, or .png for a stream; raise SettingsError where it is no picture's."""
+    suffix = Path(file).suffix.lower()
+    if suffix not in FORMATS and is_stream(Path(file)):
+        return FORMATS[0]
+    if suffix not in FORMATS:
         raise SettingsError(f"{file}: expected a file name that ends in {', '.join(FORMATS)}")
+    return suffix
 
 
 def save_plot(figure: Figure, file: Path | str, dpi: float = DPI) -> None:
-    """Write a .png, .pdf or .svg, whole or not at all; raise SettingsError for any other suffix."""
-    check_plot_file(file)
+    """Write a .png (also to a stream), .pdf or .svg; raise SettingsError for any other suffix."""
+    suffix = check_plot_file(file)
     with atomic_file(Path(file)) as temporary:
-        render(figure, temporary, Path(file).suffix.lower(), dpi)
+        render(figure, temporary, suffix, dpi)
 
 
 def save_figures(folder: Path, figures: Mapping[str, Figure]) -> None:

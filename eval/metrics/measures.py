@@ -29,7 +29,7 @@ from .accuracy import (
 )
 from .consistency import joint_cone_error, map_nees, normal_errors, turn_from_truth, with_marginals
 from .reference import limit
-from .summary import has_cones, lap_times, vehicle_of
+from .summary import has_cones, lap_times
 from .trajectory import (
     end_of_trajectory,
     longest_astray,
@@ -263,7 +263,7 @@ def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
     values: dict[str, float] = {}
     if truth is None or len(run.trajectory) == 0:
         return values
-    state = vehicle_of(run)
+    state = run.vehicle
     if state is not None:
         values |= vehicle_errors(state, float(run.trajectory_t[-1]), truth)
     if len(truth.poses):
@@ -282,7 +282,7 @@ def _told_values(cycles: Sequence[CycleRecord]) -> dict[str, float]:
 
 def _calibration_values(run: RunResult) -> dict[str, float]:
     """Return the calibrations in standard deviations of their priors, where both are known."""
-    state = vehicle_of(run)
+    state = run.vehicle
     found = {} if state is None else by_prior(state, run.settings)
     return {f"{name}_by_prior": value for name, value in found.items()}
 

@@ -8,7 +8,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.kernels import KERNELS
 from pathspace_graph.factors.noise import ray_sigmas
@@ -67,7 +66,7 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         summary["noise"] = _noise(result.noise, log)
         notes = noise_lines(result.noise)
         summary |= {"notes": notes} if notes else {}
-    state = vehicle_of(result)
+    state = result.vehicle
     if state is not None:
         summary |= _vehicle(state)
         found = diagnose(state, result.settings)
@@ -75,11 +74,6 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
     if log.truth is not None:
         summary |= _map_errors(result, log, log.truth) | _trajectory_errors(result, log.truth)
     return summary
-
-
-def vehicle_of(result: RunResult) -> VehicleState | None:
-    """Return the vehicle's state at the end of the log, where the estimator gives it."""
-    return result.vehicle_state if isinstance(result, BatchResult) else result.vehicle
 
 
 def _vehicle(state: VehicleState) -> dict[str, Any]:

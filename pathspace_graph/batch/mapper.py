@@ -24,7 +24,7 @@ from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, joint_cov
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
-from pathspace_graph.lengths import POSE, scaled
+from pathspace_graph.lengths import POSE
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import doubted, known_noise
 from pathspace_graph.mapping.revisit import Revisit
@@ -74,19 +74,6 @@ class BatchResult(BatchRun):
         with threadpool_limits(limits=1):
             weights = self.scale ** np.array(POSE, float)
             return np.outer(weights, weights) * self.system.eliminated(self.optimum).pose_marginals
-
-    @cached_property
-    def vehicle_state(self) -> VehicleState:
-        """Return the last pose and the calibration, with their joint covariance, computed once."""
-        variables, last = self.optimum.state.variables, pose_key(len(self.trajectory) - 1)
-        with threadpool_limits(limits=1):
-            keys = variables.layout.keys
-            kept = Layout(keys[~are_poses(keys) | (keys == last)])
-            information, _ = eliminated_system(self.system.linear_graph(self.optimum), kept)
-            system = FactoredSystem(kept, cholesky(information))
-            covariance = system.covariance(np.append(last, variables.calibration_keys))
-        pose = self.optimum.state.poses[-1]
-        return scaled(VehicleState.split(pose, variables.calibrations, covariance), self.scale)
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return the whole problem at the optimum by `nonlinear_graph`; its lengths are over the scale."""
@@ -144,7 +131,7 @@ class BatchMapper:
             at, convergence = optimizer.find(state)
         at, convergence = _with_doubt(optimizer, at, convergence)
         watch.lap("optimum")
-        joint = system.eliminated(at).joint(at.state.map_keys)
+        joint, vehicle = system.eliminated(at).joint(at.state.map_keys), _vehicle(system, at)
         watch.lap("covariance")
         detections = deepcopy(detections)  # the result's problem keeps its own associations
         state, joint = simplify(at.state, joint, detections, settings)
@@ -166,6 +153,7 @@ class BatchMapper:
             map_covariance=joint,
             calibration=at.state.calibration.copy(),
             noise=judged.noise,
+            vehicle=vehicle,
             online=online,
             seconds=watch.laps,
             system=system,
@@ -177,6 +165,18 @@ class BatchMapper:
             raise SettingsError("start online: expected an online mapper to begin with, found none")
         mapper = self.online(replace(self.settings, scale=1.0), self.noise)
         return *start_online(log, mapper), mapper.revisits
+
+
+def _vehicle(system: BatchSystem, at: Evaluation) -> VehicleState:
+    """Return the last pose and the calibration, with their joint covariance."""
+    variables, last = at.state.variables, pose_key(len(at.state.poses) - 1)
+    keys = variables.layout.keys
+    kept = Layout(keys[~are_poses(keys) | (keys == last)])
+    information, _ = eliminated_system(system.linear_graph(at), kept)
+    covariance = FactoredSystem(kept, cholesky(information)).covariance(
+        np.append(last, variables.calibration_keys)
+    )
+    return VehicleState.split(at.state.poses[-1], variables.calibrations, covariance)
 
 
 def find_optimum_from_odometry(optimizer: Optimizer) -> tuple[Evaluation, Convergence]:

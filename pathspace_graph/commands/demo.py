@@ -4,13 +4,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Final
 
-from joblib import Parallel, delayed, parallel_config
+from joblib import Parallel, delayed
 from tyro.conf import arg
 
 from pathspace_graph.console import output, progress, say
 from pathspace_graph.estimators import DEFAULT, make_online
 from pathspace_graph.eval.experiment.cells import run_estimator
 from pathspace_graph.eval.experiment.compare import side_by_side
+from pathspace_graph.eval.experiment.workers import workers
 from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import save_plot
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
@@ -60,9 +61,8 @@ class Demo:
 
 def map_with_both(log: Log, settings: MapperSettings) -> tuple[RunResult, RunResult]:
     """Return the spline graph's result and the landmark graph's, which runs in another process."""
-    with parallel_config(backend="loky", inner_max_num_threads=1):
-        # with one job it would be run here, and first
-        rival = Parallel(n_jobs=2, return_as="generator")([delayed(run_estimator)(RIVAL, settings, log)])
+    with workers(2, None):  # with one job it would be run here, and first
+        rival = Parallel(return_as="generator")([delayed(run_estimator)(RIVAL, settings, log)])
         result = map_online(log, make_online(DEFAULT, settings, log))
         with progress(RIVAL):
             (landmarks,) = rival  # to the end, or joblib warns of tasks that were cancelled

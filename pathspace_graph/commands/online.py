@@ -22,7 +22,6 @@ from pathspace_graph.eval.metrics.summary import (
     not_mapped,
     stretches_of,
     summarize,
-    vehicle_of,
 )
 from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_file_target, check_target
@@ -62,9 +61,7 @@ class Online:
     animate: Path | None = None
     """File for a film (.gif, or .mp4 if ffmpeg is installed); an earlier one is kept as a numbered backup."""
     recording: RecordingSettings = field(default_factory=RecordingSettings)
-    """What the viewer shows."""
     film: FilmSettings = field(default_factory=FilmSettings)
-    """The film."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
     """Settings of the estimator."""
 
@@ -150,7 +147,7 @@ def report(result: RunResult, log: Log) -> None:
     if result.batches is not None and result.batches.late:
         late = f"{result.batches.late} cycle{'' if result.batches.late == 1 else 's'}"
         say(f"in a vehicle the batch of the lap would have been {late} late")
-    state = vehicle_of(result)
+    state = result.vehicle
     say(*noise_lines(result.noise), *([] if state is None else diagnose(state, result.settings)))
     missing = not_mapped(result.map, log)
     if missing:

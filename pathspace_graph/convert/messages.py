@@ -135,12 +135,14 @@ def yaw_of(quaternion: Any) -> float:
 
 
 def points_of(message: Any, rule: LabelRule, label_field: str | None = None) -> Points:
-    """Return the points of a point cloud, an array of markers, or a message with lists of cones.
+    """Return the points of a point cloud, an array of markers, or a message with lists of cones or numbers.
 
     Anything else is a MessageError.
     """
     if hasattr(message, "point_step"):
         return cloud_points(message, rule, label_field)
+    if hasattr(message, "x") and hasattr(message, "y"):
+        return array_points(message, rule, label_field)
     if hasattr(message, "markers"):
         return marker_points(message, rule)
     return cone_points(message, rule, label_field)
@@ -193,6 +195,18 @@ def _cloud_columns(cloud: Any) -> dict[str, NDArray[Any]]:
     rows = rows[:needed].reshape(cloud.height, cloud.row_step)[:, : cloud.width * cloud.point_step]
     points = np.ascontiguousarray(rows).reshape(-1).view(of_a_point)
     return {name: points[name] for name in known}
+
+
+def array_points(message: Any, rule: LabelRule, label_field: str | None = None) -> Points:
+    """Return the points of a message with an array for each of `x`, `y` and, if it has one, the label."""
+    asked = (label_field,) if label_field else LABEL_FIELDS
+    names = ["x", "y", *[name for name in asked if hasattr(message, name)][:1]]
+    x, y, *values = (np.atleast_1d(getattr(message, name)) for name in names)
+    lengths = [len(x), len(y), *map(len, values)]
+    if len(set(lengths)) > 1:
+        raise MessageError(f"expected arrays {', '.join(names)} of one length, found {lengths}")
+    labels = rule.of_all(values[0]) if values else np.full(len(x), UNKNOWN)
+    return Points(np.column_stack([x, y]).astype(float), np.full((len(x), 2, 2), np.nan), labels)
 
 
 def marker_points(array: Any, rule: LabelRule) -> Points:

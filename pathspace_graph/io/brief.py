@@ -35,8 +35,9 @@ def brief(value: Any) -> str:
     shape = getattr(value, "shape", None)
     if shape is not None and getattr(value, "size", 0) > LONGEST:
         return f"array {shape}"
-    if isinstance(value, tuple | list) and len(value) > LONGEST:
-        return f"{type(value).__name__} of {len(value)} {type(value[0]).__name__}"
+    if isinstance(value, tuple | list | dict) and len(value) > LONGEST:
+        first = next(iter(value))
+        return f"{type(value).__name__} of {len(value)} {type(first).__name__}"
     if is_dataclass(value) and not isinstance(value, type):
         values = (f"{entry.name}={brief(getattr(value, entry.name))}" for entry in fields(value))
         return f"{type(value).__name__}({', '.join(values)})"

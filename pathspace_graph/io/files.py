@@ -44,7 +44,7 @@ def atomic_file(path: Path | str) -> Iterator[Path]:
     Symbolic links are followed. `-` is standard output; it, a device and a pipe are written in place.
     """
     path, final = Path(path), _followed(path)
-    if path == STDOUT or (path.exists() and not path.is_file() and not path.is_dir()):
+    if is_stream(path):
         with TemporaryDirectory() as folder:
             temporary = Path(folder, path.name)
             yield temporary
@@ -53,6 +53,11 @@ def atomic_file(path: Path | str) -> Iterator[Path]:
         return
     with _placed(final, Path.touch, lambda: check_file_target(final)) as temporary:
         yield temporary
+
+
+def is_stream(path: Path) -> bool:
+    """Return whether a path is standard output, a device or a pipe, which can't be replaced."""
+    return path == STDOUT or (path.exists() and not path.is_file() and not path.is_dir())
 
 
 def _copy(source: Path, target: Path) -> None:
@@ -113,6 +118,8 @@ def remove_manifest(folder: Path) -> None:
 
 def check_target(target: Path | str, marker: str) -> None:
     """Raise an OutputError where `atomic_folder` would lose something foreign at `target`, or fail."""
+    if Path(target) == STDOUT:
+        raise OutputError(f"{STDOUT}: expected a folder to write; only one file goes to standard output")
     target = _followed(target)
     _check_parents(target)
     if not target.exists():
@@ -131,6 +138,8 @@ def check_target(target: Path | str, marker: str) -> None:
 
 def check_file_target(path: Path | str) -> None:
     """Raise an OutputError where `atomic_file` could not write `path`."""
+    if is_stream(Path(path)):
+        return
     path = _followed(path)
     _check_parents(path)
     if path.is_dir():
@@ -198,6 +207,8 @@ def _naming(final: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        if any(map(disk.is_temporary, final.parts)):
+            raise  # whoever writes the folder around it names that
         named = Path(str(error.filename or final))
         if not any(map(disk.is_temporary, named.parts)) and named not in (final, *final.parents):
             raise  # of a file that is read

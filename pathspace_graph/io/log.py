@@ -69,8 +69,8 @@ MIN_RELATIVE_DETERMINANT: Final = 1e-12
 """Least det of a covariance over xx * yy; below, it is singular to double precision."""
 
 
-@dataclass(frozen=True, eq=False)
-class Odometry:
+@dataclass(frozen=True, eq=False, repr=False)
+class Odometry(Brief):
     """Measured body twists, each of which is held until the next."""
 
     LENGTHS: ClassVar = {"twist": POSE}
@@ -96,8 +96,8 @@ class Odometry:
         return Odometry(np.append(self.t, later.t[new]), np.concatenate([self.twist, later.twist[new]]))
 
 
-@dataclass(frozen=True, eq=False)
-class Detections:
+@dataclass(frozen=True, eq=False, repr=False)
+class Detections(Brief):
     """Boundary points detected in one perception cycle."""
 
     LENGTHS: ClassVar = {"points_vehicle": 1, "covariances": 2}

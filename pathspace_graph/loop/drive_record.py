@@ -1,11 +1,14 @@
 """The drive as it was measured, its poses along the curves, and its batch when the loop closes."""
 
+import os
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from functools import cache
 from multiprocessing import current_process
+from threading import Thread
 from typing import Any, Final, cast
 
 import numpy as np
@@ -59,6 +62,8 @@ def _moved(poses: Array, frames: Array, to: Array) -> Array:
 
 WORKER_IDLE: Final = 600
 """Time with nothing to do after which the process that solves laps ends (s)."""
+WATCH_SECONDS: Final = 1.0
+"""Interval (s) at which a worker checks whether the process that started it is still there."""
 LATE: Final = "the batch of the lap was late"
 """Why a batch was given up that the process has not solved in time."""
 SOLVED: Final = 3.0
@@ -273,7 +278,21 @@ def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
 def _worker() -> Any:
     if current_process().daemon:  # it may have no children: a worker of Dask is one
         return ThreadPoolExecutor(max_workers=1)
-    return loky.ProcessPoolExecutor(max_workers=1, timeout=WORKER_IDLE)
+    return loky.ProcessPoolExecutor(
+        max_workers=1, timeout=WORKER_IDLE, initializer=end_with, initargs=(os.getpid(),)
+    )
+
+
+def end_with(parent: int) -> None:
+    """End this process soon after its parent, since a parent that is killed can't end its workers."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(WATCH_SECONDS)
+        os._exit(1)
+
+    if os.getpid() != parent:
+        Thread(target=watch, daemon=True).start()
 
 
 def _end_worker() -> None:

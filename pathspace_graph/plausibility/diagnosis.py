@@ -1,8 +1,7 @@
 """What a run has found about the vehicle, in words: the constant errors, and the noise that was measured."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -11,21 +10,19 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.results import RunNoise, VehicleState
 
 LIMIT: Final = 3.0
-"""A calibration farther from zero than this number of its prior's standard deviations is worth a line."""
+"""Prior standard deviations from zero beyond which a calibration is worth a line."""
 
 
-@dataclass(frozen=True)
-class Cause:
-    """Says what a calibration means, and where its prior is in the settings."""
+class Cause(NamedTuple):
+    """What a calibration means, and the group of the settings with its prior as `sigma_` and its name."""
 
     group: str
-    """The settings have the standard deviation in this group, under `sigma_` and the calibration's name."""
     text: str
-    """This is the cause, with a place for the size."""
+    """Cause, with a place for the size."""
     unit: float
-    """The size is the absolute calibration times this."""
+    """Size of a calibration of 1."""
     signs: tuple[str, str]
-    """These words stand for a positive and for a negative calibration."""
+    """Words for a positive and for a negative calibration."""
 
 
 CAUSES: Final = {
@@ -39,14 +36,11 @@ CAUSES: Final = {
     "range_scale": Cause("calibration", "ranges are {:.1f} % too {}", 100.0, ("long", "short")),
     "range_bias": Cause("calibration", "ranges are {:.2f} m too {}", 1.0, ("long", "short")),
 }
-"""These are the causes by the name of the calibration."""
+"""Causes by the name of the calibration."""
 
 
 def by_prior(state: VehicleState, settings: Mapping[str, Any]) -> dict[str, float]:
-    """Returns each calibration by the standard deviation of its prior.
-
-    `settings` are those of the run as plain values. A calibration whose prior is not there is left out.
-    """
+    """Return each calibration whose prior is in a run's settings over the prior's standard deviation."""
     found = {}
     for name, (value, _) in state.by_name.items():
         prior = settings.get(CAUSES[name].group, {}).get(f"sigma_{name}")
@@ -56,10 +50,7 @@ def by_prior(state: VehicleState, settings: Mapping[str, Any]) -> dict[str, floa
 
 
 def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
-    """Returns a line for each calibration that its prior did not expect, with the likely cause in words.
-
-    `settings` are those of the run as plain values. The prior's standard deviations are there.
-    """
+    """Return a line for each calibration that its prior in the settings did not expect, with the cause."""
     values, lines = state.by_name, []
     for name, ratio in by_prior(state, settings).items():
         if abs(ratio) > LIMIT:
@@ -72,24 +63,24 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
 # --- measured noise --------------------------------------------------------------------------------------
 
 REFERENCE: Final = 10.0
-"""The noise of detections is told at this range (m)."""
+"""Range at which the noise of detections is told (m)."""
 CLEAR: Final = 4.0
-"""A measured error of the sensor is told where it is larger than this number of its standard deviations."""
+"""Standard deviations beyond which a measured error of the sensor is told."""
 WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_scale": 0.01, "range_bias": 0.05}
-"""It is told where it is larger than this (rad, m, s, -, m)."""
+"""Size beyond which it is told (rad, m, s, -, m)."""
 STAYING: Final = 0.1
-"""Errors that stay with a cone are told where they are this share of the variance."""
+"""Share of the variance from which errors that stay with a cone are told."""
 
 
 def noise_lines(noise: RunNoise | None) -> list[str]:
-    """Returns what was measured in a line, and in another one that ranges and speeds disagree if they do."""
+    """Return a line on what was measured, and another one where ranges and speeds disagree."""
     if noise is None or noise.measured is None or "measured" not in (noise.odometry, noise.detections):
         return []
     return [measured_line(noise.measured), *size_lines(noise)]
 
 
 def measured_line(measured: MeasuredNoise) -> str:
-    """Returns in a line the noise, and those constant errors of the sensor that are clearly there."""
+    """Return a line on the noise, and the constant errors of the sensor that are clearly there."""
     forward, sideways, turning = measured.odometry.tolist()
     line = (
         f"measured: odometry {forward:.2g} m/s, {sideways:.2g} m/s, {turning:.2g} rad/s from sample to sample"
@@ -108,7 +99,7 @@ def measured_line(measured: MeasuredNoise) -> str:
 
 
 def size_lines(noise: RunNoise) -> list[str]:
-    """Returns a line where ranges and speeds disagree: by how much, and which of them the map believes."""
+    """Return a line where ranges and speeds disagree: by how much, and which of them the map believes."""
     if noise.size is None or noise.measured is None:
         return []
     share = 100.0 * abs(noise.measured.sensor[SENSOR.index("range_scale")])
@@ -119,28 +110,20 @@ def size_lines(noise: RunNoise) -> list[str]:
 
 
 def _errors(measured: MeasuredNoise) -> list[str]:
-    """Returns the constant errors of the sensor that are clear and worth a word."""
-    clear = {
-        name: value
-        for name, value, sigma in zip(
-            SENSOR, measured.sensor.tolist(), measured.sensor_sigma.tolist(), strict=True
-        )
-        if abs(value) > max(CLEAR * sigma, WORTH[name])
-    }
-    texts = []
+    """Return the constant errors of the sensor that are clear and worth a word."""
+    errors = zip(SENSOR, measured.sensor.tolist(), measured.sensor_sigma.tolist(), strict=True)
+    clear = {name: value for name, value, sigma in errors if abs(value) > max(CLEAR * sigma, WORTH[name])}
+    side = {name: "left" if value > 0.0 else "right" for name, value in clear.items()}
+    texts, ranges = [], []
     if "latency" in clear:
         late = "late" if clear["latency"] > 0.0 else "early"
         texts.append(f"stamps {1e3 * abs(clear['latency']):.0f} ms {late}")
     if "yaw" in clear:
-        texts.append(f"turned {np.rad2deg(abs(clear['yaw'])):.1f} degrees to the {_side(clear['yaw'])}")
+        texts.append(f"turned {np.rad2deg(abs(clear['yaw'])):.1f} degrees to the {side['yaw']}")
     if "lateral" in clear:
-        texts.append(f"{abs(clear['lateral']):.2f} m too far to the {_side(clear['lateral'])}")
-    ranges = [f"{clear['range_scale']:+.1%}".replace("%", " %")] if "range_scale" in clear else []
+        texts.append(f"{abs(clear['lateral']):.2f} m too far to the {side['lateral']}")
+    if "range_scale" in clear:
+        ranges.append(f"{clear['range_scale']:+.1%}".replace("%", " %"))
     if "range_bias" in clear:
-        sign = "-" if clear["range_bias"] < 0.0 else "+"
-        ranges.append(f"{sign} {abs(clear['range_bias']):.2f} m")
+        ranges.append(f"{'-' if clear['range_bias'] < 0.0 else '+'} {abs(clear['range_bias']):.2f} m")
     return [*texts, f"ranges {' '.join(ranges)}"] if ranges else texts
-
-
-def _side(value: float) -> str:
-    return "left" if value > 0.0 else "right"

@@ -17,12 +17,35 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, UNKNOWN
-from pathspace_graph.settings.plausibility import PlausibilitySettings
 
-from .pairs import DEGREE, Meaning, Pairs, motions
+from .pairs import DEGREE, SOME_CYCLES, Meaning, Pairs, motions
 
+TURN_STEP: Final = 15.0
+"""Step of the angles that the frame of the detections is tried at (degrees)."""
+EQUAL: Final = 0.02
+"""Difference of explained shares below which hypotheses are equally good."""
+SIDED: Final = 0.2
+"""Further share of the labels on its side by which one of equally good hypotheses is better."""
+TELLING: Final = 0.2
+"""Difference of explained shares from which a pair tells two hypotheses apart."""
+CHANCE: Final = 1e-8
+"""Probability of winning as many of the pairs by chance below which a hypothesis is believed."""
+FAR_BETTER: Final = 1.8
+"""Least ratio of what a believed hypothesis explains to what the log as it is written does."""
+LEAST_SHARE: Final = 0.3
+"""Least share of the detections that a believed hypothesis explains."""
+MOUNTING_STEPS: Final = 5
+"""Gauss-Newton steps that find the mounting of the sensor."""
+LEAST_MATCHES: Final = 60
+"""Least number of matched detections from which the mounting is found."""
+WORST_CONDITION: Final = 1e6
+"""Largest condition number of the normal equations at which the mounting is found."""
+LATEST: Final = 10.0
+"""Largest delay or lead of detections that is tried (s)."""
+LATE_STEP: Final = 0.25
+"""Step of these (s)."""
 QUARTER: Final = 90.0
-"""This is a quarter turn in degrees."""
+"""A quarter turn in degrees."""
 MEANINGS: Final = (
     Meaning(),
     Meaning(content="nothing"),
@@ -44,34 +67,32 @@ MEANINGS: Final = (
     Meaning(content="pose", rate=DEGREE),
     Meaning(speed=1e-3, rate=1e-3),
 )
-"""These meanings of the odometry are tried; of equally good ones the first is told."""
+"""Meanings of the odometry that are tried; of equally good ones the first is told."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Says how the frame of the detections stands in that of the vehicle."""
+    """How the frame of the detections stands in that of the vehicle."""
 
     turn: float = 0.0
-    """The frame is turned by this to the left (degrees)."""
+    """Turn to the left (degrees)."""
     mirrored: bool = False
-    """The y axis points to the other side, seen from the x axis."""
+    """Whether the y axis points to the other side, seen from the x axis."""
 
     @property
     def matrix(self) -> Array:
-        """Returns the matrix (2, 2) that leads to the vehicle's frame."""
+        """Matrix (2, 2) that leads to the vehicle's frame."""
         return rotation(self.turn * DEGREE) @ np.diag([1.0, -1.0 if self.mirrored else 1.0])
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Says what the columns of a log mean."""
+    """What the columns of a log mean."""
 
-    frame: Frame = field(default_factory=Frame)
-    """The detections are in this frame."""
+    frame: Frame = Frame()
     meaning: Meaning = field(default_factory=Meaning)
-    """The odometry has this meaning."""
     late: float = 0.0
-    """The stamps of the detections are too large by this (s)."""
+    """How much too large the stamps of the detections are (s)."""
 
 
 AS_WRITTEN: Final = Hypothesis()
@@ -80,39 +101,37 @@ AS_WRITTEN: Final = Hypothesis()
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Holds how well a hypothesis explains the pairs of cycles."""
+    """How well a hypothesis explains the pairs of cycles."""
 
     hypothesis: Hypothesis
-    """This was tried."""
     explained: Array
-    """(P,) It explains this share of the detections of each pair."""
+    """Share (P,) of the detections of each pair that is explained."""
     sided: float = 0.0
-    """This share of the labelled detections is on the side of its label."""
+    """Share of the labelled detections on the side of their label."""
 
     @property
     def share(self) -> float:
-        """Returns the share of the detections that is explained."""
         return float(self.explained.mean())
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Compares a hypothesis with the log as it is written, on the pairs that tell them apart."""
+    """Comparison of a hypothesis with the log as it is written, on the pairs that tell them apart."""
 
     telling: int
-    """This number of pairs tells them apart."""
+    """Number of these pairs."""
     better: int
-    """The hypothesis explains more detections of this number of them."""
+    """Number of those that the hypothesis explains better."""
     share: float
-    """It explains this share of the detections of these pairs."""
+    """Share of their detections that it explains."""
     share_as_written: float
-    """The log as it is written explains this share of them."""
+    """Share of their detections that the log as it is written explains."""
 
-    def is_clear(self, settings: PlausibilitySettings) -> bool:
-        """Returns whether the hypothesis is better beyond doubt."""
+    def is_clear(self) -> bool:
+        """Return whether the hypothesis is better beyond doubt."""
         chance = float(bdtrc(self.better - 1, self.telling, 0.5))
-        far_better = self.share > settings.far_better * self.share_as_written
-        return chance < settings.chance and far_better and self.share > settings.least_share
+        far_better = self.share > FAR_BETTER * self.share_as_written
+        return chance < CHANCE and far_better and self.share > LEAST_SHARE
 
     @property
     def figures(self) -> dict[str, float]:
@@ -120,29 +139,25 @@ class Verdict:
         return {"as_written": self.share_as_written, "share": self.share}
 
 
-def verdict(trial: Trial, reference: Trial, settings: PlausibilitySettings) -> Verdict:
-    """Returns how a trial compares with the reference."""
+def verdict(trial: Trial, reference: Trial) -> Verdict:
+    """Return how a trial compares with the reference."""
     gain = trial.explained - reference.explained
-    telling: BoolArray = np.abs(gain) > settings.telling
+    telling: BoolArray = np.abs(gain) > TELLING
     if not telling.any():
         return Verdict(0, 0, 0.0, 0.0)
-    return Verdict(
-        int(telling.sum()),
-        int((gain[telling] > 0.0).sum()),
-        float(trial.explained[telling].mean()),
-        float(reference.explained[telling].mean()),
-    )
+    shares = (float(one.explained[telling].mean()) for one in (trial, reference))
+    return Verdict(int(telling.sum()), int((gain[telling] > 0.0).sum()), *shares)
 
 
 class Trials:
-    """Tries hypotheses on the pairs of cycles of a log."""
+    """Trials of hypotheses on the pairs of cycles of a log."""
 
-    def __init__(self, log: Log, pairs: Pairs, settings: PlausibilitySettings) -> None:
-        self.log, self.pairs, self.settings = log, pairs, settings
+    def __init__(self, log: Log, pairs: Pairs) -> None:
+        self.log, self.pairs = log, pairs
         self._poses: dict[Meaning, Array] = {}
 
     def motion(self, hypothesis: Hypothesis) -> Array:
-        """Returns the motion (P, 3) of the vehicle from the earlier to the later cycle of each pair."""
+        """Return the motion (P, 3) of the vehicle from the earlier to the later cycle of each pair."""
         odometry, pairs, meaning = self.log.odometry, self.pairs, hypothesis.meaning
         if meaning not in self._poses:
             self._poses[meaning] = meaning.poses(odometry)
@@ -150,27 +165,25 @@ class Trials:
         return motions(odometry.t, self._poses[meaning], begin, end)
 
     def trial(self, hypothesis: Hypothesis) -> Trial:
-        """Returns how well a hypothesis explains the pairs."""
         matrix = hypothesis.frame.matrix
         explained = self.pairs.explained(matrix, self.motion(hypothesis))
         return Trial(hypothesis, explained, self.sided(matrix))
 
     @cached_property
     def as_written(self) -> Trial:
-        """Returns how well the log as it is written explains the pairs."""
         return self.trial(AS_WRITTEN)
 
     def best(self) -> Trial:
-        """Returns the hypothesis that explains most; labels on their sides decide between equal ones."""
+        """Return the hypothesis that explains most; labels on their sides decide between equal ones."""
         trials = [self.as_written, *(self.trial(one) for one in self._others())]
         most = max(trial.share for trial in trials)
-        near = [trial for trial in trials if trial.share > most - self.settings.equal]
-        return max(near, key=lambda trial: trial.sided > max(one.sided for one in near) - self.settings.sided)
+        near = [trial for trial in trials if trial.share > most - EQUAL]
+        return max(near, key=lambda trial: trial.sided > max(one.sided for one in near) - SIDED)
 
     def _others(self) -> Iterator[Hypothesis]:
-        """Yields frames in fine steps for a right odometry, and in quarter turns for any other."""
+        """Yield frames in fine steps for a right odometry, and in quarter turns for any other."""
         for meaning in MEANINGS:
-            step = self.settings.turn if meaning == Meaning() else QUARTER
+            step = TURN_STEP if meaning == Meaning() else QUARTER
             for turn in np.arange(0.0, 360.0, step).tolist():
                 for mirrored in (False, True):
                     one = Hypothesis(Frame(turn - 360.0 if turn > 180.0 else turn, mirrored), meaning)
@@ -179,7 +192,7 @@ class Trials:
                         yield one
 
     def sided(self, matrix: Array) -> float:
-        """Returns the share of labelled detections on the side of their label in a frame; 0.5 without any."""
+        """Return the share of labelled detections on the side of their label in a frame; 0.5 without any."""
         points, labels = self._labelled
         if len(labels) == 0:
             return 0.5
@@ -187,8 +200,8 @@ class Trials:
 
     @cached_property
     def _labelled(self) -> tuple[Array, IntArray]:
-        """Returns the near detections (m, 2) of some cycles that have a label, and the labels (m,)."""
-        some = self.log.cycles[:: max(1, len(self.log.cycles) // self.settings.cycles)]
+        """Return the near detections (m, 2) of some cycles that have a label, and the labels (m,)."""
+        some = self.log.cycles[:: max(1, len(self.log.cycles) // SOME_CYCLES)]
         points = np.concatenate([cycle.points_vehicle for cycle in some])
         labels = np.concatenate([cycle.labels for cycle in some])
         distance = np.hypot(*points.T)
@@ -199,50 +212,50 @@ class Trials:
 # --- where the sensor is in the vehicle, and how late it is ----------------------------------------------
 
 MEDIAN_SQUARE: Final = 2.0 * float(np.log(2.0))
-"""The squared length of a vector of two standard normal numbers has this median."""
+"""Median of the squared length of a vector of two standard normal numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
-    """Holds how the sensor stands in the vehicle, beyond the frame of a hypothesis."""
+    """How the sensor stands in the vehicle, beyond the frame of a hypothesis."""
 
     values: Array
-    """(3,) It is turned to the left (rad), and sits ahead and to the left (m) of the odometry's point."""
+    """(3,) Turn to the left (rad), and place ahead and to the left of the odometry's point (m)."""
     sigmas: Array
-    """(3,) These are the standard deviations."""
+    """(3,) Their standard deviations."""
     scatter: float
-    """Detections of one cone are this far from each other as a rule (m)."""
+    """Median distance of detections of one cone (m)."""
     claimed: float
-    """Their covariances say that they are this far from each other as a rule (m)."""
+    """The same by their covariances (m)."""
 
     @property
     def yaw(self) -> tuple[float, float]:
-        """Returns the turn to the left and its standard deviation in degrees."""
+        """Turn to the left and its standard deviation in degrees."""
         return float(self.values[0]) / DEGREE, float(self.sigmas[0]) / DEGREE
 
     @property
     def arm(self) -> tuple[float, float]:
-        """Returns the length of the lever arm, and the larger standard deviation of its components (m)."""
+        """Length of the lever arm, and the larger standard deviation of its components (m)."""
         return float(np.hypot(*self.values[1:])), float(self.sigmas[1:].max())
 
 
-def mounting_of(trials: Trials, hypothesis: Hypothesis, settings: PlausibilitySettings) -> Mounting | None:
-    """Returns the mounting under which nearby detections lie on each other best; None without any.
+def mounting_of(trials: Trials, hypothesis: Hypothesis) -> Mounting | None:
+    """Return the mounting under which nearby detections lie on each other best; None without any.
 
     A cone at a (vehicle frame, earlier cycle) and b (later) with the motion (R, t) between them leaves
     `a - R b - t + (J t) yaw + (I - R) l`, in first order of the yaw and exactly in the lever arm l.
     """
     motion, frame = trials.motion(hypothesis), hypothesis.frame.matrix
     values, sigmas = np.zeros(3), np.full(3, np.inf)
-    for _ in range(settings.iterations):
+    for _ in range(MOUNTING_STEPS):
         turned = rotation(values[0]) @ frame
         seen = motion + lever(motion, values[1:])
         off, variances, rows = _matches(trials, turned, seen)
-        if len(rows) < settings.least_matches:
+        if len(rows) < LEAST_MATCHES:
             return None
         columns = _columns(motion[rows], values[1:])
         normal = np.einsum("nki,nkj->ij", columns, columns)
-        if np.linalg.cond(normal) > settings.worst_condition:
+        if np.linalg.cond(normal) > WORST_CONDITION:
             return None
         values = values - np.linalg.solve(normal, np.einsum("nki,nk->i", columns, off))
         sigmas = _sigmas(columns, off, rows, normal)
@@ -251,13 +264,13 @@ def mounting_of(trials: Trials, hypothesis: Hypothesis, settings: PlausibilitySe
 
 
 def lever(motion: Array, arm: Array) -> Array:
-    """Returns what a lever arm (2,) adds to motions (P, 3): a sensor there moves by `t + (R - I) l`."""
+    """Return what a lever arm (2,) adds to motions (P, 3): a sensor there moves by `t + (R - I) l`."""
     c, s = np.cos(motion[:, 2]) - 1.0, np.sin(motion[:, 2])
     return np.column_stack([c * arm[0] - s * arm[1], s * arm[0] + c * arm[1], np.zeros(len(motion))])
 
 
 def _columns(motion: Array, arm: Array) -> Array:
-    """Returns the derivatives (n, 2, 3) of the residuals by yaw and lever arm."""
+    """Return the derivatives (n, 2, 3) of the residuals by yaw and lever arm."""
     seen = motion + lever(motion, arm)
     columns = np.zeros((len(motion), 2, 3))
     columns[:, 0, 0], columns[:, 1, 0] = -seen[:, 1], seen[:, 0]
@@ -267,10 +280,7 @@ def _columns(motion: Array, arm: Array) -> Array:
 
 
 def _matches(trials: Trials, frame: Array, motion: Array) -> tuple[Array, Array, IntArray]:
-    """Returns the offsets (n, 2) of detections that are nearest to each other.
-
-    With them come the variances (n,) of one coordinate of each, in m^2, and the pair (n,) of each.
-    """
+    """Return offsets (n, 2) of mutually nearest detections, a coordinate's variances (n,), and pairs (n,)."""
     pairs = trials.pairs
     square = pairs.distances(frame, motion)
     forth, back = square.argmin(axis=2), square.argmin(axis=1)
@@ -283,15 +293,15 @@ def _matches(trials: Trials, frame: Array, motion: Array) -> tuple[Array, Array,
 
 
 def _sigmas(columns: Array, off: Array, rows: IntArray, normal: Array) -> Array:
-    """Returns the standard deviations (3,), for which the matches of one pair count as one observation."""
+    """Return the standard deviations (3,), for which the matches of one pair count as one observation."""
     scores = np.zeros((int(rows.max()) + 1, 3))
     np.add.at(scores, rows, np.einsum("nki,nk->ni", columns, off))
     inverse = np.linalg.inv(normal)
     return np.asarray(np.sqrt(np.diag(inverse @ (scores.T @ scores) @ inverse)))
 
 
-def best_lateness(trials: Trials, best: Trial, settings: PlausibilitySettings) -> Trial:
-    """Returns the trial of the lateness of the detections under which a hypothesis explains most."""
-    steps = np.arange(-settings.latest, settings.latest + settings.late_step, settings.late_step)
+def best_lateness(trials: Trials, best: Trial) -> Trial:
+    """Return the trial of the lateness of the detections under which a hypothesis explains most."""
+    steps = np.arange(-LATEST, LATEST + LATE_STEP, LATE_STEP)
     others = (trials.trial(replace(best.hypothesis, late=late)) for late in steps[steps != 0.0].tolist())
     return max([best, *others], key=lambda trial: trial.share)

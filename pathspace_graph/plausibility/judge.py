@@ -10,13 +10,66 @@ from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.lengths import scaled
 from pathspace_graph.scale.scene import scale_of
-from pathspace_graph.settings.plausibility import PlausibilitySettings
 
 from .hint import Hint, told
-from .hypotheses import Frame, Mounting, Trial, Trials, Verdict, best_lateness, mounting_of, verdict
+from .hypotheses import (
+    LEAST_SHARE,
+    Frame,
+    Mounting,
+    Trial,
+    Trials,
+    Verdict,
+    best_lateness,
+    mounting_of,
+    verdict,
+)
 from .noise import noise_hints
-from .pairs import DEGREE, Meaning, Pairs, motions, pairs_of
+from .pairs import DEGREE, GAPS, Meaning, Pairs, motions, pairs_of
 
+LEAST_TWISTS: Final = 20
+"""Least number of twists of a log of which anything is said."""
+OVERLAP: Final = 0.5
+"""Share of a cycle's detections that another could have seen, from which the two are compared."""
+SHORTEST_STEP: Final = 2e-4
+"""Shortest usual time between rows (s)."""
+LONGEST_STEP: Final = 5.0
+"""Longest usual time between rows (s)."""
+FARTHEST: Final = 120.0
+"""Usual greatest range of a detector of cones (m)."""
+FAR: Final = 20.0
+"""Range within which cones decide between two units that both give possible positions (m)."""
+NEAREST: Final = 0.05
+"""Usual least range of cones (m)."""
+FASTEST: Final = 100.0
+"""Speed that no vehicle exceeds in a tenth of its time (m/s)."""
+FASTEST_TURN: Final = 8.0
+"""Yaw rate that no vehicle exceeds in a tenth of its time (rad/s)."""
+TURNED: Final = 5.0
+"""Turn of the sensor beyond which it is told (degrees)."""
+TURNED_SIGMA: Final = 1.0
+"""Largest standard deviation of the turn at which it is told (degrees)."""
+ARM: Final = 1.0
+"""Distance of the sensor from the point that the odometry describes beyond which it is told (m)."""
+ARM_SIGMA: Final = 0.2
+"""Largest standard deviation of its place at which it is told, as a share of the distance."""
+CLAIMED_LESS: Final = 10.0
+"""Ratio of one cone's scatter to the claimed one from which covariances are too small."""
+CLAIMED_MORE: Final = 30.0
+"""Ratio of the claimed scatter to one cone's from which covariances are too large."""
+LEAST_SCATTER: Final = 0.02
+"""Scatter that detections which scatter less count as (m)."""
+BOTH_SIDES: Final = 0.15
+"""Distance from a half of the share of a label's cones on its own side at which they are on both."""
+NEAR: Final = 0.25
+"""Move by a share of the usual range, and turn (rad), below which two cycles see the same cones."""
+MANY: Final = 6
+"""Least number of detections that such cycles have together."""
+LEAST_NEAR: Final = 30
+"""Least number of such pairs of cycles that are counted."""
+UNEXPLAINED: Final = 0.15
+"""Share of the detections that the best motion must explain, or else none does."""
+LINE_RATIO: Final = 0.1
+"""Ratio of the variations of two coordinates below which detections lie on a line."""
 TIMES: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
 """Units of stamps by their size in s."""
 LENGTHS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}
@@ -49,35 +102,34 @@ MIRRORED: Final = Frame(0.0, True)
 """Frame in which y points to the right and x ahead."""
 
 
-def hints(log: Log, settings: PlausibilitySettings | None = None) -> list[Hint]:
+def hints(log: Log) -> list[Hint]:
     """Return the likely mistakes in a log, each with its figure; there are none in a good one.
 
     Only the readings are looked at, never the truth. Where a log is short, or stands still, or goes straight
     on, the evidence is weak, and nothing is said.
     """
-    settings = settings or PlausibilitySettings()
-    if len(log.odometry.t) < settings.least_twists:
+    if len(log.odometry.t) < LEAST_TWISTS:
         return []
     scale = scale_of(log)
-    return [scaled(hint, scale) for hint in _hints(scaled(log, 1.0 / scale), settings)]
+    return [scaled(hint, scale) for hint in _hints(scaled(log, 1.0 / scale))]
 
 
-def _hints(log: Log, settings: PlausibilitySettings) -> list[Hint]:
+def _hints(log: Log) -> list[Hint]:
     """Return the hints about a log at scale 1."""
     of_parts = whole_stamps(log)
     if of_parts:
         return of_parts
-    log, found = stamps_in_seconds(log, settings)
+    log, found = stamps_in_seconds(log)
     of_clocks = one_clock(log)
     if of_clocks:
         return found + of_clocks
-    log, of_positions = positions_in_metres(log, settings)
+    log, of_positions = positions_in_metres(log)
     found += of_positions
-    pairs = pairs_of(log.cycles, settings)
+    pairs = pairs_of(log.cycles)
     if pairs is None:
-        return found + beyond_any_vehicle(log.odometry, settings)
-    found += _by_motion(Trials(log, telling_pairs(log, pairs, settings), settings), settings)
-    return found or noise_hints(log, settings)
+        return found + beyond_any_vehicle(log.odometry)
+    found += _by_motion(Trials(log, telling_pairs(log, pairs)))
+    return found or noise_hints(log)
 
 
 # --- figures that tell units by themselves ---------------------------------------------------------------
@@ -95,13 +147,13 @@ def whole_stamps(log: Log) -> list[Hint]:
     return found
 
 
-def stamps_in_seconds(log: Log, settings: PlausibilitySettings) -> tuple[Log, list[Hint]]:
+def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
     """Return the log with its stamps in seconds, and a hint for each file in which they are not."""
     found, factors = [], {}
     for file, t in _stamps(log).items():
         step = _median(np.abs(np.diff(t)))
-        fitting = [one for one in TIMES if settings.shortest_step <= step * one <= settings.longest_step]
-        if step > settings.longest_step and fitting:
+        fitting = [one for one in TIMES if SHORTEST_STEP <= step * one <= LONGEST_STEP]
+        if step > LONGEST_STEP and fitting:
             factors[file] = fitting[0]
             found.append(
                 told("unit of stamps", file=file, step=step, unit=TIMES[fitting[0]], factor=fitting[0])
@@ -125,13 +177,13 @@ def one_clock(log: Log) -> list[Hint]:
     return [told("two clocks", begin=begin, end=end, first=first, last=last)]
 
 
-def positions_in_metres(log: Log, settings: PlausibilitySettings) -> tuple[Log, list[Hint]]:
+def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
     """Return the log with its detections in metres, and a hint where they were not."""
     typical = _median(np.concatenate([np.zeros(0), *(np.hypot(*c.points_vehicle.T) for c in log.cycles)]))
-    if typical > settings.farthest:
-        fitting = [unit for unit in LENGTHS if typical * unit <= settings.far] or [min(LENGTHS)]
+    if typical > FARTHEST:
+        fitting = [unit for unit in LENGTHS if typical * unit <= FAR] or [min(LENGTHS)]
         unit, what = fitting[0], f"are in {LENGTHS[fitting[0]]}, not in metres"
-    elif 0.0 < typical < settings.nearest:
+    elif 0.0 < typical < NEAREST:
         unit, what = 1e3, "were divided by 1000 although they were in metres"
     else:
         return log, []
@@ -140,12 +192,12 @@ def positions_in_metres(log: Log, settings: PlausibilitySettings) -> tuple[Log, 
     return replace(log, cycles=tuple(cycles)), [hint]
 
 
-def beyond_any_vehicle(odometry: Odometry, settings: PlausibilitySettings) -> list[Hint]:
+def beyond_any_vehicle(odometry: Odometry) -> list[Hint]:
     """Return hints about speeds and yaw rates that no vehicle has."""
     speed = float(np.quantile(np.hypot(odometry.twist[:, 0], odometry.twist[:, 1]), 0.9))
     rate = float(np.quantile(np.abs(odometry.twist[:, 2]), 0.9))
-    found = [told("too fast", speed=speed)] if speed > settings.fastest else []
-    return found + ([told("turns too fast", rate=rate)] if rate > settings.fastest_turn else [])
+    found = [told("too fast", speed=speed)] if speed > FASTEST else []
+    return found + ([told("turns too fast", rate=rate)] if rate > FASTEST_TURN else [])
 
 
 def _stamps(log: Log) -> dict[str, Array]:
@@ -160,43 +212,43 @@ def _median(values: Array) -> float:
 # --- what the motion of the detections tells -------------------------------------------------------------
 
 
-def telling_pairs(log: Log, pairs: Pairs, settings: PlausibilitySettings) -> Pairs:
+def telling_pairs(log: Log, pairs: Pairs) -> Pairs:
     """Return the pairs of cycles that see the same cones if the odometry is right.
 
     One stretch of a track looks like the next. So cycles without cones in common agree best with a vehicle
     that does not move. Where the odometry is impossible anyway, the pairs are those that follow each other.
     """
-    if beyond_any_vehicle(log.odometry, settings):
-        return pairs.chosen(pairs.gap <= settings.gaps[1])
+    if beyond_any_vehicle(log.odometry):
+        return pairs.chosen(pairs.gap <= GAPS[1])
     motion = motions(log.odometry.t, Meaning().poses(log.odometry), pairs.begin, pairs.end)
-    return pairs.chosen(pairs.overlap(motion) >= settings.overlap)
+    return pairs.chosen(pairs.overlap(motion) >= OVERLAP)
 
 
-def _by_motion(trials: Trials, settings: PlausibilitySettings) -> list[Hint]:
+def _by_motion(trials: Trials) -> list[Hint]:
     """Return the hints about frame, odometry, clocks, mounting, covariances and labels."""
     if len(trials.pairs) == 0:
-        return beyond_any_vehicle(trials.log.odometry, settings)
-    best, found = _meant(trials, settings)
-    if best.hypothesis.meaning.content == "nothing" or (found and is_a_line(trials.pairs, settings)):
+        return beyond_any_vehicle(trials.log.odometry)
+    best, found = _meant(trials)
+    if best.hypothesis.meaning.content == "nothing" or (found and is_a_line(trials.pairs)):
         return found
-    late, of_clocks = _late(trials, best, settings)
-    if best.share < settings.least_share and late is best:
-        return found + (_unexplained(trials, best, settings) if not found else [])
-    mounting = mounting_of(trials, late.hypothesis, settings)
+    late, of_clocks = _late(trials, best)
+    if best.share < LEAST_SHARE and late is best:
+        return found + (_unexplained(trials, best) if not found else [])
+    mounting = mounting_of(trials, late.hypothesis)
     found += of_clocks
     if mounting is not None:
-        found = _turned(found, late, mounting, settings)
-        found += _placed(mounting, settings) + _certain(mounting, settings)
-    return found + _labelled(trials, best, settings)
+        found = _turned(found, late, mounting)
+        found += _placed(mounting) + _certain(mounting)
+    return found + _labelled(trials, best)
 
 
-def _meant(trials: Trials, settings: PlausibilitySettings) -> tuple[Trial, list[Hint]]:
+def _meant(trials: Trials) -> tuple[Trial, list[Hint]]:
     """Return the hypothesis that explains the log, and what it says of frame and odometry."""
     best = trials.best()
-    compared = verdict(best, trials.as_written, settings)
-    if best is trials.as_written or not compared.is_clear(settings):
-        return trials.as_written, beyond_any_vehicle(trials.log.odometry, settings)
-    if is_a_line(trials.pairs, settings):
+    compared = verdict(best, trials.as_written)
+    if best is trials.as_written or not compared.is_clear():
+        return trials.as_written, beyond_any_vehicle(trials.log.odometry)
+    if is_a_line(trials.pairs):
         return trials.as_written, [_optical(trials.pairs)]
     return best, _of_frame(best, trials, compared) + _of_odometry(best.hypothesis.meaning, compared)
 
@@ -260,22 +312,22 @@ def _of_odometry(meaning: Meaning, compared: Verdict) -> list[Hint]:
     return found
 
 
-def _late(trials: Trials, best: Trial, settings: PlausibilitySettings) -> tuple[Trial, list[Hint]]:
+def _late(trials: Trials, best: Trial) -> tuple[Trial, list[Hint]]:
     """Return the trial with the lateness of the detections, and a hint where there is a large one."""
-    late = best_lateness(trials, best, settings)
-    compared = verdict(late, best, settings)
-    if not compared.is_clear(settings):
+    late = best_lateness(trials, best)
+    compared = verdict(late, best)
+    if not compared.is_clear():
         return best, []
     seconds = late.hypothesis.late
     way = "late" if seconds > 0.0 else "early"
     return late, [told("late", seconds=abs(seconds), way=way, **compared.figures)]
 
 
-def _turned(found: list[Hint], best: Trial, mounting: Mounting, settings: PlausibilitySettings) -> list[Hint]:
+def _turned(found: list[Hint], best: Trial, mounting: Mounting) -> list[Hint]:
     """Return the hints with one about a sensor that is turned by an angle that is no quarter turn."""
     yaw, sigma = mounting.yaw
     frame = best.hypothesis.frame
-    if frame.turn % 90.0 == 0.0 and (abs(yaw) < settings.turned or sigma > settings.turned_sigma):
+    if frame.turn % 90.0 == 0.0 and (abs(yaw) < TURNED or sigma > TURNED_SIGMA):
         return found
     hint = told(
         "turned",
@@ -287,10 +339,10 @@ def _turned(found: list[Hint], best: Trial, mounting: Mounting, settings: Plausi
     return [*others, replace(hint, found=figure)]
 
 
-def _placed(mounting: Mounting, settings: PlausibilitySettings) -> list[Hint]:
+def _placed(mounting: Mounting) -> list[Hint]:
     """Return a hint where the sensor sits metres away from the point that the odometry describes."""
     length, sigma = mounting.arm
-    if length < settings.arm or sigma > settings.arm_sigma * length:
+    if length < ARM or sigma > ARM_SIGMA * length:
         return []
     ahead, left = mounting.values[1:].tolist()
     place = f"{abs(ahead):.1f} m {'ahead' if ahead > 0.0 else 'behind'} and {abs(left):.1f} m to the "
@@ -298,45 +350,45 @@ def _placed(mounting: Mounting, settings: PlausibilitySettings) -> list[Hint]:
     return [told("place", place=place, ahead=ahead, left=left)]
 
 
-def _certain(mounting: Mounting, settings: PlausibilitySettings) -> list[Hint]:
+def _certain(mounting: Mounting) -> list[Hint]:
     """Return a hint where the covariances are far from how detections of one cone scatter."""
     scatter, claimed = mounting.scatter, mounting.claimed
-    if claimed * settings.claimed_less < scatter:
+    if claimed * CLAIMED_LESS < scatter:
         unit = "another unit"
-    elif claimed > settings.claimed_more * max(scatter, settings.least_scatter):
+    elif claimed > CLAIMED_MORE * max(scatter, LEAST_SCATTER):
         unit = "mm^2 or cm^2, not in m^2"
     else:
         return []
     return [told("covariances", scatter=scatter, claimed=claimed, unit=unit)]
 
 
-def _labelled(trials: Trials, best: Trial, settings: PlausibilitySettings) -> list[Hint]:
+def _labelled(trials: Trials, best: Trial) -> list[Hint]:
     """Return a hint where one label stands for cones on both sides of the vehicle."""
     labels = np.concatenate([cycle.labels for cycle in trials.log.cycles])
     present = [label for label in (LEFT, RIGHT) if (labels == label).any()]
-    if len(present) != 1 or (labels == UNKNOWN).any() or abs(best.sided - 0.5) > settings.both_sides:
+    if len(present) != 1 or (labels == UNKNOWN).any() or abs(best.sided - 0.5) > BOTH_SIDES:
         return []
     return [told("one label", label=NAMES[present[0]], share=best.sided)]
 
 
-def _unexplained(trials: Trials, best: Trial, settings: PlausibilitySettings) -> list[Hint]:
+def _unexplained(trials: Trials, best: Trial) -> list[Hint]:
     """Return a hint where detections of cycles close to each other agree with no motion at all."""
     pairs = trials.pairs
     motion = trials.motion(best.hypothesis)
     ranges = np.nanmedian(np.hypot(pairs.before[..., 0], pairs.before[..., 1]))
-    near = np.hypot(motion[:, 0], motion[:, 1]) < settings.near * ranges
-    near &= np.abs(motion[:, 2]) < settings.near
-    near &= pairs.count >= settings.many
-    share = float(best.explained[near].mean()) if near.sum() >= settings.least_near else 1.0
-    if share > settings.unexplained:
+    near = np.hypot(motion[:, 0], motion[:, 1]) < NEAR * ranges
+    near &= np.abs(motion[:, 2]) < NEAR
+    near &= pairs.count >= MANY
+    share = float(best.explained[near].mean()) if near.sum() >= LEAST_NEAR else 1.0
+    if share > UNEXPLAINED:
         return []
-    return [_optical(pairs)] if is_a_line(pairs, settings) else [told("unexplained", share=share)]
+    return [_optical(pairs)] if is_a_line(pairs) else [told("unexplained", share=share)]
 
 
-def is_a_line(pairs: Pairs, settings: PlausibilitySettings) -> bool:
+def is_a_line(pairs: Pairs) -> bool:
     """Return whether one coordinate of all detections hardly varies beside the other."""
     spread = np.nanstd(pairs.before.reshape(-1, 2), axis=0)
-    return bool(spread.min() < settings.line * spread.max())
+    return bool(spread.min() < LINE_RATIO * spread.max())
 
 
 def _optical(pairs: Pairs) -> Hint:

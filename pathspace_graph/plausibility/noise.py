@@ -11,21 +11,31 @@ from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.measurement import DRIFT, LEAST
 from pathspace_graph.front_end.sightings import GATE, MAX_RANGE, TwistRecord
 from pathspace_graph.io.log import Log
-from pathspace_graph.settings.plausibility import PlausibilitySettings
 
 from .hint import Hint, told
 
+NOISE_FACTOR: Final = 1.5
+"""Factor between measured and stated noise of the odometry from which the stated one is wrong."""
+NOISE_AGREEMENT: Final = 1.2
+"""Largest factor between the noise by differences of different orders where odometry has white noise."""
+SCATTER_FACTOR: Final = 2.0
+"""Factor between the scatter of detections and their covariances from which these are wrong; it is told
+less well, from a few cones, and with the errors of odometry and stamps in it."""
+NOISE_SHARE: Final = 0.75
+"""Share of the detections from which on wrong covariances are told."""
+NOISE_CYCLES: Final = 300
+"""Most cycles on which the noise of detections is measured."""
 TWIST: Final = (("vx", "m/s"), ("vy", "m/s"), ("wz", "rad/s"))
 
 
-def noise_hints(log: Log, settings: PlausibilitySettings) -> list[Hint]:
-    """Returns hints where the readings contradict the noise that the log states by a large factor."""
-    found = _odometry(log, settings) if log.odometry_stated else []
-    return found + (_detections(log, settings) if log.detections_stated else [])
+def noise_hints(log: Log) -> list[Hint]:
+    """Return hints where the readings contradict the noise that the log states by a large factor."""
+    found = _odometry(log) if log.odometry_stated else []
+    return found + (_detections(log) if log.detections_stated else [])
 
 
-def _odometry(log: Log, settings: PlausibilitySettings) -> list[Hint]:
-    """Returns a hint where noise from sample to sample contradicts the stated one.
+def _odometry(log: Log) -> list[Hint]:
+    """Return a hint where noise from sample to sample contradicts the stated one.
 
     Motion is in the differences of readings as well. So the stated noise is too small only where differences
     of all orders agree, and too large only beside the least slow errors of any odometry.
@@ -36,10 +46,10 @@ def _odometry(log: Log, settings: PlausibilitySettings) -> list[Hint]:
     if orders is None or white is None:
         return []
     least, interval = white
-    agree = orders.max(axis=0) < settings.noise_agreement * least
-    small = agree & (least > settings.noise_factor * log.odometry_sigma)
+    agree = orders.max(axis=0) < NOISE_AGREEMENT * least
+    small = agree & (least > NOISE_FACTOR * log.odometry_sigma)
     most = np.hypot(least, DRIFT / np.sqrt(interval))
-    large = settings.noise_factor * most < log.odometry_sigma
+    large = NOISE_FACTOR * most < log.odometry_sigma
     stated, hints = log.odometry_sigma, []
     for which, values, size in ((small, least, "small"), (large, most, "large")):
         figures = [
@@ -53,9 +63,9 @@ def _odometry(log: Log, settings: PlausibilitySettings) -> list[Hint]:
     return hints
 
 
-def _detections(log: Log, settings: PlausibilitySettings) -> list[Hint]:
-    """Returns hints where covariances contradict how single detections of a cone scatter, by range."""
-    cycles = log.cycles[: settings.noise_cycles]
+def _detections(log: Log) -> list[Hint]:
+    """Return hints where covariances contradict how single detections of a cone scatter, by range."""
+    cycles = log.cycles[:NOISE_CYCLES]
     measured = measure_log(replace(log, cycles=cycles))
     if measured is None or measured.along is None or measured.across is None:
         return []
@@ -65,7 +75,7 @@ def _detections(log: Log, settings: PlausibilitySettings) -> list[Hint]:
     near = ranges < MAX_RANGE
     hints = []
     for axis, (name, ray) in enumerate((("along", measured.along), ("across", measured.across))):
-        size = _contradicted(ranges[near], sigmas[near, axis], ray, axis, settings)
+        size = _contradicted(ranges[near], sigmas[near, axis], ray, axis)
         if size:
             at = float(np.median(ranges[near]))
             scatter = float(ray.sigmas(np.array([at]))[0])
@@ -75,20 +85,18 @@ def _detections(log: Log, settings: PlausibilitySettings) -> list[Hint]:
     return hints
 
 
-def _contradicted(
-    ranges: Array, stated: Array, ray: RayNoise, axis: int, settings: PlausibilitySettings
-) -> str:
-    """Returns whether the stated standard deviations (m,) are too small or too large in most detections.
+def _contradicted(ranges: Array, stated: Array, ray: RayNoise, axis: int) -> str:
+    """Return whether the stated standard deviations (m,) are too small or too large in most detections.
 
     A cone is no point, which bounds the scatter from below. Detections count as those of a cone only within a
     gate, so that only a scatter far below it says that the stated one is too large.
     """
     measured = ray.sigmas(ranges)
     floor = np.array([np.full(len(ranges), LEAST[0]), LEAST[1] * ranges])[axis]
-    small = measured > settings.scatter_factor * np.maximum(stated, floor)
+    small = measured > SCATTER_FACTOR * np.maximum(stated, floor)
     gate = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
-    large = (settings.scatter_factor * measured < stated) & (3.0 * measured < gate)
+    large = (SCATTER_FACTOR * measured < stated) & (3.0 * measured < gate)
     for size, which in (("small", small), ("large", large)):
-        if len(which) and which.mean() > settings.noise_share:
+        if len(which) and which.mean() > NOISE_SHARE:
             return size
     return ""

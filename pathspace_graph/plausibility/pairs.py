@@ -11,30 +11,43 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import se2_exp, wrap_angle
 from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.settings.plausibility import PlausibilitySettings
 
+MIN_DETECTIONS: Final = 2
+"""Least number of detections of a cycle that is compared."""
+MOST_DETECTIONS: Final = 14
+"""Most detections of a cycle that are compared, the nearest ones."""
+SOME_CYCLES: Final = 200
+"""Approximate number of cycles from which the spacing of the cones is told."""
+GAPS: Final = (1, 2, 4, 8)
+"""Numbers of cycles between the two that are compared."""
+PAIRS_OF_GAP: Final = 60
+"""Approximate number of pairs of cycles that are compared for each of the gaps."""
+LONGEST: Final = 1.3
+"""Longest time between the cycles of a pair (s), if cycles do not come more rarely."""
+REACH: Final = 0.2
+"""Distance from another detection, over the cones' spacing, that counts as the same by `exp(-1/2)`."""
 SEEN: Final = 0.95
-"""This share of the detections is nearer than the range, and between the bearings, that a cycle sees."""
+"""Share of the detections within the range, and between the bearings, that a cycle sees."""
 ROUND: Final = 0.1
-"""A sensor sees all around if the mean of the directions to its detections is shorter than this."""
+"""Length of the mean direction to the detections below which a sensor sees all around."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Holds pairs of cycles, whose detections are in the frame of the log; what is not there is NaN."""
+    """Pairs of cycles, whose detections are in the frame of the log; what is not there is NaN."""
 
     begin: Array
-    """(P,) These are the stamps of the earlier cycles (s)."""
+    """Stamps (P,) of the earlier cycles (s)."""
     end: Array
-    """(P,) These are the stamps of the later cycles (s)."""
+    """Stamps (P,) of the later cycles (s)."""
     before: Array
-    """(P, m, 2) These are the detections of the earlier cycles."""
+    """Detections (P, m, 2) of the earlier cycles (m)."""
     after: Array
-    """(P, m, 2) These are the detections of the later cycles."""
+    """Detections (P, m, 2) of the later cycles (m)."""
     variances: Array
-    """(P, m, m) These are the variances of one coordinate of each difference of two detections (m^2)."""
+    """Variances (P, m, m) of one coordinate of each difference of two detections (m^2)."""
     gap: IntArray
-    """(P,) The later cycle comes this number of cycles after the earlier one."""
+    """Number (P,) of cycles from the earlier to the later one."""
     reach: float
     """A detection explains another one at distance d with the weight `exp(-d^2 / 2 reach^2)`."""
 
@@ -42,7 +55,7 @@ class Pairs:
         return len(self.begin)
 
     def distances(self, frame: Array, motion: Array) -> Array:
-        """Returns the squared distances (P, m, m) of earlier from later detections, laid on them by a motion.
+        """Return the squared distances (P, m, m) of earlier from later detections, laid on them by a motion.
 
         frame (2, 2) leads from the frame of the log to the vehicle's, and motion (P, 3) from the later to the
         earlier vehicle frame. Where there is no detection the distance is infinite.
@@ -53,31 +66,24 @@ class Pairs:
         return np.where(np.isnan(square), np.inf, square)
 
     def laid(self, frame: Array, motion: Array) -> Array:
-        """Returns the later detections (P, m, 2) in the earlier vehicle frame."""
+        """Return the later detections (P, m, 2) in the earlier vehicle frame."""
         c, s = np.cos(motion[:, 2]), np.sin(motion[:, 2])
         turn = np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2)  # the transpose, for points in rows
         return np.asarray((self.after @ frame.T) @ turn + motion[:, None, :2])
 
     def explained(self, frame: Array, motion: Array) -> Array:
-        """Returns the share (P,) of the detections of both cycles that lie on one of the other cycle."""
+        """Return the share (P,) of the detections of both cycles that lie on one of the other cycle."""
         weights = np.exp(self.distances(frame, motion) / (-2.0 * self.reach**2))
         total = weights.max(axis=2).sum(axis=1) + weights.max(axis=1).sum(axis=1)
         return np.asarray(total / np.maximum(self.count, 1))
 
     def chosen(self, rows: BoolArray) -> Pairs:
-        """Returns the pairs (P,) that are flagged."""
-        return replace(
-            self,
-            begin=self.begin[rows],
-            end=self.end[rows],
-            before=self.before[rows],
-            after=self.after[rows],
-            variances=self.variances[rows],
-            gap=self.gap[rows],
-        )
+        """Return the pairs (P,) that are flagged."""
+        arrays = {name: value[rows] for name, value in vars(self).items() if name != "reach"}
+        return replace(self, **arrays)
 
     def overlap(self, motion: Array) -> Array:
-        """Returns the share (P,) of the later detections that the earlier cycle could have seen.
+        """Return the share (P,) of the later detections that the earlier cycle could have seen.
 
         What a cycle sees is told from all detections: up to which range, and to both sides of which bearing.
         """
@@ -92,47 +98,43 @@ class Pairs:
 
     @property
     def count(self) -> IntArray:
-        """Returns the number (P,) of detections of both cycles."""
-        return np.asarray(
-            np.isfinite(self.before[..., 0]).sum(axis=1) + np.isfinite(self.after[..., 0]).sum(axis=1)
-        )
+        """Number (P,) of detections of both cycles."""
+        before, after = (np.isfinite(points[..., 0]).sum(axis=1) for points in (self.before, self.after))
+        return np.asarray(before + after)
 
 
-def pairs_of(cycles: Sequence[Detections], settings: PlausibilitySettings) -> Pairs | None:
-    """Returns pairs of cycles that are spread over a log, or None where there are none with detections."""
-    full = [cycle for cycle in cycles if len(cycle.labels) >= settings.min_detections]
-    spacing = spacing_of(full[:: max(1, len(full) // settings.cycles)])
+def pairs_of(cycles: Sequence[Detections]) -> Pairs | None:
+    """Return pairs of cycles spread over a log, or None where there are none with detections."""
+    full = [cycle for cycle in cycles if len(cycle.labels) >= MIN_DETECTIONS]
+    spacing = spacing_of(full[:: max(1, len(full) // SOME_CYCLES)])
     if spacing is None:
         return None
     stamps = np.array([cycle.t for cycle in full])
-    firsts, seconds, gaps = [], [], []
+    pairs = []
     shortest = float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
-    for gap in settings.gaps:
+    for gap in GAPS:
         later = np.arange(gap, len(full))
-        near = stamps[later] - stamps[later - gap] <= max(settings.longest, 1.5 * shortest)
+        near = stamps[later] - stamps[later - gap] <= max(LONGEST, 1.5 * shortest)
         later = later[near]
-        chosen = later[:: max(1, len(later) // settings.pairs)]
-        firsts.append(chosen - gap)
-        seconds.append(chosen)
-        gaps.append(np.full(len(chosen), gap))
-    first, second = np.concatenate(firsts), np.concatenate(seconds)
+        chosen = later[:: max(1, len(later) // PAIRS_OF_GAP)]
+        pairs.append([chosen - gap, chosen, np.full(len(chosen), gap)])
+    first, second, gaps = np.concatenate(pairs, axis=1)
     if len(first) == 0:
         return None
-    points, variances = padded(full, settings.most_detections)
+    points, variances = padded(full, MOST_DETECTIONS)
     return Pairs(
         stamps[first],
         stamps[second],
         points[first],
         points[second],
         variances[first][:, :, None] + variances[second][:, None],
-        np.concatenate(gaps),
-        settings.reach * spacing,
+        gaps,
+        REACH * spacing,
     )
 
 
 def padded(cycles: Sequence[Detections], most: int) -> tuple[Array, Array]:
-    """Returns the detections of each cycle (C, m, 2), at most so many that are nearest, and the variances of
-    one coordinate of each (C, m); both are filled with NaN."""
+    """Return the nearest detections (C, m, 2) of each cycle, and a coordinate's variances (C, m), or NaN."""
     points = np.full((len(cycles), most, 2), np.nan)
     variances = np.full((len(cycles), most), np.nan)
     for k, cycle in enumerate(cycles):
@@ -143,7 +145,7 @@ def padded(cycles: Sequence[Detections], most: int) -> tuple[Array, Array]:
 
 
 def spacing_of(cycles: Sequence[Detections]) -> float | None:
-    """Returns the median distance from a detection to the next one of its cycle, or None without any."""
+    """Return the median distance from a detection to the next one of its cycle, or None without any."""
     found = []
     for cycle in cycles:
         points = cycle.points_vehicle
@@ -155,32 +157,30 @@ def spacing_of(cycles: Sequence[Detections]) -> float | None:
 
 
 def _polar(points: Array) -> tuple[Array, Array]:
-    """Returns the ranges and the bearings (P, m) of points (P, m, 2)."""
+    """Return ranges and bearings (P, m) of points (P, m, 2)."""
     return np.hypot(points[..., 0], points[..., 1]), np.arctan2(points[..., 1], points[..., 0])
 
 
 # --- the motion of the vehicle, by what the columns of the odometry may mean -----------------------------
 
 Content = Literal["twist", "twist in the map frame", "pose", "nothing"]
-"""The columns of the odometry hold this; with `nothing` the vehicle does not move at all."""
-
+"""What the columns of the odometry hold; with `nothing` the vehicle does not move at all."""
 DEGREE: Final = float(np.pi / 180.0)
-"""This is a degree in radians."""
+"""A degree in radians."""
 
 
 @dataclass(frozen=True)
 class Meaning:
-    """Says what the columns of the odometry mean."""
+    """What the columns of the odometry mean."""
 
     speed: float = 1.0
-    """The unit of the speeds is this in m/s."""
+    """Unit of the speeds (m/s)."""
     rate: float = 1.0
-    """The unit of the yaw rate is this in rad/s."""
+    """Unit of the yaw rate (rad/s)."""
     content: Content = "twist"
-    """The columns hold a twist of the vehicle, one in the axes of the map, or a pose."""
 
     def poses(self, odometry: Odometry) -> Array:
-        """Returns the poses (N, 3) at the stamps, in a frame of their own; theta is not wrapped."""
+        """Return the poses (N, 3) at the stamps, in a frame of their own; theta is not wrapped."""
         measured = odometry.twist * [self.speed, self.speed, self.rate]
         if self.content == "pose":
             return np.column_stack([measured[:, :2], np.unwrap(measured[:, 2])])
@@ -196,7 +196,7 @@ class Meaning:
 
 
 def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
-    """Returns the motions (P, 3) between stamps (P,), each in the frame of its beginning.
+    """Return the motions (P, 3) between stamps (P,), each in the frame of its beginning.
 
     Between the stamps (N,) of the poses (N, 3) the motion is even.
     """
@@ -206,11 +206,11 @@ def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
 
 
 def _at(odometry_t: Array, poses: Array, stamps: Array) -> Array:
-    """Returns the poses (P, 3) at stamps (P,) by linear interpolation; beyond the ends they are held."""
+    """Return the poses (P, 3) at stamps (P,) by linear interpolation; beyond the ends they are held."""
     return np.column_stack([np.interp(stamps, odometry_t, column) for column in poses.T])
 
 
 def _turned(vectors: Array, angles: Array) -> Array:
-    """Returns vectors (n, 2), each turned by its angle (n,)."""
+    """Return vectors (n, 2), each turned by its angle (n,)."""
     c, s = np.cos(angles), np.sin(angles)
     return np.column_stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]])

@@ -18,22 +18,23 @@ from .hint import Hint, because, told
 from .judge import hints
 
 MOST: Final = 1e20
-"""Numbers up to this size are read, so that it can be said what they mean."""
+"""Largest number that is read, to say what it means."""
 NO_LABEL: Final = frozenset({"unknown", "", "none", "nan", "null"})
-"""These words say that a detection has no label."""
+"""Words for no label."""
 SHOWN_WORDS: Final = 3
-"""At most this number of foreign labels is shown."""
+"""Most foreign labels that are shown."""
 
 
 def read_plausible_log(folder: Path, limits: LimitSettings) -> tuple[Log, list[Hint]]:
-    """Reads a log whose cycles may all be used, and judges it; otherwise raises an InputError.
+    """Read a log whose cycles may all be used, and judges it; otherwise raise an InputError.
 
     The error names the file, the row and what was expected, and where the log tells it, the likely cause.
     """
     try:
         log = read_usable_log(folder, limits)
     except InputError as error:
-        causes = because(refused_hints(folder)) if _is_data(error.file) else ""
+        of_data = error.file.name in (ODOMETRY_FILE, DETECTIONS_FILE)
+        causes = because(refused_hints(folder)) if of_data else ""
         if not causes:
             raise
         raise InputError(error.file, f"{error.message}; {causes}", error.row) from error
@@ -41,39 +42,27 @@ def read_plausible_log(folder: Path, limits: LimitSettings) -> tuple[Log, list[H
 
 
 def refused_hints(folder: Path) -> list[Hint]:
-    """Returns the hints about a log that was refused; there are none where it cannot even be parsed."""
+    """Return the hints about a log that was refused; there are none where it cannot even be parsed."""
     try:
         odometry = read_table(folder / ODOMETRY_FILE, ("t", "vx", "vy", "wz"))
         detections = read_table(folder / DETECTIONS_FILE, ("t", "x", "y", "label", "xx", "xy", "yy"))
-        log = _unchecked(odometry, detections)
+        return hints(_unchecked(odometry, detections))
     except InputError:
         return []
-    return hints(log)
-
-
-def _is_data(file: Path) -> bool:
-    return file.name in (ODOMETRY_FILE, DETECTIONS_FILE)
 
 
 def _unchecked(odometry: Table, detections: Table) -> Log:
-    """Returns a log of any numbers, whatever their size and order."""
-    t = odometry.numbers("t", MOST)
-    twist = odometry.stack(("vx", "vy", "wz"), MOST)
+    """Return a log of any numbers, whatever their size and order."""
+    twists = Odometry(odometry.numbers("t", MOST), odometry.stack(("vx", "vy", "wz"), MOST))
     stamps, points = detections.numbers("t", MOST), detections.stack(("x", "y"), MOST)
-    xx, xy, yy = (detections.numbers(name, MOST) for name in ("xx", "xy", "yy"))
-    covariances = covariances_of(xx, xy, yy)
+    covariances = covariances_of(*(detections.numbers(name, MOST) for name in ("xx", "xy", "yy")))
     labels = np.array([label_from_name(name) for name in detections.columns["label"]], dtype=int)
-    return Log(
-        Odometry(t, twist),
-        cycles_of(stamps, points, covariances, labels),
-        np.ones(3),
-        odometry_stated=False,
-        detections_stated=False,
-    )
+    cycles = cycles_of(stamps, points, covariances, labels)
+    return Log(twists, cycles, np.ones(3), odometry_stated=False, detections_stated=False)
 
 
 def _foreign_labels(folder: Path, log: Log) -> list[Hint]:
-    """Returns a hint where no label is left or right, but many are other words than unknown."""
+    """Return a hint where no label is left or right, but many are other words than unknown."""
     if not log.cycles or any((cycle.labels != UNKNOWN).any() for cycle in log.cycles):
         return []
     words = Counter(read_table(folder / DETECTIONS_FILE, ("label",)).columns["label"])

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 from functools import wraps
+from numbers import Real
 from typing import Any, ClassVar, Final, TypeVar
 
 import numpy as np
@@ -139,6 +140,9 @@ def _outwards(method: Callable[..., Any]) -> Callable[..., Any]:
 def _ahead_at_scale(method: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(method)
     def ahead(self: Any, distance: float, step: float = 1.0) -> Any:
+        for name, length in (("distance", distance), ("step", step)):
+            if not isinstance(length, Real):
+                raise SettingsError(f"{name}: expected a number (m), found {length!r}")
         scale = self._door.scene.value
         return scaled(method(self, distance / scale, step / scale), scale)
 

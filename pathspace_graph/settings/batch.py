@@ -17,8 +17,7 @@ class BreakSettings:
     baseline: float = 0.5
     """Share in [0, 1] of the knots that is spread evenly, so that straights keep their minimum."""
     curvature_max: float = 0.7
-    """Curvature that larger ones count as (1/m), that of the inside of a tight hairpin, so that a kink does
-    not attract all knots."""
+    """Curvature that larger ones count as (1/m), so that a kink does not attract all knots."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.baseline <= 1.0:
@@ -67,8 +66,8 @@ class ClosureSettings(Positive, group="batch.closure"):
     laps: float = 1.3
     """Least length of the path driven, in laps."""
     min_correlation: float = 0.9
-    """Least correlation of the curvature with itself a lap later, 1 where it is the same. Of two loops side
-    by side the second agrees with the first to 0.89 at most; a true lap agrees to 0.92 and more."""
+    """Least correlation of the curvature with itself a lap later: 0.92 and more in true laps, 0.89 at most
+    in two loops side by side."""
     used: float = 0.75
     """Least share of the first lap's coloured detections on the curves of a closed result."""
 
@@ -86,19 +85,15 @@ class OpenLapSettings(Positive, group="open_lap"):
     cycles_share: float = 0.03
     """Share of a long lap's cycles that replaces `cycles` where it is more; the window grows until then."""
     late: int = 100
-    """Most cycles by which a batch may be late: it replaces the prior once it is solved, and is given up
-    after that, or where the window would hold more than `max_poses` poses."""
+    """Most cycles by which a batch may be late, after which it is given up, as with more than `max_poses`."""
     ends: tuple[int, ...] = ()
-    """Cycles in which the batches replace the prior in a replay, one after the other: those that
-    `summary.json` has as `batches.ends`. Later ones do so when they are due."""
+    """Cycles in which the batches replace the prior in a replay: `batches.ends` of `summary.json`."""
     retry: float = 20.0
     """Length of path to the next attempt at a loop that the detections were against (m)."""
     max_cycles: float = 6000.0
-    """Most cycles of the open lap whose measurements are kept. After a longer lap the map goes on from what
-    the window has marginalized."""
+    """Most cycles of an open lap that is solved as a batch; a longer one is left to the window."""
     max_cones: float = 1500.0
-    """Most cones of a lap that is solved as a batch. With more the map goes on from what the window has
-    marginalized, since the batch would not be in time."""
+    """Most cones of a lap that is solved as a batch, since with more it would not be in time."""
 
 
 @dataclass(frozen=True)
@@ -112,24 +107,19 @@ class BatchSettings(Positive):
     size_share: float = 0.43
     """Most control points as a share of the distinct cones that were detected (the paper has 0.44)."""
     dense_share: float = 1.0
-    """Control points for each cone of the curves that are solved for, so that they meet the cones. The map's
-    own curves have fewer, and are fitted to them in the end."""
+    """Control points for each cone of the curves that are solved for, which the map's are fitted to."""
     sigma_model: float = 0.05
-    """Standard deviation (m) of a cone's distance from the curves that are solved for; its square is added to
-    the variance of each detection across them. Online it is larger (`spline.sigma_model`), since the curves
-    have fewer control points there."""
+    """Standard deviation (m) of a cone's distance from the curves that are solved for; `spline.sigma_model`
+    online, where they have fewer control points."""
     sigma_smoothness: float = 0.4
-    """Standard deviation of the second difference of control points, as a share of their spacing. It is
-    smaller than online, since a curve between cones that were never detected has many shapes that fit equally
-    well, and each start would end in its own."""
+    """Standard deviation of the second difference of control points, as a share of their spacing: smaller
+    than online, so that a curve between cones that were never detected has one best shape."""
     sigma_slide: float = 0.2
     """Standard deviation of a control point's slide along its curve from beside its first pose (m)."""
     gate: float = 4.0
     """Width of Tukey's loss: distance beyond which a detection has no weight, in standard deviations."""
     association: AssociationSettings = field(default_factory=AssociationSettings)
-    """Places of poses and detections along the curves."""
     closure: ClosureSettings = field(default_factory=ClosureSettings)
-    """Loops that no registration has closed."""
 
 
 # --- estimators to compare with --------------------------------------------------------------------------
@@ -142,22 +132,19 @@ class CkfSettings(Positive):
     ridge: float = 0.05
     """Lambda of the ridge regression, which holds control points at their places (paper: Update)."""
     sigma_model: float = 0.25
-    """Standard deviation (m) of a cone's distance from a smooth curve; its square is added to the covariance
-    of each detection."""
+    """Standard deviation of a cone's distance from a smooth curve (m), added in each detection."""
     sigma_along: float = 1.0
-    """Standard deviation (m) of the distance along the curve between a cone and its foot point; its square is
-    added to the covariance of each detection."""
+    """Standard deviation of a cone's distance along the curve from its foot point (m), added likewise."""
     threshold: float = 4.0
     """Growth threshold (m): a detection nearer to the end updates the curve instead of extending it."""
     separation: float = 4.0
     """Least distance of an extension from the second-to-last control point (m)."""
     sigma_bend: float = 0.5
     """Standard deviation of the second difference of the control points that an extension moves or adds, as a
-    share of their spacing. The bending of the end is known from the detections on it only, and without a
-    prior its uncertainty multiplies with each extension. A large value gives the filter as it is
-    published."""
+    share of their spacing. A large value gives the filter as it is published, whose uncertainty multiplies
+    with each extension."""
     knots: Knots = "curvature"
-    """What the knots of a closed boundary follow: curvature, as in the paper, or cones."""
+    """What the knots of a closed boundary follow; curvature in the paper."""
     sightings: int = 3
     """Detections that make a landmark of the baseline filter; 1, as it is described, takes every one."""
 

@@ -1,14 +1,12 @@
 """Settings of the constant errors of odometry and sensor, which are estimated along with the map.
 
-The priors are those of a vehicle that was calibrated. Where the drive contradicts one of them, they become
-wide: then odometry or sensor is not what it was said to be. What a drive does not show stays at its prior.
+The priors are those of a calibrated vehicle. Where the drive contradicts one of them, they become wide. What
+a drive does not show stays at its prior.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Final, Literal
+from typing import Final, Literal, Self
 
 from .checked import Positive
 
@@ -17,9 +15,7 @@ WIDE_ODOMETRY: Final = 10.0
 WIDE_SENSOR: Final = 20.0
 """Standard deviations of the sensor's wide priors by those of a calibrated one."""
 SIGMAS_START: Final = (1e-4, 1e-4, 1e-5)
-"""Standard deviations (m, m, rad) of the pose at the first odometry stamp.
-
-It is zero by definition, but a variance of zero has no information."""
+"""Standard deviations (m, m, rad) of the first pose: zero by definition, but that has no information."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +38,7 @@ class OdometrySettings(Positive):
     hold_scale: bool = False
     """Whether the prior of the scale never becomes wide, since the speeds set the size of the map."""
 
-    def widened(self) -> OdometrySettings:
+    def widened(self) -> Self:
         """Return the settings of wide priors, which are not doubted again."""
         scale = self.sigma_scale if self.hold_scale else WIDE_ODOMETRY * self.sigma_scale
         return replace(self, doubt=inf, sigma_scale=scale, sigma_bias=WIDE_ODOMETRY * self.sigma_bias)
@@ -101,32 +97,18 @@ class CalibrationSettings(Positive):
     @property
     def sigmas(self) -> tuple[float, ...]:
         """Standard deviations (5,) in the order of `factors.sensor:SENSOR`, or none."""
-        sigmas = (
-            self.sigma_yaw,
-            self.sigma_lateral,
-            self.sigma_latency,
-            self.sigma_range_scale,
-            self.sigma_range_bias,
-        )
-        return sigmas if self.sensor else ()
+        return tuple(getattr(self, f"sigma_{name}") for name in self.SIGNED if self.sensor)
 
     @property
     def means(self) -> tuple[float, ...]:
         """Known errors (5,) in the order of `factors.sensor:SENSOR`, or none."""
-        means = (self.yaw, self.lateral, self.latency, self.range_scale, self.range_bias)
-        return means if self.sensor else ()
+        return tuple(getattr(self, name) for name in self.SIGNED if self.sensor)
 
-    def widened(self) -> CalibrationSettings:
+    def widened(self) -> Self:
         """Return the settings of wide priors, which are not doubted again.
 
         The scale of the ranges stays as it is known: it cannot be told from the scale of the speeds, and the
         size of the map would rest on the wheels alone.
         """
-        return replace(
-            self,
-            doubt=inf,
-            sigma_yaw=WIDE_SENSOR * self.sigma_yaw,
-            sigma_lateral=WIDE_SENSOR * self.sigma_lateral,
-            sigma_latency=WIDE_SENSOR * self.sigma_latency,
-            sigma_range_bias=WIDE_SENSOR * self.sigma_range_bias,
-        )
+        names = (f"sigma_{name}" for name in self.SIGNED if name != "range_scale")
+        return replace(self, doubt=inf, **{name: WIDE_SENSOR * getattr(self, name) for name in names})

@@ -42,14 +42,15 @@ class Positive:
                 raise SettingsError(f"{self.prefix}{entry.name}: {expected:.200}")
             if isinstance(value, bool) or not isinstance(value, int | float):
                 continue
+            wrong = ""
             if entry.name in self.SIGNED:
-                if not isfinite(value):
-                    raise SettingsError(f"{self.prefix}{entry.name}: expected a number, found {value}")
-                continue
-            if not value > 0:
-                raise SettingsError(f"{self.prefix}{entry.name}: expected a positive number, found {value}")
-            if value == inf and entry.name not in self.UNLIMITED:
-                raise SettingsError(f"{self.prefix}{entry.name}: expected a finite number, found {value}")
+                wrong = "" if isfinite(value) else "a number"
+            elif not value > 0:
+                wrong = "a positive number"
+            elif value == inf and entry.name not in self.UNLIMITED:
+                wrong = "a finite number"
+            if wrong:
+                raise SettingsError(f"{self.prefix}{entry.name}: expected {wrong}, found {value}")
 
 
 @cache

@@ -31,21 +31,17 @@ class SplineSettings(Positive):
     spacing: float = 3.5
     """Distance of neighbouring control points of an open, growing curve, m."""
     size_share: float = 0.43
-    """Number of control points after closing, as a share of the number of distinct cones that were detected
-    (the paper has 0.44)."""
+    """Control points after closing as a share of the distinct cones that were detected (paper: 0.44)."""
     knots: Knots = "cones"
-    """What the knots of a closed boundary follow. With `cones` they begin at the cones, and those whose
-    removal costs least are removed. With `curvature` they lie at equal quantiles of the curvature (paper:
-    Simplification), and the distances of cones from the curve are half as large again."""
+    """What the knots of a closed boundary follow. With `cones`, those at cones whose removal costs least are
+    removed. With `curvature` (paper: Simplification), cones are half as far again from the curve."""
     linear_baseline: float = 0.5
     """Share of the knots that follow the curvature which is spread evenly along the curve."""
     sigma_model: float = 0.25
-    """Standard deviation of a cone's distance from the curve, m; its square is added to the variance of each
-    detection across the curve. A cone has the same offset each time it is detected, so this is larger than
-    the offsets themselves, which are about 0.1 m."""
+    """Standard deviation of a cone's distance from the curve, m, added in each detection. It is larger than
+    the offsets, about 0.1 m, since a cone has the same one each time."""
     sigma_shape: float = 0.1
-    """Standard deviation of what a curve with few control points cannot follow, m. It is added to the
-    covariance of a closed map, since no number of detections averages it out."""
+    """Standard deviation of what a curve with few control points cannot follow, m, added in a closed map."""
     search_iterations: int = 2
     """Newton steps at the end of a global search for a foot point."""
     refine_room: float = 2.0
@@ -74,13 +70,11 @@ class GaugeSettings(Positive):
     sigma_spacing: float = 0.3
     """Standard deviation of the distance of neighbouring control points, as a share of its nominal value."""
     sigma_smoothness: float = 1.0
-    """Standard deviation of the second difference of control points, as a share of their spacing; at 1, a
-    circle whose radius is the spacing is one standard deviation away."""
+    """Standard deviation of the second difference of control points, as a share of their spacing."""
 
     sigma_anchor: ClassVar[float] = 1e4
-    """Standard deviation of the prior that holds each control point at its place, m. It keeps the system
-    regular, and is too weak to be noticed even where a thousand control points of a long track hold its
-    heading together."""
+    """Standard deviation of the prior that holds each control point at its place, m: it keeps the system
+    regular, and is too weak to be noticed even by a thousand of them together."""
 
 
 @dataclass(frozen=True)
@@ -99,8 +93,8 @@ class GateSettings(Positive):
     view_behind: ClassVar[float] = 4.0
     """Farthest such place behind the vehicle, m."""
     chi_unknown: ClassVar[float] = 1.5
-    """Gate of a detection of unknown colour, in standard deviations of its own uncertainty alone. The large
-    cones of a start line stand beside the boundary, and would bend it."""
+    """Gate of a detection of unknown colour, in standard deviations of its own: cones of a start line, beside
+    the boundary, would bend it."""
     sigma_floor: ClassVar[float] = 0.1
     """Standard deviation of errors that the model does not know, added in the gate, m."""
     rough: ClassVar[float] = 3.0
@@ -156,48 +150,29 @@ class MapperSettings(Positive):
     steps_grown: int = 1
     """Gauss-Newton steps of a cycle in which a curve grew."""
     noise: Literal["measured", "stated"] | None = None
-    """Noise of odometry and detections that is used: what the log states, or what is measured in the drive.
-    By default what is stated, and measured where nothing is. Constant errors of the sensor are measured
-    unless this is `stated`."""
+    """Noise of odometry and detections: by default as stated, and measured where nothing is. Constant errors
+    of the sensor are measured unless this is `stated`."""
     scale: float | None = None
     """Size of the scene by that of a Formula Student track: 0.1 for a model car of 1:10, 3 for a road. All
     lengths of the settings are those at scale 1. By default the first metres of the drive tell it."""
     limits: LimitSettings = field(default_factory=LimitSettings)
-    """What a perception cycle may hold."""
     spline: SplineSettings = field(default_factory=SplineSettings)
-    """The two boundary curves."""
     gauge: GaugeSettings = field(default_factory=GaugeSettings)
-    """The weak priors on what detections leave free."""
     gate: GateSettings = field(default_factory=GateSettings)
-    """Which detections are used, and how much they weigh."""
     growth: GrowthSettings = field(default_factory=GrowthSettings)
-    """Growth at the open end of a curve."""
     closing: ClosingSettings = field(default_factory=ClosingSettings)
-    """Loop closing."""
     open_lap: OpenLapSettings = field(default_factory=OpenLapSettings)
-    """The batch over the open lap when the loop closes."""
     health: HealthSettings = field(default_factory=HealthSettings)
-    """When an estimate is good, degraded or lost."""
     far: FarSettings = field(default_factory=FarSettings)
-    """The inactive part of the map."""
     relinearize: RelinearizeSettings = field(default_factory=RelinearizeSettings)
-    """Which factors are linearized anew in a step."""
     motion: MotionSettings = field(default_factory=MotionSettings)
-    """The check of the odometry against the detections."""
     sides: SidesSettings = field(default_factory=SidesSettings)
-    """The side of a cone by the way driven."""
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
-    """Constant errors of the odometry."""
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
-    """Constant errors of the sensor."""
     batch: BatchSettings = field(default_factory=BatchSettings)
-    """The batch optimization over a whole log."""
     landmark: LandmarkSettings = field(default_factory=LandmarkSettings)
-    """The Hungarian landmark graph."""
     ckf: CkfSettings = field(default_factory=CkfSettings)
-    """The paper's filters."""
     centerline: CenterlineSettings = field(default_factory=CenterlineSettings)
-    """The estimators of a centre line with a width."""
 
     sigma_step: ClassVar[float] = 0.5
     """Standard deviation of a control point's move in a step, m: damps sliding along the curve, and leaves

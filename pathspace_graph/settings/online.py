@@ -16,8 +16,7 @@ class GrowthSettings(Positive):
     sightings: int = 3
     """Detections within `merge_radius` that confirm a tentative track."""
     sigma: float = 0.4
-    """Standard deviation in every direction (m) to which a track must be known before a curve is extended
-    through it: a far, uncertain one waits until it was seen near."""
+    """Largest standard deviation, in any direction, of a track that a curve is extended through (m)."""
     merge_radius: float = 1.0
     """Distance within which detections of one label belong to one tentative track (m)."""
     forget_after: float = 6.0
@@ -29,8 +28,7 @@ class GrowthSettings(Positive):
     max_size: float = 5000.0
     """Number of control points from which on an open curve grows no further."""
     max_unseen: float = 500.0
-    """Longest stretch of an open curve without any cone (m): it is not carried on any farther behind the
-    vehicle, and not led on to a cone beyond that."""
+    """Longest stretch of an open curve without any cone (m)."""
 
 
 # --- closing ---------------------------------------------------------------------------------------------
@@ -65,14 +63,12 @@ class ClosingSettings(Positive):
     patience: float = 40.0
     """Length of the beginning driven again after which `sigma_patience` replaces `sigma_max` (m)."""
     sigma_patience: float = 0.85
-    """After `patience`, the standard deviation of the registered position must be below this (m): detections
-    on a straight leave the position along it free, however much of it is driven again. Where the vehicle is
-    lost, `sigma_max` stays in force."""
+    """Largest standard deviation of the registered position after `patience` (m): detections on a straight
+    leave it free. Where the vehicle is lost, `sigma_max` stays in force."""
     iterations: int = 2
     """Gauss-Newton steps after the loop is found, and again after simplification."""
     gauge_laps: float = 4.0
-    """Laps on the closed map after which its position and heading as a whole are held, and no more is claimed
-    of it than is known then. Infinite where they never are."""
+    """Laps on the closed map after which its position and heading as a whole are held; `inf` for never."""
 
 
 # --- health ----------------------------------------------------------------------------------------------
@@ -90,7 +86,7 @@ class HealthSettings(Positive):
     window: float = 1.0
     """Age up to which detections are judged together (s)."""
     min_offered: int = 12
-    """Least number of detections that are judged; where the window holds fewer, older ones count as well."""
+    """Least number of detections that are judged, older ones if the window holds fewer."""
     blind: float = 2.0
     """Time without detections from which on the estimate is degraded (s)."""
     share_degraded: float = 0.8
@@ -98,12 +94,11 @@ class HealthSettings(Positive):
     share_lost: float = 0.55
     """Share of explained detections on a closed map below which the vehicle is lost."""
     open_degraded: float = 0.35
-    """Share of explained detections below which the estimate is degraded while the loop is open. It is low,
-    since detections of stretches that are not mapped yet lie beside the curves."""
+    """Share of explained detections below which the estimate is degraded while the loop is open, low since
+    detections of stretches that are not mapped yet lie beside the curves."""
     innovation: float = 1.2
     """Largest mean squared distance of detections in use from their curve in a good estimate, before the
-    update and in units of its variance, to which one sigma of the mean over the cones in view is added; about
-    1 if the model is right."""
+    update, by its variance; one sigma of the mean over the cones in view is added."""
     sigma_degraded: float = 1.0
     """Position's largest standard deviation on a closed map beyond which an estimate is degraded (m)."""
     sigma_lost: float = 5.0
@@ -127,8 +122,8 @@ class LimitSettings(Positive, group="limits"):
     yaw_rate: float = 10.0
     """Largest yaw rate, rad/s."""
     silence: float = 30.0
-    """Longest time without a twist or a cycle, s. A vehicle may be anywhere after a longer one: one cycle is
-    refused then, and the next that agrees with it is used."""
+    """Longest time without a twist or a cycle, s. After a longer one a cycle is refused, and the next that
+    agrees with it is used."""
     range_max: float = 300.0
     """Largest distance of a detection from the vehicle, m."""
 
@@ -162,5 +157,4 @@ class SidesSettings(Positive):
     min_votes: int = 3
     """Least number of cones on the side of the other colour from which the colours are swapped."""
     colourless: float = 0.7
-    """Share of detections without a colour from which sides are told from the rows of cones; at 1, they
-    never are."""
+    """Share of detections without a colour from which sides are told from the rows of cones; 1 for never."""

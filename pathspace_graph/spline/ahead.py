@@ -17,7 +17,7 @@ from pathspace_graph.factors.se2 import left_of, to_vehicle, wrap_angle
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
 from .centre_line import points_across
-from .planning import LEAST_STEP, MOST_POINTS
+from .planning import MOST_POINTS, check_length
 
 Bools = BoolArray
 
@@ -55,7 +55,7 @@ class CurveAhead:
     """Whether the curve itself is sure not to be taken back."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TrackAhead:
     """The next stretch of the track in the vehicle's frame (x forward, y left, m and rad).
 
@@ -92,6 +92,9 @@ class TrackAhead:
     right: Array
     """Points (h, 2) of the right boundary from beside the vehicle on, in m."""
 
+    def __repr__(self) -> str:
+        return f"TrackAhead({len(self.points)} points on {self.length:.1f} m)"
+
     @property
     def closed(self) -> bool:
         """Return false: what is ahead is a stretch, also of a closed track."""
@@ -109,10 +112,11 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
     `curves` are the boundaries by label, as far as they are known. SettingsError is raised where a length is
     out of its range.
     """
+    check_length("step", step)
     if not 0.0 < distance < np.inf:
         raise SettingsError(f"distance: expected a positive number (m), found {distance:g}")
-    if not LEAST_STEP <= step < np.inf or distance > MOST_POINTS * step:
-        least = max(LEAST_STEP, distance / MOST_POINTS)
+    if distance > MOST_POINTS * step:
+        least = distance / MOST_POINTS
         raise SettingsError(f"step: expected a number of at least {least:g} m, found {step:g}")
     samples = {label: _sampled(curve, distance) for label, curve in curves.items()}
     sides = [

@@ -42,7 +42,7 @@ LEVEL_CROSSING: Final = 8.0
 """Largest distance of the crossing boundaries from where the driven path crosses itself there (m)."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class BSpline:
     """Curve S(u) = sum_j N_j^p(u) c_j in the map frame, u in [knots[p], knots[n]].
 
@@ -67,6 +67,10 @@ class BSpline:
         self._check_knots()
         if self.periodic:
             self._check_period()
+
+    def __repr__(self) -> str:
+        ends = "periodic" if self.periodic else "open"
+        return f"{type(self).__name__}({ends}, degree {self.degree}, {self.size} control points)"
 
     def _check_shapes(self) -> None:
         points, knots = self.control_points, self.knots

@@ -28,7 +28,7 @@ _EDGE_BREAKS: Final = 2
 """Knot intervals of an edge for each one of the ribbon, since it is no B-spline itself."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Ribbon(BSpline):
     """A spline (x, y, h)(u) = sum_j N_j(u) c_j, with C = (x, y) and the edges C + h n and C - h n.
 

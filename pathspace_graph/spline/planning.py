@@ -1,8 +1,12 @@
 """What a planner takes of a track: a centre line with widths, curvature and sigmas, and a speed profile."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from importlib import import_module
 from math import inf, sqrt
-from typing import Final, Protocol
+from numbers import Real
+from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
@@ -12,6 +16,9 @@ from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.settings.output import SpeedSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.centre_line import CentreCurve, Crossing, find_line
+
+if TYPE_CHECKING:
+    import pandas as pd  # imported when it is asked for: a planner has no use for it
 
 
 class SampledLine(Protocol):
@@ -131,7 +138,7 @@ _SHORT: Final = 0.95
 """Share of the way to where two normals would cross that is left to both widths."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CentreLine:
     """Centre line of a track at n points, evenly spaced, in the map frame.
 
@@ -170,6 +177,25 @@ class CentreLine:
     length_sigma: float
     """Standard deviation of the whole length, in m."""
 
+    def __repr__(self) -> str:
+        ends = "closed" if self.closed else "open"
+        return f"CentreLine({ends}, {len(self.points)} points on {self.length:.1f} m)"
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return the line as a frame: a row for each point, with x, y and every other array as a column."""
+        x, y = self.points.T
+        names = (entry.name for entry in fields(self))
+        columns = {name: getattr(self, name) for name in names if name != "points"}
+        arrays = {name: value for name, value in columns.items() if isinstance(value, np.ndarray)}
+        frame: pd.DataFrame = import_module("pandas").DataFrame({"x": x, "y": y, **arrays})
+        return frame
+
+
+def check_length(name: str, length: float) -> None:
+    """Raise a SettingsError unless a length (m) is a number of at least the shortest step."""
+    if not isinstance(length, Real) or not LEAST_STEP <= length < inf:
+        raise SettingsError(f"{name}: expected a number of at least {LEAST_STEP:g} m, found {length!r}")
+
 
 def centre_line(
     left: BSpline, right: BSpline, covariance: Array | None, closed: bool, step: float
@@ -180,8 +206,7 @@ def centre_line(
     control points of the left and then the right boundary, in the order x0, y0, x1, y1 and so on (m^2). It is
     propagated to first order. SettingsError is raised where the step is out of its range, and by `find_line`.
     """
-    if not LEAST_STEP <= step < np.inf:
-        raise SettingsError(f"step: expected a number of at least {LEAST_STEP:g} m, found {step:g}")
+    check_length("step", step)
     most, longest = MOST_POINTS * step, max(left.length(), right.length())
     if longest > most:
         raise SettingsError(f"expected boundaries of at most {most:g} m at this step, found {longest:.6g} m")

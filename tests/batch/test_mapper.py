@@ -174,7 +174,8 @@ def test_a_run_that_did_not_converge_is_written_and_reported(
 
 def test_the_vehicle_at_the_end_is_known_as_well_as_its_pose() -> None:
     result = solved("odometry")
-    state = result.vehicle_state
+    state = result.vehicle
+    assert state is not None
     np.testing.assert_array_equal(state.pose, result.trajectory[-1])
     np.testing.assert_array_equal(state.calibration, result.calibration)
     np.testing.assert_allclose(state.covariance[:3, :3], result.pose_covariances[-1], rtol=1e-6, atol=1e-12)

@@ -168,6 +168,17 @@ def test_a_message_without_a_twist_is_refused(messages: Messages) -> None:
         twist_of(messages.vector())
 
 
+def test_arrays_of_numbers_are_points() -> None:
+    message = SimpleNamespace(x=np.array([4.0, 5.0]), y=np.array([1.0, -1.0]), colour=["blue", "yellow"])
+    found = points_of(message, RULE)
+    np.testing.assert_array_equal(found.points, [[4.0, 1.0], [5.0, -1.0]])
+    np.testing.assert_array_equal(found.labels, [LEFT, RIGHT])
+    assert np.isnan(found.covariances).all()
+    assert points_of(SimpleNamespace(x=[4.0], y=[1.0]), RULE).labels == [UNKNOWN]
+    with pytest.raises(MessageError, match=r"arrays x, y, colour of one length, found \[2, 1, 2\]"):
+        points_of(SimpleNamespace(x=[4.0, 5.0], y=[1.0], colour=["blue", "yellow"]), RULE)
+
+
 def test_detections_of_objects_have_their_label_in_a_hypothesis() -> None:
     """`vision_msgs/Detection3DArray`, by its fields."""
 

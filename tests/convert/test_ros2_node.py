@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -19,6 +18,7 @@ from pathspace_graph.sim.track_generator import generate_track
 
 from ..scenes.paths import ROOT
 from .bags import EPOCH, Messages
+from .ros2 import Node, ReliabilityPolicy, install, message_class
 
 CYCLES = 40
 
@@ -66,27 +66,15 @@ def test_a_bad_message_never_stops_the_mapper(node: ModuleType, log: Log, tmp_pa
     assert read_map(tmp_path / "map").boundaries.keys() == {LEFT, RIGHT}
 
 
-class Blank:
-    """A message whose fields are there once they are asked for, as those of ROS have defaults."""
-
-    def __init__(self, **fields: Any) -> None:
-        vars(self).update(fields)
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        value = [] if name in ("poses", "points") else Blank()
-        setattr(self, name, value)
-        return value
-
-
 def test_markers_and_poses_are_filled_in(node: ModuleType) -> None:
-    points = np.array([[1.0, 2.0], [3.0, 4.0]])
-    marker = node.fill_line(Blank(), points, LEFT, Blank)
-    assert [(point.x, point.y, point.z) for point in marker.points] == [(1.0, 2.0, 0.0), (3.0, 4.0, 0.0)]
-    assert marker.color.b > marker.color.r
-    assert node.fill_line(Blank(), points, RIGHT, Blank).color.r > 0.5
-    filled = node.fill_pose(Blank(), np.array([1.0, 2.0, np.pi])).pose
+    points, point = np.array([[1.0, 2.0], [3.0, 4.0]]), message_class("geometry_msgs/Point")
+    marker = node.fill_line(message_class("visualization_msgs/Marker")(), points, LEFT, point)
+    assert [(at.x, at.y, at.z) for at in marker.points] == [(1.0, 2.0, 0.0), (3.0, 4.0, 0.0)]
+    assert marker.color.b > marker.color.r and marker.type == marker.LINE_STRIP
+    blank = message_class("visualization_msgs/Marker")()
+    assert node.fill_line(blank, points, RIGHT, point).color.r > 0.5
+    blank = message_class("geometry_msgs/PoseStamped")()
+    filled = node.fill_pose(blank, np.array([1.0, 2.0, np.pi])).pose
     assert (filled.position.x, filled.position.y) == (1.0, 2.0)
     assert filled.orientation.z == pytest.approx(1.0)
 
@@ -94,44 +82,27 @@ def test_markers_and_poses_are_filled_in(node: ModuleType) -> None:
 def test_the_node_publishes_and_saves_when_it_is_stopped(
     node: ModuleType, log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The whole of `main`, where ROS is a stand-in."""
-    published: dict[str, list[Any]] = {}
-    callbacks: dict[str, Any] = {}
-    clock = SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=EPOCH * 10**9, to_msg=Blank))
-    handle = SimpleNamespace(
-        declare_parameter=lambda _, value: SimpleNamespace(value=value),
-        create_publisher=lambda _, name, depth: SimpleNamespace(
-            publish=published.setdefault(name, []).append, depth=depth
-        ),
-        create_subscription=lambda _, topic, callback, depth: callbacks.update({topic: callback}),
-        get_clock=lambda: clock,
-        get_logger=lambda: SimpleNamespace(info=lambda _: None),
-    )
+    """The whole of `main`, against the recorded interface of ROS."""
+    nodes = []
 
-    def spin(_: Any) -> None:
-        feed(log, callbacks["odometry"], callbacks["detections"])
+    def spin(running: Node) -> None:
+        nodes.append(running)
+        (odometry, take_odometry, deep), (cloud, take_cloud, _) = running.subscribed.values()
+        assert (odometry.__name__, cloud.__name__) == ("Odometry", "PointCloud2")
+        assert deep.reliability == ReliabilityPolicy.BEST_EFFORT  # which every publisher fits
+        feed(log, take_odometry, take_cloud)
         raise KeyboardInterrupt
 
-    names = ("Point", "PoseStamped", "Odometry", "Path", "PointCloud2", "Marker", "MarkerArray", "Header")
-    kinds = {name: type(name, (Blank,), {}) for name in names}
-    ros = {
-        "rclpy": {"init": lambda: None, "create_node": lambda _: handle, "spin": spin},
-        "rclpy.executors": {"ExternalShutdownException": type("ExternalShutdownException", (Exception,), {})},
-        **{f"{package}_msgs.msg": kinds for package in ("geometry", "nav", "sensor", "std", "visualization")},
-    }
-    for name, members in ros.items():
-        module = ModuleType(name)
-        vars(module).update(members)
-        monkeypatch.setitem(sys.modules, name, module)
-        monkeypatch.setitem(
-            sys.modules, name.partition(".")[0], sys.modules.get(name.partition(".")[0], module)
-        )
+    install(monkeypatch, spin, EPOCH * 10**9)
     monkeypatch.chdir(tmp_path)
     node.main()
     assert read_map(tmp_path / "map").boundaries.keys() == {LEFT, RIGHT}
+    published = nodes[0].published
     assert {name: len(messages) for name, messages in published.items()} == dict.fromkeys(
         ("~/map", "~/ahead", "~/path"), CYCLES
     )
+    frames = [published[topic][-1].markers[0].header.frame_id for topic in ("~/map", "~/ahead")]
+    assert frames == ["map", "base_link"]
     assert len(published["~/path"][-1].poses) == CYCLES
     left, right, centre = (marker.points for marker in published["~/ahead"][-1].markers)
     assert min(len(left), len(right), len(centre)) > 5

@@ -153,6 +153,8 @@ def test_a_minus_is_standard_output(tmp_path: Path, capfdbinary: pytest.CaptureF
     with atomic_file("-") as path:
         path.write_bytes(b"\x00\xff")
     assert capfdbinary.readouterr().out == b"\x00\xff"
+    with pytest.raises(OutputError, match="only one file goes to standard output"):
+        check_target("-", "marker")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
@@ -170,11 +172,14 @@ from pathspace_graph.io.files import atomic_file, atomic_folder, write_text
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 write = {"file": atomic_file, "folder": lambda target: atomic_folder(target, "marker")}
-for name in ("file", "folder", "text"):
+for name in ("file", "folder", "text", "nested"):
     target = Path(sys.argv[1], name)
     try:
         if name == "text":
             write_text(target, 2000 * "x")
+        elif name == "nested":
+            with atomic_folder(target, "marker") as temporary:
+                write_text(temporary / "marker", 2000 * "x")
         else:
             with write[name](target) as temporary:
                 (temporary if name == "file" else temporary / "marker").write_text(2000 * "x")
@@ -185,7 +190,7 @@ for name in ("file", "folder", "text"):
 
 def test_a_full_disk_names_the_file_and_leaves_nothing(tmp_path: Path) -> None:
     run = subprocess.run([sys.executable, "-c", FULL, tmp_path], capture_output=True, text=True, check=True)
-    for line, name in zip(run.stdout.splitlines(), ("file", "folder", "text"), strict=True):
+    for line, name in zip(run.stdout.splitlines(), ("file", "folder", "text", "nested"), strict=True):
         assert line == f"{tmp_path / name}: can't be written: File too large"
     assert names(tmp_path) == []
 

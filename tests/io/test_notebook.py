@@ -11,7 +11,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from pathspace_graph import LEFT, RIGHT, FixedLagMapper, Log, Map, RunResult, SettingsError, run_online
+from pathspace_graph import (
+    LEFT,
+    RIGHT,
+    FixedLagMapper,
+    Log,
+    Map,
+    RunResult,
+    SettingsError,
+    run_online,
+    split_odometry,
+)
 from pathspace_graph.io.brief import brief
 
 from ..scenes.drives import short_drive
@@ -29,7 +39,11 @@ def drive() -> tuple[Log, RunResult]:
 
 def test_records_have_short_texts_that_say_what_they_hold() -> None:
     log, result = drive()
-    for record in (log, log.truth, result, result.map, result.map.left, result.vehicle):
+    line, mapper = result.map.centre_line(), FixedLagMapper(None, log.odometry_sigma)
+    cycle = mapper.update(*next(iter(split_odometry(log))))
+    records = [log, log.truth, log.odometry, log.cycles[0], result, result.map, result.vehicle]
+    records += [result.map.left, result.map.left.spline, line, mapper, mapper.ahead(5.0), cycle]
+    for record in records:
         assert len(repr(record)) < LONGEST
     assert f"{len(log.cycles)} cycles" in repr(log)
     assert f"left: {result.map.left.size} control points" in repr(result.map)
@@ -55,6 +69,23 @@ def test_a_run_is_a_frame_with_a_row_for_each_cycle() -> None:
     assert len(frame) == len(result.cycles)
     np.testing.assert_array_equal(frame[["x", "y", "theta"]].to_numpy(), result.trajectory)
     np.testing.assert_array_equal(frame["readings"], [record.readings for record in result.cycles])
+
+
+def test_a_centre_line_is_a_frame_with_a_row_for_each_point() -> None:
+    _, result = drive()
+    line = result.map.centre_line(2.0)
+    frame = line.to_frame()
+    np.testing.assert_array_equal(frame[["x", "y"]].to_numpy(), line.points)
+    np.testing.assert_array_equal(frame["width_left_sigma"], line.width_left_sigma)
+    assert "length" not in frame
+
+
+def test_a_length_of_a_wrong_type_is_named() -> None:
+    log, result = drive()
+    with pytest.raises(SettingsError, match=r"step: expected a number of at least .*, found 'far'"):
+        result.map.centre_line("far")  # type: ignore[arg-type]
+    with pytest.raises(SettingsError, match=r"distance: expected a number \(m\), found None"):
+        FixedLagMapper(None, log.odometry_sigma).ahead(None)  # type: ignore[arg-type]
 
 
 def test_records_are_drawn() -> None:

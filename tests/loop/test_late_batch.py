@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -267,6 +270,21 @@ def test_where_no_process_can_be_begun_there_is_a_notice(monkeypatch: pytest.Mon
     assert [result.notice for result in results if result.notice] == [
         f"{OWN_PRIOR}: the batch of the lap has failed: OSError: out of memory"
     ]
+
+
+KILLED = """
+import os, signal
+from pathspace_graph.loop import drive_record
+
+print(drive_record._submit(os.getpid).result(), flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_the_process_of_the_batch_ends_with_a_mapper_that_is_killed() -> None:
+    run = subprocess.run([sys.executable, "-c", KILLED], stdout=subprocess.PIPE, timeout=60.0, check=False)
+    assert run.returncode == -signal.SIGKILL
+    assert int(run.stdout) > 0  # it was begun; and its end was waited for, since it has the same output
 
 
 def test_a_late_batch_is_sent_again_by_a_restored_mapper(

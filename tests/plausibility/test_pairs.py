@@ -7,10 +7,8 @@ import pytest
 
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.io.log import Detections
-from pathspace_graph.plausibility.pairs import Pairs, pairs_of, spacing_of
-from pathspace_graph.settings.plausibility import PlausibilitySettings
+from pathspace_graph.plausibility.pairs import LONGEST, REACH, Pairs, pairs_of, spacing_of
 
-SETTINGS = PlausibilitySettings()
 CONES = np.array([[2.0, 2.0], [6.0, 2.2], [10.0, 2.0], [2.5, -1.9], [7.0, -2.0], [11.0, -2.1]])
 MOTION = np.array([1.0, 0.3, 0.2])
 
@@ -21,7 +19,7 @@ def cycle(t: float, pose: np.ndarray, cones: np.ndarray = CONES) -> Detections:
 
 
 def pair(motion: np.ndarray = MOTION) -> Pairs:
-    found = pairs_of([cycle(0.0, np.zeros(3)), cycle(0.1, motion)], SETTINGS)
+    found = pairs_of([cycle(0.0, np.zeros(3)), cycle(0.1, motion)])
     assert found is not None
     return found
 
@@ -40,9 +38,9 @@ def test_a_frame_that_is_undone_explains_everything() -> None:
 
 def test_a_detection_at_one_reach_counts_by_its_weight() -> None:
     cones = np.array([[0.0, 0.0], [100.0, 0.0]])
-    found = pairs_of([cycle(0.0, np.zeros(3), cones), cycle(0.1, np.zeros(3), cones)], SETTINGS)
+    found = pairs_of([cycle(0.0, np.zeros(3), cones), cycle(0.1, np.zeros(3), cones)])
     assert found is not None
-    assert found.reach == pytest.approx(100.0 * SETTINGS.reach)
+    assert found.reach == pytest.approx(100.0 * REACH)
     off = np.array([[0.0, found.reach, 0.0]])
     assert found.explained(np.eye(2), off)[0] == pytest.approx(np.exp(-0.5))
 
@@ -60,13 +58,13 @@ def test_variances_are_those_of_differences() -> None:
 def test_cycles_far_apart_are_no_pair() -> None:
     cycles = [cycle(0.1 * k, np.zeros(3)) for k in range(5)]
     gap = [cycle(100.0 + 0.1 * k, np.zeros(3)) for k in range(5)]
-    found = pairs_of([*cycles, *gap], SETTINGS)
+    found = pairs_of([*cycles, *gap])
     assert found is not None
-    assert (found.end - found.begin).max() < SETTINGS.longest
+    assert (found.end - found.begin).max() < LONGEST
 
 
 def test_single_detections_give_no_pairs() -> None:
-    assert pairs_of([cycle(0.1 * k, np.zeros(3), CONES[:1]) for k in range(9)], SETTINGS) is None
+    assert pairs_of([cycle(0.1 * k, np.zeros(3), CONES[:1]) for k in range(9)]) is None
     assert spacing_of([]) is None
 
 

@@ -216,9 +216,7 @@ def test_a_batch_of_a_log_s_times_as_large_is_s_times_as_large() -> None:
     larger = scaled(log, 3.0)
     found = make_batch("spline", MapperSettings(), larger).solve(larger)
     assert_alike(found, known, 3.0)
-    np.testing.assert_allclose(
-        found.vehicle_state.pose, known.vehicle_state.pose * [3.0, 3.0, 1.0], rtol=1e-6
-    )
+    np.testing.assert_allclose(found.vehicle.pose, known.vehicle.pose * [3.0, 3.0, 1.0], rtol=1e-6)
     np.testing.assert_allclose(
         found.pose_covariances[-1], known.pose_covariances[-1] * np.outer([3, 3, 1], [3, 3, 1]), rtol=1e-3
     )

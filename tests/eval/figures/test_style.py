@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from matplotlib.figure import Figure
 
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.figures.style import (
+    check_plot_file,
     figure_context,
     fit_height,
     grouped_legend,
+    save_plot,
     set_frame,
     shared_legend,
 )
@@ -76,3 +80,13 @@ def test_the_context_is_left_as_it_was() -> None:
     with figure_context():
         assert Figure().subplots().title.get_fontsize() == 8.0
     assert Figure().subplots().title.get_fontsize() == before
+
+
+def test_a_picture_without_a_suffix_is_a_png_where_it_goes_to_a_stream(
+    capfdbinary: pytest.CaptureFixture[bytes],
+) -> None:
+    save_plot(Figure((1.0, 1.0)), "-")
+    assert capfdbinary.readouterr().out.startswith(b"\x89PNG")
+    assert check_plot_file("/dev/null") == ".png"
+    with pytest.raises(SettingsError, match=r"ends in \.png"):
+        check_plot_file("picture")
