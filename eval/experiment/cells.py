@@ -1,15 +1,12 @@
 """Cells, each one estimator with one set of settings on one log: how they are run, measured and kept."""
 
-from __future__ import annotations
-
 import time
 import traceback
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, Generic, Self, TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -19,7 +16,7 @@ from pathspace_graph.eval.metrics.measures import Row, StageTime, measure, onlin
 from pathspace_graph.eval.metrics.metric import METRICS
 from pathspace_graph.eval.metrics.summary import has_cones, lap_times, vehicle_of, versions
 from pathspace_graph.eval.metrics.trajectory import ReachObserver
-from pathspace_graph.io.files import replacing, to_plain, write_json
+from pathspace_graph.io.files import to_plain, write_json
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.parsing import read_json
 from pathspace_graph.io.results import RunResult
@@ -28,7 +25,7 @@ from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .drives import Drive, identity, read_log_file, write_log_file
+from .drives import Drive, identity
 
 FORMAT: Final = "pathspace-cell/3"
 DIGEST: Final = "digest"
@@ -41,14 +38,11 @@ Record = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class NamedLog:
-    """A log with its name."""
+    """A log with the name of its folder, and the mistakes that are likely in it."""
 
     name: str
-    """Name of the log's folder."""
     log: Log
-    """The log."""
     hints: tuple[Hint, ...] = ()
-    """Mistakes that are likely in it."""
 
     @property
     def names(self) -> dict[str, Any]:
@@ -60,6 +54,9 @@ class NamedLog:
         """Identity among the logs of one experiment."""
         return identity(log=self.name)
 
+    def load(self) -> Log:
+        return self.log
+
 
 D = TypeVar("D", Drive, NamedLog)
 
@@ -69,11 +66,8 @@ class Cell(Generic[D]):
     """One run of an experiment."""
 
     drive: D
-    """Drive or log that is mapped."""
     estimator: str
-    """Name of the estimator."""
     settings: MapperSettings
-    """Settings of the estimator."""
     variant: str | None = None
     """Name of the settings, where there are several."""
     measured: Mapping[str, Any] = field(default_factory=dict)
@@ -82,8 +76,7 @@ class Cell(Generic[D]):
     @cached_property
     def id(self) -> str:
         """Identity of everything that the result depends on, except the code."""
-        yardsticks = self.measured.get("yardsticks", False)
-        settings = asdict(self.settings)
+        yardsticks, settings = self.measured.get("yardsticks", False), asdict(self.settings)
         return identity(
             drive=self.drive.id, estimator=self.estimator, settings=settings, yardsticks=yardsticks
         )
@@ -118,7 +111,7 @@ class Outcome:
         return 0 if self.result is None else self.result.laps
 
     @classmethod
-    def failed(cls, cell: Cell[Any], error: BaseException) -> Outcome:
+    def failed(cls, cell: Cell[Any], error: BaseException) -> Self:
         """Make the outcome of a cell that ended with an error."""
         failure = " ".join(f"{type(error).__name__}: {error}".split())
         return cls(cell.names, failure=failure, trace="".join(traceback.format_exception(error)))
@@ -127,9 +120,10 @@ class Outcome:
 # --- runs ------------------------------------------------------------------------------------------------
 
 
-def run_cell(cell: Cell[Any], log: Log) -> Outcome:
+def run_cell(cell: Cell[Any]) -> Outcome:
     """Run and measure a cell with one thread of BLAS; never raise."""
     try:
+        log = cell.drive.load()
         with threadpool_limits(limits=1):
             begin = time.perf_counter()
             result = run_estimator(cell.estimator, cell.settings, log)
@@ -158,9 +152,9 @@ def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
 # --- records ---------------------------------------------------------------------------------------------
 
 
-def record_cell(cell: Cell[Drive], log: Log) -> Record:
+def record_cell(cell: Cell[Drive]) -> Record:
     """Run a cell and return its record."""
-    return record_of(cell, run_cell(cell, log))
+    return record_of(cell, run_cell(cell))
 
 
 def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
@@ -172,13 +166,13 @@ def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
         "versions": versions(),
         "failure": outcome.failure,
         "traceback": outcome.trace,
-        "said": said(outcome.result),
+        "said": _said(outcome.result),
         "laps": lap_rows(outcome.rows),
     }
 
 
-def said(run: RunResult | None) -> str:
-    """Return the notices of a run's cycles and its diagnosis, each once, or an empty text."""
+def _said(run: RunResult | None) -> str:
+    """Return the notices of a run's cycles and its diagnosis, each once."""
     if run is None:
         return ""
     state = vehicle_of(run)
@@ -199,65 +193,26 @@ def lap_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return [{"lap": row.lap, **row.values, **shared} for row in laps] or [{"lap": 1, **whole.values}]
 
 
-@dataclass(frozen=True)
-class Store:
-    """Records of a study in a file each, and its logs while cells are missing.
-
-    All of them are data. A folder that comes from elsewhere can be resumed without running anything in it.
-    """
-
-    folder: Path
-    """Folder of the study."""
-
-    def read(self, cell: Cell[Drive]) -> Record | None:
-        """Return the cell's record, or None if there is none that is as it was written."""
-        try:
-            record = read_json(self._file(cell), "a cell")
-        except InputError:
-            return None
-        return record if _is_record(record) and record["id"] == cell.id else None
-
-    def write(self, cell: Cell[Drive], record: Record) -> None:
-        """Write the record as a file of its own, whole or not at all."""
-        write_json(self._file(cell), {**record, DIGEST: _digest(record)}, indent=1)
-
-    def has_log(self, drive: Drive) -> bool:
-        """Return whether the drive has been simulated."""
-        return self._log(drive).is_file()
-
-    def read_log(self, drive: Drive) -> Log:
-        """Return the log of a drive, simulated again where it can't be read."""
-        try:
-            return read_log_file(self._log(drive))
-        except InputError:
-            return drive.simulate()
-
-    def write_log(self, drive: Drive, log: Log) -> None:
-        """Write a simulated log, whole or not at all."""
-        with replacing(self._log(drive)) as temporary:
-            write_log_file(temporary, log)
-
-    def drop_logs(self) -> None:
-        """Remove the logs, since they can be simulated again."""
-        logs = self.folder / "logs"
-        for file in (*logs.glob("*.log"), *logs.glob("*.pickle")):  # pickles of older versions
-            file.unlink()
-        with suppress(OSError):  # there is none, or it holds something else
-            logs.rmdir()
-
-    def _file(self, cell: Cell[Drive]) -> Path:
-        return self.folder / "cells" / f"{cell.id}.json"
-
-    def _log(self, drive: Drive) -> Path:
-        return self.folder / "logs" / f"{drive.id}.log"
-
-
-def _is_record(record: Any) -> bool:
-    """Return whether this is a whole record with the right digest; older ones have none."""
+def read_record(folder: Path, cell: Cell[Drive]) -> Record | None:
+    """Return the cell's record in a study's folder, or None if there is none that is as it was written."""
+    try:
+        record = read_json(_file(folder, cell), "a cell")
+    except InputError:
+        return None
     if not isinstance(record, dict) or record.get("format") != FORMAT:
-        return False
-    digest = record.pop(DIGEST, None)
-    return record.keys() == _KEYS and digest in (None, _digest(record))
+        return None
+    digest = record.pop(DIGEST, None)  # older records have none
+    whole = record.keys() == _KEYS and digest in (None, _digest(record)) and record["id"] == cell.id
+    return record if whole else None
+
+
+def write_record(folder: Path, cell: Cell[Drive], record: Record) -> None:
+    """Write the record as a file of its own, whole or not at all."""
+    write_json(_file(folder, cell), {**record, DIGEST: _digest(record)}, indent=1)
+
+
+def _file(folder: Path, cell: Cell[Drive]) -> Path:
+    return folder / "cells" / f"{cell.id}.json"
 
 
 def _digest(record: Record) -> str:

@@ -1,10 +1,7 @@
-"""Drives: tracks by name, the logs that are simulated on them, and the files that keep those exactly."""
+"""Drives: tracks by name, and the logs that are simulated on them."""
 
 import hashlib
-import io
 import json
-import zipfile
-import zlib
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -12,10 +9,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
-from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth
+from pathspace_graph.io.log import Log
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import EVENTS, Track
 from pathspace_graph.sim.track_files import read_track
@@ -27,13 +23,8 @@ _IDENTITY_DIGITS: Final = 20
 """Number of hexadecimal digits of an identity, which are 80 bits."""
 _SEED_DIGITS: Final = 8
 """Number of hexadecimal digits of a seed."""
-_TRUTH: Final = {
-    name: name for name in ("pose_t", "poses", "cones", "cone_labels", "associations", "calibration")
-} | {"sensor": "true_sensor", "noise": "true_noise"}
-_SENSOR: Final = ("range_max", "fov", "rate")
-_DIGEST_BYTES: Final = hashlib.sha256().digest_size
-_ERRORS: Final = (OSError, ValueError, LookupError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error)
-"""Archives of something else, and arrays that do not fit each other, raise these."""
+_latest: dict[str, Log] = {}
+"""The log that was simulated last, by its drive."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +32,7 @@ class NamedTrack:
     """A track with the name that it has in the results."""
 
     name: str
-    """Name of the track."""
     track: Track
-    """Cones of the track."""
 
     @cached_property
     def digest(self) -> str:
@@ -56,16 +45,14 @@ class NamedTrack:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """One lap or more on a track, simulated once; its log serves every run on it."""
+    """One lap or more on a track."""
 
     track: NamedTrack
-    """Track of the drive."""
     seed: int
     """Number of the drive on its track."""
     noise: str
     """Name of the noise."""
     simulation: SimulationSettings
-    """Settings of the simulation."""
 
     @property
     def names(self) -> dict[str, Any]:
@@ -82,8 +69,14 @@ class Drive:
         """Identity of everything that the log depends on, except the code."""
         return identity(track=self.track.digest, seed=self.own_seed, simulation=asdict(self.simulation))
 
+    def load(self) -> Log:
+        """Return the log; the last one is kept, since cells are in the order of their logs."""
+        if self.id not in _latest:
+            _latest.clear()
+            _latest[self.id] = self.simulate()
+        return _latest[self.id]
+
     def simulate(self) -> Log:
-        """Simulate the log."""
         return simulate(self.track.track, self.simulation, self.own_seed)
 
 
@@ -91,14 +84,6 @@ def identity(**parts: Any) -> str:
     """Return a text that is the same for the same values, which are JSON's types only."""
     text = json.dumps(parts, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:_IDENTITY_DIGITS]
-
-
-def try_drive(drive: Drive) -> Log | Exception:
-    """Return the drive's log, or the error of its simulation: other drives go on."""
-    try:
-        return drive.simulate()
-    except Exception as error:
-        return error
 
 
 def load_tracks(tracks: Iterable[Path | int]) -> list[NamedTrack]:
@@ -113,7 +98,6 @@ def load_tracks(tracks: Iterable[Path | int]) -> list[NamedTrack]:
 
 
 def _expanded(entry: Path | int) -> list[Path | int]:
-    """Return the entry itself, or the track files of a folder in the order of their names."""
     if isinstance(entry, int) or not entry.is_dir():
         return [entry]
     files = sorted(file for file in entry.iterdir() if file.suffix in TRACK_SUFFIXES)
@@ -123,19 +107,14 @@ def _expanded(entry: Path | int) -> list[Path | int]:
 
 
 def _load(track: Path | int, stems: list[str]) -> NamedTrack:
-    """Name a file by its stem, and by its folder too where several files have that stem.
-
-    A path that is no file but ends with the name of an event is that event's track.
-    """
+    """Name a file by its stem, and by its folder too where several files have that stem."""
     if isinstance(track, int):
         return NamedTrack(f"generated {track}", generate_track(np.random.default_rng(track)))
     if track.name in EVENTS and not track.exists():
         return NamedTrack(track.name, EVENTS[track.name]())
     _check_file(track)
-    unique = stems.count(track.stem) == 1
-    return NamedTrack(
-        track.stem if unique else f"{track.resolve().parent.name}/{track.stem}", read_track(track)
-    )
+    folder = f"{track.resolve().parent.name}/" if stems.count(track.stem) > 1 else ""
+    return NamedTrack(f"{folder}{track.stem}", read_track(track))
 
 
 def _check_file(file: Path) -> None:
@@ -146,60 +125,3 @@ def _check_file(file: Path) -> None:
             check_name(file.name, beside, "expected a track file")
         except SettingsError as error:
             raise InputError(file, str(error)) from error
-
-
-# --- files -----------------------------------------------------------------------------------------------
-
-
-def write_log_file(file: Path, log: Log) -> None:
-    """Write the log as a numpy archive behind its SHA-256."""
-    cycles, sensor = log.cycles, [getattr(log.sensor, name) for name in _SENSOR]
-    arrays: dict[str, Any] = {
-        "odometry_t": log.odometry.t,
-        "odometry_twist": log.odometry.twist,
-        "odometry_sigma": log.odometry_sigma,
-        "cycle_t": np.array([cycle.t for cycle in cycles]),
-        "cycle_size": np.array([len(cycle.labels) for cycle in cycles], dtype=int),
-        "points": np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in cycles)]),
-        "covariances": np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in cycles)]),
-        "labels": np.concatenate([np.zeros(0, dtype=int), *(cycle.labels for cycle in cycles)]),
-        "sensor": np.array([np.nan if value is None else value for value in sensor]),
-        "source": np.array(json.dumps(dict(log.source))),
-    }
-    if log.truth is not None:
-        known = {array: getattr(log.truth, name) for name, array in _TRUTH.items()}
-        arrays |= {name: value for name, value in known.items() if value is not None}
-    archive = io.BytesIO()
-    np.savez(archive, **arrays)
-    content = archive.getvalue()
-    file.write_bytes(hashlib.sha256(content).digest() + content)
-
-
-def read_log_file(file: Path) -> Log:
-    """Return the log of an archive; an InputError says that it is none, or damaged."""
-    try:
-        data = file.read_bytes()
-        digest, content = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
-        if digest != hashlib.sha256(content).digest():
-            raise ValueError("it is not as it was written")
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        return _log(arrays)
-    except (*_ERRORS, EOFError) as error:
-        raise InputError(file, f"expected the log of a study: {error}") from error
-
-
-def _log(arrays: dict[str, NDArray[Any]]) -> Log:
-    at = np.cumsum(arrays["cycle_size"])[:-1]
-    points, covariances, labels = (np.split(arrays[name], at) for name in ("points", "covariances", "labels"))
-    cycles = zip(arrays["cycle_t"].tolist(), points, covariances, labels, strict=bool(len(arrays["cycle_t"])))
-    sensor = [None if np.isnan(value) else value for value in arrays["sensor"].tolist()]
-    truth = {name: arrays[array] for name, array in _TRUTH.items() if array in arrays}
-    return Log(
-        Odometry(arrays["odometry_t"], arrays["odometry_twist"]),
-        tuple(Detections(*cycle) for cycle in cycles),
-        arrays["odometry_sigma"],
-        SensorInfo(*sensor),
-        json.loads(str(arrays["source"])),
-        truth=Truth(**truth) if truth else None,
-    )
