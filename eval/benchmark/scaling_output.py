@@ -177,7 +177,6 @@ def plot_laps(scaling: Scaling) -> Figure:
 
 
 def _draw_sweep(axes: Axes, scaling: Scaling, sweep: Sweep, linestyle: str = "none") -> dict[str, str]:
-    """Draw the points of every estimator that has some, and return the colours by name."""
     drawn: dict[str, str] = {}
     for name, color, marker in zip(scaling.estimators, cycle(PALETTE), cycle(MARKERS), strict=False):
         points = scaling.of(sweep, name)
@@ -196,7 +195,6 @@ def _draw_sweep(axes: Axes, scaling: Scaling, sweep: Sweep, linestyle: str = "no
 
 
 def _draw_power_law(axes: Axes, scaling: Scaling, sweep: Sweep, name: str, color: str) -> None:
-    """Draw the fitted power law through the mean of its points' logarithms, over their range."""
     slope = scaling.slope(sweep, name)
     if not np.isfinite(slope["slope"]):
         return

@@ -46,7 +46,6 @@ class NamedLog:
 
     @property
     def names(self) -> dict[str, Any]:
-        """Name that distinguishes the log from others in the results."""
         return {"log": self.name}
 
     @cached_property
@@ -83,7 +82,6 @@ class Cell(Generic[D]):
 
     @property
     def names(self) -> dict[str, Any]:
-        """Names that distinguish the cell from the others of its experiment."""
         names = self.drive.names | {"estimator": self.estimator}
         return names if self.variant is None else names | {"variant": self.variant}
 
@@ -172,7 +170,6 @@ def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
 
 
 def _said(run: RunResult | None) -> str:
-    """Return the notices of a run's cycles and its diagnosis, each once."""
     if run is None:
         return ""
     state = vehicle_of(run)

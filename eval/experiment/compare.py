@@ -274,7 +274,6 @@ def paired_table(comparison: Comparison) -> TextTable:
 
 
 def _interval(metric: Metric, row: Any) -> str:
-    """Return `mean [low, high]` in the metric's unit, with * where it excludes 0."""
     mean, low, high = (metric.factor * float(row[name]) for name in ("mean", "low", "high"))
     if np.isnan(mean):
         return UNKNOWN
@@ -296,7 +295,6 @@ def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
 
 
 def _three(row: LapMetrics | None) -> str:
-    """Return the paper's three figures of a lap, each as wide as its title."""
     values = {} if row is None else asdict(row)
     return _SPACE.join(_cell(metric, values).rjust(len(metric.heading)) for metric in PAPER)
 

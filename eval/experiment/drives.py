@@ -56,7 +56,6 @@ class Drive:
 
     @property
     def names(self) -> dict[str, Any]:
-        """Names that distinguish the drive from others in the results."""
         return {"track": self.track.name, "seed": self.seed, "noise": self.noise}
 
     @cached_property
@@ -107,7 +106,6 @@ def _expanded(entry: Path | int) -> list[Path | int]:
 
 
 def _load(track: Path | int, stems: list[str]) -> NamedTrack:
-    """Name a file by its stem, and by its folder too where several files have that stem."""
     if isinstance(track, int):
         return NamedTrack(f"generated {track}", generate_track(np.random.default_rng(track)))
     if track.name in EVENTS and not track.exists():

@@ -153,7 +153,6 @@ class FaultOutcome:
         }
 
     def _calibration(self) -> dict[str, float]:
-        """Return the mean of each estimate by its prior's sigma, where it is conspicuous."""
         keys = [name for name in self.runs if name.endswith(BY_PRIOR)]
         means = {
             METRICS[key].title.removesuffix(TITLE_BY_PRIOR): mean(known(self.runs[key].astype(float)))

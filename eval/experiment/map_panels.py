@@ -196,7 +196,6 @@ def _draw_map(axes: Axes, track: Map, truth: Truth | None, style: MapStyle) -> N
 
 
 def _caption(outcome: Outcome) -> str:
-    """Return the estimator's name and the paper's metrics, where they are known."""
     row = outcome.rows[-1].values
     words = {
         metric.key: f"{metric.title} {metric.text(float(row[metric.key]))} {metric.unit}".strip()

@@ -121,7 +121,6 @@ def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings
 
 
 def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
-    """Write the maps and figures of one log."""
     found = comparison.of(named.name)
     for outcome in found:
         if outcome.result is not None:

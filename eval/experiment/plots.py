@@ -102,12 +102,10 @@ def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
 
 
 def _is_known(contrast: Contrast) -> bool:
-    """Return whether a combination isn't the baseline itself and has pairs."""
     return contrast.difference is not None and contrast.difference.count > 0
 
 
 def _differs(panel: Sequence[Contrast]) -> bool:
-    """Return whether any run differs from the baseline."""
     return any(d != 0.0 for contrast in panel for d in contrast.differences)
 
 
@@ -251,7 +249,6 @@ def _draw_faulty_run(axes: Axes, at: float, ratio: float, lost: bool, told: bool
 
 
 def _broken(title: str) -> str:
-    """Return the title in two lines where it is long."""
     if len(title) <= _TITLE_LENGTH:
         return title
     cut = title.rfind(" ", 0, _TITLE_LENGTH)

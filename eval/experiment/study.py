@@ -153,7 +153,6 @@ class Study:
         return tuple(name for name in names if not name.endswith(f".{PRESET}"))
 
     def _named(self) -> dict[str, MapperSettings]:
-        """Return the settings of every variant, also of those that come to the same."""
         points = {DEFAULT: MapperSettings()}
         for name, overrides in self.variants.items():
             points[name] = override(MapperSettings(), overrides, f"variants.{name}")
@@ -164,7 +163,6 @@ class Study:
 
 
 def _grid(grid: Mapping[str, Sequence[Any]]) -> dict[str, Overrides]:
-    """Return every combination of the values by its name."""
     for name, values in grid.items():
         if not isinstance(values, list | tuple) or not values:
             raise SettingsError(f"grid.{name}: expected a list of values, found {shown(values)}")
@@ -244,7 +242,6 @@ def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "s
 
 
 def _typed(key: str, value: Any, kind: type) -> Any:
-    """Return a value of TOML that has to be of a kind."""
     if not isinstance(value, kind):
         expected = "a list" if kind is list else "text" if kind is str else "a table"
         raise SettingsError(f"{key}: expected {expected}, found {shown(value)}")

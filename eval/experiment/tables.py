@@ -185,7 +185,6 @@ def track_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
 
 
 def _rows(columns: Sequence[Column], frame: pd.DataFrame) -> Iterator[tuple[str, ...]]:
-    """Yield a row of texts for each track, and those over all runs."""
     finished = frame.groupby([*RUN], sort=False)["failure"].first() == ""
     values = [_values(column, frame).reindex(finished.index) for column in columns]
     whole = (f"{int(finished.sum())} of {len(finished)}",)

@@ -83,7 +83,6 @@ def outcomes(work: Callable[[T], R], items: Sequence[T]) -> Iterator[tuple[T, R 
 
 
 def _noted(remaining: dict[int, T], sent: list[int]) -> Iterator[tuple[int, T]]:
-    """Yield the remaining work a little ahead of the workers, and note its indices in `sent`."""
     for index, item in list(remaining.items()):
         sent.append(index)
         yield index, item
@@ -107,7 +106,6 @@ def _alone(work: Callable[[T], R], item: T) -> R | WorkerDiedError:
 
 
 def _deaths() -> tuple[type[Exception], ...]:
-    """Return the exceptions that mean that a worker died."""
     try:
         from distributed import KilledWorker  # noqa: PLC0415 - an extra
     except ImportError:

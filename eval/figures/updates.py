@@ -18,32 +18,9 @@ from pathspace_graph.sim.curves import left_normals, unit
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 from pathspace_graph.spline.knots import fit_spline
 
+from . import style
 from .curves import posterior
-from .style import (
-    BLUE,
-    DARK,
-    GREEN,
-    LIGHT,
-    MARKER_SIZE,
-    ORANGE,
-    PURPLE,
-    RED,
-    THIN_WIDTH,
-    WIDTH,
-    draw_band,
-    draw_control_points,
-    draw_curve,
-    draw_ellipses,
-    draw_points,
-    figure_context,
-    fit_height,
-    normals,
-    point_blocks,
-    set_frame,
-    shared_legend,
-)
-
-Bools = BoolArray
+from .style import BLUE, DARK, GREEN, LIGHT, MARKER_SIZE, ORANGE, PURPLE, RED, THIN_WIDTH, WIDTH
 
 # a curve ends at the origin, on a left bend that it leaves to the outside by a share of its length (m)
 _RADIUS, _DRIFT = 30.0, 0.03
@@ -57,22 +34,17 @@ _SETTINGS = CkfSettings(threshold=2.0, separation=2.0)
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """The three steps."""
+    """The three steps, on a curve with the joint covariance of its control points."""
 
     detections: Array
-    """(m, 2) Positions of the detections (m)."""
-    sigma: float
-    """Standard deviation of each detection (m)."""
-    expands: Bools
+    """(m, 2) Positions (m)."""
+    expands: BoolArray
     """(m,) Detections that mark an expansion of the curve in step (a)."""
     order: IntArray
     """Proximity chain of those detections; the curve is extended to the last one."""
     before: SplineBoundary
-    """Curve of step (a), with the joint covariance of its control points."""
     extended: SplineBoundary
-    """Curve of step (b)."""
     updated: SplineBoundary
-    """Curve of step (c)."""
 
 
 def expansion() -> Expansion:
@@ -88,7 +60,7 @@ def expansion() -> Expansion:
     extended = extend(before, detections[order[-1]], covariances[order[-1]])
     others = np.arange(len(detections)) != order[-1]
     updated = update(extended, detections[others], covariances[others])
-    return Expansion(detections, SIGMA_DETECTION, expands, order, before, extended, updated)
+    return Expansion(detections, expands, order, before, extended, updated)
 
 
 def extend(boundary: SplineBoundary, detection: Array, covariance: Array) -> SplineBoundary:
@@ -133,50 +105,52 @@ def _on_bend(along: Array, inside: Array) -> Array:
     return np.stack([r * np.sin(angle), _RADIUS - r * np.cos(angle)], axis=1)
 
 
-# --- figure ----------------------------------------------------------------------------------------------
-
-
 def plot_expansion(data: Expansion) -> Figure:
     """Draw (a) classified detections, (b) the curve extended to the last of their chain, (c) the update."""
     interpolated = np.arange(len(data.detections)) == data.order[-1]
-    with figure_context():
+    steps = (
+        ("(a) detections beyond the end expand the curve, the others update it", data.before, None),
+        (
+            "(b) the curve is extended to the last of their chain; the others update it too",
+            data.extended,
+            data.before,
+        ),
+        ("(c) the curve after the update", data.updated, data.extended),
+    )
+    with style.figure_context():
         figure = Figure((WIDTH, 7.4), layout="compressed")
         panels = figure.subplots(3, 1, sharex=True)
-        _draw_step(panels[0], data, data.before, data.expands)
-        _draw_step(panels[1], data, data.extended, interpolated)
-        _draw_step(panels[2], data, data.updated, interpolated)
-        _draw_chain(panels[0], data)
-        for axes, before in ((panels[1], data.before), (panels[2], data.extended)):
-            draw_curve(axes, before.spline, DARK, "spline before the step", 0.9, linestyle="--", zorder=3.5)
-        panels[0].set_title("(a) detections beyond the end expand the curve, the others update it")
-        panels[1].set_title("(b) the curve is extended to the last of their chain; the others update it too")
-        panels[2].set_title("(c) the curve after the update")
+        for axes, (title, boundary, before) in zip(panels, steps, strict=True):
+            _draw_step(axes, data, boundary, data.expands if before is None else interpolated)
+            if before is None:
+                _draw_chain(axes, data)
+            else:
+                look = {"linestyle": "--", "zorder": 3.5}
+                style.draw_curve(axes, before.spline, DARK, "spline before the step", 0.9, **look)
+            axes.set(ylabel="y [m]", title=title)
         panels[2].set_xlabel("x [m]")
-        for axes in panels:
-            axes.set_ylabel("y [m]")
-        shared_legend(figure, 4)
-        fit_height(figure)
+        style.shared_legend(figure, 4)
+        style.fit_height(figure)
     return figure
 
 
-def _draw_step(axes: Axes, data: Expansion, boundary: SplineBoundary, expands: Bools) -> None:
+def _draw_step(axes: Axes, data: Expansion, boundary: SplineBoundary, expands: BoolArray) -> None:
     color, name = (PURPLE, "updated spline") if boundary is data.updated else (BLUE, "spline")
-    draw_band(axes, boundary, color, f"{name}, 2σ", zorder=1)
-    draw_curve(axes, boundary.spline, color, name)
-    draw_control_points(axes, boundary.spline.control_points, color, f"{name}, control points")
+    style.draw_band(axes, boundary, color, f"{name}, 2σ", zorder=1)
+    style.draw_curve(axes, boundary.spline, color, name)
+    style.draw_control_points(axes, boundary.spline.control_points, color, f"{name}, control points")
     for chosen, of, text in (
         (~expands, GREEN, "detections that update, 2σ"),
         (expands, RED, "detections that expand, 2σ"),
     ):
         points = data.detections[chosen]
-        draw_ellipses(axes, points, np.tile(data.sigma**2 * np.eye(2), (len(points), 1, 1)), of)
-        draw_points(axes, points, "o", of, text)
+        style.draw_ellipses(axes, points, np.tile(SIGMA_DETECTION**2 * np.eye(2), (len(points), 1, 1)), of)
+        style.draw_points(axes, points, "o", of, text)
     shown = np.concatenate([data.detections, data.updated.spline.control_points])
-    set_frame(axes, shown.min(axis=0) - 1.0, shown.max(axis=0) + 0.8)
+    style.set_frame(axes, shown.min(axis=0) - 1.0, shown.max(axis=0) + 0.8)
 
 
 def _draw_chain(axes: Axes, data: Expansion) -> None:
-    """Draw the proximity chain, from the end of the curve on."""
     chain = np.concatenate([data.before.spline.control_points[-1:], data.detections[data.order]])
     axes.plot(*chain.T, color=RED, linewidth=0.8, linestyle=":", zorder=2, label="proximity chain")
 
@@ -195,9 +169,9 @@ class Fit:
     curve: BSpline
     """S_mu, the state's curve."""
     detections: Array
-    """(m, 2) Positions z of the detections (m)."""
+    """(m, 2) Positions z (m)."""
     covariances: Array
-    """Detections' covariances (m, 2, 2), m^2."""
+    """(m, 2, 2), m^2."""
     foot_u: Array
     """Parameters (m,) of the closest points."""
     basis: Array
@@ -222,13 +196,14 @@ def fit() -> Fit:
     points = np.stack([x, -swing * np.cos(2.0 * np.pi * x / x[-1])], axis=1)
     curve = BSpline.open_uniform(points, interval=spacing).clamp()
     beside = curve.parameters_at(np.array(_SHARES) * curve.length())
-    detections = curve.evaluate(beside) + np.array(_OFFSETS)[:, None] * normals(curve, beside)
+    detections = curve.evaluate(beside) + np.array(_OFFSETS)[:, None] * style.normals(curve, beside)
     covariances = _ray_covariances(detections - np.array(_VEHICLE), _SIGMAS)
     foot_u = curve.foot_points(detections).u
     basis = curve.basis_matrix(foot_u)
     settings = CkfSettings(ridge=RIDGE)
     measurement = fit_detections(basis, detections, covariances, curve.control_points, settings)
-    sigma_points = _sigma_points(detections, covariances)
+    root = square_root(block_diag(*covariances))
+    sigma_points = cubature_points(detections.ravel(), root).reshape(-1, *detections.shape)
     innovations = sigma_points - basis @ curve.control_points
     fitted_points = curve.control_points + np.einsum("nm,kmd->knd", measurement.gain, innovations)
     return Fit(curve, detections, covariances, foot_u, basis, sigma_points, fitted_points, measurement)
@@ -241,14 +216,6 @@ def _ray_covariances(rays: Array, sigmas: tuple[float, float]) -> Array:
     return np.asarray(sum(s**2 * v[:, :, None] * v[:, None, :] for s, v in parts))
 
 
-def _sigma_points(detections: Array, covariances: Array) -> Array:
-    """Return the cubature points (4 m, m, 2) of all detections (m, 2), (m, 2, 2) together."""
-    root = square_root(block_diag(*covariances))
-    return cubature_points(detections.ravel(), root).reshape(-1, *detections.shape)
-
-
-# --- figure ----------------------------------------------------------------------------------------------
-
 _INVISIBLE: Final = 1e-3
 """Value of a basis function below which it can't be seen."""
 _DETECTIONS: Final = "detections $z$ (a: 2σ)"
@@ -257,11 +224,11 @@ _DIAMOND: Final = 0.8 * MARKER_SIZE
 
 def plot_fit(data: Fit) -> Figure:
     """Draw (a) closest points, (b) sigma points and their fits, (c) S_z, (d) the basis functions there."""
-    with figure_context():
+    with style.figure_context():
         figure = Figure((WIDTH, 4.0), layout="compressed")
         closest, sigma, fitted, basis = figure.subplots(2, 2).flat
         for axes in (closest, sigma, fitted):
-            draw_curve(axes, data.curve, BLUE, r"$S_\mu$")
+            style.draw_curve(axes, data.curve, BLUE, r"$S_\mu$")
         _draw_closest(closest, data)
         _draw_sigma_points(sigma, data)
         _draw_fitted(fitted, data)
@@ -270,56 +237,51 @@ def plot_fit(data: Fit) -> Figure:
         low = shown.min(axis=0) - np.array([1.0, 1.6])
         high = shown.max(axis=0) + np.array([1.0, 1.9])
         for axes in (closest, sigma, fitted):
-            draw_points(axes, data.detections, "o", GREEN, _DETECTIONS)
-            set_frame(axes, low, high)
-            axes.set_xlabel("x [m]")
-            axes.set_ylabel("y [m]")
+            style.draw_points(axes, data.detections, "o", GREEN, _DETECTIONS)
+            style.set_frame(axes, low, high)
+            axes.set(xlabel="x [m]", ylabel="y [m]")
         width, height = high - low
         basis.set_box_aspect(height / width)
-        shared_legend(figure, 5)
-        fit_height(figure)
+        style.shared_legend(figure, 5)
+        style.fit_height(figure)
     return figure
 
 
 def _draw_closest(axes: Axes, data: Fit) -> None:
-    draw_control_points(axes, data.curve.control_points, BLUE, r"$C_\mu$")
+    style.draw_control_points(axes, data.curve.control_points, BLUE, r"$C_\mu$")
     nearest = data.curve.evaluate(data.foot_u)
     for ends in np.stack([data.detections, nearest], axis=1):
         axes.plot(*ends.T, color=DARK, linewidth=0.7, zorder=4)
-    draw_ellipses(axes, data.detections, data.covariances, GREEN)
-    draw_points(axes, nearest, "D", ORANGE, "closest points", markersize=_DIAMOND)
+    style.draw_ellipses(axes, data.detections, data.covariances, GREEN)
+    style.draw_points(axes, nearest, "D", ORANGE, "closest points", markersize=_DIAMOND)
     axes.set_title("(a) closest points on the state's curve")
 
 
 def _draw_sigma_points(axes: Axes, data: Fit) -> None:
     for number, points in enumerate(data.fitted_points):
         label = None if number else "splines $Z$"
-        draw_curve(axes, data.curve.with_points(points), LIGHT, label, THIN_WIDTH, zorder=2)
-    draw_points(axes, data.sigma_points.reshape(-1, 2), ".", RED, "sigma points $X$", zorder=5)
+        style.draw_curve(axes, data.curve.with_points(points), LIGHT, label, THIN_WIDTH, zorder=2)
+    style.draw_points(axes, data.sigma_points.reshape(-1, 2), ".", RED, "sigma points $X$", zorder=5)
     axes.set_title("(b) sigma points, and a fit to each")
 
 
 def _draw_fitted(axes: Axes, data: Fit) -> None:
     points = data.measurement.points
-    draw_curve(axes, data.fitted, PURPLE, "$S_z$", zorder=3.5)
-    draw_control_points(axes, points, PURPLE, "$C_z$, 2σ")
-    draw_ellipses(axes, points, point_blocks(data.measurement.covariance), PURPLE)
+    style.draw_curve(axes, data.fitted, PURPLE, "$S_z$", zorder=3.5)
+    style.draw_control_points(axes, points, PURPLE, "$C_z$, 2σ")
+    style.draw_ellipses(axes, points, style.point_blocks(data.measurement.covariance), PURPLE)
     axes.set_title("(c) $S_z$: their mean and covariance")
 
 
 def _draw_basis(axes: Axes, data: Fit) -> None:
-    """Draw the basis functions over the parameter, and mark their values at the detections."""
     u = np.linspace(*data.curve.domain, 400)
     for j, values in enumerate(data.curve.basis_matrix(u).T):
         color = PURPLE if data.basis[:, j].sum() > _INVISIBLE else LIGHT
         axes.plot(np.where(values > _INVISIBLE, u, np.nan), values, color=color, linewidth=0.9, zorder=2)
     rows, columns = np.nonzero(data.basis > _INVISIBLE)
     values = np.stack([data.foot_u[rows], data.basis[rows, columns]], axis=1)
-    draw_points(axes, values, "D", ORANGE, "basis at the closest points", markersize=_DIAMOND, zorder=3)
+    style.draw_points(axes, values, "D", ORANGE, "basis at the closest points", markersize=_DIAMOND, zorder=3)
     for foot in data.foot_u:
         axes.axvline(foot, color=ORANGE, linewidth=0.7, linestyle=":", zorder=1)
-    axes.set_xlim(*data.curve.domain)
-    axes.set_ylim(0.0, 1.0)
-    axes.set_xlabel("parameter $u$ [m]")
-    axes.set_ylabel("basis $β_j(u)$")
+    axes.set(xlim=data.curve.domain, ylim=(0.0, 1.0), xlabel="parameter $u$ [m]", ylabel="basis $β_j(u)$")
     axes.set_title("(d) basis: how freely each control point moves")

@@ -52,7 +52,6 @@ class Compare:
     """Settings of every estimator."""
 
     def run(self) -> None:
-        """Check, run, write and report; the exit code is 3 where an estimator failed."""
         estimators = choose(self.estimators)
         reference = choose_reference(self.reference, estimators)
         check_jobs(self.jobs)

@@ -98,7 +98,6 @@ class Convert:
     """Noise that the record does not state."""
 
     def run(self) -> None:
-        """Convert one record, or each of a folder, and name those that are refused in one line."""
         records = self._records()
         if not records:
             self._convert(self.source, self.out)
@@ -126,7 +125,6 @@ class Convert:
         return sorted({*known, *bags})
 
     def _convert(self, source: Path | None, out: Path) -> None:
-        """Read, convert, write and report."""
         check_target(out, LOG_FILE)
         frames = Frames(self.mounting, self.y_odometry or self.y, self.y)
         rule = LabelRule(self.labels)

@@ -51,7 +51,6 @@ class Export:
     """End the `profile` of an open track at a standstill."""
 
     def run(self) -> None:
-        """Read the map and write the file."""
         check_file_target(self.out)
         if not LEAST_STEP <= self.step < np.inf:
             raise SettingsError(

@@ -69,7 +69,6 @@ class Online:
     """Settings of the estimator."""
 
     def run(self) -> None:
-        """Read, map, write and report."""
         check_online(self.estimator)
         name = for_map(self.estimator, self.map)
         check_target(self.out, MAP_FILE)

@@ -92,7 +92,6 @@ class Verify:
     """Folder of a log, a map, or the result of another command, with its subfolders."""
 
     def run(self) -> None:
-        """Check and report; a file that is missing or has changed ends it."""
         count = verify_all(self.folder)
         line = f"{self.folder}: {count} files are as they were written"
         say(line)

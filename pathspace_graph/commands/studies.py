@@ -99,7 +99,6 @@ class Ablate(StudyCommand):
     """TOML file of the study, or name of one that comes with the package."""
 
     def run(self) -> None:
-        """Check, run, write and report the study; the exit code is 3 where cells failed."""
         self.execute(read_study(find_study(self.study)), write_study)
 
 
@@ -122,7 +121,6 @@ class FaultSuite(StudyCommand):
     """Run each fault at its greatest strength only."""
 
     def run(self) -> None:
-        """Check, run, write and report the suite; the exit code is 3 where runs failed."""
         chosen = replace(only(suite(), self.only), estimators=(self.estimator,))
         self.execute(strongest(chosen) if self.quick else chosen, write_suite)
 
@@ -152,7 +150,6 @@ class Scale:
     """Settings of every estimator."""
 
     def run(self) -> None:
-        """Check, simulate, time, write and report."""
         names = tuple(dict.fromkeys(self.estimators or ONLINE))
         for name in names:
             check_online(name)
@@ -194,7 +191,6 @@ class Report:
     """Drive little, to see that everything works; it goes with no pages."""
 
     def run(self) -> None:
-        """Check, measure, write and report."""
         check_jobs(self.jobs)
         if self.quick and self.pages is not None:
             raise SettingsError("--pages: expected none with --quick, whose figures mean little")
