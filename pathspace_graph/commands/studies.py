@@ -173,8 +173,8 @@ class Scale:
 class Report:
     """Measure the figures of the pages, or what remains of them, and write them and the pages' tables.
 
-    The experiments are `accuracy`, `skidpad` and `speed`. Each keeps its runs in a folder of its own, from
-    which a second call goes on.
+    The experiments are `accuracy`, `skidpad`, `camera`, `faults` and `speed`. Each keeps its runs in a folder
+    of its own, from which a second call goes on.
     """
 
     out: Path
