@@ -20,7 +20,7 @@ from .cells import Cell, Outcome, Record, read_record, record_cell, record_of, w
 from .drives import Drive, NamedTrack, load_tracks
 from .frame import frame_of
 from .study import Study
-from .workers import check_jobs, outcomes, workers
+from .workers import WorkerDiedError, check_jobs, outcomes, workers
 
 FORMAT: Final = "pathspace-study/1"
 STUDY_FILE: Final = "study.json"
@@ -109,8 +109,10 @@ def run_plan(
         on_cell = on_cell or (lambda done, total: None)
         on_cell(0, len(remaining))
         for done, (cell, result) in enumerate(outcomes(record_cell, remaining), start=1):
-            died = not isinstance(result, dict)
-            write_record(out, cell, record_of(cell, Outcome.failed(cell, result)) if died else result)
+            if isinstance(result, WorkerDiedError):
+                write_record(out, cell, record_of(cell, Outcome.failed(cell, result)))
+            else:
+                write_record(out, cell, result)
             on_cell(done, len(remaining))
     return frame_of(plan.study, [(cell, read_record(out, cell)) for cell in plan.cells])
 

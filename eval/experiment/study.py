@@ -48,11 +48,8 @@ class Study:
     tracks: tuple[Path | int, ...]
     """Track files, and seeds of generated tracks."""
     seeds: tuple[int, ...] = (0,)
-    """Seeds of the drives and their noise."""
     laps: int = 5
-    """Number of laps of each drive."""
     name: str = "study"
-    """Name of the study."""
     question: str = ""
     """Question that the study answers."""
     estimators: tuple[str, ...] = (registry.DEFAULT,)
@@ -127,11 +124,10 @@ class Study:
     @property
     def points(self) -> dict[str, MapperSettings]:
         """Settings to run by name; of variants with equal settings the first."""
-        distinct: dict[str, MapperSettings] = {}
+        first: dict[MapperSettings, str] = {}
         for name, settings in self._named().items():
-            if settings not in distinct.values():
-                distinct[name] = settings
-        return distinct
+            first.setdefault(settings, name)
+        return {name: settings for settings, name in first.items()}
 
     @property
     def baseline_variant(self) -> str:
@@ -142,9 +138,8 @@ class Study:
     @property
     def varied(self) -> tuple[str, ...]:
         """Dotted settings that any variant overrides."""
-        return tuple(
-            dict.fromkeys(name for group in (*self.variants.values(), *self.grids) for name in group)
-        )
+        groups = (*self.variants.values(), *self.grids)
+        return tuple(dict.fromkeys(name for group in groups for name in group))
 
     @property
     def varied_noise(self) -> tuple[str, ...]:

@@ -17,26 +17,8 @@ from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, RIGHT
 
-from .style import (
-    BLUE,
-    DARK,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    RED,
-    SIGMAS,
-    WIDTH,
-    Picture,
-    draw_band,
-    draw_control_points,
-    draw_curve,
-    draw_ellipses,
-    draw_points,
-    figure_context,
-    grouped_legend,
-    point_blocks,
-    set_frame,
-)
+from . import style
+from .style import BLUE, DARK, GREEN, ORANGE, PURPLE, RED, WIDTH, Picture
 
 MARGIN: Final = 3.0
 """Free space around what is drawn (m)."""
@@ -99,7 +81,7 @@ def plot_map(
     """
     if not band_scale > 0.0:
         raise SettingsError(f"band_scale: expected a positive number, found {band_scale}")
-    with figure_context():
+    with style.figure_context():
         figure = Picture(layout="constrained")
         axes = figure.add_subplot()
         # the legend names what is drawn first before the rest; zorder decides what lies on top
@@ -121,90 +103,88 @@ def plot_map(
 
 
 def draw_boundary(
-    axes: Axes, boundary: MapBoundary, label: int, style: MapStyle, band_scale: float = 1.0
+    axes: Axes, boundary: MapBoundary, label: int, look: MapStyle, band_scale: float = 1.0
 ) -> None:
     """Draw a curve with its band and control points, or landmarks with their ellipses, in the map frame."""
     if isinstance(boundary, PointBoundary):
-        _draw_landmarks(axes, boundary, label, style, band_scale)
+        _draw_landmarks(axes, boundary, label, look, band_scale)
     else:
-        _draw_spline(axes, boundary, label, style, band_scale)
+        _draw_spline(axes, boundary, label, look, band_scale)
 
 
-def _draw_spline(
-    axes: Axes, boundary: SplineBoundary, label: int, style: MapStyle, band_scale: float
-) -> None:
+def _draw_spline(axes: Axes, boundary: SplineBoundary, label: int, look: MapStyle, band_scale: float) -> None:
     color, name, spline = BOUNDARY_COLORS[label], NAMES[label], boundary.spline
     text = f"{name} {_band_name(band_scale)}"
     if boundary.covariance.size:  # the outline of a map has none
-        draw_band(axes, boundary, color, text, band_scale, BAND_ALPHA, widest=style.widest_band)
+        style.draw_band(axes, boundary, color, text, band_scale, look.widest_band, alpha=BAND_ALPHA)
     until = boundary.confirmed_until
-    draw_curve(axes, spline, color, f"{name} boundary", style.curve_width, (-np.inf, until), zorder=4)
+    style.draw_curve(axes, spline, color, f"{name} boundary", look.curve_width, (-np.inf, until), zorder=4)
     if until < spline.domain[1]:
         text, dashed = f"{name} tentative", {"linestyle": TENTATIVE_DASHES, "zorder": 4}
-        draw_curve(axes, spline, color, text, style.curve_width, (until, np.inf), **dashed)
-    squares = {"markersize": style.marker_size, "markeredgewidth": 0.6, "zorder": 5}
+        style.draw_curve(axes, spline, color, text, look.curve_width, (until, np.inf), **dashed)
+    squares = {"markersize": look.marker_size, "markeredgewidth": 0.6, "zorder": 5}
     points, text = spline.distinct_control_points, f"{name} control points"
-    draw_control_points(axes, points, color, text, polygon=False, **squares)
+    style.draw_control_points(axes, points, color, text, polygon=False, **squares)
 
 
 def _draw_landmarks(
-    axes: Axes, boundary: PointBoundary, label: int, style: MapStyle, band_scale: float
+    axes: Axes, boundary: PointBoundary, label: int, look: MapStyle, band_scale: float
 ) -> None:
     color, name = BOUNDARY_COLORS[label], NAMES[label]
     area = {"alpha": BAND_ALPHA, "linewidth": 0.0}
-    own = point_blocks(boundary.covariance)
-    draw_ellipses(axes, boundary.points, own, color, band_scale, zorder=2, **area)
+    own = style.point_blocks(boundary.covariance)
+    style.draw_ellipses(axes, boundary.points, own, color, band_scale, zorder=2, **area)
     # a collection of ellipses has no key of its own in a legend: an empty patch lends it one
     key = PathPatch(Outline(np.zeros((0, 2))), facecolor=color, **area)
     key.set_label(f"{name} {_band_name(band_scale, 'ellipses')}")
     axes.add_patch(key)
-    size = style.landmark_size
-    draw_points(axes, boundary.points, "o", color, f"{name} landmarks", markersize=size, zorder=4)
+    size = look.landmark_size
+    style.draw_points(axes, boundary.points, "o", color, f"{name} landmarks", markersize=size, zorder=4)
 
 
-def draw_orange(axes: Axes, points: Array, label: int, style: MapStyle) -> None:
+def draw_orange(axes: Axes, points: Array, label: int, look: MapStyle) -> None:
     """Draw orange cones (n, 2) as triangles, those of gates larger, map frame (m)."""
-    size = (2.0 if label == BIG_ORANGE else 1.2) * style.landmark_size
+    size = (2.0 if label == BIG_ORANGE else 1.2) * look.landmark_size
     name = NAMES[label].replace("_", " ")
-    draw_points(axes, points, "^", RED, f"{name} cones", markersize=size, zorder=4.5)
+    style.draw_points(axes, points, "^", RED, f"{name} cones", markersize=size, zorder=4.5)
 
 
 def _band_name(scale: float, shape: str = "band") -> str:
     exaggerated = "" if scale == 1.0 else f" (drawn {scale:g}× as wide)"
-    return f"{SIGMAS:g}σ {shape}{exaggerated}"
+    return f"{style.SIGMAS:g}σ {shape}{exaggerated}"
 
 
-def draw_trajectory(axes: Axes, trajectory: Array, style: MapStyle, label: str = "trajectory") -> None:
+def draw_trajectory(axes: Axes, trajectory: Array, look: MapStyle, label: str = "trajectory") -> None:
     """Draw poses (n, 3) or positions (n, 2) as a line, map frame (m)."""
-    line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": style.path_width, "zorder": 3}
+    line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": look.path_width, "zorder": 3}
     axes.plot(*trajectory[:, :2].T, label=label, **line)
 
 
-def draw_unhealthy(axes: Axes, trajectory: Array, health: Sequence[str], style: MapStyle) -> None:
+def draw_unhealthy(axes: Axes, trajectory: Array, health: Sequence[str], look: MapStyle) -> None:
     """Draw the parts of the trajectory again that were degraded or lost, each in its colour."""
     for condition, color in HEALTH_COLORS.items():
         chosen = np.array([word == condition for word in health], bool)
         if len(chosen) != len(trajectory) or not chosen.any():
             continue
-        line: dict[str, Any] = {"color": color, "linewidth": 2.0 * style.path_width, "zorder": 3.2}
+        line: dict[str, Any] = {"color": color, "linewidth": 2.0 * look.path_width, "zorder": 3.2}
         x, y = np.where(chosen[:, None], trajectory[:, :2], np.nan).T
         axes.plot(x, y, label=condition, **line)
 
 
-def draw_truth(axes: Axes, truth: Truth, style: MapStyle) -> None:
+def draw_truth(axes: Axes, truth: Truth, look: MapStyle) -> None:
     """Draw the true path dashed and the true cones as crosses, as far as they are known, map frame (m)."""
     if len(truth.poses):
-        line: dict[str, Any] = {"linewidth": 0.6 * style.path_width, "linestyle": (0, (5, 3)), "zorder": 3.5}
+        line: dict[str, Any] = {"linewidth": 0.6 * look.path_width, "linestyle": (0, (5, 3)), "zorder": 3.5}
         axes.plot(*truth.poses[:, :2].T, color=TRUTH_COLOR, label="true path", **line)
     if len(truth.cones):
-        cross = {"markersize": style.marker_size, "markeredgewidth": 0.6}
-        draw_points(axes, truth.cones, "x", TRUTH_COLOR, "true cones", **cross)
+        cross = {"markersize": look.marker_size, "markeredgewidth": 0.6}
+        style.draw_points(axes, truth.cones, "x", TRUTH_COLOR, "true cones", **cross)
 
 
-def draw_start(axes: Axes, style: MapStyle) -> None:
+def draw_start(axes: Axes, look: MapStyle) -> None:
     """Mark the origin of the map frame, where the vehicle stood first, heading along x."""
-    size = 2.0 * style.marker_size
-    draw_points(axes, np.zeros((1, 2)), ">", "black", "start", markersize=size, zorder=7)
+    size = 2.0 * look.marker_size
+    style.draw_points(axes, np.zeros((1, 2)), ">", "black", "start", markersize=size, zorder=7)
 
 
 def finish(figure: Figure, axes: Axes, title: str | None) -> None:
@@ -213,11 +193,11 @@ def finish(figure: Figure, axes: Axes, title: str | None) -> None:
     axes.autoscale_view()
     drawn = np.array([axes.get_xlim(), axes.get_ylim()])
     low, high = drawn[:, 0] - MARGIN, drawn[:, 1] + MARGIN
-    set_frame(axes, low, high)
+    style.set_frame(axes, low, high)
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     if title:
         axes.set_title(title)
-    grouped_legend(figure)
+    style.grouped_legend(figure)
     width, height = high - low
     figure.set_size_inches(WIDTH, min(_MAX_HEIGHT, WIDTH * height / width + _LABELS_HEIGHT))

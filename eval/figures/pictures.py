@@ -11,23 +11,16 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import NAMES, POINTS, UNKNOWN
 
-from .map_plot import (
-    BOUNDARY_COLORS,
-    TRAJECTORY_COLOR,
-    WHOLE_TRACK,
-    draw_start,
-    draw_truth,
-    finish,
-    plot_map,
-)
-from .style import GREY, RED, Picture, draw_points, figure_context
+from . import map_plot, style
+from .map_plot import BOUNDARY_COLORS, TRAJECTORY_COLOR, WHOLE_TRACK, plot_map
+from .style import GREY, RED
 
 __all__ = ["plot_log", "plot_map"]
 
 LABEL_COLORS = {**BOUNDARY_COLORS, UNKNOWN: GREY, **dict.fromkeys(POINTS, RED)}
 
 
-def plot_log(log: Log, *, title: str | None = None) -> Picture:
+def plot_log(log: Log, *, title: str | None = None) -> style.Picture:
     """Draw where the odometry alone leads, the detections seen from there, and the truth if it is known.
 
     Dead reckoning drifts: laps lie beside each other, and the detections of a cone apart.
@@ -35,8 +28,8 @@ def plot_log(log: Log, *, title: str | None = None) -> Picture:
     odometry, stamps = log.odometry, np.array([cycle.t for cycle in log.cycles])
     poses = integrate_poses(np.diff(odometry.t), odometry.twist[:-1])
     poses = np.concatenate([np.zeros((1, 3)), poses])
-    with figure_context():
-        figure = Picture(layout="constrained")
+    with style.figure_context():
+        figure = style.Picture(layout="constrained")
         axes = figure.add_subplot()
         # a cycle lies between two odometry stamps: its pose is interpolated, which a picture can bear
         at = np.column_stack([np.interp(stamps, odometry.t, column) for column in poses.T])
@@ -44,9 +37,9 @@ def plot_log(log: Log, *, title: str | None = None) -> Picture:
         line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": WHOLE_TRACK.path_width, "zorder": 3}
         axes.plot(*poses[:, :2].T, label="odometry alone", **line)
         if log.truth is not None:
-            draw_truth(axes, log.truth, WHOLE_TRACK)
-        draw_start(axes, WHOLE_TRACK)
-        finish(figure, axes, title)
+            map_plot.draw_truth(axes, log.truth, WHOLE_TRACK)
+        map_plot.draw_start(axes, WHOLE_TRACK)
+        map_plot.finish(figure, axes, title)
     return figure
 
 
@@ -59,4 +52,6 @@ def _draw_detections(axes: Axes, log: Log, poses: Array) -> None:
     for label, color in LABEL_COLORS.items():
         if (labels == label).any():
             text = f"{NAMES[label].replace('_', ' ')} detections"
-            draw_points(axes, points[labels == label], ".", color, text, markersize=1.2, zorder=2, alpha=0.4)
+            style.draw_points(
+                axes, points[labels == label], ".", color, text, markersize=1.2, zorder=2, alpha=0.4
+            )

@@ -1,7 +1,7 @@
 """The paper's expansion of a curve in three steps, and its fit of detections, as figures."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -125,7 +125,7 @@ def plot_expansion(data: Expansion) -> Figure:
             if before is None:
                 _draw_chain(axes, data)
             else:
-                look = {"linestyle": "--", "zorder": 3.5}
+                look: dict[str, Any] = {"linestyle": "--", "zorder": 3.5}
                 style.draw_curve(axes, before.spline, DARK, "spline before the step", 0.9, **look)
             axes.set(ylabel="y [m]", title=title)
         panels[2].set_xlabel("x [m]")

@@ -142,8 +142,8 @@ def watchers(options: Watched, log: Log) -> Iterator[list[Observer]]:
     observers: list[Observer] = []
     with ExitStack() as stack:
         if options.view or options.save_view is not None:
-            shown = {"window": options.view, "settings": options.recording, "truth": log.truth}
-            observers.append(stack.enter_context(recording(options.save_view, **shown)))
+            how: dict[str, Any] = {"settings": options.recording, "truth": log.truth}
+            observers.append(stack.enter_context(recording(options.save_view, window=options.view, **how)))
         animation = None
         if options.animate is not None:
             if not log.cycles:

@@ -64,7 +64,10 @@ class StudyCommand:
         text = write(study, frame, self.out)
         write_manifest(self.out)
         say(text.rstrip("\n"), f"\nwritten to {self.out}")
-        report_failures(frame, len(plan.cells))
+        failures = frame[frame["failure"] != ""]["failure"].tolist()
+        if failures:
+            note(f"{len(failures)} of {len(plan.cells)} cells failed, the first of {failures[0]}")
+            raise SystemExit(CELLS_FAILED)
 
 
 def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], laps: int | None) -> Study:
@@ -78,14 +81,6 @@ def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], l
     own |= {"laps": laps} if laps else {}
     own |= {"tracks": tuple(int(t) if t.isdecimal() else Path(t) for t in tracks)} if tracks else {}
     return replace(study, **own)  # type: ignore[arg-type]
-
-
-def report_failures(frame: pd.DataFrame, cells: int) -> None:
-    """Say on standard error how many cells failed, and exit with code 3 where any did."""
-    failures = frame[frame["failure"] != ""]
-    if len(failures):
-        note(f"{len(failures)} of {cells} cells failed, the first of {failures.iloc[0]['failure']}")
-        raise SystemExit(CELLS_FAILED)
 
 
 # --- ablate ----------------------------------------------------------------------------------------------
