@@ -20,7 +20,7 @@ from tyro.conf import arg
 from pathspace_graph.console import note, progress, say
 from pathspace_graph.errors import PathspaceError, check_name
 from pathspace_graph.estimators import DEFAULT, make_online
-from pathspace_graph.eval.experiment.drives import NamedTrack, load_tracks
+from pathspace_graph.eval.experiment.cells import NamedTrack, load_tracks
 from pathspace_graph.eval.experiment.tables import TextTable
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.io.files import atomic_folder, check_target

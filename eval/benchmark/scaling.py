@@ -158,8 +158,9 @@ def binned(sweep: Sweep, times: LaneTimes, at: Array, edges: Array) -> pd.DataFr
     """Return a point for each interval between two `edges` that holds cycles; `at` (n,): their abscissas."""
     frame = pd.DataFrame({"at": at[: len(times.seconds)], "seconds": times.seconds, "size": times.sizes})
     bins = np.searchsorted(edges, frame["at"], side="right") - 1
-    inside = frame[(bins >= 0) & (bins < len(edges) - 1)].groupby(bins[(bins >= 0) & (bins < len(edges) - 1)])
-    means = inside.mean().assign(sweep=sweep, estimator=times.lane.estimator, cycles=inside.size())
+    inside = (bins >= 0) & (bins < len(edges) - 1)
+    points = frame[inside].groupby(bins[inside])
+    means = points.mean().assign(sweep=sweep, estimator=times.lane.estimator, cycles=points.size())
     return means[["sweep", "estimator", "at", "seconds", "cycles", "size"]].reset_index(drop=True)
 
 

@@ -39,7 +39,6 @@ FAILED: Final = "failed"
 AT_END: Final = "end"
 """Text in place of a lap for an estimator that completed no lap."""
 _SPACE: Final = "   "
-"""Space between figures that share a column."""
 _PRINTED: Final = (
     *("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "two_way", "ghost_share", "size", "ate"),
     "ms_mean",
@@ -61,7 +60,6 @@ class Comparison:
     reference: str
     """Estimator that the others are compared with."""
     outcomes: tuple[Outcome, ...] = ()
-    """Outcome of each estimator on each log."""
 
     @cached_property
     def frame(self) -> pd.DataFrame:

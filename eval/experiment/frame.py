@@ -17,8 +17,7 @@ from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.overrides import leaves
 
-from .cells import Cell, Record
-from .drives import Drive
+from .cells import Cell, Drive, Record
 from .study import Study
 
 COMBINATION: Final = ("noise", "estimator", "variant")
@@ -202,8 +201,8 @@ def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
         if key != base:
             shared = values.index[values.index.isin(against.index)]
             d = values[shared].to_numpy() - against[shared].to_numpy()
-            by = {"difference": estimate(d), "differences": tuple(d.tolist()), "p": paired_p(d)}
-            contrast = replace(contrast, **by)
+            pairs = tuple(d.tolist())
+            contrast = replace(contrast, difference=estimate(d), differences=pairs, p=paired_p(d))
         contrasted.append(contrast)
     corrected = holm(np.array([contrast.p for contrast in contrasted]))
     return [replace(contrast, p=float(p)) for contrast, p in zip(contrasted, corrected, strict=True)]

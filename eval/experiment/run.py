@@ -16,8 +16,18 @@ from pathspace_graph.io.manifest import verified
 from pathspace_graph.io.overrides import flatten
 from pathspace_graph.io.parsing import read_json
 
-from .cells import Cell, Outcome, Record, read_record, record_cell, record_of, write_record
-from .drives import Drive, NamedTrack, load_tracks
+from .cells import (
+    Cell,
+    Drive,
+    NamedTrack,
+    Outcome,
+    Record,
+    load_tracks,
+    read_record,
+    record_cell,
+    record_of,
+    write_record,
+)
 from .frame import frame_of
 from .study import Study
 from .workers import WorkerDiedError, check_jobs, outcomes, workers

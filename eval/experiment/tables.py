@@ -30,7 +30,6 @@ class TextTable:
     title: str
     """Sentence above the table, which may be empty."""
     header: tuple[str, ...]
-    """Title of every column."""
     rows: tuple[tuple[str, ...], ...]
     """Rows, each as long as the header."""
     groups: tuple[int, ...] = ()

@@ -1,4 +1,4 @@
-"""A picture of a map: boundaries with their 2-sigma band, control points, trajectory, truth if known."""
+"""Pictures of a map, with its 2-sigma band and the truth if known, and of a log before it is mapped."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,14 +11,16 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.odometry import integrate_poses
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
-from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, RIGHT
+from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, POINTS, RIGHT, UNKNOWN
 
 from . import style
-from .style import BLUE, DARK, GREEN, ORANGE, PURPLE, RED, WIDTH, Picture
+from .style import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, RED, WIDTH, Picture
 
 MARGIN: Final = 3.0
 """Free space around what is drawn (m)."""
@@ -201,3 +203,43 @@ def finish(figure: Figure, axes: Axes, title: str | None) -> None:
     style.grouped_legend(figure)
     width, height = high - low
     figure.set_size_inches(WIDTH, min(_MAX_HEIGHT, WIDTH * height / width + _LABELS_HEIGHT))
+
+
+LABEL_COLORS = {**BOUNDARY_COLORS, UNKNOWN: GREY, **dict.fromkeys(POINTS, RED)}
+
+
+def plot_log(log: Log, *, title: str | None = None) -> style.Picture:
+    """Draw where the odometry alone leads, the detections seen from there, and the truth if it is known.
+
+    Dead reckoning drifts: laps lie beside each other, and the detections of a cone apart.
+    """
+    odometry, stamps = log.odometry, np.array([cycle.t for cycle in log.cycles])
+    poses = integrate_poses(np.diff(odometry.t), odometry.twist[:-1])
+    poses = np.concatenate([np.zeros((1, 3)), poses])
+    with style.figure_context():
+        figure = style.Picture(layout="constrained")
+        axes = figure.add_subplot()
+        # a cycle lies between two odometry stamps: its pose is interpolated, which a picture can bear
+        at = np.column_stack([np.interp(stamps, odometry.t, column) for column in poses.T])
+        _draw_detections(axes, log, at)
+        line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": WHOLE_TRACK.path_width, "zorder": 3}
+        axes.plot(*poses[:, :2].T, label="odometry alone", **line)
+        if log.truth is not None:
+            draw_truth(axes, log.truth, WHOLE_TRACK)
+        draw_start(axes, WHOLE_TRACK)
+        finish(figure, axes, title)
+    return figure
+
+
+def _draw_detections(axes: Axes, log: Log, poses: Array) -> None:
+    """Draw the detections of all cycles, seen from the poses (n, 3) of the cycles."""
+    counts = [len(cycle.labels) for cycle in log.cycles]
+    seen = np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in log.cycles)])
+    points = to_map(seen, np.repeat(poses, counts, axis=0))
+    labels: IntArray = np.concatenate([np.zeros(0, int), *(cycle.labels for cycle in log.cycles)])
+    for label, color in LABEL_COLORS.items():
+        if (labels == label).any():
+            text = f"{NAMES[label].replace('_', ' ')} detections"
+            style.draw_points(
+                axes, points[labels == label], ".", color, text, markersize=1.2, zorder=2, alpha=0.4
+            )

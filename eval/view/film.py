@@ -51,9 +51,13 @@ def film(file: Path | str, frames_per_second: float) -> Iterator[Film]:
             frames = GifFilm()
             yield frames
             frames.write(temporary)
-        else:
-            with _encoding(temporary, frames_per_second) as encoder:
-                yield encoder
+            return
+        encoder = _FfmpegFilm(temporary, frames_per_second)
+        try:
+            yield encoder
+            encoder.writer.finish()
+        except (subprocess.CalledProcessError, BrokenPipeError) as error:
+            raise OutputError(f"{temporary.name}: ffmpeg could not write the film: {error}") from error
 
 
 # --- gif -------------------------------------------------------------------------------------------------
@@ -93,17 +97,6 @@ def pixels_of(figure: Figure) -> Pixels:
 
 
 # --- mp4 -------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _encoding(file: Path, frames_per_second: float) -> Iterator[Film]:
-    """Yield a film that ffmpeg writes to `file`; an OutputError where it fails."""
-    encoder = _FfmpegFilm(file, frames_per_second)
-    try:
-        yield encoder
-        encoder.writer.finish()
-    except (subprocess.CalledProcessError, BrokenPipeError) as error:
-        raise OutputError(f"{file.name}: ffmpeg could not write the film: {error}") from error
 
 
 class _FfmpegFilm:

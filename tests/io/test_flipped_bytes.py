@@ -13,8 +13,15 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError, PathspaceError
-from pathspace_graph.eval.experiment.cells import Cell, Outcome, read_record, record_of, write_record
-from pathspace_graph.eval.experiment.drives import Drive, NamedTrack
+from pathspace_graph.eval.experiment.cells import (
+    Cell,
+    Drive,
+    NamedTrack,
+    Outcome,
+    read_record,
+    record_of,
+    write_record,
+)
 from pathspace_graph.io.log import FILES, read_log, write_log
 from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
 from pathspace_graph.io.map import read_map

@@ -12,9 +12,9 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.errors import OutputError, SettingsError
-from pathspace_graph.eval.experiment import drives
+from pathspace_graph.eval.experiment import cells as drives
 from pathspace_graph.eval.experiment import run as study_run
-from pathspace_graph.eval.experiment.drives import Drive
+from pathspace_graph.eval.experiment.cells import Drive
 from pathspace_graph.eval.experiment.frame import TIMES, without_times
 from pathspace_graph.eval.experiment.output import write_study, write_tables
 from pathspace_graph.eval.experiment.run import run_study
