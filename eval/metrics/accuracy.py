@@ -261,19 +261,17 @@ def _apart(begin: Array, end: Array, a: Array, b: Array) -> BoolArray:
 
 @dataclass(frozen=True, slots=True)
 class CentreLineErrors:
-    """Errors of a mapped centre line at its n points, along their normals, and their sigmas (m).
+    """Errors of a mapped centre line at its n points, along their normals, and their claimed sigmas (n,), m.
 
     A value is NaN where a true boundary does not cross the normal near the mapped one.
     """
 
     across: Array
-    """(n,) Distance of the true centre to the left of the mapped one."""
+    """Distance of the true centre to the left of the mapped one."""
     across_sigma: Array
-    """(n,) Its claimed standard deviation."""
     width: Array
-    """(n,) By how much the true track is wider to each side than the mapped one."""
+    """Width by which the true track is wider to each side than the mapped one."""
     width_sigma: Array
-    """(n,) Its claimed standard deviation: the mean of both sides."""
 
 
 def centre_line_errors(track: Map, truth: Truth, step: float = CENTRE_STEP) -> CentreLineErrors | None:

@@ -1,8 +1,7 @@
 """The film of a run: the map as it grows, the vehicle, its window and readings, and what is known by then."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -62,8 +61,7 @@ def lap_seconds(log: Log) -> float:
     return ((end - begin) / (turns if turns > LEAST_TURN else 1.0)) or 1.0
 
 
-@dataclass(frozen=True)
-class Moment:
+class Moment(NamedTuple):
     """Figure of the moment, its value with the unit."""
 
     name: str
@@ -185,10 +183,10 @@ class Animation:
         axes.set_axis_off()
         moments = [*_moments(cycle, self._seconds), *_against_truth(cycle.map, self._truth)]
         self._seconds.clear()
-        for number, moment in enumerate(moments):
+        for number, (name, value, color) in enumerate(moments):
             y = 1.0 - _LINE * (number + 0.5)
-            axes.text(0.0, y, moment.name, color=DARK, va="center", fontsize=8.5)
-            axes.text(1.0, y, moment.value, color=moment.color, va="center", ha="right", fontsize=8.5)
+            axes.text(0.0, y, name, color=DARK, va="center", fontsize=8.5)
+            axes.text(1.0, y, value, color=color, va="center", ha="right", fontsize=8.5)
         handles = _legend(self._truth, bool(cycle.map.points))
         axes.legend(handles=handles, loc="lower left", borderaxespad=0.0, borderpad=0.0)
 
@@ -196,12 +194,11 @@ class Animation:
 def _moments(cycle: ObservedCycle, seconds: Sequence[float]) -> list[Moment]:
     result, condition = cycle.result, cycle.result.health.condition
     points = any(isinstance(one, PointBoundary) for one in cycle.map.boundaries.values())
-    kind = "landmarks" if points else "control points"
     moments = [
         Moment("time", f"{result.t:.1f} s"),
         Moment("lap", str(cycle.lap)),
         Moment("loop", "closed" if result.closed else "open"),
-        Moment(kind, " + ".join(map(str, result.sizes))),
+        Moment("landmarks" if points else "control points", " + ".join(map(str, result.sizes))),
         Moment("readings used", f"{result.readings} of {len(cycle.detections.labels)}"),
         Moment("update", f"{1e3 * float(np.mean(seconds)):.1f} ms"),
     ]
