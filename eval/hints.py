@@ -45,7 +45,6 @@ MARKER: Final = "hints.csv"
 AS_SIMULATED: Final = "as simulated"
 """Kind of good logs with nothing unusual."""
 CONFIDENCE: Final = 0.95
-"""Confidence of the intervals."""
 MISSED: Final = 0.05
 """A map that misses a larger share of the cones is bad."""
 WORSE: Final = 2.0
@@ -88,7 +87,6 @@ class Good:
     """Whether the track is open: its second half is not there."""
 
     def log(self, track: NamedTrack, seed: int, laps: int) -> Log:
-        """Return a log of this kind."""
         cones = track.track
         if self.open_road:
             left, right = cones.left[: len(cones.left) // 2], cones.right[: len(cones.right) // 2]
@@ -136,12 +134,10 @@ def backs_up(log: Log) -> Log:
 
 
 def slow_odometry(log: Log) -> Log:
-    """Return the log with every fifth twist."""
     return replace(log, odometry=Odometry(log.odometry.t[::5], log.odometry.twist[::5]))
 
 
 def in_unix_time(log: Log) -> Log:
-    """Return the log with stamps since 1970."""
     odometry = replace(log.odometry, t=log.odometry.t + 1.7e9)
     cycles = tuple(replace(cycle, t=cycle.t + 1.7e9) for cycle in log.cycles)
     return replace(log, odometry=odometry, cycles=cycles, truth=None)
@@ -191,7 +187,6 @@ GOOD: Final = {
     "stamps since 1970": Good(edit=in_unix_time),
     "open road": Good(open_road=True),
 }
-"""Kinds of good logs by name."""
 
 
 # --- the measurement -------------------------------------------------------------------------------------

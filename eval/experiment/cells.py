@@ -33,7 +33,6 @@ from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.track_generator import generate_track
 
 TRACK_SUFFIXES: Final = (".yaml", ".yml", ".csv")
-"""Suffixes of track files."""
 _IDENTITY_DIGITS: Final = 20
 """Number of hexadecimal digits of an identity, which are 80 bits."""
 _SEED_DIGITS: Final = 8
@@ -66,7 +65,6 @@ class Drive:
     seed: int
     """Number of the drive on its track."""
     noise: str
-    """Name of the noise."""
     simulation: SimulationSettings
 
     @property
@@ -262,12 +260,10 @@ def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
 
 
 def record_cell(cell: Cell[Drive]) -> Record:
-    """Run a cell and return its record."""
     return record_of(cell, run_cell(cell))
 
 
 def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
-    """Return the record of a cell's outcome."""
     return {
         "format": FORMAT,
         "id": cell.id,

@@ -31,7 +31,6 @@ from .tables import TextTable, group_starts
 from .workers import check_jobs, outcomes, workers
 
 RUN: Final = ("log", "estimator")
-"""Columns that identify a run."""
 NO_TRUTH: Final = "the log has no true cones, which rmse, missed and most other metrics need"
 """Part of a title where the columns of the paper are missing."""
 FAILED: Final = "failed"
@@ -80,7 +79,6 @@ class Comparison:
 
     @property
     def final(self) -> pd.DataFrame:
-        """Rows of whole logs."""
         return self.frame[self.frame["scope"] == "log"]
 
     def times(self) -> pd.DataFrame:
@@ -89,7 +87,6 @@ class Comparison:
         return pd.DataFrame(rows, columns=[*RUN, "stage", "mean", "median", "p99", "share"])
 
     def of(self, log: str) -> list[Outcome]:
-        """Return the outcomes on one log."""
         return [outcome for outcome in self.outcomes if outcome.names["log"] == log]
 
     def result(self, log: str, estimator: str) -> RunResult | None:
@@ -98,7 +95,6 @@ class Comparison:
 
     @property
     def has_truth(self) -> bool:
-        """Whether any log has true cones."""
         return any(n.log.truth is not None and has_cones(n.log.truth) for n in self.logs)
 
     @property

@@ -26,7 +26,6 @@ CLEAN: Final = "clean"
 BY_PRIOR: Final = "_by_prior"
 """Suffix of metrics that are estimates of a calibration by the sigma of its prior."""
 TITLE_BY_PRIOR: Final = " by its prior's sigma"
-"""End of the titles of these metrics."""
 HEADER: Final = (
     "fault",
     "strength",
@@ -83,12 +82,10 @@ def fault_of(noise: str) -> Fault:
 
 
 def suite() -> Study:
-    """Return the suite that ships with the package."""
     return read_study(find_study(SUITE))
 
 
 def kinds(study: Study) -> list[str]:
-    """Return the kinds of faults of a suite, in its order."""
     every = dict.fromkeys(fault_of(noise).kind for noise in study.noise)
     return [kind for kind in every if kind != CLEAN]
 
@@ -131,7 +128,6 @@ class FaultOutcome:
     """Runs that finished, with the `ratio` of the rmse and the `size_ratio` to those of the clean run, NaN
     where either has no map, and whether anything was `told`."""
     failed: int
-    """Number of runs that ended with an error."""
 
     def values(self) -> dict[str, Any]:
         """Return the outcome as a row of plain values; what is not known is NaN."""

@@ -25,7 +25,6 @@ COMBINATION: Final = ("noise", "estimator", "variant")
 RUN: Final = ("track", "seed")
 """Columns that name a drive; combinations are paired on the same drive and noise."""
 RUN_OF: Final = (*RUN, *COMBINATION)
-"""Columns that name a run."""
 SIMULATION: Final = "simulation."
 """Prefix of columns with settings of the simulation."""
 SETTING: Final = "settings."
@@ -175,7 +174,6 @@ class Contrast:
     difference: Estimate | None
     """Mean over the pairs; None for the baseline itself."""
     differences: tuple[float, ...] = ()
-    """Difference of each pair of runs."""
     p: float = float("nan")
     """P of the paired t-test, corrected for all comparisons of the metric."""
 

@@ -88,7 +88,6 @@ CLOSE_UP: Final = MapStyle(curve_width=1.1, marker_size=4.2, landmark_size=3.0, 
 # heights (in): a panel's title, the outer tick labels with axis titles, more than any legend, gaps
 _TITLE_HEIGHT, _TICK_LABELS, _LEGEND_HEIGHT, _GAP = 0.6, 0.48, 2.0, 0.12
 _RING_SIZE: Final = 8.0
-"""Size of the ring around a missed cone (pt)."""
 
 
 def plot_maps(outcomes: Sequence[Outcome], log: Log) -> Figure:

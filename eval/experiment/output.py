@@ -58,7 +58,6 @@ def write_tables(study: Study, frame: pd.DataFrame, out: Path) -> str:
 
 
 def write_results(frame: pd.DataFrame, out: Path) -> None:
-    """Write `results.csv` and `times.csv`."""
     write_csv(out / "results.csv", without_times(frame))
     write_csv(out / "times.csv", times_of(frame))
 

@@ -16,7 +16,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import PLAIN, PRESETS, SimulationSettings, preset
 
 SHIPPED: Final = Path(__file__).parents[1] / "studies"
-"""Folder of the studies that ship with the package."""
 DEFAULT: Final = "default"
 """Variant that overrides nothing, part of every study."""
 PRESET: Final = "preset"
@@ -36,7 +35,6 @@ class Baseline:
     """Combination that every other one is compared with, on the same track, seed and noise."""
 
     variant: str = DEFAULT
-    """Variant of the baseline."""
     estimator: str | None = None
     """Estimator of the baseline; without one, each estimator is compared with itself."""
 
@@ -51,7 +49,6 @@ class Study:
     laps: int = 5
     name: str = "study"
     question: str = ""
-    """Question that the study answers."""
     estimators: tuple[str, ...] = (registry.DEFAULT,)
     """Estimators to run, online and batch ones; `all` stands for every one."""
     noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
@@ -209,7 +206,6 @@ def read_study(file: Path | str) -> Study:
 
 
 def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "study") -> Study:
-    """Return the study with the content of a TOML file."""
     known = ["grid" if entry.name == "grids" else entry.name for entry in fields(Study)]
     for key in content:
         check_name(key, known, "expected a known key")

@@ -155,12 +155,10 @@ def _figures(estimated: Estimate, factor: float, digits: int, sign: str) -> tupl
 
 
 def as_text(tables: Sequence[TextTable], caption: str) -> str:
-    """Return the caption and the tables for a text file."""
     return "\n\n".join([caption, *(f"{table.title}\n{table.text()}" for table in tables)]) + "\n"
 
 
 def as_markdown(tables: Sequence[TextTable], caption: str) -> str:
-    """Return the caption and the tables in Markdown."""
     bold = (replace(table, title=f"**{table.title}**") for table in tables)
     return "\n".join([caption.replace("*", r"\*") + "\n", *(table.markdown() for table in bold)])
 

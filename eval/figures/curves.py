@@ -150,7 +150,6 @@ class Simplified:
 
     @property
     def rms(self) -> float:
-        """Return the root mean square of the distances (m)."""
         return root_mean_square(self.errors)
 
 

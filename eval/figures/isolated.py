@@ -188,7 +188,6 @@ class Fit:
 
     @property
     def fitted(self) -> BSpline:
-        """Return S_z as a curve."""
         return self.curve.with_points(self.measurement.points)
 
 
@@ -293,7 +292,6 @@ def _draw_basis(axes: Axes, data: Fit) -> None:
 MARKER: Final = "captions.md"
 """File by which a folder of these figures is known."""
 _SEED: Final = 0
-"""Seed of the splines that are drawn at random."""
 
 
 @dataclass(frozen=True)
@@ -352,7 +350,6 @@ FIGURES: Final = (
     IsolatedFigure("fit", _fit),
     IsolatedFigure("simplification", _simplification),
 )
-"""All figures, in the paper's order."""
 
 
 def write_figures(out: Path, on_figure: Callable[[], None] = lambda: None) -> None:

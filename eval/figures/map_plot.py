@@ -35,7 +35,6 @@ BOUNDARY_COLORS: Final = {LEFT: BLUE, RIGHT: ORANGE}
 """Colours of the boundaries, those of their cones; yellow is amber, which can be seen on white paper."""
 TRAJECTORY_COLOR: Final = GREEN
 HEALTH_COLORS: Final = {DEGRADED: PURPLE, LOST: RED}
-"""Colours of the trajectory where it is not good."""
 BAND_ALPHA: Final = 0.35
 
 TENTATIVE_DASHES: Final = (0, (4, 2))
@@ -47,11 +46,9 @@ class MapStyle:
     """Line widths and marker sizes (pt), which depend on how much of a track a panel shows."""
 
     curve_width: float = 0.7
-    """Width of boundaries."""
     path_width: float = 0.6
     """Width of the trajectory; the true path is thinner."""
     marker_size: float = 2.6
-    """Size of cones and control points."""
     landmark_size: float = 1.4
     """Size of landmarks, small enough for their ellipses to be seen."""
     widest_band: float = np.inf

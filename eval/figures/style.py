@@ -114,7 +114,6 @@ def grouped_legend(figure: Figure) -> None:
 
 
 def _entries(panels: Iterable[Axes]) -> dict[str, Any]:
-    """Return the first artist of each label."""
     entries: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):

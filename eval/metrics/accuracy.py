@@ -195,7 +195,6 @@ class CurveDistance:
 
     @property
     def two_way(self) -> float:
-        """Return the mean of both."""
         return 0.5 * (self.mapped_to_truth + self.truth_to_mapped)
 
 
@@ -336,7 +335,6 @@ class Ghosts:
     """What is mapped but doesn't exist, on both boundaries together."""
 
     landmarks: int
-    """Number of landmarks without a true boundary near."""
     metres: float
     """Length of mapped curves without a true boundary near (m)."""
     share: float

@@ -55,7 +55,6 @@ class NormalizedError:
 
     @property
     def honest(self) -> bool:
-        """Return whether `ratio` lies in its interval."""
         low, high = self.interval
         return low <= self.ratio <= high
 
@@ -226,7 +225,6 @@ class Turn:
 
 
 def turn_from_truth(track: Map, truth: Truth) -> Turn:
-    """Return the turn of a map from the true cones."""
     return turn(track, {label: truth.cones[truth.cone_labels == label] for label in BOUNDARIES})
 
 

@@ -47,7 +47,6 @@ class Metric:
 
     @property
     def heading(self) -> str:
-        """Title with the unit in brackets."""
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
     @property
@@ -73,7 +72,6 @@ PAPER: Final = (
     Metric("missed", "missed", "%", 1),
     Metric("size", "size", digits=0),
 )
-"""Metrics of the paper's Table 1."""
 _ALL: Final = (
     *PAPER,
     Metric("cones", "true cones", digits=0),

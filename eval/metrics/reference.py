@@ -41,7 +41,6 @@ class Limit:
 
     @property
     def total(self) -> float:
-        """Return sqrt(l^2 + f^2) in m."""
         return float(np.hypot(self.l, self.f))
 
 

@@ -133,12 +133,10 @@ def _health(result: RunResult) -> dict[str, Any]:
 
 
 def stretches_of(result: RunResult) -> list[Stretch]:
-    """Return the stretches of a run that were not good."""
     return stretches([r.t for r in result.cycles], [health_of(r) for r in result.cycles])
 
 
 def health_of(record: CycleRecord) -> Health:
-    """Return the health in a cycle's record."""
     return Health(record.health, record.reason)
 
 
@@ -187,7 +185,6 @@ def not_mapped(track: Map, log: Log) -> list[str]:
 
 
 def has_cones(truth: Truth) -> bool:
-    """Return whether any true cone belongs to a boundary."""
     return bool(np.isin(truth.cone_labels, BOUNDARIES).any())
 
 

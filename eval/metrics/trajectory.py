@@ -218,7 +218,6 @@ class CycleReach(NamedTuple):
 
 
 NOT_COUNTED: Final = CycleReach(np.nan, 0.0, 0)
-"""Row of a cycle that doesn't count."""
 
 
 def cycle_reach(road: TrueRoad, station: float, pose_true: Array, pose: Array, track: Map) -> CycleReach:
@@ -257,7 +256,6 @@ class ReachObserver:
         self._rows: list[CycleReach] = []
 
     def __call__(self, cycle: ObservedCycle) -> None:
-        """Measure one cycle, with the map as it stands."""
         result = cycle.result
         station, pose_true = self._road.at(result.t)
         counts = self._road.counts(result.t, station)
@@ -268,7 +266,6 @@ class ReachObserver:
 
     @property
     def rows(self) -> Array:
-        """Return the rows (n, 3) of `RunResult.reach`."""
         return np.array(self._rows, float).reshape(-1, 3)
 
 

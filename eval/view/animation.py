@@ -118,7 +118,6 @@ class Animation:
             self._frames += due
 
     def finish(self) -> None:
-        """Hold the last frame for a while."""
         if self._frames:
             self._film.add(self._figure, self.settings.hold)
 

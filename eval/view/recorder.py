@@ -102,7 +102,6 @@ class Recorder:
             self._log_static(TRUE_CONES, rerun.Points2D(truth.cones))
 
     def __call__(self, cycle: ObservedCycle) -> None:
-        """Record one cycle."""
         self._stream.set_time(TIMELINE, sequence=cycle.number)
         self._stream.set_time(TIME, duration=cycle.detections.t)
         self._show_map(cycle.outline)
